@@ -1,0 +1,79 @@
+"""Stamped coordinate transforms for programs that live in an event loop.
+
+A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of every frame, answers where a frame was,
+seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
+"""
+
+from tfbus.broadcaster import TransformBroadcaster
+from tfbus.buffer import Buffer
+from tfbus.bus import Bus
+from tfbus.clock import Clock, SimulatedClock, SystemClock
+from tfbus.data import PointStamped, PoseStamped, Stamped, Vector3Stamped, do_transform
+from tfbus.errors import (
+    BusClosedError,
+    ClockResetError,
+    DisconnectedError,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    InvalidTransformError,
+    LookupTimeoutError,
+    PastExtrapolationError,
+    TransformError,
+    TransformLookupError,
+    UnknownFrameError,
+)
+from tfbus.geometry import Transform
+from tfbus.history import Edge, Outcome
+from tfbus.registration import Registration
+from tfbus.stamped import TransformStamped
+from tfbus.stamps import LATEST, SECOND, Latest, from_seconds, to_seconds
+from tfbus.statistics import BufferStatistics, BusStatistics, QueueStatistics
+from tfbus.stream import Stream
+from tfbus.threadsafe import ThreadPublisher
+from tfbus.ticks import Ticks
+from tfbus.tree import TransformTree
+from tfbus.waiting import PendingLookup, Question
+
+__all__ = [
+    "LATEST",
+    "SECOND",
+    "Buffer",
+    "BufferStatistics",
+    "Bus",
+    "BusClosedError",
+    "BusStatistics",
+    "Clock",
+    "ClockResetError",
+    "DisconnectedError",
+    "Edge",
+    "ExtrapolationError",
+    "FutureExtrapolationError",
+    "InvalidTransformError",
+    "Latest",
+    "LookupTimeoutError",
+    "Outcome",
+    "PastExtrapolationError",
+    "PendingLookup",
+    "PointStamped",
+    "PoseStamped",
+    "Question",
+    "QueueStatistics",
+    "Registration",
+    "SimulatedClock",
+    "Stamped",
+    "Stream",
+    "SystemClock",
+    "ThreadPublisher",
+    "Ticks",
+    "Transform",
+    "TransformBroadcaster",
+    "TransformError",
+    "TransformLookupError",
+    "TransformStamped",
+    "TransformTree",
+    "UnknownFrameError",
+    "Vector3Stamped",
+    "do_transform",
+    "from_seconds",
+    "to_seconds",
+]

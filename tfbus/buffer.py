@@ -1,0 +1,295 @@
+"""A tree that a bus feeds, and lookups that wait for what is still missing."""
+
+import logging
+import math
+from types import TracebackType
+from typing import Any, TypeVar
+
+import anyio
+import anyio.lowlevel
+
+from tfbus.bus import Bus
+from tfbus.data import Stamped, do_transform
+from tfbus.errors import (
+    BusClosedError,
+    ClockResetError,
+    DisconnectedError,
+    FutureExtrapolationError,
+    LookupTimeoutError,
+    TransformLookupError,
+    UnknownFrameError,
+)
+from tfbus.feed import Feed
+from tfbus.once import OnceLogger
+from tfbus.stamped import TransformStamped, is_frame
+from tfbus.stamps import LATEST, Latest, as_duration, from_seconds
+from tfbus.tree import TransformTree
+from tfbus.waiting import PendingLookup, Question, Waiter, blocking_frames
+
+DataT = TypeVar("DataT", bound=Stamped)
+
+_REPORT_AFTER = 5.0
+_MAY_COME = (UnknownFrameError, DisconnectedError, FutureExtrapolationError)
+
+
+class Buffer:
+    """A few seconds of every frame on a bus, and the transforms between them.
+
+    Parameters
+    ----------
+    bus : Bus
+        It feeds the buffer from now on, what is latched included, and holds it until `close`.
+    keep : float or None
+        How much history to keep for each frame, in s before that frame's newest stamp; None keeps everything.
+
+    Raises
+    ------
+    BusClosedError
+        If the bus is closed.
+    ValueError
+        If `keep` is negative.
+
+    Notes
+    -----
+    `lookup_nowait` and `tree` may be used from any thread; what is awaited, only on the bus's event loop.
+    """
+
+    def __init__(self, bus: Bus, keep: float | None = 10.0) -> None:
+        self.bus = bus
+        self._clock = bus.clock
+        self._feed = Feed(keep)
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        bus.attach(self._feed)
+
+    @property
+    def tree(self) -> TransformTree:
+        """The tree behind this buffer, to read: its samples come from the bus."""
+        return self._feed.tree
+
+    def lookup_nowait(
+        self,
+        target: str,
+        source: str,
+        at: int | Latest = LATEST,
+        *,
+        max_age: float | None = None,
+        source_at: int | Latest | None = None,
+        fixed: str | None = None,
+    ) -> TransformStamped:
+        """Where `source` is, seen from `target`, or an error at once. See `TransformTree.lookup`.
+
+        Parameters
+        ----------
+        target, source : str
+        at : int or LATEST
+            ns.
+        max_age : float, optional
+            Count a `LATEST` answer older than this many s as not yet arrived.
+        source_at, fixed
+            As `TransformTree.lookup`.
+
+        Raises
+        ------
+        TransformLookupError, TypeError
+            As `TransformTree.lookup`.
+        """
+        not_before = None if max_age is None else self._clock.now() - from_seconds(as_duration(max_age, "max_age"))
+        return self._feed.tree.lookup(target, source, at, source_at=source_at, fixed=fixed, not_before=not_before)
+
+    async def lookup(
+        self,
+        target: str,
+        source: str,
+        at: int | Latest = LATEST,
+        *,
+        timeout: float | None = None,
+        max_age: float | None = None,
+        source_at: int | Latest | None = None,
+        fixed: str | None = None,
+    ) -> TransformStamped:
+        """Where `source` is, seen from `target`, as soon as that can be answered.
+
+        What can be answered is answered after one checkpoint. What waiting cannot help fails at once: a stamp older
+        than an edge's window raises `PastExtrapolationError`. Everything else waits; a frame that nobody ever
+        publishes waits for ever, unless there is a timeout, and is logged after 5 s.
+
+        Parameters
+        ----------
+        target, source : str
+        at : int or LATEST
+            ns. `LATEST` is the newest stamp that every moving edge on the path can answer.
+        timeout : float, optional
+            In s on the bus's clock; None waits for ever.
+        max_age : float, optional
+            Count a `LATEST` answer older than this many s as not yet arrived, so that a dead broadcaster cannot
+            answer for ever.
+        source_at : int or LATEST, optional
+            Take source at this stamp instead, and carry it to `at` through `fixed`.
+        fixed : str, optional
+            The frame that is held still between the two stamps.
+
+        Returns
+        -------
+        TransformStamped
+            Parent is target and child is source.
+
+        Raises
+        ------
+        LookupTimeoutError
+            If the timeout ran out; its ``__cause__`` says what was still missing.
+        PastExtrapolationError
+            If it is older than an edge's window.
+        BusClosedError
+            If it cannot be answered and nothing more will come.
+        ClockResetError
+            If the clock jumped back meanwhile.
+        UnknownFrameError
+            At once, if a name cannot be that of a frame: empty, or with a leading slash.
+        TypeError
+            If a stamp is a float, or `max_age` comes without a `LATEST`.
+        """
+        limit = math.inf if timeout is None else as_duration(timeout, "timeout")
+        reset = self._feed.last_reset
+        await anyio.lowlevel.checkpoint()
+        question = Question(target, source, at, source_at, fixed)
+        try:
+            return self._read(question, max_age, reset)
+        except _MAY_COME as error:
+            if isinstance(error, UnknownFrameError) and not is_frame(error.frame):
+                raise
+            blocker = error
+        self.bus.check_thread()
+        return await self._wait(question, max_age, limit, reset, blocker)
+
+    async def transform(
+        self, data: DataT, target: str, *, timeout: float | None = None, max_age: float | None = None
+    ) -> DataT:
+        """`data` in the frame `target`, by the transform of its own stamp, as soon as that has arrived.
+
+        Parameters
+        ----------
+        data : PointStamped, Vector3Stamped, PoseStamped, or a type registered with `do_transform`
+            With `frame` and `stamp`; the stamp may be `LATEST`.
+        target : str
+        timeout, max_age : float, optional
+            As `lookup`.
+
+        Returns
+        -------
+        same type as `data`
+            Its frame is `target`, its stamp that of the transform.
+
+        Raises
+        ------
+        TypeError
+            If `data` is of a type that is not registered.
+        TransformError
+            As `lookup`.
+        """
+        found = await self.lookup(target, data.frame, data.stamp, timeout=timeout, max_age=max_age)
+        moved: DataT = do_transform(data, found)
+        return moved
+
+    def transform_nowait(self, data: DataT, target: str, *, max_age: float | None = None) -> DataT:
+        """As `transform`, or an error at once."""
+        moved: DataT = do_transform(data, self.lookup_nowait(target, data.frame, data.stamp, max_age=max_age))
+        return moved
+
+    def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
+        """Whether `lookup_nowait` with the same arguments has an answer now."""
+        try:
+            self.lookup_nowait(target, source, at, **question)
+        except TransformLookupError:
+            return False
+        return True
+
+    def pending(self) -> tuple[PendingLookup, ...]:
+        """The lookups that wait now, with what blocks each."""
+        return self._feed.waiting.pending()
+
+    def describe(self) -> str:
+        """The tree as text, with each edge's rate, age, span and authority, and the lookups that wait."""
+        lines = [self.tree.describe(self._clock.now())]
+        lines += [f"waiting: {pending}" for pending in self.pending()]
+        return "\n".join(lines)
+
+    def close(self) -> None:
+        """Leave the bus; lookups that wait end with `BusClosedError`. What is buffered can still be looked up."""
+        self.bus.detach(self._feed)
+        self._feed.end("the buffer is closed")
+
+    def __enter__(self) -> "Buffer":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    async def _wait(
+        self,
+        question: Question,
+        max_age: float | None,
+        limit: float,
+        reset: ClockResetError | None,
+        blocker: TransformLookupError,
+    ) -> TransformStamped:
+        """Park under what is missing, read again when woken, and so on until there is an answer or the time is up."""
+        since = self._clock.now()
+        quiet = min(limit, _REPORT_AFTER)
+        for seconds in (quiet, limit - quiet):
+            with self._clock.move_on_after(seconds):
+                while True:
+                    if seconds is not quiet:
+                        self._report(question, blocker)
+                    await self._park(question, since, blocker)
+                    try:
+                        return self._read(question, max_age, reset)
+                    except _MAY_COME as error:
+                        blocker = error
+            if seconds >= limit:
+                break
+        try:
+            # The data may have come in the very turn of the loop in which the time was up.
+            return self._read(question, max_age, reset)
+        except _MAY_COME as error:
+            raise LookupTimeoutError(
+                target=question.target, source=question.source, timeout=limit, missing=error
+            ) from error
+
+    async def _park(self, question: Question, since: int, blocker: TransformLookupError) -> None:
+        """Wait until something comes that can have removed what blocks a lookup."""
+        if self._feed.ended:
+            raise BusClosedError(self._feed.ended) from blocker
+        woken = anyio.Event()
+        waiter = Waiter(question, since, woken.set)
+        self._feed.waiting.park(waiter, blocker)
+        try:
+            await woken.wait()
+        finally:
+            self._feed.waiting.remove(waiter)
+
+    def _read(self, question: Question, max_age: float | None, reset: ClockResetError | None) -> TransformStamped:
+        """As `lookup_nowait`, for a lookup that began when the clock's last jump back was `reset`."""
+        latest = self._feed.last_reset
+        if latest is not None and latest is not reset:
+            raise ClockResetError(before=latest.before, after=latest.after)
+        return self.lookup_nowait(
+            question.target,
+            question.source,
+            question.at,
+            max_age=max_age,
+            source_at=question.source_at,
+            fixed=question.fixed,
+        )
+
+    def _report(self, question: Question, blocker: TransformLookupError) -> None:
+        """Log what blocks a lookup that has waited for long."""
+        self._log.warning(
+            (type(blocker), blocking_frames(blocker)),
+            "a lookup of %r in %r has waited for more than %g s: %s",
+            question.source,
+            question.target,
+            _REPORT_AFTER,
+            blocker,
+        )

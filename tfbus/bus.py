@@ -1,0 +1,288 @@
+"""The bus: who publishes reaches every buffer, stream and subscriber.
+
+`Bus.publish` is a plain function that does its work at once: it judges a batch by the newest parents that it knows of,
+has every buffer insert it and wake its waiters, then calls the subscribers. The bus owns no task and no loop, so
+nothing can be lost between "sent" and "buffered".
+"""
+
+import logging
+from collections.abc import Iterable
+from threading import get_ident
+from types import TracebackType
+from typing import Literal
+
+import anyio
+
+from tfbus.clock import Clock, SystemClock
+from tfbus.errors import BusClosedError, UnknownFrameError
+from tfbus.feed import Feed
+from tfbus.once import OnceLogger
+from tfbus.registration import Registration
+from tfbus.sample_queue import Overflow
+from tfbus.stamped import Batch, TransformStamped, as_batch
+from tfbus.statistics import BusStatistics
+from tfbus.stream import Stream
+from tfbus.subscribers import BatchCallback, Subscribers
+from tfbus.threadsafe import ThreadPublisher
+from tfbus.topology import Topology
+
+
+class Bus:
+    """Broadcasts stamped transforms inside one process.
+
+    Parameters
+    ----------
+    clock : Clock, optional
+        Where stamps, timeouts and timed tasks take their time from; by default a `SystemClock`.
+
+    Notes
+    -----
+    A bus may be made before an event loop runs. It belongs to the thread that made it, or to the thread whose event
+    loop uses it first; other threads publish through `threadsafe`.
+    """
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        self.clock: Clock = SystemClock() if clock is None else clock
+        self._thread = get_ident()
+        self._on_a_loop = False
+        self._closed = False
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._topology = Topology(self._log)
+        self._subscribers = Subscribers(self._log)
+        self._feeds: list[Feed] = []
+        self._streams: list[Stream] = []
+        self._threads: list[ThreadPublisher] = []
+        self._batches = 0
+        self._samples = 0
+        self._resets = 0
+        self._jumps = self.clock.on_jump(self._clock_jumped)
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._closed
+
+    def publish(
+        self, samples: TransformStamped | Iterable[TransformStamped], invalid: Literal["raise", "drop"] = "raise"
+    ) -> None:
+        """Send one sample, or a batch that is seen all or not at all.
+
+        When this returns, every buffer has the samples and the lookups that waited for them have been woken.
+
+        Parameters
+        ----------
+        samples : TransformStamped or iterable of them
+        invalid : {"raise", "drop"}
+            What to do with a sample that would close a loop of parents: refuse the whole batch, or leave that sample
+            out and count it. ``"drop"`` is for those who pass on what others have sent.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a sample would close a loop of parents. Nothing is stored.
+        TypeError
+            If something in it is not a `TransformStamped`.
+        BusClosedError
+            If the bus is closed.
+        RuntimeError
+            If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
+        """
+        if get_ident() != self._thread:
+            self.check_thread()
+        if self._closed:
+            raise BusClosedError
+        if type(samples) is TransformStamped:
+            batch: Batch = (samples,)
+        elif invalid == "raise":
+            batch = as_batch(samples)
+        else:
+            batch = self._well_typed(samples)
+        if self._subscribers:
+            self._subscribers.check_backlog()
+        batch = self._topology.take(batch, invalid)
+        if not batch:
+            return
+        self._batches += 1
+        self._samples += len(batch)
+        for feed in self._feeds:
+            feed.receive(batch)
+        for stream in self._streams:
+            stream.put(batch)
+        if self._subscribers:
+            self._subscribers.deliver(batch)
+
+    def check_thread(self) -> None:
+        """Raise `RuntimeError` unless the caller may use the bus directly.
+
+        The first event loop to use a bus that another thread has made takes it over.
+        """
+        if get_ident() == self._thread and self._on_a_loop:
+            return
+        try:
+            anyio.get_current_task()
+        except RuntimeError:
+            on_a_loop = False
+        else:
+            on_a_loop = True
+        if get_ident() != self._thread:
+            if self._on_a_loop or not on_a_loop:
+                raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
+            self._thread = get_ident()
+        self._on_a_loop = self._on_a_loop or on_a_loop
+
+    def subscribe(self, callback: BatchCallback) -> Registration:
+        """Call `callback` with each batch, a tuple of samples, until the registration is closed.
+
+        It is called inside `publish`, so it should be quick; if it publishes, those batches are delivered behind the
+        current one. If it raises an `Exception`, that is logged once and counted, and nobody else notices. What is
+        latched, it is given at once.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        self._check_open()
+        return self._subscribers.add(callback, tuple(self._topology.latched.values()))
+
+    def stream(self, capacity: int = 1_000, overflow: Overflow = "conflate") -> Stream:
+        """The batches as an async iterator: ``with bus.stream() as batches: async for batch in batches``.
+
+        Parameters
+        ----------
+        capacity : int
+            How many moving samples may wait for the reader; with ``"conflate"`` that is a number of children.
+        overflow : {"conflate", "drop_oldest"}
+            Keep the newest sample a child, or the newest whole batches. Static samples are never dropped.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        self._check_open()
+        stream = Stream(capacity, overflow, self._detach_stream)
+        if self._topology.latched:
+            stream.put(tuple(self._topology.latched.values()))
+        self._streams.append(stream)
+        return stream
+
+    def threadsafe(self, capacity: int = 10_000) -> ThreadPublisher:
+        """A way in for other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
+
+        ``publish(samples)`` may then be called from any thread. The bus publishes what has gathered with
+        ``invalid="drop"``; when more than `capacity` moving samples wait, the oldest batches are dropped and counted.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        self._check_open()
+        publisher = ThreadPublisher(capacity, self._publish_from_thread, self._threads.remove)
+        self._threads.append(publisher)
+        return publisher
+
+    def attach(self, feed: Feed) -> None:
+        """Have a buffer's feed receive what is latched now and all that is published from now on."""
+        self._check_open()
+        if self._topology.latched:
+            feed.receive(tuple(self._topology.latched.values()))
+        self._feeds.append(feed)
+
+    def detach(self, feed: Feed) -> None:
+        """Take a feed off the bus, if it is on it."""
+        if feed in self._feeds:
+            self._feeds.remove(feed)
+
+    def remove_frame(self, frame: str) -> None:
+        """Make a frame disappear: from every buffer, from what streams still hold, and for whoever joins later.
+
+        Frames below it stay, as a tree of their own.
+
+        Raises
+        ------
+        UnknownFrameError
+            If nobody has published it.
+        """
+        self._check_open()
+        if frame not in (names := self._topology.names()):
+            raise UnknownFrameError(frame=frame, known=tuple(names))
+        self._topology.remove(frame)
+        for publisher in self._threads:
+            publisher.forget(frame)
+        for stream in self._streams:
+            stream.queue.forget(frame)
+        for feed in self._feeds:
+            feed.remove_frame(frame)
+
+    def statistics(self) -> BusStatistics:
+        """All counters, as they are now."""
+        return BusStatistics(
+            batches=self._batches,
+            samples=self._samples,
+            rejected=dict(self._topology.rejected),
+            reparented=self._topology.reparented,
+            kind_changes=self._topology.kind_changes,
+            authority_conflicts=self._topology.conflicts,
+            clock_resets=self._resets,
+            callbacks_failed=self._subscribers.failures,
+            frames=len(self._topology),
+            buffers=tuple(feed.statistics() for feed in self._feeds),
+            queues=(
+                *(stream.queue.statistics("stream") for stream in self._streams),
+                *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
+            ),
+        )
+
+    def close(self) -> None:
+        """End every stream and every waiting lookup; buffers go on answering what they can.
+
+        A second call does nothing.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        self._jumps.close()
+        for publisher in self._threads:
+            publisher.end()
+        for stream in self._streams:
+            stream.end()
+        for feed in self._feeds:
+            feed.end("the bus is closed")
+
+    def __enter__(self) -> "Bus":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise BusClosedError
+
+    def _detach_stream(self, stream: Stream) -> None:
+        if stream in self._streams:
+            self._streams.remove(stream)
+
+    def _well_typed(self, samples: object) -> Batch:
+        """The samples of a batch; whatever else is in it is counted."""
+        things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
+        batch = tuple(thing for thing in things if isinstance(thing, TransformStamped))
+        self._topology.rejected["not a sample"] += len(things) - len(batch)
+        return batch
+
+    def _publish_from_thread(self, batch: Batch) -> None:
+        if not self._closed:
+            self.publish(batch, invalid="drop")
+
+    def _clock_jumped(self, before: int, after: int) -> None:
+        if after >= before:
+            return
+        self._resets += 1
+        self._topology.clear_moving()
+        for publisher in self._threads:
+            publisher.discard()
+        for stream in self._streams:
+            stream.queue.discard_moving()
+        for feed in self._feeds:
+            feed.reset(before, after)

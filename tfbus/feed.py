@@ -1,0 +1,87 @@
+"""What a bus sees of a buffer: it puts batches into the tree and wakes the lookups that they can have unblocked.
+
+Sans-IO like the tree and the index that it joins: waking is calling what each waiter brought along.
+"""
+
+from collections.abc import Iterable
+
+from tfbus.errors import ClockResetError, UnknownFrameError
+from tfbus.stamped import Batch
+from tfbus.statistics import BufferStatistics
+from tfbus.tree import TransformTree
+from tfbus.waiting import Waiter, WaitingIndex
+
+
+class Feed:
+    """A tree and the lookups that wait for it.
+
+    Parameters
+    ----------
+    keep : float or None
+        As `TransformTree`.
+
+    Attributes
+    ----------
+    tree : TransformTree
+    waiting : WaitingIndex
+    ended : str
+        Why nothing more will come; empty while it may.
+    last_reset : ClockResetError or None
+        The last jump back of the clock; another object for each.
+    """
+
+    def __init__(self, keep: float | None) -> None:
+        self.tree = TransformTree(keep)
+        self.waiting = WaitingIndex()
+        self.ended = ""
+        self.last_reset: ClockResetError | None = None
+        self._offered = 0
+
+    def receive(self, batch: Batch) -> None:
+        """Insert a batch that the bus has judged, and wake whom it can have unblocked."""
+        self._offered += len(batch)
+        tree, blocked = self.tree, self.waiting.blocked
+        if not blocked:
+            tree.commit(batch)
+            return
+        structure, names = tree.structure_version, tree.names_version
+        tree.commit(batch)
+        if tree.structure_version != structure:
+            _wake(self.waiting.take_all())
+            return
+        for sample in batch:
+            child = sample._fields[1]
+            if child in blocked:
+                _wake(self.waiting.take(child, tree.newest_stamp(child)))
+        if tree.names_version != names:
+            for sample in batch:
+                _wake(self.waiting.take(sample.parent, None))
+
+    def remove_frame(self, frame: str) -> None:
+        """Forget a frame, if it is known; lookups that wait learn of it."""
+        try:
+            self.tree.remove_frame(frame)
+        except UnknownFrameError:
+            return
+        _wake(self.waiting.take_all())
+
+    def reset(self, before: int, after: int) -> None:
+        """Drop moving samples: the clock has jumped back. Lookups that wait get a `ClockResetError`."""
+        self.tree.clear()
+        self.last_reset = ClockResetError(before=before, after=after)
+        _wake(self.waiting.take_all())
+
+    def end(self, reason: str) -> None:
+        """Wake every waiter for the last time: nothing more will come."""
+        self.ended = self.ended or reason
+        _wake(self.waiting.take_all())
+
+    def statistics(self) -> BufferStatistics:
+        """Counters since the feed was attached."""
+        tree = self.tree
+        return BufferStatistics(self._offered, tree.inserted, tree.replaced, tree.expired, len(self.waiting))
+
+
+def _wake(waiters: Iterable[Waiter]) -> None:
+    for waiter in waiters:
+        waiter.wake()

@@ -1,0 +1,216 @@
+"""The way between two frames, and the arithmetic along it.
+
+A path climbs from the source to the lowest common ancestor and from the target to the same frame, so no edge above that
+can fail or slow a lookup. Runs of static edges are folded into one row. `climb` is the kernel of every scalar lookup:
+one loop over Python floats, because a function call or a small array for each edge would cost more than its arithmetic.
+Its formulas are those of `tfbus.geometry`.
+"""
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from math import acos, sin
+from struct import Struct
+
+from tfbus.errors import DisconnectedError, ExtrapolationError, PastExtrapolationError
+from tfbus.geometry import IDENTITY, Row, compose, invert
+from tfbus.history import RECORD, RECORD_SIZE, FrameHistory
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN
+
+_unpack = RECORD.unpack_from
+_unpack_pair = Struct("=q7dq7d").unpack_from
+
+Step = FrameHistory | Row
+
+
+class Path:
+    """How to get from `source` to `target`, with the parents that hold at one instant.
+
+    Attributes
+    ----------
+    frames : tuple of str
+        From target to source, the common ancestor once.
+    moving : tuple of FrameHistory
+        The edges that are not static.
+    lasting : bool
+        Whether it is the path at every stamp, because no frame on it changes parent inside its window.
+    """
+
+    __slots__ = ("_down", "_up", "frames", "lasting", "moving", "static_stamp")
+
+    def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
+        edges = ups + downs
+        self._up = _fold(ups)
+        self._down = _fold(downs)
+        self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
+        self.moving = tuple(edge for edge in edges if not edge.static)
+        self.lasting = all(edge.parents is None for edge in edges)
+        self.static_stamp = max((edge.static_stamp for edge in edges), default=0)
+
+    def row(self, at: int) -> Row:
+        """Source in target at a stamp.
+
+        Raises
+        ------
+        ExtrapolationError
+            If an edge does not cover it.
+        """
+        try:
+            if not self._down:
+                return climb(self._up, at)
+            return compose(invert(climb(self._down, at)), climb(self._up, at))
+        except ExtrapolationError:
+            raise self._blocker(at) from None
+
+    def newest_common(self) -> tuple[int, FrameHistory]:
+        """The newest stamp that every moving edge has reached, and the edge that has come no further.
+
+        Raises
+        ------
+        FutureExtrapolationError
+            If an edge has no samples.
+        """
+        lagging = self.moving[0]
+        common = STAMP_MAX
+        for edge in self.moving:
+            if not edge.stamps:
+                raise edge.missing(LATEST)
+            if edge.stamps[-1] < common:
+                lagging, common = edge, edge.stamps[-1]
+        return common, lagging
+
+    def _blocker(self, at: int) -> ExtrapolationError:
+        """The edge that decides among those that do not cover a stamp: one past for good, or the last to come."""
+        missing = [edge.missing(at) for edge in self.moving if not edge.covers(at)]
+        for error in missing:
+            if isinstance(error, PastExtrapolationError):
+                return error
+        return min(missing, key=lambda error: STAMP_MIN if error.newest is None else error.newest)
+
+
+def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
+    steps: list[Step] = []
+    for edge in edges:
+        if not edge.static:
+            steps.append(edge)
+        elif steps and isinstance(steps[-1], tuple):
+            steps[-1] = compose(edge.row, steps[-1])
+        else:
+            steps.append(edge.row)
+    return tuple(steps)
+
+
+def climb(steps: tuple[Step, ...], at: int) -> Row:
+    """The first step's child, seen from the last step's parent, at a stamp."""
+    if not steps:
+        return IDENTITY
+    first = True
+    for step in steps:
+        if isinstance(step, tuple):
+            ax, ay, az, ai, aj, ak, aw = step
+        else:
+            stamps = step.stamps
+            i = bisect_left(stamps, at, step.start)
+            if i == step.start or i == len(stamps):
+                if i == len(stamps) or stamps[i] != at:
+                    raise step.missing(at)
+                _, ax, ay, az, ai, aj, ak, aw = _unpack(step.records, i * RECORD_SIZE)
+            else:
+                s0, ax, ay, az, ai, aj, ak, aw, s1, bx, by, bz, bi, bj, bk, bw = _unpack_pair(
+                    step.records, (i - 1) * RECORD_SIZE
+                )
+                if at == s1:
+                    ax, ay, az, ai, aj, ak, aw = bx, by, bz, bi, bj, bk, bw
+                elif step.parents is None or step.origins[i - 1][0] == step.origins[i][0]:
+                    f = (at - s0) / (s1 - s0)
+                    ax += f * (bx - ax)
+                    ay += f * (by - ay)
+                    az += f * (bz - az)
+                    dot = ai * bi + aj * bj + ak * bk + aw * bw
+                    if -1.0 < dot < 1.0:
+                        angle = acos(dot if dot > 0.0 else -dot)
+                        scale = 1.0 / sin(angle)
+                        keep = sin(angle - f * angle) * scale
+                        turn = sin(f * angle) * scale
+                        if dot < 0.0:
+                            turn = -turn
+                        ai = keep * ai + turn * bi
+                        aj = keep * aj + turn * bj
+                        ak = keep * ak + turn * bk
+                        aw = keep * aw + turn * bw
+        if first:
+            x, y, z, qx, qy, qz, qw = ax, ay, az, ai, aj, ak, aw
+            first = False
+        else:
+            tx = 2.0 * (aj * z - ak * y)
+            ty = 2.0 * (ak * x - ai * z)
+            tz = 2.0 * (ai * y - aj * x)
+            x += ax + aw * tx + aj * tz - ak * ty
+            y += ay + aw * ty + ak * tx - ai * tz
+            z += az + aw * tz + ai * ty - aj * tx
+            qx, qy, qz, qw = (
+                aw * qx + ai * qw + aj * qz - ak * qy,
+                aw * qy - ai * qz + aj * qw + ak * qx,
+                aw * qz + ai * qy - aj * qx + ak * qw,
+                aw * qw - ai * qx - aj * qy - ak * qz,
+            )
+    return x, y, z, qx, qy, qz, qw
+
+
+def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: int | None) -> Path:
+    """The path that holds at a stamp, or with each frame's newest parent.
+
+    Both ends climb in turn, so the search stops at most one side's length beyond the common ancestor.
+
+    Parameters
+    ----------
+    frames : mapping of child to its history
+    target, source : str
+    at : int or None
+        ns; None for the newest parents.
+
+    Raises
+    ------
+    DisconnectedError
+        If they do not meet, or a side comes back to where it was: out-of-order samples can form a loop in the past.
+    """
+    up, down = _Climber(frames, source, at), _Climber(frames, target, at)
+    while True:
+        if up.here in down.seen:
+            return Path(up.edges, down.edges[: down.seen[up.here]], up.here)
+        if down.here in up.seen:
+            return Path(up.edges[: up.seen[down.here]], down.edges, down.here)
+        if up.ended and down.ended:
+            raise DisconnectedError(
+                target=target, source=source, roots=(down.here, up.here), stamp=at, loop=up.loop or down.loop
+            )
+        up.climb()
+        down.climb()
+
+
+class _Climber:
+    """One end of a path on its way to the root."""
+
+    __slots__ = ("_at", "_frames", "edges", "ended", "here", "loop", "seen")
+
+    def __init__(self, frames: Mapping[str, FrameHistory], frame: str, at: int | None) -> None:
+        self._frames = frames
+        self._at = at
+        self.here = frame
+        self.edges: list[FrameHistory] = []
+        self.seen = {frame: 0}
+        self.ended = False
+        self.loop: tuple[str, ...] = ()
+
+    def climb(self) -> None:
+        """Go one edge up, unless this is the root."""
+        edge = self._frames.get(self.here)
+        if edge is None or self.ended:
+            self.ended = True
+            return
+        self.here = edge.parent if self._at is None else edge.parent_at(self._at)
+        self.edges.append(edge)
+        if self.here in self.seen:
+            self.loop = (*[edge.child for edge in self.edges[self.seen[self.here] :]], self.here)
+            self.ended = True
+        else:
+            self.seen[self.here] = len(self.edges)

@@ -1,0 +1,65 @@
+"""Counters, as plain frozen data: ``dataclasses.asdict`` makes them JSON."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class BufferStatistics:
+    """One buffer since it was attached: ``offered == inserted + replaced + expired``."""
+
+    offered: int
+    inserted: int
+    replaced: int
+    expired: int
+    waiting: int
+
+
+@dataclass(frozen=True, slots=True)
+class QueueStatistics:
+    """One bounded queue: a stream, or the samples of other threads."""
+
+    kind: str
+    overflow: str
+    capacity: int
+    pending: int
+    dropped: int
+
+
+@dataclass(frozen=True, slots=True)
+class BusStatistics:
+    """A bus since it was made.
+
+    Attributes
+    ----------
+    batches, samples : int
+        Published and accepted.
+    rejected : mapping of str to int
+        Samples that were refused, by reason.
+    reparented : int
+        Samples that gave a child another newest parent.
+    kind_changes : int
+        Samples that turned a static child into a moving one, or back.
+    authority_conflicts : int
+        Samples of a child that followed one from another authority.
+    clock_resets : int
+        Jumps back of the clock.
+    callbacks_failed : int
+        Exceptions that subscribers raised.
+    frames : int
+        Children that the bus knows now.
+    buffers : tuple of BufferStatistics
+    queues : tuple of QueueStatistics
+    """
+
+    batches: int
+    samples: int
+    rejected: Mapping[str, int]
+    reparented: int
+    kind_changes: int
+    authority_conflicts: int
+    clock_resets: int
+    callbacks_failed: int
+    frames: int
+    buffers: tuple[BufferStatistics, ...]
+    queues: tuple[QueueStatistics, ...]

@@ -1,0 +1,214 @@
+"""Who hangs on whom by the newest samples, and whether a batch may change it.
+
+The newest edges must form a forest, judged after the whole batch: one batch may turn an edge round. The bus keeps a
+`Topology` and asks it before anything is committed, so that the sender hears of a bad edge; a tree that is used alone
+has its own histories judged by `admit`.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Literal, Protocol
+
+from tfbus.errors import InvalidTransformError
+from tfbus.once import OnceLogger
+from tfbus.stamped import Batch, TransformStamped
+
+
+class NewestEdge(Protocol):
+    """The newest that is known of one child."""
+
+    @property
+    def parent(self) -> str: ...
+
+    @property
+    def static(self) -> bool: ...
+
+    @property
+    def newest(self) -> int | None: ...
+
+
+def admit(
+    edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]
+) -> tuple[Batch, list[InvalidTransformError]]:
+    """Split a batch into the samples that leave a forest and the errors of those that do not.
+
+    Of the samples that close a loop, the last one in the batch is refused, until no loop is left.
+
+    Parameters
+    ----------
+    edges : mapping of child to its newest edge
+        A child that is neither static nor has a newest stamp counts as having no parent.
+    batch : sequence of TransformStamped
+    """
+    accepted = list(batch)
+    refused: list[InvalidTransformError] = []
+    while loop := _find_loop(edges, changes := _changed_parents(edges, accepted)):
+        at, sample = next(
+            (at, sample)
+            for at, sample in reversed(list(enumerate(accepted)))
+            if sample.child in loop and changes.get(sample.child) == sample.parent
+        )
+        del accepted[at]
+        refused.append(_cycle(sample, loop))
+    return tuple(accepted), refused
+
+
+def _cycle(sample: TransformStamped, loop: tuple[str, ...]) -> InvalidTransformError:
+    start = loop.index(sample.child)
+    circle = (*loop[start:-1], *loop[: start + 1])
+    return InvalidTransformError(
+        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {' -> '.join(circle)}",
+        reason="cycle",
+        parent=sample.parent,
+        child=sample.child,
+        authority=sample.authority,
+        loop=circle,
+    )
+
+
+def _parent(edge: NewestEdge | None) -> str | None:
+    return None if edge is None or (edge.newest is None and not edge.static) else edge.parent
+
+
+def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
+    """The children whose newest parent is another one after the batch, with that parent."""
+    newest: dict[str, tuple[str, bool, int | None]] = {}
+    for sample in batch:
+        parent, child, stamp, _, _, static = sample._fields
+        edge = edges.get(child)
+        had = newest.get(child)
+        if had is None and edge is not None:
+            had = edge.parent, edge.static, edge.newest
+        # The last kind wins; of moving samples, the newest stamp.
+        if had is None or static or had[1] or had[2] is None or stamp >= had[2]:
+            newest[child] = parent, static, None if static else stamp
+    return {child: parent for child, (parent, _, _) in newest.items() if parent != _parent(edges.get(child))}
+
+
+def _find_loop(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> tuple[str, ...]:
+    """A loop that runs through a changed child, from that child over its parents back to it; empty if there is none."""
+    for child in changes:
+        walk = [child]
+        seen = {child}
+        here: str | None = child
+        while here is not None:
+            here = changes[here] if here in changes else _parent(edges.get(here))
+            if here == child:
+                return (*walk, child)
+            if here in seen:
+                break
+            if here is not None:
+                seen.add(here)
+                walk.append(here)
+    return ()
+
+
+class _Newest:
+    """The newest that a topology knows of one child."""
+
+    __slots__ = ("authority", "newest", "parent", "static")
+
+    def __init__(self, parent: str, static: bool, authority: str) -> None:
+        self.parent = parent
+        self.static = static
+        self.newest: int | None = None
+        self.authority = authority
+
+
+class Topology:
+    """Each child's newest parent, kind and authority, and the static samples that late joiners need.
+
+    Attributes
+    ----------
+    latched : dict of str to TransformStamped
+        The static sample of each static child.
+    rejected : Counter
+        Samples that were refused, by reason.
+    reparented, kind_changes, conflicts : int
+        Samples that gave a child another newest parent, or another kind, or came from another authority than before.
+    """
+
+    def __init__(self, log: OnceLogger) -> None:
+        self._log = log
+        self._newest: dict[str, _Newest] = {}
+        self.latched: dict[str, TransformStamped] = {}
+        self.rejected: Counter[str] = Counter()
+        self.reparented = 0
+        self.kind_changes = 0
+        self.conflicts = 0
+
+    def __len__(self) -> int:
+        return len(self._newest)
+
+    def names(self) -> set[str]:
+        """Every frame that an edge names."""
+        return {*self._newest, *(known.parent for known in self._newest.values())}
+
+    def take(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
+        """Judge a batch, note what may be committed of it, and give that back.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a sample closes a loop and `invalid` is ``"raise"``; then nothing was noted.
+        """
+        newest = self._newest
+        for sample in batch:
+            parent, child, _, _, authority, static = sample._fields
+            known = newest.get(child)
+            if known is None or known.parent != parent or known.authority != authority or known.static or static:
+                return self._judge(batch, invalid)
+        # Nearly always: more of the same, of which only the stamps are news.
+        for sample in batch:
+            fields = sample._fields
+            known = newest[fields[1]]
+            if known.newest is None or fields[2] > known.newest:
+                known.newest = fields[2]
+        return batch
+
+    def remove(self, child: str) -> None:
+        """Forget a child."""
+        self._newest.pop(child, None)
+        self.latched.pop(child, None)
+
+    def clear_moving(self) -> None:
+        """Forget every child that is not static."""
+        self._newest = {child: known for child, known in self._newest.items() if known.static}
+
+    def _judge(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
+        accepted, refused = admit(self._newest, batch)
+        for error in refused:
+            self.rejected[error.reason] += 1
+        if refused and invalid == "raise":
+            raise refused[0]
+        for error in refused:
+            self._log.warning((error.reason, error.child, error.authority), "dropped a sample: %s", error)
+        for sample in accepted:
+            self._note(sample)
+        return accepted
+
+    def _note(self, sample: TransformStamped) -> None:
+        parent, child, stamp, _, authority, static = sample._fields
+        known = self._newest.get(child)
+        if known is None:
+            known = self._newest[child] = _Newest(parent, static, authority)
+        if known.authority != authority:
+            self.conflicts += 1
+            first, second = sorted((known.authority, authority))
+            key = ("authority", child, first, second)
+            self._log.warning(key, "frame %r comes from two authorities, %r and %r", child, first, second)
+            known.authority = authority
+        if known.static != static:
+            self.kind_changes += 1
+            kind = "static" if static else "moving"
+            self._log.warning(("kind", child, authority), "frame %r is now %s, from %r", child, kind, authority)
+            known.static = static
+            known.newest = None
+        if static or known.newest is None or stamp >= known.newest:
+            known.newest = None if static else stamp
+            self.reparented += known.parent != parent
+            known.parent = parent
+        if static:
+            self.latched[child] = sample
+        else:
+            self.latched.pop(child, None)

@@ -1,0 +1,184 @@
+"""Who waits for what.
+
+A lookup that cannot be answered is parked under what blocks it: an edge whose newest stamp is too old, ordered by the
+stamp it needs; a frame that nobody has named; or the roots of two trees. An insertion then finds those that it can have
+unblocked without looking at the others. Nothing here waits or evaluates: whoever inserts takes the waiters that are due
+and wakes them, and they read again for themselves.
+"""
+
+from bisect import bisect_left, bisect_right, insort
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import count
+from operator import itemgetter
+
+from tfbus.errors import DisconnectedError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus.stamps import STAMP_MIN, Latest
+
+_Place = tuple[int, int, "Waiter"]
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What a lookup asks: its arguments, stamps in ns."""
+
+    target: str
+    source: str
+    at: int | Latest
+    source_at: int | Latest | None = None
+    fixed: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PendingLookup:
+    """One lookup that waits: its question, since when (ns on the bus's clock), and the error that blocks it."""
+
+    question: Question
+    since: int
+    blocked_by: TransformLookupError
+
+    def __str__(self) -> str:
+        return f"{self.question.source!r} in {self.question.target!r}: {self.blocked_by}"
+
+
+class Waiter:
+    """A parked lookup.
+
+    Parameters
+    ----------
+    question : Question
+    since : int
+        When the lookup began to wait, in ns.
+    wake : callable
+        Called once, by whoever took the waiter from the index.
+    """
+
+    __slots__ = ("blocked_by", "names", "place", "question", "since", "wake")
+
+    def __init__(self, question: Question, since: int, wake: Callable[[], object]) -> None:
+        self.question = question
+        self.since = since
+        self.wake = wake
+        self.blocked_by: TransformLookupError | None = None
+        self.names: tuple[str, ...] = ()
+        self.place: _Place | None = None
+
+
+def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
+    """The frames of which a sample may remove what `error` says.
+
+    Raises
+    ------
+    TypeError
+        If `error` is of a kind that waiting cannot help.
+    """
+    if isinstance(error, FutureExtrapolationError):
+        return (error.child,)
+    if isinstance(error, UnknownFrameError):
+        return (error.frame,)
+    if isinstance(error, DisconnectedError):
+        return error.roots
+    raise TypeError(f"waiting cannot help against {error!r}")
+
+
+class _Blocked:
+    """The waiters under one frame: by the stamp that its edge must reach, and those that need any sample of it."""
+
+    __slots__ = ("by_stamp", "for_any")
+
+    def __init__(self) -> None:
+        self.by_stamp: list[_Place] = []
+        self.for_any: dict[Waiter, None] = {}
+
+
+class WaitingIndex:
+    """The parked lookups of one buffer.
+
+    Attributes
+    ----------
+    blocked : mapping
+        The frames that somebody is parked under. A frame that is not in it has nothing to take.
+    """
+
+    def __init__(self) -> None:
+        self.blocked: dict[str, _Blocked] = {}
+        self._waiters: dict[Waiter, None] = {}
+        self._order = count()
+
+    def __len__(self) -> int:
+        return len(self._waiters)
+
+    def park(self, waiter: Waiter, error: TransformLookupError) -> None:
+        """Put a waiter under what `error` says is missing.
+
+        Raises
+        ------
+        TypeError
+            If `error` is of a kind that waiting cannot help.
+        """
+        waiter.names = blocking_frames(error)
+        if isinstance(error, FutureExtrapolationError):
+            needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp
+            waiter.place = (needed, next(self._order), waiter)
+            insort(self._under(error.child).by_stamp, waiter.place)
+        else:
+            waiter.place = None
+            for name in waiter.names:
+                self._under(name).for_any[waiter] = None
+        waiter.blocked_by = error
+        self._waiters[waiter] = None
+
+    def remove(self, waiter: Waiter) -> None:
+        """Take one waiter out, if it is still parked."""
+        if waiter not in self._waiters:
+            return
+        del self._waiters[waiter]
+        for name in waiter.names:
+            blocked = self.blocked.get(name)
+            if blocked is None:
+                continue
+            if waiter.place is not None:
+                del blocked.by_stamp[bisect_left(blocked.by_stamp, waiter.place)]
+            else:
+                blocked.for_any.pop(waiter, None)
+            if not blocked.by_stamp and not blocked.for_any:
+                del self.blocked[name]
+
+    def take(self, frame: str, newest: int | None) -> list[Waiter]:
+        """Take out those that a sample of `frame` can have unblocked: all that need less than its newest stamp."""
+        blocked = self.blocked.get(frame)
+        if blocked is None:
+            return []
+        ready = list(blocked.for_any)
+        for waiter in ready:
+            self.remove(waiter)
+        if newest is not None:
+            due = bisect_right(blocked.by_stamp, newest, key=itemgetter(0))
+            for _, _, waiter in blocked.by_stamp[:due]:
+                del self._waiters[waiter]
+                ready.append(waiter)
+            del blocked.by_stamp[:due]
+        if not blocked.by_stamp:
+            self.blocked.pop(frame, None)
+        return ready
+
+    def take_all(self) -> list[Waiter]:
+        """Take everybody out, as when the tree's shape has changed."""
+        ready = list(self._waiters)
+        self._waiters.clear()
+        self.blocked.clear()
+        return ready
+
+    def _under(self, frame: str) -> _Blocked:
+        blocked = self.blocked.get(frame)
+        if blocked is None:
+            blocked = self.blocked[frame] = _Blocked()
+        return blocked
+
+    def pending(self) -> tuple[PendingLookup, ...]:
+        """Who waits, and what blocks each."""
+        return tuple(
+            PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
+            for waiter in self._waiters
+            if waiter.blocked_by is not None
+        )
