@@ -49,10 +49,9 @@ class Bus:
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._topology = Topology(self._log)
         self._subscribers = Subscribers(self._log)
-        self._feeds: list[Feed] = []
+        self._feeds: dict[Feed, int] = {}
         self._streams: list[Stream] = []
         self._threads: list[ThreadPublisher] = []
-        self._batches = 0
         self._samples = 0
         self._resets = 0
         self._jumps = self.clock.on_jump(self._clock_jumped)
@@ -97,18 +96,18 @@ class Bus:
             batch = as_batch(samples)
         else:
             batch = self._well_typed(samples)
-        if self._subscribers:
+        callbacks = self._subscribers.callbacks
+        if callbacks:
             self._subscribers.check_backlog()
         batch = self._topology.take(batch, invalid)
         if not batch:
             return
-        self._batches += 1
         self._samples += len(batch)
         for feed in self._feeds:
             feed.receive(batch)
         for stream in self._streams:
             stream.put(batch)
-        if self._subscribers:
+        if callbacks:
             self._subscribers.deliver(batch)
 
     def check_thread(self) -> None:
@@ -183,14 +182,14 @@ class Bus:
     def attach(self, feed: Feed) -> None:
         """Have a buffer's feed receive what is latched now and all that is published from now on."""
         self._check_open()
-        if self._topology.latched:
-            feed.receive(tuple(self._topology.latched.values()))
-        self._feeds.append(feed)
+        latched = tuple(self._topology.latched.values())
+        self._feeds[feed] = self._samples - len(latched)
+        if latched:
+            feed.receive(latched)
 
     def detach(self, feed: Feed) -> None:
         """Take a feed off the bus, if it is on it."""
-        if feed in self._feeds:
-            self._feeds.remove(feed)
+        self._feeds.pop(feed, None)
 
     def remove_frame(self, frame: str) -> None:
         """Make a frame disappear: from every buffer, from what streams still hold, and for whoever joins later.
@@ -216,7 +215,6 @@ class Bus:
     def statistics(self) -> BusStatistics:
         """All counters, as they are now."""
         return BusStatistics(
-            batches=self._batches,
             samples=self._samples,
             rejected=dict(self._topology.rejected),
             reparented=self._topology.reparented,
@@ -225,7 +223,7 @@ class Bus:
             clock_resets=self._resets,
             callbacks_failed=self._subscribers.failures,
             frames=len(self._topology),
-            buffers=tuple(feed.statistics() for feed in self._feeds),
+            buffers=tuple(feed.statistics(self._samples - before) for feed, before in self._feeds.items()),
             queues=(
                 *(stream.queue.statistics("stream") for stream in self._streams),
                 *(publisher.queue.statistics("threadsafe") for publisher in self._threads),

@@ -39,6 +39,9 @@ def _restore(
 class TransformError(Exception):
     """Base of every error of tfbus."""
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({str(self)!r})"
+
     def __reduce__(self) -> tuple[Any, ...]:
         return _restore, (type(self), self.args, self.__dict__, self.__cause__)
 

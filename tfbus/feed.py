@@ -35,12 +35,11 @@ class Feed:
         self.waiting = WaitingIndex()
         self.ended = ""
         self.last_reset: ClockResetError | None = None
-        self._offered = 0
+        self._blocked = self.waiting.blocked
 
     def receive(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake whom it can have unblocked."""
-        self._offered += len(batch)
-        tree, blocked = self.tree, self.waiting.blocked
+        tree, blocked = self.tree, self._blocked
         if not blocked:
             tree.commit(batch)
             return
@@ -76,10 +75,10 @@ class Feed:
         self.ended = self.ended or reason
         _wake(self.waiting.take_all())
 
-    def statistics(self) -> BufferStatistics:
-        """Counters since the feed was attached."""
+    def statistics(self, offered: int) -> BufferStatistics:
+        """Counters; how many samples it was offered, the bus knows."""
         tree = self.tree
-        return BufferStatistics(self._offered, tree.inserted, tree.replaced, tree.expired, len(self.waiting))
+        return BufferStatistics(offered, tree.inserted, tree.replaced, tree.expired, len(self.waiting))
 
 
 def _wake(waiters: Iterable[Waiter]) -> None:

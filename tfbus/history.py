@@ -1,8 +1,9 @@
 """One frame's samples in stamp order.
 
 Storage is by column: stamps for `bisect`, one 64-byte record a sample (stamp, translation, rotation) from which the
-lookup unpacks two neighbours in a single call, and who sent it. Expired samples are skipped by an offset and cut off in
-larger pieces, so pruning costs little. Every sample carries its own parent, because a frame may be reparented.
+lookup unpacks two neighbours in a single call, and who sent it. What is older than the horizon does not count and is
+cut off some time later, because moving the rest down costs as much for one sample as for a hundred. Every sample
+carries its own parent, because a frame may be reparented.
 """
 
 from array import array
@@ -14,10 +15,11 @@ from struct import Struct
 
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, PastExtrapolationError
 from tfbus.geometry import IDENTITY, Row
-from tfbus.stamps import SECOND, Latest
+from tfbus.stamps import SECOND, STAMP_MIN, Latest
 
-RECORD = Struct("=q7d")
+RECORD = Struct("q7d")
 RECORD_SIZE = RECORD.size
+FOREVER = 2**64
 _pack = RECORD.pack
 
 
@@ -58,6 +60,8 @@ class FrameHistory:
     Parameters
     ----------
     child : str
+    parent : str
+    static : bool
     keep : int or None
         Length of the window before the newest stamp, in ns; None keeps everything.
 
@@ -66,49 +70,58 @@ class FrameHistory:
     parent, authority : str
         Of the newest sample; they stay after `clear`.
     static : bool
-        Whether the one sample holds at every stamp; then `row` is its transform and `static_stamp` its stamp.
+        Whether the one sample holds at every stamp; then `row` is its transform and `static_stamp` its stamp in ns.
     parents : Counter or None
         How many samples name each parent, while there are several; None while all agree.
+    horizon : int
+        Samples with a stamp before this one, in ns, have left the window.
     changed : bool
         Set when an insertion may change the path of a lookup: another parent or kind, or a longer past. Whoever acts
         on it clears it.
     """
 
     __slots__ = (
+        "_cut_after",
+        "_keep",
         "_origin",
         "authority",
         "changed",
         "child",
-        "keep",
+        "horizon",
         "origins",
         "parent",
         "parents",
         "records",
         "row",
         "stamps",
-        "start",
         "static",
         "static_stamp",
     )
 
-    def __init__(self, child: str, parent: str, keep: int | None) -> None:
+    def __init__(self, child: str, parent: str, static: bool, keep: int | None) -> None:
         self.child = child
-        self.keep = keep
+        self._keep = FOREVER if keep is None else keep
         self.parent = parent
         self.authority = ""
-        self.static = False
-        self.static_stamp = 0
+        self.static = static
+        self.static_stamp: int | None = None
         self.row: Row = IDENTITY
         self.parents: Counter[str] | None = None
         self.changed = False
         self.stamps = array("q")
         self.records = bytearray()
         self.origins: list[tuple[str, str]] = []
-        self.start = 0
+        self.horizon = -FOREVER
+        self._cut_after = STAMP_MIN
         self._origin = (parent, "")
 
     def __len__(self) -> int:
         return 1 if self.static else len(self.stamps) - self.start
+
+    @property
+    def start(self) -> int:
+        """The index of the oldest sample in the window."""
+        return bisect_left(self.stamps, self.horizon)
 
     @property
     def oldest(self) -> int | None:
@@ -125,31 +138,52 @@ class FrameHistory:
         """Every parent that a sample in the window names."""
         return (self.parent,) if self.parents is None else tuple(self.parents)
 
+    def append(self, parent: str, stamp: int, row: Row, authority: str) -> bool:
+        """Store a moving sample if it is just the next one of the same kind, as nearly all are; else do nothing."""
+        stamps = self.stamps
+        origin = self._origin
+        if (
+            not stamps
+            or stamp <= stamps[-1]
+            or parent != origin[0]
+            or authority != origin[1]
+            or self.parents is not None
+        ):
+            return False
+        # Spelt out, because `*row` would build a list of the arguments first.
+        x, y, z, qx, qy, qz, qw = row
+        stamps.append(stamp)
+        self.records += _pack(stamp, x, y, z, qx, qy, qz, qw)
+        self.origins.append(origin)
+        self.horizon = stamp - self._keep
+        if stamp > self._cut_after:
+            self._cut()
+        return True
+
     def insert(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
-        """Store one moving sample, then drop what fell out of the window. A static sample is dropped first."""
+        """Store a moving sample; the window ends at the newest. A static sample is dropped first."""
         if self.static:
             self._become_moving(parent)
-        stamps = self.stamps
-        if stamps and stamp <= stamps[-1]:
+        if self.stamps and stamp <= self.stamps[-1]:
             return self._insert_late(parent, stamp, row, authority)
         if parent != self.parent:
-            self._reparent(parent, authority)
-        elif authority != self.authority:
-            self.authority = authority
-            self._origin = (parent, authority)
+            self._reparent(parent)
+        self.authority = authority
+        self._origin = (parent, authority)
         if self.parents is not None:
             self.parents[parent] += 1
-        stamps.append(stamp)
+        self.stamps.append(stamp)
         self.records += _pack(stamp, *row)
         self.origins.append(self._origin)
-        if self.keep is not None and stamps[self.start] < stamp - self.keep:
-            self._prune(stamp - self.keep)
+        self.horizon = stamp - self._keep
+        if stamp > self._cut_after:
+            self._cut()
         return Outcome.INSERTED
 
     def insert_static(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
         """Store the sample that holds at every stamp; moving samples are dropped."""
-        outcome = Outcome.REPLACED if self.static else Outcome.INSERTED
-        if not self.static or parent != self.parent or row != self.row:
+        fresh = self.static_stamp is None
+        if not self.static or (not fresh and (parent != self.parent or row != self.row)):
             self.clear()
             self.changed = True
         self.static = True
@@ -157,14 +191,15 @@ class FrameHistory:
         self.parent = parent
         self.authority = authority
         self.row = row
-        return outcome
+        return Outcome.INSERTED if fresh else Outcome.REPLACED
 
     def clear(self) -> None:
         """Drop all moving samples; the newest parent is remembered."""
         del self.stamps[:]
         del self.records[:]
         del self.origins[:]
-        self.start = 0
+        self.horizon = -FOREVER
+        self._cut_after = STAMP_MIN
         if self.parents is not None:
             self.parents = None
             self.changed = True
@@ -173,14 +208,15 @@ class FrameHistory:
         """The parent that holds at `stamp`; outside the window, that of the nearest sample."""
         if self.parents is None:
             return self.parent
-        return self.origins[max(bisect_right(self.stamps, stamp, self.start) - 1, self.start)][0]
+        start = self.start
+        return self.origins[max(bisect_right(self.stamps, stamp, start) - 1, start)][0]
 
     def since(self) -> int | None:
         """The stamp from which the newest parent has held without a break."""
         if self.parents is None:
             return self.oldest
-        first = len(self.origins) - 1
-        while first > self.start and self.origins[first - 1][0] == self.parent:
+        first, start = len(self.origins) - 1, self.start
+        while first > start and self.origins[first - 1][0] == self.parent:
             first -= 1
         return self.stamps[first]
 
@@ -201,8 +237,8 @@ class FrameHistory:
 
     def copy(self) -> "FrameHistory":
         """An independent copy."""
-        twin = FrameHistory(self.child, self.parent, self.keep)
-        for name in ("authority", "static", "static_stamp", "row", "start", "_origin"):
+        twin = FrameHistory(self.child, self.parent, self.static, self._keep)
+        for name in ("authority", "static_stamp", "row", "horizon", "_origin", "_cut_after"):
             setattr(twin, name, getattr(self, name))
         twin.stamps = self.stamps[:]
         twin.records = self.records[:]
@@ -212,30 +248,30 @@ class FrameHistory:
 
     def _become_moving(self, parent: str) -> None:
         self.static = False
+        self.static_stamp = None
         self.parent = parent
-        self.authority = ""
-        self._origin = (parent, "")
         self.changed = True
 
-    def _reparent(self, parent: str, authority: str) -> None:
-        """Take note of a sample that is about to be stored as the newest and names another parent."""
+    def _reparent(self, parent: str) -> None:
+        """Take note that the sample which is about to become the newest names another parent."""
         if self.stamps and self.parents is None:
             self.parents = Counter({self.parent: len(self)})
         self.parent = parent
-        self.authority = authority
-        self._origin = (parent, authority)
+        self._cut_after = STAMP_MIN
         self.changed = True
 
     def _insert_late(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
         """Store a sample that is not newer than the newest."""
         stamps = self.stamps
-        if self.keep is not None and stamp < stamps[-1] - self.keep:
+        if stamp < self.horizon:
             return Outcome.EXPIRED
-        at = bisect_left(stamps, stamp, self.start)
+        at = bisect_left(stamps, stamp)
         replaces = stamps[at] == stamp
         if at == self.start and not replaces:
             self.changed = True
         if self.parents is not None or parent != self.parent:
+            self._cut()
+            at = bisect_left(stamps, stamp)
             self.parents = self.parents or Counter({self.parent: len(self)})
             self.parents[parent] += 1
             if replaces:
@@ -253,21 +289,17 @@ class FrameHistory:
         self._settle_parents()
         return Outcome.REPLACED if replaces else Outcome.INSERTED
 
-    def _prune(self, horizon: int) -> None:
-        """Drop the samples older than `horizon`."""
-        stamps, first = self.stamps, self.start
-        while stamps[self.start] < horizon:
-            self.start += 1
+    def _cut(self) -> None:
+        """Cut off what has left the window; with one parent throughout, again when a sixteenth more has."""
+        start = self.start
         if self.parents is not None:
-            for parent, _ in self.origins[first : self.start]:
+            for parent, _ in self.origins[:start]:
                 self._forget(parent)
             self._settle_parents()
-        # One cut for many samples: moving the rest down costs as much for one as for a hundred.
-        if self.start * 8 >= len(stamps) and self.start >= 16:
-            del stamps[: self.start]
-            del self.origins[: self.start]
-            del self.records[: self.start * RECORD_SIZE]
-            self.start = 0
+        del self.stamps[:start]
+        del self.origins[:start]
+        del self.records[: start * RECORD_SIZE]
+        self._cut_after = self.stamps[0] + self._keep + (0 if self.parents is not None else self._keep // 16)
 
     def _forget(self, parent: str) -> None:
         """One sample that named `parent` has gone."""

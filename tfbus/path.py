@@ -6,10 +6,10 @@ one loop over Python floats, because a function call or a small array for each e
 Its formulas are those of `tfbus.geometry`.
 """
 
+import struct
 from bisect import bisect_left
 from collections.abc import Mapping
 from math import acos, sin
-from struct import Struct
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, PastExtrapolationError
 from tfbus.geometry import IDENTITY, Row, compose, invert
@@ -17,7 +17,7 @@ from tfbus.history import RECORD, RECORD_SIZE, FrameHistory
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN
 
 _unpack = RECORD.unpack_from
-_unpack_pair = Struct("=q7dq7d").unpack_from
+_unpack_pair = struct.Struct("q7dq7d").unpack_from
 
 Step = FrameHistory | Row
 
@@ -44,7 +44,7 @@ class Path:
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
         self.lasting = all(edge.parents is None for edge in edges)
-        self.static_stamp = max((edge.static_stamp for edge in edges), default=0)
+        self.static_stamp = max((edge.static_stamp or 0 for edge in edges), default=0)
 
     def row(self, at: int) -> Row:
         """Source in target at a stamp.
@@ -54,12 +54,9 @@ class Path:
         ExtrapolationError
             If an edge does not cover it.
         """
-        try:
-            if not self._down:
-                return climb(self._up, at)
-            return compose(invert(climb(self._down, at)), climb(self._up, at))
-        except ExtrapolationError:
-            raise self._blocker(at) from None
+        if not self._down:
+            return climb(self._up, at)
+        return compose(invert(climb(self._down, at)), climb(self._up, at))
 
     def newest_common(self) -> tuple[int, FrameHistory]:
         """The newest stamp that every moving edge has reached, and the edge that has come no further.
@@ -78,7 +75,7 @@ class Path:
                 lagging, common = edge, edge.stamps[-1]
         return common, lagging
 
-    def _blocker(self, at: int) -> ExtrapolationError:
+    def blocker(self, at: int) -> ExtrapolationError:
         """The edge that decides among those that do not cover a stamp: one past for good, or the last to come."""
         missing = [edge.missing(at) for edge in self.moving if not edge.covers(at)]
         for error in missing:
@@ -108,16 +105,19 @@ def climb(steps: tuple[Step, ...], at: int) -> Row:
         if isinstance(step, tuple):
             ax, ay, az, ai, aj, ak, aw = step
         else:
-            stamps = step.stamps
-            i = bisect_left(stamps, at, step.start)
-            if i == step.start or i == len(stamps):
-                if i == len(stamps) or stamps[i] != at:
-                    raise step.missing(at)
-                _, ax, ay, az, ai, aj, ak, aw = _unpack(step.records, i * RECORD_SIZE)
-            else:
+            i = bisect_left(step.stamps, at)
+            try:
                 s0, ax, ay, az, ai, aj, ak, aw, s1, bx, by, bz, bi, bj, bk, bw = _unpack_pair(
-                    step.records, (i - 1) * RECORD_SIZE
+                    step.records, i * RECORD_SIZE - RECORD_SIZE
                 )
+            except struct.error:
+                # There is no pair round the first stamp, nor beyond the last.
+                if not step.covers(at):
+                    raise step.missing(at) from None
+                _, ax, ay, az, ai, aj, ak, aw = _unpack(step.records)
+            else:
+                if s0 < step.horizon and not step.covers(at):
+                    raise step.missing(at)
                 if at == s1:
                     ax, ay, az, ai, aj, ak, aw = bx, by, bz, bi, bj, bk, bw
                 elif step.parents is None or step.origins[i - 1][0] == step.origins[i][0]:
@@ -147,12 +147,13 @@ def climb(steps: tuple[Step, ...], at: int) -> Row:
             x += ax + aw * tx + aj * tz - ak * ty
             y += ay + aw * ty + ak * tx - ai * tz
             z += az + aw * tz + ai * ty - aj * tx
-            qx, qy, qz, qw = (
-                aw * qx + ai * qw + aj * qz - ak * qy,
-                aw * qy - ai * qz + aj * qw + ak * qx,
-                aw * qz + ai * qy - aj * qx + ak * qw,
-                aw * qw - ai * qx - aj * qy - ak * qz,
-            )
+            turned_x = aw * qx + ai * qw + aj * qz - ak * qy
+            turned_y = aw * qy - ai * qz + aj * qw + ak * qx
+            turned_z = aw * qz + ai * qy - aj * qx + ak * qw
+            qw = aw * qw - ai * qx - aj * qy - ak * qz
+            qx = turned_x
+            qy = turned_y
+            qz = turned_z
     return x, y, z, qx, qy, qz, qw
 
 

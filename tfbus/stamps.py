@@ -66,6 +66,8 @@ def as_stamp(value: object) -> int:
     ValueError
         If it does not fit a signed 64-bit integer.
     """
+    if type(value) is int and STAMP_MIN <= value <= STAMP_MAX:
+        return value
     if isinstance(value, float):
         raise TypeError(f"a stamp is an int of nanoseconds, not the float {value!r}: use from_seconds({value!r})")
     if isinstance(value, bool):

@@ -32,7 +32,7 @@ class BusStatistics:
 
     Attributes
     ----------
-    batches, samples : int
+    samples : int
         Published and accepted.
     rejected : mapping of str to int
         Samples that were refused, by reason.
@@ -52,7 +52,6 @@ class BusStatistics:
     queues : tuple of QueueStatistics
     """
 
-    batches: int
     samples: int
     rejected: Mapping[str, int]
     reparented: int

@@ -20,42 +20,40 @@ class Subscribers:
 
     Attributes
     ----------
+    callbacks : dict of int to callable
     failures : int
         Exceptions that subscribers raised.
     """
 
     def __init__(self, log: OnceLogger) -> None:
         self._log = log
-        self._callbacks: dict[int, BatchCallback] = {}
+        self.callbacks: dict[int, BatchCallback] = {}
         self._keys = count()
         self._backlog: deque[Batch] = deque()
         self._calling: BatchCallback | None = None
         self._queued = 0
         self.failures = 0
 
-    def __len__(self) -> int:
-        return len(self._callbacks)
-
     def add(self, callback: BatchCallback, latched: Batch) -> Registration:
         """Register a callback, and call it with what is latched if that is anything."""
         if not callable(callback):
             raise TypeError(f"a subscriber must be callable, not {callback!r}")
         key = next(self._keys)
-        self._callbacks[key] = callback
+        self.callbacks[key] = callback
         if latched:
             outer, self._calling = self._calling, callback
             try:
                 self._call(key, latched)
             finally:
                 self._calling = outer
-        return Registration(lambda: self._callbacks.pop(key, None))
+        return Registration(lambda: self.callbacks.pop(key, None))
 
     def check_backlog(self) -> None:
         """Raise `RuntimeError` if callbacks publish without end."""
         if self._queued >= _QUEUED_BATCHES:
             raise RuntimeError(
-                f"the subscriber {_name(self._calling)} publishes without end: {self._queued} batches are queued behind "
-                "the one that it was called with"
+                f"the subscriber {_name(self._calling)} publishes without end: {self._queued} batches are queued "
+                "behind the one that it was called with"
             )
 
     def deliver(self, batch: Batch) -> None:
@@ -67,16 +65,16 @@ class Subscribers:
         try:
             while self._backlog:
                 batch = self._backlog.popleft()
-                for key in tuple(self._callbacks):
-                    if key in self._callbacks:
-                        self._calling = self._callbacks[key]
+                for key in tuple(self.callbacks):
+                    if key in self.callbacks:
+                        self._calling = self.callbacks[key]
                         self._call(key, batch)
         finally:
             self._calling = None
             self._queued = 0
 
     def _call(self, key: int, batch: Batch) -> None:
-        callback = self._callbacks[key]
+        callback = self.callbacks[key]
         try:
             callback(batch)
         except Exception as error:  # noqa: BLE001 - a subscriber is somebody else's code

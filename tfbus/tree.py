@@ -9,19 +9,20 @@ import threading
 from collections.abc import Iterable
 from typing import Any
 
-from tfbus.errors import TransformLookupError, UnknownFrameError
+from tfbus.errors import ExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.geometry import Row, compose
 from tfbus.history import Edge, FrameHistory, Outcome
 from tfbus.names import FrameNames
 from tfbus.path import Path, find_path
 from tfbus.picture import describe, to_dot, to_yaml
 from tfbus.stamped import Batch, TransformStamped, answer, as_batch
-from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, as_stamp, from_seconds
+from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds
 from tfbus.topology import admit
 
 _PATHS_KEPT = 10_000
 
 At = int | Latest
+_Answer = tuple[int, Row, bool]
 
 
 class TransformTree:
@@ -60,6 +61,8 @@ class TransformTree:
         self.keep = keep
         self._window = None if seconds is None or seconds == math.inf else from_seconds(seconds)
         self._lock = threading.Lock()
+        # Called in every lookup and insertion, where `with` would cost as much as a dozen multiplications.
+        self._acquire, self._release = self._lock.acquire, self._lock.release
         self._frames: dict[str, FrameHistory] = {}
         self._names = FrameNames()
         self._paths: dict[tuple[str, str], Path] = {}
@@ -101,19 +104,24 @@ class TransformTree:
 
     def commit(self, batch: Batch) -> None:
         """Store a batch that somebody has judged already, such as the bus; what is too old expires."""
-        self._lock.acquire()
+        frames = self._frames
+        self._acquire()
         try:
             for sample in batch:
-                self._store(sample)
+                parent, child, stamp, row, authority, static = sample._fields
+                history = frames.get(child)
+                if history is not None and not static and history.append(parent, stamp, row, authority):
+                    self.inserted += 1
+                else:
+                    self._store(sample)
         finally:
-            self._lock.release()
+            self._release()
 
     def _store(self, sample: TransformStamped) -> Outcome:
         parent, child, stamp, row, authority, static = sample._fields
         history = self._frames.get(child)
         if history is None:
-            history = self._add(child, parent)
-            history.static = static
+            history = self._add(child, parent, static)
         if static:
             outcome = history.insert_static(parent, stamp, row, authority)
         else:
@@ -128,9 +136,9 @@ class TransformTree:
             self.expired += 1
         return outcome
 
-    def _add(self, child: str, parent: str) -> FrameHistory:
+    def _add(self, child: str, parent: str, static: bool) -> FrameHistory:
         # A new edge hangs a whole tree under another one, so every path that there was is still the path.
-        history = self._frames[child] = FrameHistory(child, parent, self._window)
+        history = self._frames[child] = FrameHistory(child, parent, static, self._window)
         self._names.update(child, history.mentioned)
         return history
 
@@ -194,35 +202,35 @@ class TransformTree:
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
             `not_before` comes without a `LATEST`.
         """
-        if source_at is not None or fixed is not None:
-            return self._travel(target, source, at, source_at, fixed, not_before)
-        if at is not LATEST:
-            if type(at) is not int or not STAMP_MIN <= at <= STAMP_MAX:
-                at = as_stamp(at)
-            if not_before is not None:
-                raise TypeError("not_before goes with at=LATEST: an answer at a given stamp never gets newer")
-        self._lock.acquire()
+        if not_before is not None and at is not LATEST and source_at is not LATEST:
+            raise TypeError("not_before goes with LATEST: an answer at a given stamp never gets newer")
+        if type(at) is not int and at is not LATEST:
+            at = as_stamp(at)
+        self._acquire()
         try:
-            stamp, row, static = self._answer(target, source, at, not_before)
+            if source_at is not None or fixed is not None:
+                stamp, row, static = self._travel(target, source, at, source_at, fixed, not_before)
+            else:
+                stamp, row, static = self._answer(target, source, at, not_before)
         finally:
-            self._lock.release()
+            self._release()
         return answer(target, source, stamp, row, static)
 
     def _travel(
         self, target: str, source: str, at: At, source_at: At | None, fixed: str | None, not_before: int | None
-    ) -> TransformStamped:
+    ) -> _Answer:
+        """As `_answer`, with source at its own stamp, carried through the fixed frame."""
         if source_at is None or fixed is None:
             raise TypeError("source_at and fixed go together: source at its stamp, carried through the fixed frame")
-        at = at if at is LATEST else as_stamp(at)
-        source_at = source_at if source_at is LATEST else as_stamp(source_at)
-        with self._lock:
-            for name in (target, source, fixed):
-                self._check_known(name)
-            stamp, target_from_fixed, static = self._answer(target, fixed, at, not_before)
-            _, fixed_from_source, still = self._answer(fixed, source, source_at, not_before)
-        return answer(target, source, stamp, compose(target_from_fixed, fixed_from_source), static and still)
+        if source_at is not LATEST:
+            source_at = as_stamp(source_at)
+        for name in (target, source, fixed):
+            self._check_known(name)
+        stamp, target_from_fixed, static = self._answer(target, fixed, at, not_before)
+        _, fixed_from_source, still = self._answer(fixed, source, source_at, not_before)
+        return stamp, compose(target_from_fixed, fixed_from_source), static and still
 
-    def _answer(self, target: str, source: str, at: At, not_before: int | None) -> tuple[int, Row, bool]:
+    def _answer(self, target: str, source: str, at: At, not_before: int | None) -> _Answer:
         """Stamp, row and whether it is static. The lock is held."""
         path = self._paths.get((target, source))
         if path is None:
@@ -230,12 +238,15 @@ class TransformTree:
         if not path.moving:
             if isinstance(at, Latest):
                 at = path.static_stamp if len(path.frames) > 1 else self._newest_of(target)
-            return at, path.row(at), True
-        if isinstance(at, Latest):
+            return as_stamp(at), path.row(0), True
+        if at is LATEST:
             return self._latest(path, target, source, not_before)
-        return at, path.row(at), False
+        try:
+            return at, path.row(at), False
+        except ExtrapolationError:
+            raise path.blocker(as_stamp(at)) from None
 
-    def _latest(self, path: Path, target: str, source: str, not_before: int | None) -> tuple[int, Row, bool]:
+    def _latest(self, path: Path, target: str, source: str, not_before: int | None) -> _Answer:
         """As `_answer`, at the newest stamp that every moving edge has reached."""
         common, lagging = path.newest_common()
         if not_before is not None and common < not_before:
@@ -252,7 +263,7 @@ class TransformTree:
 
     def _newest_of(self, frame: str) -> int:
         history = self._frames.get(frame)
-        return 0 if history is None else history.static_stamp if history.static else history.newest or 0
+        return 0 if history is None else history.static_stamp or history.newest or 0
 
     def _find_path(self, target: str, source: str, at: At) -> Path:
         """The path for a question, remembered if it is that of every stamp. The lock is held."""
