@@ -1,0 +1,84 @@
+"""For tests of programs that use tfbus: simulated time that runs by itself, and a comparison that explains itself."""
+
+from collections.abc import Awaitable, Callable
+from typing import TypeVar
+
+import anyio
+
+from tfbus.clock import SimulatedClock
+from tfbus.geometry import Transform
+from tfbus.stamped import TransformStamped
+
+T = TypeVar("T")
+
+
+async def simulate(clock: SimulatedClock, function: Callable[[], Awaitable[T]], *, limit: float = 3600.0) -> T:
+    """Run an async function while simulated time passes as fast as it can.
+
+    Parameters
+    ----------
+    clock : SimulatedClock
+        Driven until the function has ended, and by nobody else meanwhile.
+    function : async callable
+        Without arguments; use `functools.partial` to pass some.
+    limit : float
+        The most simulated s that it may take.
+
+    Returns
+    -------
+    What the function returns; what it raises comes out as it is, without an `ExceptionGroup`.
+
+    Raises
+    ------
+    TimeoutError
+        If the function has not ended after `limit`: the usual reason is that it waits for what nobody sends.
+    """
+    result: list[T] = []
+    error: list[Exception] = []
+    async with anyio.create_task_group() as tasks:
+
+        async def call() -> None:
+            try:
+                result.append(await function())
+            except Exception as raised:  # noqa: BLE001 - it is raised again outside the task group
+                error.append(raised)
+            tasks.cancel_scope.cancel()
+
+        tasks.start_soon(call)
+        await clock.advance(limit)
+        tasks.cancel_scope.cancel()
+    if error:
+        raise error[0]
+    if not result:
+        raise TimeoutError(f"not finished after {limit:g} simulated s")
+    return result[0]
+
+
+def assert_close(
+    actual: Transform | TransformStamped,
+    expected: Transform | TransformStamped,
+    *,
+    translation_tolerance: float = 1e-9,
+    rotation_tolerance: float = 1e-9,
+) -> None:
+    """Assert that two transforms are close, or say how far they are apart.
+
+    Parameters
+    ----------
+    actual, expected : Transform or TransformStamped
+        Of the latter only the transform is compared.
+    translation_tolerance : float
+        Greatest distance in m.
+    rotation_tolerance : float
+        Greatest angle in rad.
+    """
+    left = actual.transform if isinstance(actual, TransformStamped) else actual
+    right = expected.transform if isinstance(expected, TransformStamped) else expected
+    if left.is_close(right, translation_tolerance=translation_tolerance, rotation_tolerance=rotation_tolerance):
+        return
+    apart = left.inverse() @ right
+    distance = sum(part * part for part in apart.translation) ** 0.5
+    raise AssertionError(
+        f"{left} is {distance:.3g} m and {apart.as_axis_angle()[1]:.3g} rad from {right} "
+        f"(allowed: {translation_tolerance:g} m, {rotation_tolerance:g} rad)"
+    )
