@@ -18,7 +18,7 @@ async def broadcast(bus: tfbus.Bus) -> None:
         broadcaster.send("base_link", "base_laser", base_from_laser)
 
 
-async def listen(buffer: tfbus.Buffer, lines: int | None = None) -> None:
+async def listen(buffer: tfbus.Buffer) -> None:
     clock = buffer.bus.clock
     async for tick in clock.ticks(1.0):
         if tick == 0:
@@ -40,8 +40,6 @@ async def listen(buffer: tfbus.Buffer, lines: int | None = None) -> None:
                 f"[ INFO] {now(clock)}: base_laser: ({x:.2f}, {y:.2f}. {z:.2f}) -----> "
                 f"base_link: ({bx:.2f}, {by:.2f}, {bz:.2f}) at time {tfbus.to_seconds(base_point.stamp):.2f}"
             )
-        if tick == lines:
-            return
 
 
 def now(clock: tfbus.Clock) -> str:
@@ -49,8 +47,8 @@ def now(clock: tfbus.Clock) -> str:
     return f"{seconds}.{nanoseconds:09d}"
 
 
-async def main() -> None:
-    with tfbus.Bus() as bus, tfbus.Buffer(bus) as buffer:
+async def main(clock: tfbus.Clock | None = None) -> None:
+    with tfbus.Bus(clock) as bus, tfbus.Buffer(bus) as buffer:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(broadcast, bus)
             tasks.start_soon(listen, buffer)

@@ -1,10 +1,14 @@
-"""Every async test runs on asyncio, on asyncio with uvloop, and on trio."""
+"""Every async test runs on asyncio, on asyncio with uvloop, and on trio; no example of hypothesis has a deadline."""
 
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
 import anyio
 import pytest
+from hypothesis import settings
+
+settings.register_profile("tfbus", deadline=None)
+settings.load_profile("tfbus")
 
 T = TypeVar("T")
 Backend = tuple[str, dict[str, Any]]

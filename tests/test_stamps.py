@@ -1,11 +1,155 @@
-import pytest
+import copy
+import math
+import pickle
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any
 
-from tfbus import from_seconds
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import TODAY, stamps
+
+from tfbus import LATEST, SECOND, from_seconds, to_seconds
+from tfbus.stamps import as_duration, as_stamp, format_duration, format_stamp
+
+HUGE = pytest.param(10**400, id="huge")
+UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": SECOND}
 
 
 def test_seconds_become_whole_nanoseconds() -> None:
     assert from_seconds(1.5) == 1_500_000_000
+    assert from_seconds(-0.25) == -250_000_000
+    assert type(from_seconds(1.5)) is int
 
 
-@pytest.mark.anyio
-async def test_every_async_test_runs_on_every_loop() -> None: ...
+@given(st.floats(-9e9, 9e9))
+def test_a_float_of_seconds_becomes_the_nearest_nanosecond(seconds: float) -> None:
+    exact = Fraction(seconds) * SECOND
+    assert abs(from_seconds(seconds) - exact) <= Fraction(1, 2) + Fraction(1, 10**6)
+
+
+@given(st.integers(-9_223_372_036, 9_223_372_036))
+def test_whole_seconds_are_converted_exactly(seconds: int) -> None:
+    assert from_seconds(seconds) == seconds * SECOND
+
+
+@given(st.integers(-(4 * 10**15), 4 * 10**15))
+def test_stamps_of_the_first_46_days_survive_a_round_trip_through_seconds(stamp: int) -> None:
+    assert from_seconds(to_seconds(stamp)) == stamp
+
+
+def test_a_stamp_of_today_does_not_survive_a_float() -> None:
+    assert from_seconds(to_seconds(TODAY + 1)) == TODAY
+
+
+@given(stamps())
+def test_to_seconds_gives_the_nearest_float(stamp: int) -> None:
+    seconds = to_seconds(stamp)
+    exact = Fraction(stamp, SECOND)
+    error = abs(Fraction(seconds) - exact)
+    assert error <= abs(Fraction(math.nextafter(seconds, math.inf)) - exact)
+    assert error <= abs(Fraction(math.nextafter(seconds, -math.inf)) - exact)
+
+
+@pytest.mark.parametrize("seconds", [math.nan, math.inf, -math.inf, 9.3e9, -9.3e9, 1e300, HUGE])
+def test_seconds_that_no_stamp_can_hold_are_a_value_error(seconds: float) -> None:
+    with pytest.raises(ValueError, match=r"finite|64-bit"):
+        from_seconds(seconds)
+
+
+@pytest.mark.parametrize("value", [0, -1, -(2**63), 2**63 - 1, np.int64(7), np.uint8(7), np.array(7)])
+def test_any_integer_is_a_stamp_and_becomes_a_plain_int(value: Any) -> None:
+    stamp = as_stamp(value)
+    assert type(stamp) is int
+    assert stamp == int(value)
+
+
+@pytest.mark.parametrize("value", [1.5, math.nan, np.float64(1.5)])
+def test_a_float_stamp_is_a_type_error_that_names_from_seconds(value: object) -> None:
+    with pytest.raises(TypeError, match="from_seconds"):
+        as_stamp(value)
+
+
+@pytest.mark.parametrize("value", [None, "1", True, np.True_, Fraction(1), Decimal(1), LATEST, np.float32(1), [1]])
+def test_what_is_not_an_integer_is_not_a_stamp(value: object) -> None:
+    with pytest.raises(TypeError, match="int of nanoseconds"):
+        as_stamp(value)
+
+
+@pytest.mark.parametrize("value", [-(2**63) - 1, 2**63, 10**30, np.uint64(2**63)])
+def test_a_stamp_fits_64_bits(value: object) -> None:
+    with pytest.raises(ValueError, match="64-bit"):
+        as_stamp(value)
+
+
+@pytest.mark.parametrize("value", [0, 0.0, 1, 2.5, math.inf])
+def test_a_duration_is_a_float_that_may_be_infinite(value: float) -> None:
+    seconds = as_duration(value, "timeout")
+    assert type(seconds) is float
+    assert seconds == value
+
+
+@pytest.mark.parametrize("value", [-1e-9, -1, -math.inf, math.nan])
+def test_a_negative_duration_is_a_value_error_that_names_the_argument(value: float) -> None:
+    with pytest.raises(ValueError, match=rf"timeout .*{value!r}"):
+        as_duration(value, "timeout")
+
+
+@pytest.mark.parametrize("value", [None, "1", True, LATEST, [1.0]])
+def test_a_duration_that_is_no_number_is_a_type_error_that_names_the_argument(value: Any) -> None:
+    with pytest.raises(TypeError, match="keep must be a number of seconds"):
+        as_duration(value, "keep")
+
+
+@pytest.mark.parametrize(
+    ("stamp", "text"),
+    [
+        (12_500_000_000, "12.500 s"),
+        (12_500_000_001, "12.500000001 s"),
+        (0, "0.000 s"),
+        (1, "0.000000001 s"),
+        (-1, "-0.000000001 s"),
+        (-1_500_000_000, "-1.500 s"),
+        (1_000_100_000, "1.0001 s"),
+    ],
+)
+def test_a_stamp_is_written_with_milliseconds_at_least(stamp: int, text: str) -> None:
+    assert format_stamp(stamp) == text
+
+
+@given(stamps())
+def test_a_written_stamp_is_exact(stamp: int) -> None:
+    number, unit = format_stamp(stamp).split(" ")
+    assert unit == "s"
+    assert Fraction(number) * SECOND == stamp
+
+
+@pytest.mark.parametrize(
+    ("nanoseconds", "text"),
+    [
+        (0, "0 ns"),
+        (1, "1 ns"),
+        (999, "999 ns"),
+        (1_500, "1.5 us"),
+        (410_000_000, "410 ms"),
+        (2_500_000_000, "2.5 s"),
+        (3_600 * SECOND, "3600 s"),
+        (-410_000_000, "-410 ms"),
+    ],
+)
+def test_a_duration_is_written_in_the_unit_that_fits(nanoseconds: int, text: str) -> None:
+    assert format_duration(nanoseconds) == text
+
+
+@given(st.integers(-(2**64), 2**64))
+def test_a_written_duration_is_right_to_three_digits(nanoseconds: int) -> None:
+    number, unit = format_duration(nanoseconds).split(" ")
+    assert abs(Fraction(number) * UNITS[unit] - nanoseconds) <= abs(Fraction(nanoseconds)) * Fraction(5, 1000)
+
+
+def test_latest_stays_the_one_and_only_when_pickled_or_copied() -> None:
+    assert pickle.loads(pickle.dumps(LATEST)) is LATEST
+    assert copy.deepcopy(LATEST) is LATEST
+    assert repr(LATEST) == "LATEST"

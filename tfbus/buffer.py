@@ -93,7 +93,7 @@ class Buffer:
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
         """
-        not_before = None if max_age is None else self._clock.now() - from_seconds(as_duration(max_age, "max_age"))
+        not_before = None if max_age is None else self._not_before(max_age)
         return self._feed.tree.lookup(target, source, at, source_at=source_at, fixed=fixed, not_before=not_before)
 
     async def lookup(
@@ -155,8 +155,9 @@ class Buffer:
         try:
             return self._read(question, max_age, reset)
         except _MAY_COME as error:
-            if isinstance(error, UnknownFrameError) and not is_frame(error.frame):
-                raise
+            for name in (target, source, fixed):
+                if name is not None and not is_frame(name):
+                    raise UnknownFrameError(frame=name) from None
             blocker = error
         self.bus.check_thread()
         return await self._wait(question, max_age, limit, reset, blocker)
@@ -237,25 +238,26 @@ class Buffer:
         """Park under what is missing, read again when woken, and so on until there is an answer or the time is up."""
         since = self._clock.now()
         quiet = min(limit, _REPORT_AFTER)
-        for seconds in (quiet, limit - quiet):
+        for late, seconds in ((False, quiet), (True, limit - quiet)):
             with self._clock.move_on_after(seconds):
                 while True:
-                    if seconds is not quiet:
+                    if late:
                         self._report(question, blocker)
                     await self._park(question, since, blocker)
                     try:
                         return self._read(question, max_age, reset)
                     except _MAY_COME as error:
                         blocker = error
+            try:
+                # The data may have come in the very turn of the loop in which the time was up.
+                return self._read(question, max_age, reset)
+            except _MAY_COME as error:
+                blocker = error
             if seconds >= limit:
                 break
-        try:
-            # The data may have come in the very turn of the loop in which the time was up.
-            return self._read(question, max_age, reset)
-        except _MAY_COME as error:
-            raise LookupTimeoutError(
-                target=question.target, source=question.source, timeout=limit, missing=error
-            ) from error
+        raise LookupTimeoutError(
+            target=question.target, source=question.source, timeout=limit, missing=blocker
+        ) from blocker
 
     async def _park(self, question: Question, since: int, blocker: TransformLookupError) -> None:
         """Wait until something comes that can have removed what blocks a lookup."""
@@ -266,22 +268,29 @@ class Buffer:
         self._feed.waiting.park(waiter, blocker)
         try:
             await woken.wait()
-        finally:
+        except BaseException:
+            # Cancelled; whoever wakes a waiter has taken it out already.
             self._feed.waiting.remove(waiter)
+            raise
 
     def _read(self, question: Question, max_age: float | None, reset: ClockResetError | None) -> TransformStamped:
         """As `lookup_nowait`, for a lookup that began when the clock's last jump back was `reset`."""
         latest = self._feed.last_reset
         if latest is not None and latest is not reset:
             raise ClockResetError(before=latest.before, after=latest.after)
-        return self.lookup_nowait(
+        return self._feed.tree.lookup(
             question.target,
             question.source,
             question.at,
-            max_age=max_age,
             source_at=question.source_at,
             fixed=question.fixed,
+            not_before=None if max_age is None else self._not_before(max_age),
         )
+
+    def _not_before(self, max_age: float) -> int | None:
+        if as_duration(max_age, "max_age") == math.inf:
+            return None
+        return self._clock.now() - from_seconds(max_age)
 
     def _report(self, question: Question, blocker: TransformLookupError) -> None:
         """Log what blocks a lookup that has waited for long."""

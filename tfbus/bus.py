@@ -55,6 +55,7 @@ class Bus:
         self._samples = 0
         self._resets = 0
         self._jumps = self.clock.on_jump(self._clock_jumped)
+        self.check_thread()
 
     @property
     def closed(self) -> bool:
@@ -158,7 +159,7 @@ class Bus:
         BusClosedError
         """
         self._check_open()
-        stream = Stream(capacity, overflow, self._detach_stream)
+        stream = Stream(capacity, overflow, self.check_thread, self._detach_stream)
         if self._topology.latched:
             stream.put(tuple(self._topology.latched.values()))
         self._streams.append(stream)
@@ -175,7 +176,7 @@ class Bus:
         BusClosedError
         """
         self._check_open()
-        publisher = ThreadPublisher(capacity, self._publish_from_thread, self._threads.remove)
+        publisher = ThreadPublisher(capacity, self.check_thread, self._publish_from_thread, self._threads.remove)
         self._threads.append(publisher)
         return publisher
 
@@ -266,7 +267,8 @@ class Bus:
         """The samples of a batch; whatever else is in it is counted."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
         batch = tuple(thing for thing in things if isinstance(thing, TransformStamped))
-        self._topology.rejected["not a sample"] += len(things) - len(batch)
+        if len(batch) < len(things):
+            self._topology.rejected["not a sample"] += len(things) - len(batch)
         return batch
 
     def _publish_from_thread(self, batch: Batch) -> None:
@@ -277,6 +279,7 @@ class Bus:
         if after >= before:
             return
         self._resets += 1
+        self._log.warning(("clock", before, after), "the clock jumped back: moving samples are dropped")
         self._topology.clear_moving()
         for publisher in self._threads:
             publisher.discard()

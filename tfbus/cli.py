@@ -13,7 +13,6 @@ from tfbus.clock import Clock, SimulatedClock, SystemClock
 try:
     from cyclopts import App, CycloptsError, Parameter
     from cyclopts.validators import Number
-    from rich.console import Console
 except ImportError:
     raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
 
@@ -23,8 +22,6 @@ INTERRUPTED = 130
 app = App(
     name="tfbus",
     help="Stamped coordinate transforms for asyncio and trio.",
-    error_console=Console(stderr=True),
-    error_formatter=lambda error: f"tfbus: {error}",
     suppress_keyboard_interrupt=False,
 )
 
@@ -79,8 +76,10 @@ def main() -> None:
     """Run the command and exit: 0 when done, 2 for a wrong call, 130 for Ctrl-C."""
     status = 0
     try:
-        app(exit_on_error=False, result_action="return_value")
-    except* CycloptsError:
+        app(exit_on_error=False, print_error=False, result_action="return_value")
+    except* CycloptsError as wrong:
+        for error in wrong.exceptions:
+            print(f"tfbus: {error}", file=sys.stderr)
         status = USAGE_ERROR
     except* KeyboardInterrupt:
         status = INTERRUPTED

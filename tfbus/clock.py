@@ -126,7 +126,10 @@ class SimulatedClock:
 
     async def sleep(self, seconds: float) -> None:
         """Sleep for a simulated duration; zero is one checkpoint."""
-        await self._sleep_until_elapsed(self._elapsed + from_seconds(as_duration(seconds, "seconds")))
+        duration = as_duration(seconds, "seconds")
+        if duration * SECOND >= STAMP_MAX:
+            await anyio.sleep_forever()
+        await self._sleep_until_elapsed(self._elapsed + from_seconds(duration))
 
     async def sleep_until(self, stamp: int) -> None:
         """Sleep until the clock has reached a stamp, by advancing or by a jump.

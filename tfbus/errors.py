@@ -29,10 +29,13 @@ from tfbus.stamps import Latest, format_duration, format_stamp
 def _restore(
     cls: type["TransformError"], args: tuple[Any, ...], facts: dict[str, Any], cause: BaseException | None
 ) -> "TransformError":
-    error = cls.__new__(cls, *args)
+    # `cls.__new__` of a timeout is that of LookupError, which refuses to make what is an OSError too.
+    make = OSError.__new__ if issubclass(cls, OSError) else cls.__new__
+    error: TransformError = make(cls, *args)
     error.args = args
     error.__dict__.update(facts)
-    error.__cause__ = cause
+    if cause is not None:
+        error.__cause__ = cause
     return error
 
 
@@ -68,6 +71,7 @@ class UnknownFrameError(TransformLookupError):
 
     @cached_property
     def close_matches(self) -> tuple[str, ...]:
+        """Known frames with a similar name, the most similar first."""
         return tuple(difflib.get_close_matches(self.frame, self._known))
 
     def __str__(self) -> str:

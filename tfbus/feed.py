@@ -43,16 +43,16 @@ class Feed:
         if not blocked:
             tree.commit(batch)
             return
-        structure, names = tree.structure_version, tree.names_version
+        structure, edges = tree.structure_version, tree.edges_version
         tree.commit(batch)
         if tree.structure_version != structure:
             _wake(self.waiting.take_all())
             return
         for sample in batch:
-            child = sample._fields[1]
-            if child in blocked:
-                _wake(self.waiting.take(child, tree.newest_stamp(child)))
-        if tree.names_version != names:
+            fields = sample._fields
+            if fields[1] in blocked:
+                _wake(self.waiting.take(fields[1], fields[2]))
+        if tree.edges_version != edges:
             for sample in batch:
                 _wake(self.waiting.take(sample.parent, None))
 

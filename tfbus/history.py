@@ -255,6 +255,7 @@ class FrameHistory:
     def _reparent(self, parent: str) -> None:
         """Take note that the sample which is about to become the newest names another parent."""
         if self.stamps and self.parents is None:
+            self._cut()
             self.parents = Counter({self.parent: len(self)})
         self.parent = parent
         self._cut_after = STAMP_MIN

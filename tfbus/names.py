@@ -2,21 +2,14 @@
 
 
 class FrameNames:
-    """Counts who names whom, so that a frame is forgotten with the last sample that names it.
+    """Counts who names whom, so that a frame is forgotten with the last sample that names it."""
 
-    Attributes
-    ----------
-    version : int
-        Grows with every change.
-    """
-
-    __slots__ = ("_mentions", "_named", "_sorted", "version")
+    __slots__ = ("_mentions", "_named", "_sorted")
 
     def __init__(self) -> None:
         self._named: dict[str, tuple[str, ...]] = {}
         self._mentions: dict[str, int] = {}
         self._sorted: tuple[str, ...] | None = None
-        self.version = 0
 
     def __contains__(self, frame: object) -> bool:
         return frame in self._named or frame in self._mentions
@@ -31,13 +24,11 @@ class FrameNames:
         self._forget(before or ())
         self._named[child] = parents
         self._sorted = None
-        self.version += 1
 
     def remove(self, child: str) -> None:
         """Take note that no sample of `child` is left."""
         self._forget(self._named.pop(child))
         self._sorted = None
-        self.version += 1
 
     def sorted(self) -> tuple[str, ...]:
         """All of them, in order."""

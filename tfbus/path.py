@@ -35,7 +35,7 @@ class Path:
         Whether it is the path at every stamp, because no frame on it changes parent inside its window.
     """
 
-    __slots__ = ("_down", "_up", "frames", "lasting", "moving", "static_stamp")
+    __slots__ = ("_down", "_static", "_up", "frames", "lasting", "moving")
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
         edges = ups + downs
@@ -44,7 +44,12 @@ class Path:
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
         self.lasting = all(edge.parents is None for edge in edges)
-        self.static_stamp = max((edge.static_stamp or 0 for edge in edges), default=0)
+        self._static = tuple(edge for edge in edges if edge.static)
+
+    @property
+    def static_stamp(self) -> int:
+        """The newest stamp among the static samples, in ns; sending one again may change it, but not the path."""
+        return max((edge.static_stamp or 0 for edge in self._static), default=0)
 
     def row(self, at: int) -> Row:
         """Source in target at a stamp.
@@ -131,12 +136,15 @@ def climb(steps: tuple[Step, ...], at: int) -> Row:
                         scale = 1.0 / sin(angle)
                         keep = sin(angle - f * angle) * scale
                         turn = sin(f * angle) * scale
-                        if dot < 0.0:
-                            turn = -turn
-                        ai = keep * ai + turn * bi
-                        aj = keep * aj + turn * bj
-                        ak = keep * ak + turn * bk
-                        aw = keep * aw + turn * bw
+                    else:
+                        keep = 1.0 - f
+                        turn = f
+                    if dot < 0.0:
+                        turn = -turn
+                    ai = keep * ai + turn * bi
+                    aj = keep * aj + turn * bj
+                    ak = keep * ak + turn * bk
+                    aw = keep * aw + turn * bw
         if first:
             x, y, z, qx, qy, qz, qw = ax, ay, az, ai, aj, ak, aw
             first = False
@@ -176,10 +184,9 @@ def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: 
     """
     up, down = _Climber(frames, source, at), _Climber(frames, target, at)
     while True:
-        if up.here in down.seen:
-            return Path(up.edges, down.edges[: down.seen[up.here]], up.here)
-        if down.here in up.seen:
-            return Path(up.edges[: up.seen[down.here]], down.edges, down.here)
+        for meeting in (up.here, down.here):
+            if meeting in up.seen and meeting in down.seen:
+                return Path(up.edges[: up.seen[meeting]], down.edges[: down.seen[meeting]], meeting)
         if up.ended and down.ended:
             raise DisconnectedError(
                 target=target, source=source, roots=(down.here, up.here), stamp=at, loop=up.loop or down.loop

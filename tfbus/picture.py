@@ -1,10 +1,13 @@
 """Pictures of a tree: text for people, Graphviz, and tf2's YAML."""
 
 import json
+import re
 from collections.abc import Iterator, Sequence
 
 from tfbus.history import Edge
-from tfbus.stamps import format_duration, to_seconds
+from tfbus.stamps import format_duration, format_stamp
+
+_NOT_IN_YAML = re.compile(r"[\x7f-\xa0\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
 def describe(edges: Sequence[Edge], now: int | None = None) -> str:
@@ -29,27 +32,38 @@ def describe(edges: Sequence[Edge], now: int | None = None) -> str:
 
 def _facts(edge: Edge, now: int) -> str:
     sender = f"  from {edge.authority!r}" if edge.authority else ""
-    if edge.static:
-        return f"static{sender}"
     if edge.oldest is None or edge.newest is None:
-        return f"no samples{sender}"
-    rate = "one sample" if edge.rate is None else f"{edge.rate:.1f} Hz"
+        return f"{_rate(edge)}{sender}"
     span = format_duration(edge.newest - edge.oldest)
-    return f"{rate}  age {format_duration(now - edge.newest)}  span {span}{sender}"
+    return f"{_rate(edge)}  age {format_duration(now - edge.newest)}  span {span}{sender}"
+
+
+def _rate(edge: Edge) -> str:
+    if edge.static:
+        return "static"
+    if edge.newest is None:
+        return "no samples"
+    return "one sample" if edge.rate is None else f"{edge.rate:.1f} Hz"
 
 
 def _branches(edges: Sequence[Edge]) -> Iterator[tuple[str, Edge | None]]:
-    """Each frame's label and its edge, roots first; a loop is opened at its first frame."""
+    """Each frame's label and its edge, roots first; a loop is opened at one of its frames."""
     below: dict[str, list[Edge]] = {}
     for edge in edges:
         below.setdefault(edge.parent, []).append(edge)
-    children = {edge.child for edge in edges}
+    above = {edge.child: edge.parent for edge in edges}
     drawn: set[str] = set()
-    for root in [*sorted(parent for parent in below if parent not in children), *sorted(children)]:
-        if root in drawn:
+    for frame in [*sorted(parent for parent in below if parent not in above), *sorted(above)]:
+        if frame in drawn:
             continue
+        # What no root leads to hangs in a loop, or below one: up to the first frame that comes again.
+        root = frame
+        climbed: set[str] = set()
+        while root in above and root not in climbed:
+            climbed.add(root)
+            root = above[root]
         drawn.add(root)
-        yield (f"{root} (in a loop)" if root in children else root), None
+        yield (f"{root} (in a loop)" if root in above else root), None
         stack = _stacked(below.get(root, []), "")
         while stack:
             edge, branch, indent = stack.pop()
@@ -70,11 +84,9 @@ def to_dot(edges: Sequence[Edge]) -> str:
     """The edges in Graphviz's language; static ones are dashed."""
     lines = ["digraph tf {"]
     for edge in edges:
-        label = "static" if edge.static else "no samples" if edge.rate is None else f"{edge.rate:.1f} Hz"
-        if edge.authority:
-            label += f"\n{edge.authority}"
+        label = _rate(edge) + (f"\n{edge.authority}" if edge.authority else "")
         style = ", style=dashed" if edge.static else ""
-        lines.append(f"    {json.dumps(edge.parent)} -> {json.dumps(edge.child)} [label={json.dumps(label)}{style}];")
+        lines.append(f"    {_quoted(edge.parent)} -> {_quoted(edge.child)} [label={_quoted(label)}{style}];")
     return "\n".join([*lines, "}", ""])
 
 
@@ -84,17 +96,26 @@ def to_yaml(edges: Sequence[Edge]) -> str:
         return "{}\n"
     lines = []
     for edge in edges:
-        oldest = None if edge.oldest is None else to_seconds(edge.oldest)
-        newest = None if edge.newest is None else to_seconds(edge.newest)
+        length = None if edge.oldest is None or edge.newest is None else edge.newest - edge.oldest
         facts = {
-            "parent": edge.parent,
-            "broadcaster": edge.authority,
-            "static": edge.static,
-            "rate": edge.rate,
-            "most_recent_transform": newest,
-            "oldest_transform": oldest,
-            "buffer_length": None if oldest is None or newest is None else newest - oldest,
+            "parent": _quoted(edge.parent),
+            "broadcaster": _quoted(edge.authority),
+            "static": json.dumps(edge.static),
+            "rate": json.dumps(edge.rate),
+            "most_recent_transform": _seconds(edge.newest),
+            "oldest_transform": _seconds(edge.oldest),
+            "buffer_length": _seconds(length),
         }
-        lines.append(f"{json.dumps(edge.child)}:")
-        lines += [f"  {key}: {json.dumps(value)}" for key, value in facts.items()]
+        lines.append(f"{_quoted(edge.child)}:")
+        lines += [f"  {key}: {value}" for key, value in facts.items()]
     return "\n".join([*lines, ""])
+
+
+def _seconds(stamp: int | None) -> str:
+    """Exact, and never with an exponent, which YAML 1.1 takes for a string."""
+    return "null" if stamp is None else format_stamp(stamp).removesuffix(" s")
+
+
+def _quoted(text: str) -> str:
+    """In double quotes as YAML and Graphviz read them; Graphviz knows no ``\\u``, so letters of any alphabet stay."""
+    return _NOT_IN_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(text, ensure_ascii=False))

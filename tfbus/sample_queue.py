@@ -21,7 +21,8 @@ class SampleQueue:
         How many moving samples may be pending; at least one. With ``"conflate"`` that is a number of children.
     overflow : {"conflate", "drop_oldest"}
         ``"conflate"`` keeps the newest sample a child and, when there are too many children, drops the one that
-        has waited longest. ``"drop_oldest"`` drops the oldest whole batches; the newest batch always stays.
+        has waited longest. ``"drop_oldest"`` drops the oldest whole batches, also when more than `capacity` batches
+        are pending (all static, they would never fill the queue); the newest batch always stays.
 
     Attributes
     ----------
@@ -56,7 +57,7 @@ class SampleQueue:
         else:
             self._batches.append(batch)
             self._moving += sum(not sample.static for sample in batch)
-            while self._moving > self.capacity and len(self._batches) > 1:
+            while max(self._moving, len(self._batches)) > self.capacity and len(self._batches) > 1:
                 self._drop_batch()
 
     def get(self) -> Batch | None:

@@ -134,19 +134,19 @@ def answer(target: str, source: str, stamp: int, row: Row, static: bool) -> Tran
     return sample
 
 
-def is_frame(name: str) -> bool:
-    """Whether `name` can name a frame."""
+def is_frame(name: object) -> bool:
+    """Whether `name` can name a frame; `TypeError` if it is not a string."""
+    if not isinstance(name, str):
+        raise TypeError(f"a frame name must be a str, not {name!r}")
     return bool(name) and not name.startswith("/")
 
 
-def check_frame(
-    name: object, parent: str | None = None, child: str | None = None, authority: str | None = None
-) -> None:
+def check_frame(name: str, parent: str | None = None, child: str | None = None, authority: str | None = None) -> None:
     """Raise `InvalidTransformError` unless `name` can name a frame; the other arguments are for the error."""
-    if not isinstance(name, str):
-        raise TypeError(f"a frame name must be a str, not {name!r}")
     if not is_frame(name):
-        why = f"must not start with '/', got {name!r}: write {name.lstrip('/')!r}" if name else "must not be empty"
+        bare = name.lstrip("/")
+        hint = f": write {bare!r}" if bare else ""
+        why = f"must not start with '/', got {name!r}{hint}" if name else "must not be empty"
         raise InvalidTransformError(
             f"a frame name {why}", reason="frame name", parent=parent, child=child, authority=authority
         )

@@ -42,7 +42,7 @@ def from_seconds(seconds: float) -> int:
     ValueError
         If `seconds` is not finite, or the result does not fit a signed 64-bit integer.
     """
-    if not math.isfinite(seconds):
+    if not -math.inf < seconds < math.inf:
         raise ValueError(f"seconds must be finite, not {seconds!r}")
     whole = math.floor(seconds)
     stamp = whole * SECOND + round((seconds - whole) * SECOND)

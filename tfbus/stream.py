@@ -16,9 +16,17 @@ class Stream:
     The iteration ends when the bus or the stream is closed and what was pending has been read.
     """
 
-    def __init__(self, capacity: int, overflow: Overflow, detach: Callable[["Stream"], object]) -> None:
+    def __init__(
+        self,
+        capacity: int,
+        overflow: Overflow,
+        check_thread: Callable[[], object],
+        detach: Callable[["Stream"], object],
+    ) -> None:
         self.queue = SampleQueue(capacity, overflow)
+        self._check_thread = check_thread
         self._detach = detach
+        self._reading = anyio.ResourceGuard("reading from")
         self._reader: anyio.Event | None = None
         self._ended = False
 
@@ -54,17 +62,17 @@ class Stream:
         return self
 
     async def __anext__(self) -> Batch:
-        if self._reader is not None:
-            raise anyio.BusyResourceError("reading from")
-        await anyio.lowlevel.checkpoint()
-        while (batch := self.queue.get()) is None:
-            if self._ended:
-                raise StopAsyncIteration
-            self._reader = anyio.Event()
-            try:
-                await self._reader.wait()
-            finally:
-                self._reader = None
+        self._check_thread()
+        with self._reading:
+            await anyio.lowlevel.checkpoint()
+            while (batch := self.queue.get()) is None:
+                if self._ended:
+                    raise StopAsyncIteration
+                self._reader = anyio.Event()
+                try:
+                    await self._reader.wait()
+                finally:
+                    self._reader = None
         return batch
 
     def _wake(self) -> None:

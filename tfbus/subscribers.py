@@ -46,6 +46,8 @@ class Subscribers:
                 self._call(key, latched)
             finally:
                 self._calling = outer
+            if outer is None:
+                self._deliver_backlog()
         return Registration(lambda: self.callbacks.pop(key, None))
 
     def check_backlog(self) -> None:
@@ -62,6 +64,9 @@ class Subscribers:
         if self._calling is not None:
             self._queued += 1
             return
+        self._deliver_backlog()
+
+    def _deliver_backlog(self) -> None:
         try:
             while self._backlog:
                 batch = self._backlog.popleft()

@@ -206,7 +206,16 @@ class Topology:
             known.newest = None
         if static or known.newest is None or stamp >= known.newest:
             known.newest = None if static else stamp
-            self.reparented += known.parent != parent
+            if known.parent != parent:
+                self.reparented += 1
+                self._log.info(
+                    ("parent", child, authority),
+                    "frame %r moves from %r to %r, says %r",
+                    child,
+                    known.parent,
+                    parent,
+                    authority,
+                )
             known.parent = parent
         if static:
             self.latched[child] = sample

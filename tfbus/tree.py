@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterable
 from typing import Any
 
-from tfbus.errors import ExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus.errors import ExtrapolationError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.geometry import Row, compose
 from tfbus.history import Edge, FrameHistory, Outcome
 from tfbus.names import FrameNames
@@ -46,6 +46,8 @@ class TransformTree:
     structure_version : int
         Grows whenever an existing frame gets another parent or kind, a longer past, or is removed: then any lookup may
         have another answer.
+    edges_version : int
+        Grows whenever a frame gets its first parent: then frames may have become known, and trees joined.
 
     Examples
     --------
@@ -67,6 +69,7 @@ class TransformTree:
         self._names = FrameNames()
         self._paths: dict[tuple[str, str], Path] = {}
         self.structure_version = 0
+        self.edges_version = 0
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
@@ -138,8 +141,12 @@ class TransformTree:
 
     def _add(self, child: str, parent: str, static: bool) -> FrameHistory:
         # A new edge hangs a whole tree under another one, so every path that there was is still the path.
+        has_children = child in self._names
         history = self._frames[child] = FrameHistory(child, parent, static, self._window)
         self._names.update(child, history.mentioned)
+        self.edges_version += 1
+        if has_children:
+            self._forget_empty_loop(history)
         return history
 
     def _restructure(self, history: FrameHistory) -> None:
@@ -152,12 +159,14 @@ class TransformTree:
 
     def _forget_empty_loop(self, history: FrameHistory) -> None:
         """Drop emptied frames that now stand in a loop: their last parent is no longer the truth."""
-        walk = [history]
-        while (above := self._frames.get(walk[-1].parent)) is not None and above not in walk:
-            walk.append(above)
+        walk = {history: None}
+        here = history
+        while (above := self._frames.get(here.parent)) is not None and above not in walk:
+            walk[above] = None
+            here = above
         if above is history:
-            for edge in walk[1:]:
-                if not len(edge):
+            for edge in walk:
+                if edge is not history and not len(edge):
                     self._remove(edge.child)
 
     # Lookup
@@ -208,10 +217,10 @@ class TransformTree:
             at = as_stamp(at)
         self._acquire()
         try:
-            if source_at is not None or fixed is not None:
-                stamp, row, static = self._travel(target, source, at, source_at, fixed, not_before)
-            else:
+            if source_at is None and fixed is None:
                 stamp, row, static = self._answer(target, source, at, not_before)
+            else:
+                stamp, row, static = self._travel(target, source, at, source_at, fixed, not_before)
         finally:
             self._release()
         return answer(target, source, stamp, row, static)
@@ -226,7 +235,12 @@ class TransformTree:
             source_at = as_stamp(source_at)
         for name in (target, source, fixed):
             self._check_known(name)
-        stamp, target_from_fixed, static = self._answer(target, fixed, at, not_before)
+        try:
+            stamp, target_from_fixed, static = self._answer(target, fixed, at, not_before)
+        except FutureExtrapolationError:
+            # Waiting for this leg is no use if it cannot help the other one.
+            self._answer(fixed, source, source_at, not_before)
+            raise
         _, fixed_from_source, still = self._answer(fixed, source, source_at, not_before)
         return stamp, compose(target_from_fixed, fixed_from_source), static and still
 
@@ -256,7 +270,7 @@ class TransformTree:
             return common, there.row(common), False
         except TransformLookupError as error:
             # The lagging edge has to come as far as the others still reach back.
-            needed = max(edge.since() or common for edge in path.moving)
+            needed = max(common if (since := edge.since()) is None else since for edge in path.moving)
             if needed <= common:
                 raise
             raise lagging.missing(needed) from error
@@ -342,16 +356,6 @@ class TransformTree:
             if not history.covers(at):
                 raise history.missing(at)
             return history.parent_at(at)
-
-    @property
-    def names_version(self) -> int:
-        """Grows whenever frames become known or are forgotten."""
-        return self._names.version
-
-    def newest_stamp(self, frame: str) -> int | None:
-        """The stamp of a frame's newest moving sample, in ns; None if there is none."""
-        history = self._frames.get(frame)
-        return None if history is None else history.newest
 
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""

@@ -6,11 +6,10 @@ unblocked without looking at the others. Nothing here waits or evaluates: whoeve
 and wakes them, and they read again for themselves.
 """
 
-from bisect import bisect_left, bisect_right, insort
+from bisect import bisect_left, insort
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
-from operator import itemgetter
 
 from tfbus.errors import DisconnectedError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.stamps import STAMP_MIN, Latest
@@ -82,12 +81,15 @@ def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
 
 
 class _Blocked:
-    """The waiters under one frame: by the stamp that its edge must reach, and those that need any sample of it."""
+    """The waiters under one frame: by the stamp that its edge must reach, and those that need any sample of it.
 
-    __slots__ = ("by_stamp", "for_any")
+    The places are sorted backwards, by negative stamp and negative order, so that whoever is due stands at the end.
+    """
+
+    __slots__ = ("for_any", "places")
 
     def __init__(self) -> None:
-        self.by_stamp: list[_Place] = []
+        self.places: list[_Place] = []
         self.for_any: dict[Waiter, None] = {}
 
 
@@ -119,8 +121,8 @@ class WaitingIndex:
         waiter.names = blocking_frames(error)
         if isinstance(error, FutureExtrapolationError):
             needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp
-            waiter.place = (needed, next(self._order), waiter)
-            insort(self._under(error.child).by_stamp, waiter.place)
+            waiter.place = (-needed, -next(self._order), waiter)
+            insort(self._under(error.child).places, waiter.place)
         else:
             waiter.place = None
             for name in waiter.names:
@@ -138,27 +140,29 @@ class WaitingIndex:
             if blocked is None:
                 continue
             if waiter.place is not None:
-                del blocked.by_stamp[bisect_left(blocked.by_stamp, waiter.place)]
+                del blocked.places[bisect_left(blocked.places, waiter.place)]
             else:
                 blocked.for_any.pop(waiter, None)
-            if not blocked.by_stamp and not blocked.for_any:
+            if not blocked.places and not blocked.for_any:
                 del self.blocked[name]
 
-    def take(self, frame: str, newest: int | None) -> list[Waiter]:
-        """Take out those that a sample of `frame` can have unblocked: all that need less than its newest stamp."""
+    def take(self, frame: str, stamp: int | None) -> list[Waiter]:
+        """Take out those that a sample of `frame` can have unblocked: who needs any, or its stamp or an older one.
+
+        Who needs an older one than the newest has never been parked, so a late sample unblocks nobody else.
+        """
         blocked = self.blocked.get(frame)
         if blocked is None:
             return []
         ready = list(blocked.for_any)
         for waiter in ready:
             self.remove(waiter)
-        if newest is not None:
-            due = bisect_right(blocked.by_stamp, newest, key=itemgetter(0))
-            for _, _, waiter in blocked.by_stamp[:due]:
-                del self._waiters[waiter]
-                ready.append(waiter)
-            del blocked.by_stamp[:due]
-        if not blocked.by_stamp:
+        places = blocked.places
+        while stamp is not None and places and -places[-1][0] <= stamp:
+            waiter = places.pop()[2]
+            del self._waiters[waiter]
+            ready.append(waiter)
+        if not places:
             self.blocked.pop(frame, None)
         return ready
 

@@ -1,0 +1,60 @@
+"""What the tests of the bus need all the time: a moving child, a pause, and a call in a task of its own."""
+
+from collections.abc import Awaitable, Callable
+from typing import Generic, TypeVar
+
+import anyio
+import anyio.lowlevel
+from anyio.abc import TaskGroup
+
+from tfbus import Transform, TransformStamped, from_seconds
+
+T = TypeVar("T")
+
+
+def driving(parent: str, child: str, seconds: float, authority: str = "") -> TransformStamped:
+    """A sample of a child that drives at 1 m/s: at t s it is t m along the first axis."""
+    return TransformStamped(parent, child, from_seconds(seconds), Transform((seconds, 0.0, 0.0)), authority)
+
+
+async def settle() -> None:
+    """Let everything run until all tasks are blocked."""
+    for _ in range(5):
+        await anyio.lowlevel.checkpoint()
+    await anyio.wait_all_tasks_blocked()
+
+
+class Asked(Generic[T]):
+    """A call in a task of its own, and how it ended."""
+
+    def __init__(self, tasks: TaskGroup, call: Callable[[], Awaitable[T]]) -> None:
+        self._call = call
+        self._answer: list[T] = []
+        self._scope = anyio.CancelScope()
+        self.error: Exception | None = None
+        self.ended = False
+        tasks.start_soon(self._run)
+
+    @property
+    def cancelled(self) -> bool:
+        return self._scope.cancelled_caught
+
+    @property
+    def answer(self) -> T:
+        """What the call returned; what it raised is raised here."""
+        if self.error is not None:
+            raise self.error
+        assert self.ended, "the call still waits"
+        assert self._answer, "the call was cancelled"
+        return self._answer[0]
+
+    def cancel(self) -> None:
+        self._scope.cancel()
+
+    async def _run(self) -> None:
+        try:
+            with self._scope:
+                self._answer.append(await self._call())
+        except Exception as error:  # noqa: BLE001 - the test looks at it
+            self.error = error
+        self.ended = True

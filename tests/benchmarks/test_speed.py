@@ -1,0 +1,309 @@
+"""How fast it is, beside its peers: `pytest tests/benchmarks` ends with a table. The default run leaves this out.
+
+Timings on a shared machine drift, so what counts is the ratio of two sides that take turns, round by round; that is
+why there is a runner here, where pytest-benchmark would time one side. No test asserts a time.
+"""
+
+import itertools
+import json
+import subprocess
+import tracemalloc
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import cases
+import pytest
+from cases import AUTHORITY, BASE, START, Case, Figures, Pass, Vector
+
+from tfbus import LATEST, Buffer, Bus, Transform, TransformStamped
+
+ROUNDS = 9
+FEW_ROUNDS = 5
+WAKE_UPS = 200
+CROWD = 10_000
+SYSTEM_PYTHON = "/usr/bin/python3"
+
+Backend = tuple[str, dict[str, Any]]
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+Ask = Callable[[Case], tuple[Figures, Vector]]
+Calls = Sequence[TransformStamped | Sequence[TransformStamped]]
+
+
+class Table:
+    """What was measured, shown at the end of the run."""
+
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+
+    def add(self, label: str, ours: str, peer: str = "", ratio: str = "", wanted: str = "") -> None:
+        self._lines.append(f"{label:36} {ours:>17}   {peer:24} {ratio:18} {wanted}".rstrip())
+
+    def compare(
+        self, label: str, ours: list[Figures], name: str, peer: list[Figures], wanted: str = "", unit: str = "us"
+    ) -> None:
+        ratios = [mine / other for (mine, _), (other, _) in zip(ours, peer, strict=True)]
+        ratio = f"{median(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f})"
+        self.add(label, _show(ours, unit), f"{name} {_show(peer, unit)}", ratio, wanted)
+
+    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
+        terminalreporter.write_sep("=", "speed")
+        terminalreporter.write_line(f"{ROUNDS} rounds: median and (least) time of a call, median ratio and (range)")
+        for line in self._lines:
+            terminalreporter.write_line(line)
+
+
+def _show(rounds: list[Figures], unit: str) -> str:
+    scale = {"us": 1e6, "ms": 1e3}[unit]
+    return (
+        f"{median(middle for middle, _ in rounds) * scale:.2f} ({min(least for _, least in rounds) * scale:.2f}) {unit}"
+    )
+
+
+@pytest.fixture(scope="session")
+def table(request: pytest.FixtureRequest) -> Table:
+    table = Table()
+    table.add("", "tfbus", "peer", "ratio", "wanted")
+    request.config.pluginmanager.register(table)
+    return table
+
+
+@pytest.fixture(scope="session")
+def tf2() -> Iterator[Ask | str]:
+    """Has the real tf2, in a process of its own, measure one round of a case; or says why there is none."""
+    if not Path(SYSTEM_PYTHON).exists():
+        yield f"no {SYSTEM_PYTHON}"
+        return
+    script = Path(__file__).with_name("tf2_peer.py")
+    with subprocess.Popen([SYSTEM_PYTHON, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        requests, replies = process.stdin, process.stdout
+        assert requests is not None
+        assert replies is not None
+
+        def ask(case: Case) -> tuple[Figures, Vector]:
+            print(json.dumps(case), file=requests, flush=True)
+            figures, answer = json.loads(replies.readline())
+            return figures, answer
+
+        greeting = replies.readline().strip()
+        yield ask if greeting == "ready" else f"{SYSTEM_PYTHON}: {greeting}"
+
+
+def build(sample: cases.Sample) -> TransformStamped:
+    transform = Transform(sample.translation, sample.rotation)
+    return TransformStamped(sample.parent, sample.child, sample.stamp, transform, AUTHORITY, sample.static)
+
+
+def publish_all(bus: Bus, calls: Calls) -> float:
+    """Seconds in all."""
+    publish = bus.publish
+    start = perf_counter()
+    for samples in calls:
+        publish(samples)
+    return perf_counter() - start
+
+
+def publish_stamped(bus: Bus, parts: list[tuple[int, Transform]]) -> float:
+    """As `publish_all`, with the making of the samples."""
+    publish = bus.publish
+    start = perf_counter()
+    for stamp, transform in parts:
+        publish(TransformStamped(BASE, "f0", stamp, transform, AUTHORITY))
+    return perf_counter() - start
+
+
+def insert(kind: str) -> Pass:
+    samples = [build(sample) for sample in cases.insertions(kind)]
+    parts = [(sample.stamp, sample.transform) for sample in samples]
+    calls: Calls = samples
+    if kind == "insert batches":
+        calls = [samples[i : i + cases.BATCH] for i in range(0, len(samples), cases.BATCH)]
+
+    def one_pass() -> tuple[float, Vector]:
+        bus = Bus()
+        buffer = Buffer(bus, cases.KEEP)
+        seconds = publish_stamped(bus, parts) if kind == "insert stamped" else publish_all(bus, calls)
+        return seconds / len(samples), buffer.lookup_nowait(BASE, "f0").transform.translation
+
+    return one_pass
+
+
+def lookup(case: Case) -> Pass:
+    bus = Bus()
+    buffer = Buffer(bus, 2 * cases.KEEP)
+    bus.publish(build(sample) for sample in cases.history(case.chain))
+    stamps = [LATEST if case.kind == "lookup latest" else stamp for stamp in cases.questions()]
+    source = f"f{len(case.chain) - 1}"
+
+    def one_pass() -> tuple[float, Vector]:
+        ask = buffer.lookup_nowait
+        start = perf_counter()
+        for stamp in stamps:
+            found = ask(BASE, source, stamp)
+        return (perf_counter() - start) / len(stamps), found.transform.translation
+
+    return one_pass
+
+
+@pytest.mark.parametrize(
+    ("label", "case", "wanted"),
+    [
+        ("publish 1, built beforehand", Case("insert"), "<= 1.0"),
+        ("publish 1, stamped in the timing", Case("insert stamped"), "<= 1.0"),
+        ("publish 20, each", Case("insert batches"), "<= 1.0"),
+        ("lookup, 1 edge", Case("lookup", "m"), "<= 0.5"),
+        ("lookup, 3 edges", Case("lookup", "mmm"), "<= 1.1"),
+        ("lookup, 10 edges", Case("lookup", "mmmmmmmmmm"), "<= 2.7"),
+        ("lookup, 10 edges, 7 of them static", Case("lookup", "msssmsssms"), ""),
+        ("lookup LATEST, 1 edge", Case("lookup latest", "m"), ""),
+        ("lookup LATEST, 3 edges", Case("lookup latest", "mmm"), ""),
+        ("lookup LATEST, 10 edges", Case("lookup latest", "mmmmmmmmmm"), ""),
+    ],
+)
+def test_beside_tf2(table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
+    one_pass = lookup(case) if case.chain else insert(case.kind)
+    if isinstance(tf2, str):
+        table.add(label, _show([cases.measure(one_pass)[0]], "us"), "no tf2")
+        pytest.skip(f"no tf2 to measure beside ({tf2}); on Debian: apt-get install python3-tf2-ros")
+    rounds = [(cases.measure(one_pass), tf2(case)) for _ in range(ROUNDS)]
+    table.compare(label, [ours for (ours, _), _ in rounds], "tf2", [peer for _, (peer, _) in rounds], wanted)
+    (_, answer), (_, expected) = rounds[-1]
+    assert answer == pytest.approx(expected, abs=1e-6)
+
+
+def loop_name(backend: Backend) -> str:
+    return "uvloop" if backend[1] else backend[0]
+
+
+def moving(child: str, count: int) -> list[TransformStamped]:
+    return [TransformStamped(BASE, child, START + i * cases.PERIOD, Transform(), AUTHORITY) for i in range(count)]
+
+
+async def wake_up(
+    wait: Callable[[], Awaitable[object]], waiting: Callable[[], object], wake: Callable[[], object]
+) -> float:
+    """Seconds from the call of `wake` to the line after `wait`, in a task that was `waiting` by then."""
+    woken = 0.0
+    done = anyio.Event()
+
+    async def waiter() -> None:
+        nonlocal woken
+        await wait()
+        woken = perf_counter()
+        done.set()
+
+    async with anyio.create_task_group() as group:
+        group.start_soon(waiter)
+        while not waiting():
+            await anyio.lowlevel.checkpoint()
+        start = perf_counter()
+        wake()
+        await done.wait()
+    return woken - start
+
+
+def test_wake_up(table: Table, run: Run, anyio_backend: Backend) -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    samples = iter(moving("a", 1 + ROUNDS * WAKE_UPS))
+    bus.publish(next(samples))
+
+    async def by_lookup() -> float:
+        sample = next(samples)
+        wait = partial(buffer.lookup, BASE, "a", sample.stamp, timeout=60.0)
+        return await wake_up(wait, buffer.pending, partial(bus.publish, sample))
+
+    async def by_event() -> float:
+        event = anyio.Event()
+        return await wake_up(event.wait, lambda: event.statistics().tasks_waiting, event.set)
+
+    lookups: list[Figures] = []
+    events: list[Figures] = []
+
+    async def take_turns() -> None:
+        for _ in range(ROUNDS):
+            pairs = [(await by_lookup(), await by_event()) for _ in range(WAKE_UPS)]
+            lookups.append(cases.figures([ours for ours, _ in pairs]))
+            events.append(cases.figures([peer for _, peer in pairs]))
+
+    run(take_turns)
+    table.compare(f"wake-up, {loop_name(anyio_backend)}", lookups, "Event", events, "<= 2.5")
+
+
+@asynccontextmanager
+async def crowd(wait: Callable[[int], Any]) -> AsyncIterator[None]:
+    """Ten thousand tasks that wait, until the end of the block cancels them."""
+    async with anyio.create_task_group() as group:
+        for i in range(CROWD):
+            group.start_soon(wait, START + 1 + i)
+        await anyio.wait_all_tasks_blocked()
+        yield
+        group.cancel_scope.cancel()
+
+
+def look_up_a(buffer: Buffer, at: int) -> Awaitable[object]:
+    return buffer.lookup(BASE, "a", at, timeout=60.0)
+
+
+def test_publishing_past_waiters(table: Table) -> None:
+    buses = Bus(), Bus()
+    buffer, _ = (Buffer(bus) for bus in buses)
+    samples = moving("b", 1 + ROUNDS * cases.PASSES * 2_000)
+    chunks = (samples[first : first + 2_000] for first in range(1, len(samples), 2_000))
+    for bus in buses:
+        bus.publish([*moving("a", 1), samples[0]])
+    crowded: list[Figures] = []
+    empty: list[Figures] = []
+
+    async def take_turns() -> None:
+        async with crowd(partial(look_up_a, buffer)):
+            for _ in range(ROUNDS):
+                passes = itertools.islice(chunks, cases.PASSES)
+                pairs = [[publish_all(bus, chunk) / len(chunk) for bus in buses] for chunk in passes]
+                crowded.append(cases.figures([first for first, _ in pairs]))
+                empty.append(cases.figures([second for _, second in pairs]))
+
+    anyio.run(take_turns)
+    table.compare("publish on B while 10,000 wait on A", crowded, "none", empty, "<= 1.1")
+
+
+def test_cancelling(table: Table, run: Run, anyio_backend: Backend) -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    bus.publish(moving("a", 1))
+    lookups: list[Figures] = []
+    sleepers: list[Figures] = []
+
+    async def cancel(wait: Callable[[int], Any]) -> Figures:
+        async with crowd(wait):
+            start = perf_counter()
+        return cases.figures([perf_counter() - start])
+
+    async def take_turns() -> None:
+        for _ in range(FEW_ROUNDS):
+            lookups.append(await cancel(partial(look_up_a, buffer)))
+            assert not buffer.pending()
+            sleepers.append(await cancel(lambda _: anyio.sleep_forever()))
+
+    run(take_turns)
+    table.compare(f"cancel 10,000 waiters, {loop_name(anyio_backend)}", lookups, "sleep", sleepers, unit="ms")
+
+
+def test_memory(table: Table) -> None:
+    edges, samples = 20, 1_000
+    bus = Bus()
+    buffer = Buffer(bus)
+    tracemalloc.start()
+    for i in range(edges):
+        for stamp in range(START, START + samples * cases.PERIOD, cases.PERIOD):
+            bus.publish(TransformStamped(BASE, f"f{i}", stamp, Transform(), AUTHORITY))
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(buffer.tree.frames()) == edges + 1
+    table.add("memory a sample, 1,000 an edge", f"{size / edges / samples:.0f} B")

@@ -1,0 +1,86 @@
+"""The real tf2's side of `test_speed.py`, under the Python that has `tf2_py` (Debian: python3-tf2-ros).
+
+Says ``ready``, or what is missing; then answers each `Case`, a JSON line, with the figures of one round.
+"""
+
+import json
+import sys
+from time import perf_counter
+from typing import Any
+
+from cases import AUTHORITY, BASE, KEEP, Case, Pass, Sample, Vector, history, insertions, measure, questions
+
+try:
+    import rospy  # type: ignore[import-not-found]
+    import tf2_py  # type: ignore[import-not-found]
+    from geometry_msgs.msg import TransformStamped  # type: ignore[import-not-found]
+except ImportError as error:
+    print(error)
+    sys.exit()
+
+
+def time_parts(stamp: int) -> tuple[int, int]:
+    return divmod(stamp, 1_000_000_000)
+
+
+def build(sample: Sample) -> Any:
+    message = TransformStamped()
+    message.header.frame_id = sample.parent
+    message.header.stamp = rospy.Time(*time_parts(sample.stamp))
+    message.child_frame_id = sample.child
+    translation, rotation = message.transform.translation, message.transform.rotation
+    translation.x, translation.y, translation.z = sample.translation
+    rotation.x, rotation.y, rotation.z, rotation.w = sample.rotation
+    return message
+
+
+def translation_of(message: Any) -> Vector:
+    translation = message.transform.translation
+    return translation.x, translation.y, translation.z
+
+
+def insert(kind: str) -> Pass:
+    messages = [build(sample) for sample in insertions(kind)]
+    parts = [(message, *time_parts(sample.stamp)) for message, sample in zip(messages, insertions(kind), strict=True)]
+
+    def one_pass() -> tuple[float, Vector]:
+        core = tf2_py.BufferCore(rospy.Duration(KEEP))
+        set_transform, time = core.set_transform, rospy.Time
+        start = perf_counter()
+        if kind == "insert stamped":
+            for message, seconds, nanoseconds in parts:
+                message.header.stamp = time(seconds, nanoseconds)
+                set_transform(message, AUTHORITY)
+        else:
+            for message in messages:
+                set_transform(message, AUTHORITY)
+        seconds_each = (perf_counter() - start) / len(messages)
+        return seconds_each, translation_of(core.lookup_transform_core(BASE, "f0", time()))
+
+    return one_pass
+
+
+def lookup(case: Case) -> Pass:
+    core = tf2_py.BufferCore(rospy.Duration(2 * KEEP))
+    for sample in history(case.chain):
+        (core.set_transform_static if sample.static else core.set_transform)(build(sample), AUTHORITY)
+    times = [rospy.Time() if case.kind == "lookup latest" else rospy.Time(*time_parts(stamp)) for stamp in questions()]
+    source = f"f{len(case.chain) - 1}"
+
+    def one_pass() -> tuple[float, Vector]:
+        ask = core.lookup_transform_core
+        start = perf_counter()
+        for time in times:
+            found = ask(BASE, source, time)
+        return (perf_counter() - start) / len(times), translation_of(found)
+
+    return one_pass
+
+
+print("ready", flush=True)
+prepared: dict[str, Pass] = {}
+for line in sys.stdin:
+    if line not in prepared:
+        case = Case(*json.loads(line))
+        prepared = {line: lookup(case) if case.chain else insert(case.kind)}
+    print(json.dumps(measure(prepared[line])), flush=True)

@@ -1,0 +1,456 @@
+import math
+import time
+from collections.abc import Awaitable, Callable
+from functools import partial
+from itertools import count
+
+import anyio
+import pytest
+from asking import Asked, driving, settle
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tfbus import SECOND, Buffer, Bus, Clock, ClockResetError, SimulatedClock, SystemClock, from_seconds, to_seconds
+
+pytestmark = pytest.mark.anyio
+
+Run = Callable[[Callable[[], Awaitable[list[str]]]], list[str]]
+
+CLOCKS = [pytest.param(SystemClock, id="system"), pytest.param(SimulatedClock, id="simulated")]
+NEVER = 1e6
+
+
+async def test_simulated_time_stands_still_until_it_is_advanced() -> None:
+    clock = SimulatedClock(start=7)
+    await settle()
+    assert clock.now() == 7
+    await clock.advance(2.5)
+    assert clock.now() == 7 + 2_500_000_000
+
+
+async def test_a_sleeper_wakes_at_its_own_time_not_at_the_end_of_the_advance() -> None:
+    clock = SimulatedClock(start=100)
+    woken = []
+
+    async def sleep(seconds: float) -> None:
+        await clock.sleep(seconds)
+        woken.append(clock.now())
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(sleep, 1.25)
+        await clock.advance(10.0)
+    assert woken == [100 + 1_250_000_000]
+
+
+async def test_tasks_that_have_just_been_started_fall_asleep_before_time_moves() -> None:
+    clock = SimulatedClock()
+    async with anyio.create_task_group() as tasks:
+        asked = [Asked(tasks, partial(clock.sleep_until, k * SECOND)) for k in range(1, 4)]
+        await clock.advance(3.0)
+        assert all(sleeper.ended for sleeper in asked)
+
+
+async def test_sleepers_that_are_born_during_an_advance_are_woken_by_it() -> None:
+    clock = SimulatedClock()
+    woken = []
+
+    async def nap() -> None:
+        for _ in range(10):
+            await clock.sleep(0.1)
+            woken.append(clock.now())
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(nap)
+        await clock.advance(1.0)
+    assert woken == [k * 100_000_000 for k in range(1, 11)]
+
+
+async def test_sleepers_wake_in_order_of_stamp_then_of_registration() -> None:
+    clock = SimulatedClock()
+    woken = []
+
+    async def sleep(name: int, seconds: float) -> None:
+        await clock.sleep(seconds)
+        woken.append((seconds, name))
+
+    async with anyio.create_task_group() as tasks:
+        for name in range(50):
+            tasks.start_soon(sleep, name, 1.0 + name % 2)
+            await settle()
+        await clock.advance(2.0)
+    assert woken == [(1.0, name) for name in range(0, 50, 2)] + [(2.0, name) for name in range(1, 50, 2)]
+
+
+async def test_each_timed_task_has_run_until_it_blocks_before_the_next_one_wakes() -> None:
+    clock = SimulatedClock()
+    events = []
+
+    async def work(name: str) -> None:
+        await clock.sleep(1.0)
+        for step in range(3):
+            events.append(f"{name}{step}")
+            await anyio.lowlevel.checkpoint()
+
+    async with anyio.create_task_group() as tasks:
+        for name in "ab":
+            tasks.start_soon(work, name)
+            await settle()
+        await clock.advance(1.0)
+    assert events == ["a0", "a1", "a2", "b0", "b1", "b2"]
+
+
+async def _broadcast_and_listen() -> list[str]:
+    """A 100 Hz broadcaster and a 1 Hz listener for ten simulated seconds."""
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    log = []
+
+    async def broadcast() -> None:
+        async for _ in clock.ticks(100):
+            bus.publish(driving("map", "base", to_seconds(clock.now())))
+            log.append(f"{clock.now()} sent")
+
+    async def listen() -> None:
+        async for _ in clock.ticks(1):
+            found = await buffer.lookup("map", "base")
+            log.append(f"{clock.now()} heard {found.stamp}")
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(broadcast)
+        await settle()
+        tasks.start_soon(listen)
+        await clock.advance(10.0)
+        tasks.cancel_scope.cancel()
+    return log
+
+
+def test_ten_seconds_of_100_hz_beside_1_hz_give_the_same_events_on_every_loop_and_every_run(run: Run) -> None:
+    period = SECOND // 100
+    expected = ["0 sent", "0 heard 0"]
+    for k in range(1, 1001):
+        if k % 100 == 0:
+            # The listener fell asleep a second ago and so goes first: what it hears is one period old.
+            expected.append(f"{k * period} heard {(k - 1) * period}")
+        expected.append(f"{k * period} sent")
+    for _ in range(2):
+        assert run(_broadcast_and_listen) == expected
+
+
+Naps = list[list[float]]
+
+
+async def _sleep_in_turn(naps: Naps) -> list[str]:
+    clock = SimulatedClock()
+    log = []
+
+    async def sleep(name: int, seconds: list[float]) -> None:
+        for nap in seconds:
+            await clock.sleep(nap)
+            log.append(f"{name} {clock.now()}")
+
+    async with anyio.create_task_group() as tasks:
+        for name, seconds in enumerate(naps):
+            tasks.start_soon(sleep, name, seconds)
+            await settle()
+        await clock.advance(10.0)
+    return log
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(naps=st.lists(st.lists(st.sampled_from([0.01, 0.02, 0.03, 0.1]), max_size=8), max_size=5))
+def test_any_tasks_that_only_sleep_run_in_the_order_of_an_obvious_model(run: Run, naps: Naps) -> None:
+    # One sleeper at a time: the one whose nap ends first, and of those the one that lay down first.
+    order = count()
+    sleepers = [
+        (from_seconds(seconds[0]), next(order), name, seconds[1:]) for name, seconds in enumerate(naps) if seconds
+    ]
+    expected = []
+    while sleepers:
+        woken = min(sleepers)
+        sleepers.remove(woken)
+        now, _, name, rest = woken
+        expected.append(f"{name} {now}")
+        if rest:
+            sleepers.append((now + from_seconds(rest[0]), next(order), name, rest[1:]))
+    assert run(partial(_sleep_in_turn, naps)) == expected
+
+
+async def test_a_sleep_is_a_duration_and_survives_jumps() -> None:
+    clock = SimulatedClock()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(clock.sleep, 2.0))
+        await clock.advance(1.0)
+        clock.set(1_000 * SECOND)
+        clock.set(50 * SECOND)
+        await clock.advance(0.999)
+        assert not asked.ended
+        await clock.advance(0.001)
+        assert asked.ended
+        assert asked.error is None
+        assert clock.now() == 51 * SECOND
+
+
+async def test_sleep_until_ends_when_a_jump_passes_its_stamp() -> None:
+    clock = SimulatedClock()
+    async with anyio.create_task_group() as tasks:
+        on_the_stamp = Asked(tasks, partial(clock.sleep_until, 5 * SECOND))
+        later = Asked(tasks, partial(clock.sleep_until, 8 * SECOND))
+        await settle()
+        clock.set(5 * SECOND)
+        await settle()
+        assert on_the_stamp.ended
+        assert not later.ended
+        await clock.advance(2.999)
+        assert not later.ended
+        await clock.advance(0.001)
+        assert later.ended
+
+
+async def test_sleep_until_learns_of_a_jump_back() -> None:
+    clock = SimulatedClock()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(clock.sleep_until, 9 * SECOND))
+        await clock.advance(4.0)
+        clock.set(1 * SECOND)
+        await settle()
+        error = asked.error
+        assert isinstance(error, ClockResetError)
+        assert (error.before, error.after) == (4 * SECOND, 1 * SECOND)
+
+
+async def test_a_jump_to_the_present_resets_nobody() -> None:
+    clock = SimulatedClock(start=4)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(clock.sleep_until, 9))
+        await settle()
+        clock.set(4)
+        await settle()
+        assert not asked.ended
+        asked.cancel()
+
+
+async def test_jump_callbacks_get_both_stamps_until_they_are_closed() -> None:
+    clock = SimulatedClock(start=5)
+    jumps: list[tuple[int, int]] = []
+    registration = clock.on_jump(lambda before, after: jumps.append((before, after)))
+    clock.set(9)
+    clock.set(2)
+    await clock.advance(1.0)
+    registration.close()
+    clock.set(0)
+    assert jumps == [(5, 9), (9, 2)]
+
+
+def test_a_jump_callback_may_close_itself() -> None:
+    clock = SimulatedClock()
+    jumps = []
+
+    def once(_before: int, after: int) -> None:
+        jumps.append(after)
+        registration.close()
+
+    registration = clock.on_jump(once)
+    clock.on_jump(lambda _before, after: jumps.append(-after))
+    clock.set(1)
+    clock.set(2)
+    assert jumps == [1, -1, -2]
+
+
+async def test_move_on_after_counts_simulated_time_across_jumps() -> None:
+    clock = SimulatedClock()
+
+    async def wait() -> int:
+        with clock.move_on_after(3.0) as scope:
+            await anyio.sleep_forever()
+        assert scope.cancelled_caught
+        return clock.now()
+
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, wait)
+        await clock.advance(2.0)
+        clock.set(0)
+        await clock.advance(2.0)
+        assert asked.answer == 1 * SECOND
+
+
+async def test_an_outer_move_on_after_that_ends_first_is_not_taken_for_the_inner_one() -> None:
+    clock = SimulatedClock()
+
+    async def wait() -> tuple[bool, bool]:
+        with clock.move_on_after(1.0) as outer, clock.move_on_after(2.0) as inner:
+            await anyio.sleep_forever()
+        return outer.cancelled_caught, inner.cancelled_caught
+
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, wait)
+        await clock.advance(5.0)
+        assert asked.answer == (True, False)
+
+
+@pytest.mark.parametrize("make", CLOCKS)
+async def test_move_on_after_zero_ends_at_the_first_checkpoint(make: Callable[[], Clock]) -> None:
+    with make().move_on_after(0) as scope:
+        await anyio.lowlevel.checkpoint()
+    assert scope.cancelled_caught
+
+
+@pytest.mark.parametrize("seconds", [math.inf, 1e300])
+async def test_move_on_after_may_be_infinite(seconds: float) -> None:
+    clock = SimulatedClock()
+
+    async def wait() -> None:
+        with clock.move_on_after(seconds):
+            await clock.sleep(NEVER)
+
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, wait)
+        await clock.advance(NEVER - 1.0)
+        assert not asked.ended
+        await clock.advance(1.0)
+        assert asked.ended
+        assert not asked.cancelled
+
+
+@pytest.mark.parametrize("make", CLOCKS)
+async def test_sleeping_for_ever_is_allowed(make: Callable[[], Clock]) -> None:
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(make().sleep, math.inf))
+        await settle()
+        assert not asked.ended
+        asked.cancel()
+
+
+@pytest.mark.parametrize("make", CLOCKS)
+@pytest.mark.parametrize(("seconds", "error"), [(-1.0, ValueError), (math.nan, ValueError), ("1", TypeError)])
+async def test_a_bad_duration_raises_where_it_is_used(
+    make: Callable[[], Clock], seconds: float, error: type[Exception]
+) -> None:
+    with pytest.raises(error, match="seconds"):
+        await make().sleep(seconds)
+
+
+@pytest.mark.parametrize("make", CLOCKS)
+async def test_a_float_stamp_is_refused_with_the_way_out(make: Callable[[], Clock]) -> None:
+    with pytest.raises(TypeError, match=r"from_seconds\(1\.5\)"):
+        await make().sleep_until(1.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("make", CLOCKS)
+@pytest.mark.parametrize("sleep", [lambda clock: clock.sleep(0), lambda clock: clock.sleep_until(0)])
+async def test_sleeping_for_nothing_still_passes_a_checkpoint(
+    make: Callable[[], Clock], sleep: Callable[[Clock], Awaitable[None]]
+) -> None:
+    clock = make()
+    await sleep(clock)
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        await sleep(clock)
+    assert scope.cancelled_caught
+
+
+@pytest.mark.parametrize(("seconds", "error"), [(-1.0, ValueError), (math.inf, ValueError), (math.nan, ValueError)])
+async def test_time_cannot_be_advanced_by_nonsense(seconds: float, error: type[Exception]) -> None:
+    clock = SimulatedClock(start=3)
+    with pytest.raises(error):
+        await clock.advance(seconds)
+    await clock.advance(1.0)
+    assert clock.now() == 3 + SECOND
+
+
+async def test_only_one_task_may_advance_a_clock_at_a_time() -> None:
+    clock = SimulatedClock()
+    async with anyio.create_task_group() as tasks:
+        second = Asked(tasks, partial(clock.advance, 1.0))
+        sleeper = Asked(tasks, partial(clock.sleep, 2.0))
+        await clock.advance(5.0)
+        assert isinstance(second.error, RuntimeError)
+        assert sleeper.ended
+    assert clock.now() == 5 * SECOND
+
+
+async def test_a_sleeper_that_advances_the_clock_which_woke_it_is_refused() -> None:
+    clock = SimulatedClock()
+
+    async def meddle() -> None:
+        await clock.sleep(1.0)
+        await clock.advance(1.0)
+
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, meddle)
+        await clock.advance(3.0)
+        assert isinstance(asked.error, RuntimeError)
+    assert clock.now() == 3 * SECOND
+
+
+async def test_an_advance_that_is_cancelled_stops_where_it_is_and_can_be_resumed() -> None:
+    clock = SimulatedClock()
+
+    async def cancel_after_a_second() -> None:
+        await clock.sleep(1.0)
+        scope.cancel()
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(cancel_after_a_second)
+        with anyio.CancelScope() as scope:
+            await clock.advance(10.0)
+        assert clock.now() == 1 * SECOND
+        await clock.advance(1.0)
+        assert clock.now() == 2 * SECOND
+
+
+async def test_a_cancelled_sleeper_is_gone() -> None:
+    clock = SimulatedClock()
+    async with anyio.create_task_group() as tasks:
+        cancelled = [Asked(tasks, partial(clock.sleep, 1.0)), Asked(tasks, partial(clock.sleep_until, SECOND))]
+        stays = Asked(tasks, partial(clock.sleep, 1.0))
+        await settle()
+        for asked in cancelled:
+            asked.cancel()
+        await settle()
+        clock.set(10 * SECOND)
+        await clock.advance(1.0)
+        assert all(asked.cancelled for asked in cancelled)
+        assert stays.ended
+
+
+def test_a_clock_needs_no_event_loop_to_be_made_and_set() -> None:
+    clock = SimulatedClock(start=-5)
+    clock.set(2**63 - 1)
+    assert clock.now() == 2**63 - 1
+    with pytest.raises(ValueError, match="64-bit"):
+        clock.set(2**63)
+    with pytest.raises(TypeError, match="from_seconds"):
+        SimulatedClock(start=0.5)  # type: ignore[arg-type]
+    assert clock.now() == 2**63 - 1
+
+
+def test_the_system_clock_gives_nanoseconds_since_1970() -> None:
+    before = time.time_ns()
+    now = SystemClock().now()
+    assert before <= now <= time.time_ns()
+
+
+async def test_the_system_clock_sleeps_until_a_stamp_that_is_still_to_come() -> None:
+    clock = SystemClock()
+    await clock.sleep_until(clock.now() - SECOND)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(clock.sleep_until, clock.now() + 3600 * SECOND))
+        await settle()
+        assert not asked.ended
+        asked.cancel()
+
+
+async def test_the_system_clock_ticks_in_real_time() -> None:
+    ticks = SystemClock().ticks(1_000)
+    seen = [await anext(ticks) for _ in range(3)]
+    assert seen[0] == 0
+    assert seen == sorted(set(seen))
+    assert seen[-1] == 2 + ticks.skipped
+
+
+async def test_the_system_clock_never_announces_a_jump() -> None:
+    jumps = []
+    with SystemClock().on_jump(lambda before, after: jumps.append((before, after))):
+        await settle()
+    assert not jumps

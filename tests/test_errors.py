@@ -1,0 +1,333 @@
+import builtins
+import copy
+import inspect
+import pickle
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+import tfbus
+from tfbus import (
+    LATEST,
+    BusClosedError,
+    ClockResetError,
+    DisconnectedError,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    InvalidTransformError,
+    LookupTimeoutError,
+    PastExtrapolationError,
+    TransformError,
+    TransformLookupError,
+    UnknownFrameError,
+    errors,
+    from_seconds,
+)
+
+CLASSES = {
+    name: kind
+    for name, kind in vars(errors).items()
+    if isinstance(kind, type) and issubclass(kind, Exception) and kind.__module__ == errors.__name__
+}
+
+SHORT = FutureExtrapolationError(
+    child="base_link",
+    stamp=from_seconds(12.5),
+    oldest=from_seconds(2.09),
+    newest=from_seconds(12.09),
+    authority="odometry",
+)
+
+ONE_OF_EACH: list[tuple[TransformError, str]] = [
+    (TransformError("something is wrong"), "something is wrong"),
+    (TransformLookupError("no transform"), "no transform"),
+    (
+        UnknownFrameError(frame="base_lnik", known=("base_link", "map", "base_laser")),
+        "frame 'base_lnik' is not known, did you mean 'base_link' or 'base_laser'?",
+    ),
+    (
+        DisconnectedError(target="map", source="tool0", roots=("map", "arm_base"), stamp=from_seconds(12.5)),
+        "no path from 'tool0' to 'map': they are in different trees at 12.500 s, with roots 'map' and 'arm_base'",
+    ),
+    (
+        ExtrapolationError(child="base_link", stamp=from_seconds(12.5), oldest=None, newest=None),
+        "frame 'base_link': asked for 12.500 s, there is no sample in its window",
+    ),
+    (
+        SHORT,
+        "frame 'base_link': asked for 12.500 s, newest sample is 12.090 s (410 ms short), from 'odometry'",
+    ),
+    (
+        PastExtrapolationError(
+            child="base_link",
+            stamp=from_seconds(1),
+            oldest=from_seconds(2.5),
+            newest=from_seconds(12.5),
+            authority="odometry",
+        ),
+        "frame 'base_link': asked for 1.000 s, oldest sample is 2.500 s (1.5 s too early), from 'odometry'",
+    ),
+    (
+        LookupTimeoutError(target="map", source="base_link", timeout=0.25, missing=SHORT),
+        "no transform from 'base_link' to 'map' within 0.25 s: "
+        "frame 'base_link': asked for 12.500 s, newest sample is 12.090 s (410 ms short), from 'odometry'",
+    ),
+    (
+        InvalidTransformError(
+            "frame 'a' cannot be its own parent", reason="self transform", parent="a", child="a", authority="odometry"
+        ),
+        "frame 'a' cannot be its own parent",
+    ),
+    (
+        ClockResetError(before=from_seconds(90), after=from_seconds(3.5)),
+        "the clock jumped back from 90.000 s to 3.500 s",
+    ),
+    (BusClosedError(), "the bus is closed"),
+]
+
+
+each_error = pytest.mark.parametrize(
+    "error", [pytest.param(error, id=type(error).__name__) for error, _ in ONE_OF_EACH]
+)
+
+
+def facts(error: TransformError) -> dict[str, Any]:
+    return {name: value for name, value in vars(error).items() if not name.startswith("_")}
+
+
+def documented_tree() -> Iterator[tuple[str, str | None, str | None, list[str]]]:
+    """Each line of the docstring's tree: the class, what it is drawn under, its builtin base, its attributes."""
+    above: list[str] = []
+    for line in inspect.getdoc(errors).splitlines():  # type: ignore[union-attr]
+        found = re.fullmatch(r"( +)(\w+Error)(?: \((\w+)\))?( .*)?", line)
+        if found:
+            indent, name, builtin, rest = found.groups()
+            depth = len(indent) // 4 - 1
+            yield name, above[depth - 1] if depth else None, builtin, re.findall(r"\.(\w+)", rest or "")
+            above[depth:] = [name]
+
+
+def test_the_samples_of_this_file_have_every_class() -> None:
+    assert {type(error) for error, _ in ONE_OF_EACH} == set(CLASSES.values())
+
+
+def test_the_classes_form_the_tree_that_the_docstring_draws() -> None:
+    drawn = {name: (parent, builtin) for name, parent, builtin, _ in documented_tree()}
+    assert drawn.keys() == CLASSES.keys()
+    for name, (parent, builtin) in drawn.items():
+        bases = {CLASSES[parent] if parent else Exception, *([getattr(builtins, builtin)] if builtin else [])}
+        assert set(CLASSES[name].__bases__) == bases, name
+
+
+def test_the_tree_is_the_one_that_programs_catch_by() -> None:
+    assert issubclass(TransformLookupError, LookupError)
+    assert issubclass(InvalidTransformError, ValueError)
+    assert issubclass(LookupTimeoutError, TimeoutError)
+    assert issubclass(LookupTimeoutError, TransformLookupError)
+    assert not issubclass(PastExtrapolationError, FutureExtrapolationError)
+    assert not issubclass(ClockResetError, LookupError)
+    assert not issubclass(BusClosedError, LookupError)
+
+
+def test_every_attribute_that_the_docstring_draws_is_there() -> None:
+    drawn = {name: attributes for name, _, _, attributes in documented_tree()}
+    for error, _ in ONE_OF_EACH:
+        for kind in type(error).__mro__:
+            for attribute in drawn.get(kind.__name__, ()):
+                assert hasattr(error, attribute), f"{type(error).__name__}.{attribute}"
+
+
+def test_every_error_class_is_exported() -> None:
+    for name, kind in CLASSES.items():
+        assert name in tfbus.__all__
+        assert getattr(tfbus, name) is kind
+
+
+@pytest.mark.parametrize(("error", "text"), ONE_OF_EACH, ids=lambda value: type(value).__name__)
+def test_a_message_says_what_was_asked_what_there_is_and_the_gap(error: TransformError, text: str) -> None:
+    assert str(error) == text
+    assert repr(error) == f"{type(error).__name__}({text!r})"
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (UnknownFrameError(frame="map"), "frame 'map' is not known"),
+        (UnknownFrameError(frame="map", known=("lidar",)), "frame 'map' is not known"),
+        (
+            DisconnectedError(target="map", source="tool0", roots=("map", "arm_base")),
+            "no path from 'tool0' to 'map': they are in different trees, with roots 'map' and 'arm_base'",
+        ),
+        (
+            DisconnectedError(target="map", source="a", roots=("map", "a"), stamp=1, loop=("a", "b", "a")),
+            "no path from 'a' to 'map': the frames a -> b -> a form a loop at 0.000000001 s",
+        ),
+        (
+            FutureExtrapolationError(child="base_link", stamp=from_seconds(12.5), oldest=None, newest=None),
+            "frame 'base_link': asked for 12.500 s, it has no samples",
+        ),
+        (
+            FutureExtrapolationError(child="base_link", stamp=LATEST, oldest=None, newest=None, authority="odometry"),
+            "frame 'base_link': asked for the latest, it has no samples, from 'odometry'",
+        ),
+        (
+            FutureExtrapolationError(child="base_link", stamp=2_000_000_001, oldest=0, newest=2_000_000_000),
+            "frame 'base_link': asked for 2.000000001 s, newest sample is 2.000 s (1 ns short)",
+        ),
+        (BusClosedError("the buffer is closed"), "the buffer is closed"),
+    ],
+)
+def test_a_message_leaves_out_what_is_not_known(error: TransformError, text: str) -> None:
+    assert str(error) == text
+
+
+@each_error
+def test_a_message_is_one_lower_case_clause(error: TransformError) -> None:
+    text = str(error)
+    assert text[0].islower()
+    assert "\n" not in text
+    assert not text.endswith(".")
+
+
+def test_an_extrapolation_error_holds_its_facts() -> None:
+    assert facts(SHORT) == {
+        "child": "base_link",
+        "stamp": 12_500_000_000,
+        "oldest": 2_090_000_000,
+        "newest": 12_090_000_000,
+        "authority": "odometry",
+    }
+
+
+def test_the_other_errors_hold_their_facts() -> None:
+    disconnected = DisconnectedError(target="t", source="s", roots=("r", "q"), stamp=7, loop=("a", "b", "a"))
+    assert facts(disconnected) == {
+        "target": "t",
+        "source": "s",
+        "roots": ("r", "q"),
+        "stamp": 7,
+        "loop": ("a", "b", "a"),
+    }
+    late = LookupTimeoutError(target="t", source="s", timeout=0.5, missing=SHORT)
+    assert facts(late) == {"target": "t", "source": "s", "timeout": 0.5}
+    invalid = InvalidTransformError(
+        "no", reason="cycle", parent="b", child="a", authority="odometry", loop=("a", "b", "a")
+    )
+    assert facts(invalid) == {
+        "reason": "cycle",
+        "parent": "b",
+        "child": "a",
+        "authority": "odometry",
+        "loop": ("a", "b", "a"),
+    }
+    assert facts(ClockResetError(before=9, after=3)) == {"before": 9, "after": 3}
+
+
+class Names:
+    """Frame names that count how often they are gone through."""
+
+    def __init__(self) -> None:
+        self.reads = 0
+
+    def __iter__(self) -> Iterator[str]:
+        self.reads += 1
+        return iter(("map", "base_link"))
+
+
+def test_similar_names_are_worked_out_once_and_only_when_somebody_looks() -> None:
+    names = Names()
+    error = UnknownFrameError(frame="base_lnik", known=names)
+    assert error.frame == "base_lnik"
+    assert names.reads == 0
+    assert error.close_matches == ("base_link",)
+    assert error.close_matches == ("base_link",)
+    assert "did you mean 'base_link'?" in str(error)
+    assert names.reads == 1
+
+
+def test_the_most_similar_name_comes_first() -> None:
+    error = UnknownFrameError(frame="lidar_1", known=("map", "lidar", "lidar_11", "radar_1"))
+    assert error.close_matches[0] == "lidar_11"
+    assert "map" not in error.close_matches
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+@each_error
+def test_an_error_pickles_with_its_facts_and_its_cause(error: TransformError, protocol: int) -> None:
+    raised = raise_and_catch(error)
+    twin = pickle.loads(pickle.dumps(raised, protocol))
+    assert_same_error(twin, raised)
+    assert_same_error(twin.__cause__, SHORT)
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy])
+@each_error
+def test_an_error_copies_with_its_facts_and_its_cause(error: TransformError, duplicate: Any) -> None:
+    raised = raise_and_catch(error)
+    twin = duplicate(raised)
+    assert twin is not raised
+    assert_same_error(twin, raised)
+    assert_same_error(twin.__cause__, SHORT)
+
+
+def raise_and_catch(error: TransformError) -> TransformError:
+    try:
+        raise copy.copy(error) from SHORT
+    except TransformError as caught:
+        return caught
+
+
+def assert_same_error(twin: object, error: TransformError) -> None:
+    assert isinstance(twin, type(error))
+    assert str(twin) == str(error)
+    assert twin.args == error.args
+    for name, value in facts(error).items():
+        assert getattr(twin, name) == value
+    if isinstance(error, UnknownFrameError):
+        assert isinstance(twin, UnknownFrameError)
+        assert twin.close_matches == error.close_matches
+
+
+def test_an_error_nobody_looked_at_pickles_with_its_similar_names() -> None:
+    names = (name for name in ("map", "base_link"))
+    twin: UnknownFrameError = pickle.loads(pickle.dumps(UnknownFrameError(frame="base_lnik", known=names)))
+    assert twin.close_matches == ("base_link",)
+
+
+def test_notes_survive_pickling() -> None:
+    error = BusClosedError()
+    error.add_note("while the robot drove")
+    assert pickle.loads(pickle.dumps(error)).__notes__ == ["while the robot drove"]
+
+
+def test_a_copy_without_a_cause_still_shows_what_it_was_raised_from() -> None:
+    twin = copy.copy(BusClosedError())
+    try:
+        try:
+            raise KeyError
+        except KeyError:
+            raise twin  # noqa: B904 - the context is what is tested
+    except BusClosedError as error:
+        assert isinstance(error.__context__, KeyError)
+        assert not error.__suppress_context__
+
+
+def test_a_subclass_of_a_program_pickles_too() -> None:
+    error = SubclassError(child="tool0", stamp=3, oldest=1, newest=2)
+    error.extra = "fact"
+    twin = pickle.loads(pickle.dumps(error))
+    assert_same_error(twin, error)
+    assert twin.extra == "fact"
+
+
+class SubclassError(FutureExtrapolationError):
+    extra: str
+
+
+def test_a_timeout_is_caught_as_what_it_is_before_os_error() -> None:
+    with pytest.raises(TransformLookupError) as caught:
+        raise LookupTimeoutError(target="map", source="tool0", timeout=1.0, missing=SHORT) from SHORT
+    assert isinstance(caught.value, OSError)
+    assert caught.value.__cause__ is SHORT

@@ -1,0 +1,148 @@
+import pytest
+from samples import moving, static
+
+from tfbus import (
+    BufferStatistics,
+    ClockResetError,
+    DisconnectedError,
+    FutureExtrapolationError,
+    Question,
+    TransformLookupError,
+    UnknownFrameError,
+)
+from tfbus.feed import Feed
+from tfbus.waiting import Waiter
+
+
+def park(feed: Feed, target: str, source: str, at: int, woken: list[str]) -> None:
+    """Park a lookup that writes its source down when it is woken."""
+    with pytest.raises(TransformLookupError) as caught:
+        feed.tree.lookup(target, source, at)
+    waiter = Waiter(Question(target, source, at), 0, lambda: woken.append(source))
+    feed.waiting.park(waiter, caught.value)
+
+
+def blockers(feed: Feed) -> list[type[TransformLookupError]]:
+    return [type(pending.blocked_by) for pending in feed.waiting.pending()]
+
+
+def test_a_sample_wakes_those_whose_stamp_it_reaches_and_no_others() -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("map", "a", 1), moving("map", "b", 1)))
+    for at in (5, 3, 4):
+        park(feed, "map", "a", at, woken)
+    park(feed, "map", "b", 3, woken)
+    feed.receive((moving("map", "a", 2),))
+    assert woken == []
+    feed.receive((moving("map", "a", 4),))
+    assert woken == ["a", "a"]
+    assert [pending.question.at for pending in feed.waiting.pending()] == [5, 3]
+
+
+def test_a_sample_that_expires_or_fills_the_past_wakes_nobody_who_waits_for_the_future() -> None:
+    feed = Feed(1e-6)
+    woken: list[str] = []
+    feed.receive((moving("map", "a", 9_000), moving("map", "a", 10_000)))
+    park(feed, "map", "a", 11_000, woken)
+    feed.receive((moving("map", "a", 1), moving("map", "a", 9_500)))
+    assert woken == []
+    assert feed.statistics(4) == BufferStatistics(offered=4, inserted=3, replaced=0, expired=1, waiting=1)
+
+
+@pytest.mark.parametrize("sample", [moving("map", "a", 1), moving("a", "child", 1), static("map", "a")])
+def test_a_frame_becomes_known_as_child_or_as_parent(sample: object) -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("map", "b", 1),))
+    park(feed, "map", "a", 1, woken)
+    assert blockers(feed) == [UnknownFrameError]
+    feed.receive((moving("b", "c", 1),))
+    assert woken == []
+    feed.receive((sample,))  # type: ignore[arg-type]
+    assert woken == ["a"]
+
+
+@pytest.mark.parametrize("root", ["map", "world"])
+def test_two_trees_are_joined_by_a_sample_of_either_root(root: str) -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("map", "a", 1), moving("world", "b", 1)))
+    park(feed, "a", "b", 1, woken)
+    assert blockers(feed) == [DisconnectedError]
+    feed.receive((moving("map", "a", 2), moving("world", "b", 2)))
+    assert woken == []
+    feed.receive((moving("elsewhere", root, 1),))
+    assert woken == ["b"]
+
+
+@pytest.mark.parametrize(
+    "sample",
+    [
+        pytest.param(moving("other", "a", 9), id="another parent"),
+        pytest.param(static("map", "a"), id="another kind"),
+        pytest.param(moving("map", "a", 0), id="a longer past"),
+    ],
+)
+def test_everybody_looks_again_when_a_frame_changes_what_its_past_samples_said(sample: object) -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("map", "a", 1), moving("map", "b", 1)))
+    park(feed, "map", "a", 9, woken)
+    park(feed, "map", "b", 9, woken)
+    feed.receive((sample,))  # type: ignore[arg-type]
+    assert sorted(woken) == ["a", "b"]
+
+
+def test_a_removed_frame_wakes_everybody() -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("map", "a", 1), moving("map", "b", 1)))
+    park(feed, "map", "a", 9, woken)
+    park(feed, "map", "b", 9, woken)
+    feed.remove_frame("nobody")
+    assert woken == []
+    feed.remove_frame("b")
+    assert sorted(woken) == ["a", "b"]
+    assert feed.tree.frames() == ["a", "map"]
+
+
+def test_a_reset_drops_moving_samples_keeps_statics_and_wakes_everybody() -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("map", "a", 5), static("a", "camera")))
+    park(feed, "map", "a", 9, woken)
+    feed.reset(5, 2)
+    assert woken == ["a"]
+    error = feed.last_reset
+    assert isinstance(error, ClockResetError)
+    assert (error.before, error.after) == (5, 2)
+    assert feed.tree.can_transform("a", "camera", 5)
+    with pytest.raises(FutureExtrapolationError):
+        feed.tree.lookup("map", "a", 5)
+
+
+def test_two_equal_resets_are_two_objects() -> None:
+    feed = Feed(None)
+    feed.reset(5, 2)
+    first = feed.last_reset
+    feed.reset(5, 2)
+    assert feed.last_reset is not first
+
+
+def test_the_end_wakes_everybody_and_its_first_reason_stays() -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    park(feed, "map", "a", 9, woken)
+    feed.end("the buffer is closed")
+    feed.end("the bus is closed")
+    assert woken == ["a"]
+    assert feed.ended == "the buffer is closed"
+
+
+def test_every_sample_that_was_offered_is_counted_once() -> None:
+    feed = Feed(1.0)
+    batch = (moving("map", "a", 5), moving("map", "a", 5, 1.0), static("map", "s"), static("map", "s", x=2.0))
+    feed.receive(batch)
+    feed.receive((moving("map", "a", 10**10), moving("map", "a", 6)))
+    assert feed.statistics(6) == BufferStatistics(offered=6, inserted=3, replaced=2, expired=1, waiting=0)

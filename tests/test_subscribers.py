@@ -1,0 +1,232 @@
+import logging
+
+import pytest
+from samples import moving, static
+
+from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
+
+Batch = tuple[TransformStamped, ...]
+
+
+def children(batches: list[Batch]) -> list[str]:
+    return [sample.child for batch in batches for sample in batch]
+
+
+def test_a_subscriber_gets_each_batch_as_a_tuple_until_it_is_closed() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    with bus.subscribe(got.append):
+        bus.publish(moving("map", "a", 1))
+        bus.publish(moving("map", name, 2) for name in "ab")
+    bus.publish(moving("map", "a", 3))
+    assert got == [(moving("map", "a", 1),), (moving("map", "a", 2), moving("map", "b", 2))]
+
+
+def test_an_empty_batch_calls_nobody() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish([])
+    assert got == []
+
+
+def test_the_buffers_have_a_batch_before_a_subscriber_is_called() -> None:
+    bus = Bus(SimulatedClock())
+    stamps = []
+    bus.subscribe(lambda _: stamps.append(buffer.lookup_nowait("map", "a").stamp))
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "a", 2))
+    assert stamps == [1, 2]
+
+
+def test_who_subscribes_late_gets_the_latched_statics_first() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish([static("map", "a"), static("map", "b"), moving("map", "c", 1)])
+    bus.publish(static("map", "b", x=2.0))
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    assert [set(batch) for batch in got] == [{static("map", "a"), static("map", "b", x=2.0)}]
+    bus.publish(moving("map", "c", 2))
+    assert got[1:] == [(moving("map", "c", 2),)]
+
+
+def test_subscribers_are_called_in_the_order_of_their_registration() -> None:
+    bus = Bus(SimulatedClock())
+    calls = []
+    for name in range(5):
+        bus.subscribe(lambda _, name=name: calls.append(name))  # type: ignore[misc]
+    bus.publish(moving("map", "a", 1))
+    assert calls == [0, 1, 2, 3, 4]
+
+
+def test_a_subscriber_that_raises_disturbs_nobody_and_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def clumsy(_batch: Batch) -> None:
+        raise ValueError("spilt the coffee")
+
+    bus.subscribe(clumsy)
+    bus.subscribe(got.append)
+    for stamp in range(3):
+        bus.publish(moving("map", "a", stamp))
+    assert len(got) == 3
+    assert bus.statistics().callbacks_failed == 3
+    (record,) = caplog.records
+    assert (record.name, record.levelno) == ("tfbus", logging.WARNING)
+    assert "clumsy" in record.getMessage()
+    assert record.exc_info is not None
+    assert str(record.exc_info[1]) == "spilt the coffee"
+
+
+def test_what_is_no_exception_is_not_swallowed_and_the_bus_goes_on() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def interrupted(batch: Batch) -> None:
+        got.append(batch)
+        if batch[0].stamp == 1:
+            raise KeyboardInterrupt
+
+    bus.subscribe(interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "a", 2))
+    assert [batch[0].stamp for batch in got] == [1, 2]
+
+
+def test_a_subscriber_may_close_itself() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def once(batch: Batch) -> None:
+        got.append(batch)
+        registration.close()
+
+    registration = bus.subscribe(once)
+    bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "a", 2))
+    assert got == [(moving("map", "a", 1),)]
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_a_subscriber_that_another_one_closes_is_not_called_any_more() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(lambda _: victim.close())
+    victim = bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    assert got == []
+
+
+def test_a_subscriber_may_subscribe_another_which_sees_every_batch_from_the_next_one_on() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def recruit(batch: Batch) -> None:
+        if batch[0].child == "a":
+            bus.subscribe(got.append)
+
+    bus.subscribe(recruit)
+    bus.publish(static("map", "s"))
+    bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "b", 2))
+    assert children(got) == ["s", "b"]
+
+
+def test_what_a_subscriber_publishes_is_buffered_at_once_and_delivered_behind_the_current_batch() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    echoes = {"a": ["b", "c"], "b": ["d"]}
+    first: list[Batch] = []
+    last: list[Batch] = []
+
+    def echo(batch: Batch) -> None:
+        for child in echoes.get(batch[0].child, []):
+            bus.publish(moving("map", child, 1))
+            assert buffer.can_transform("map", child, 1)
+
+    bus.subscribe(first.append)
+    bus.subscribe(echo)
+    bus.subscribe(last.append)
+    bus.publish(moving("map", "a", 1))
+    assert children(first) == children(last) == ["a", "b", "c", "d"]
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_what_a_subscriber_publishes_on_being_registered_reaches_everybody_at_once() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish(static("map", "a"))
+
+    def answer(batch: Batch) -> None:
+        if batch[0].child == "a":
+            bus.publish(moving("a", "b", 1))
+
+    bus.subscribe(answer)
+    assert children(got) == ["a", "b"]
+
+
+def test_a_subscriber_that_publishes_without_end_is_stopped_by_an_error_that_names_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    bus = Bus(SimulatedClock())
+    errors: list[RuntimeError] = []
+
+    def chatterbox(batch: Batch) -> None:
+        try:
+            bus.publish(moving("map", "a", batch[0].stamp + 1))
+        except RuntimeError as error:
+            errors.append(error)
+            raise
+
+    bus.subscribe(chatterbox)
+    bus.publish(moving("map", "a", 0))
+    (error,) = errors
+    assert "chatterbox" in str(error)
+    assert bus.statistics().samples == 1_001
+    assert bus.statistics().callbacks_failed == 1
+    assert len(caplog.records) == 1
+    bus.publish(moving("map", "a", 5_000))
+    assert len(errors) == 2
+
+
+def test_a_thousand_batches_from_inside_a_callback_are_still_fine() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def burst(batch: Batch) -> None:
+        if batch[0].child == "a":
+            for stamp in range(1_000):
+                bus.publish(moving("map", "b", stamp))
+
+    bus.subscribe(burst)
+    bus.subscribe(got.append)
+    for _ in range(2):
+        got.clear()
+        bus.publish(moving("map", "a", 0))
+        assert [batch[0].stamp for batch in got[1:]] == list(range(1_000))
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_a_subscriber_that_closes_the_bus_ends_publishing_but_not_the_batch() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(lambda _: bus.close())
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    assert got == [(moving("map", "a", 1),)]
+    with pytest.raises(BusClosedError):
+        bus.publish(moving("map", "a", 2))
+
+
+def test_only_callables_can_subscribe_and_only_on_an_open_bus() -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(TypeError, match="callable"):
+        bus.subscribe("print")  # type: ignore[arg-type]
+    bus.publish(moving("map", "a", 1))
+    bus.close()
+    with pytest.raises(BusClosedError):
+        bus.subscribe(print)
