@@ -19,6 +19,7 @@ ABOVE_THE_ASYNC_LINE = [
     ("geometry",),
     ("stamped", "history"),
     ("data", "path", "picture", "topology", "sample_queue", "subscribers", "waiting"),
+    ("forest",),
     ("tree",),
     ("feed",),
 ]
@@ -39,7 +40,7 @@ ALLOWED_EFFECTS = {"tree": {"threading"}}
 
 CORE = {"anyio", "numpy", "transforms3d"}
 EXTRAS = {"cyclopts", "hypothesis", "rich", "starlette", "uvicorn"}
-ALLOWED_EXTRAS = {"cli": {"cyclopts", "rich"}, "testing": {"hypothesis"}}
+ALLOWED_EXTRAS = {"cli": {"cyclopts"}}
 
 
 def module_name(path: Path) -> str:

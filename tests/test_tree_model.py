@@ -267,7 +267,7 @@ class Model:
         common, lagging, moving = found
         try:
             return Answer(self.at_stamp(target, source, common), common, static=False)
-        except (Blocked, Circle) as error:
+        except Blocked as error:
             needed = max(self.children[name].since() for name in moving)
             if needed <= common:
                 raise AssertionError("a path whose edges all reach the common stamp has an answer there") from error

@@ -39,20 +39,21 @@ class Feed:
 
     def receive(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake whom it can have unblocked."""
-        tree, blocked = self.tree, self._blocked
+        blocked = self._blocked
         if not blocked:
-            tree.commit(batch)
+            self.tree.commit(batch)
             return
-        structure, edges = tree.structure_version, tree.edges_version
-        tree.commit(batch)
-        if tree.structure_version != structure:
+        forest = self.tree.forest
+        structure, edges = forest.structure_version, forest.edges_version
+        self.tree.commit(batch)
+        if forest.structure_version != structure:
             _wake(self.waiting.take_all())
             return
         for sample in batch:
             fields = sample._fields
             if fields[1] in blocked:
                 _wake(self.waiting.take(fields[1], fields[2]))
-        if tree.edges_version != edges:
+        if forest.edges_version != edges:
             for sample in batch:
                 _wake(self.waiting.take(sample.parent, None))
 

@@ -272,6 +272,7 @@ class FrameHistory:
             self.changed = True
         if self.parents is not None or parent != self.parent:
             self._cut()
+            self._cut_after = STAMP_MIN
             at = bisect_left(stamps, stamp)
             self.parents = self.parents or Counter({self.parent: len(self)})
             self.parents[parent] += 1

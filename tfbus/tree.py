@@ -9,17 +9,15 @@ import threading
 from collections.abc import Iterable
 from typing import Any
 
-from tfbus.errors import ExtrapolationError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus.errors import ExtrapolationError, FutureExtrapolationError, TransformLookupError
+from tfbus.forest import Forest
 from tfbus.geometry import Row, compose
-from tfbus.history import Edge, FrameHistory, Outcome
-from tfbus.names import FrameNames
+from tfbus.history import Edge, Outcome
 from tfbus.path import Path, find_path
 from tfbus.picture import describe, to_dot, to_yaml
 from tfbus.stamped import Batch, TransformStamped, answer, as_batch
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds
 from tfbus.topology import admit
-
-_PATHS_KEPT = 10_000
 
 At = int | Latest
 _Answer = tuple[int, Row, bool]
@@ -43,11 +41,8 @@ class TransformTree:
     keep : float or None
     inserted, replaced, expired : int
         How many samples had each `Outcome`.
-    structure_version : int
-        Grows whenever an existing frame gets another parent or kind, a longer past, or is removed: then any lookup may
-        have another answer.
-    edges_version : int
-        Grows whenever a frame gets its first parent: then frames may have become known, and trees joined.
+    forest : Forest
+        What the tree is made of. For the rest of the package: reading it is not covered by the lock.
 
     Examples
     --------
@@ -61,15 +56,10 @@ class TransformTree:
     def __init__(self, keep: float | None = 10.0) -> None:
         seconds = None if keep is None else as_duration(keep, "keep")
         self.keep = keep
-        self._window = None if seconds is None or seconds == math.inf else from_seconds(seconds)
         self._lock = threading.Lock()
         # Called in every lookup and insertion, where `with` would cost as much as a dozen multiplications.
         self._acquire, self._release = self._lock.acquire, self._lock.release
-        self._frames: dict[str, FrameHistory] = {}
-        self._names = FrameNames()
-        self._paths: dict[tuple[str, str], Path] = {}
-        self.structure_version = 0
-        self.edges_version = 0
+        self.forest = Forest(None if seconds is None or seconds == math.inf else from_seconds(seconds))
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
@@ -100,14 +90,24 @@ class TransformTree:
         """
         batch = as_batch(samples)
         with self._lock:
-            _, refused = admit(self._frames, batch)
+            _, refused = admit(self.forest.frames, batch)
             if refused:
                 raise refused[0]
             return [self._store(sample) for sample in batch]
 
+    def _store(self, sample: TransformStamped) -> Outcome:
+        outcome = self.forest.store(sample)
+        if outcome is Outcome.INSERTED:
+            self.inserted += 1
+        elif outcome is Outcome.REPLACED:
+            self.replaced += 1
+        else:
+            self.expired += 1
+        return outcome
+
     def commit(self, batch: Batch) -> None:
         """Store a batch that somebody has judged already, such as the bus; what is too old expires."""
-        frames = self._frames
+        frames = self.forest.frames
         self._acquire()
         try:
             for sample in batch:
@@ -119,55 +119,6 @@ class TransformTree:
                     self._store(sample)
         finally:
             self._release()
-
-    def _store(self, sample: TransformStamped) -> Outcome:
-        parent, child, stamp, row, authority, static = sample._fields
-        history = self._frames.get(child)
-        if history is None:
-            history = self._add(child, parent, static)
-        if static:
-            outcome = history.insert_static(parent, stamp, row, authority)
-        else:
-            outcome = history.insert(parent, stamp, row, authority)
-        if history.changed:
-            self._restructure(history)
-        if outcome is Outcome.INSERTED:
-            self.inserted += 1
-        elif outcome is Outcome.REPLACED:
-            self.replaced += 1
-        else:
-            self.expired += 1
-        return outcome
-
-    def _add(self, child: str, parent: str, static: bool) -> FrameHistory:
-        # A new edge hangs a whole tree under another one, so every path that there was is still the path.
-        has_children = child in self._names
-        history = self._frames[child] = FrameHistory(child, parent, static, self._window)
-        self._names.update(child, history.mentioned)
-        self.edges_version += 1
-        if has_children:
-            self._forget_empty_loop(history)
-        return history
-
-    def _restructure(self, history: FrameHistory) -> None:
-        """Forget what an insertion may have made stale."""
-        history.changed = False
-        self._paths.clear()
-        self.structure_version += 1
-        self._names.update(history.child, history.mentioned)
-        self._forget_empty_loop(history)
-
-    def _forget_empty_loop(self, history: FrameHistory) -> None:
-        """Drop emptied frames that now stand in a loop: their last parent is no longer the truth."""
-        walk = {history: None}
-        here = history
-        while (above := self._frames.get(here.parent)) is not None and above not in walk:
-            walk[above] = None
-            here = above
-        if above is history:
-            for edge in walk:
-                if edge is not history and not len(edge):
-                    self._remove(edge.child)
 
     # Lookup
 
@@ -234,7 +185,7 @@ class TransformTree:
         if source_at is not LATEST:
             source_at = as_stamp(source_at)
         for name in (target, source, fixed):
-            self._check_known(name)
+            self.forest.check_known(name)
         try:
             stamp, target_from_fixed, static = self._answer(target, fixed, at, not_before)
         except FutureExtrapolationError:
@@ -246,9 +197,9 @@ class TransformTree:
 
     def _answer(self, target: str, source: str, at: At, not_before: int | None) -> _Answer:
         """Stamp, row and whether it is static. The lock is held."""
-        path = self._paths.get((target, source))
+        path = self.forest.paths.get((target, source))
         if path is None:
-            path = self._find_path(target, source, at)
+            path = self.forest.find_path(target, source, at)
         if not path.moving:
             if isinstance(at, Latest):
                 at = path.static_stamp if len(path.frames) > 1 else self._newest_of(target)
@@ -266,7 +217,7 @@ class TransformTree:
         if not_before is not None and common < not_before:
             raise lagging.missing(not_before)
         try:
-            there = path if path.lasting else find_path(self._frames, target, source, common)
+            there = path if path.lasting else find_path(self.forest.frames, target, source, common)
             return common, there.row(common), False
         except TransformLookupError as error:
             # The lagging edge has to come as far as the others still reach back.
@@ -276,25 +227,8 @@ class TransformTree:
             raise lagging.missing(needed) from error
 
     def _newest_of(self, frame: str) -> int:
-        history = self._frames.get(frame)
+        history = self.forest.frames.get(frame)
         return 0 if history is None else history.static_stamp or history.newest or 0
-
-    def _find_path(self, target: str, source: str, at: At) -> Path:
-        """The path for a question, remembered if it is that of every stamp. The lock is held."""
-        self._check_known(target)
-        self._check_known(source)
-        path = find_path(self._frames, target, source, None if isinstance(at, Latest) else at)
-        if path.lasting:
-            if len(self._paths) >= _PATHS_KEPT:
-                self._paths.clear()
-            self._paths[target, source] = path
-        return path
-
-    def _check_known(self, frame: str) -> None:
-        if frame not in self._names:
-            if not isinstance(frame, str):
-                raise TypeError(f"a frame name must be a str, not {frame!r}")
-            raise UnknownFrameError(frame=frame, known=self._names.sorted())
 
     def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
@@ -315,7 +249,7 @@ class TransformTree:
             As `lookup`.
         """
         with self._lock:
-            path = self._paths.get((target, source)) or self._find_path(target, source, LATEST)
+            path = self.forest.find_path(target, source, LATEST)
             return path.newest_common()[0] if path.moving else None
 
     def chain(self, target: str, source: str, at: At = LATEST) -> list[str]:
@@ -328,12 +262,12 @@ class TransformTree:
         if at is not LATEST:
             at = as_stamp(at)
         with self._lock:
-            return list((self._paths.get((target, source)) or self._find_path(target, source, at)).frames)
+            return list(self.forest.find_path(target, source, at).frames)
 
     def frames(self) -> list[str]:
         """Every frame that a sample in the tree names, sorted."""
         with self._lock:
-            return list(self._names.sorted())
+            return list(self.forest.names.sorted())
 
     def parent(self, frame: str, at: At = LATEST) -> str | None:
         """The frame's parent: at a stamp, or the newest one. None for a root.
@@ -347,8 +281,8 @@ class TransformTree:
         if at is not LATEST:
             at = as_stamp(at)
         with self._lock:
-            self._check_known(frame)
-            history = self._frames.get(frame)
+            self.forest.check_known(frame)
+            history = self.forest.frames.get(frame)
             if history is None:
                 return None
             if isinstance(at, Latest):
@@ -360,11 +294,11 @@ class TransformTree:
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
         with self._lock:
-            return [self._frames[child].edge() for child in sorted(self._frames)]
+            return [self.forest.frames[child].edge() for child in sorted(self.forest.frames)]
 
     def __contains__(self, frame: object) -> bool:
         with self._lock:
-            return frame in self._names
+            return frame in self.forest.names
 
     # Changes other than samples
 
@@ -376,31 +310,19 @@ class TransformTree:
         UnknownFrameError
         """
         with self._lock:
-            self._check_known(frame)
-            self._remove(frame)
-
-    def _remove(self, frame: str) -> None:
-        if self._frames.pop(frame, None) is not None:
-            self._names.remove(frame)
-            self._paths.clear()
-            self.structure_version += 1
+            self.forest.check_known(frame)
+            self.forest.remove(frame)
 
     def clear(self) -> None:
         """Drop all moving samples. Static ones and the frames' names stay."""
         with self._lock:
-            for history in self._frames.values():
-                history.clear()
-                history.changed = False
-                self._names.update(history.child, history.mentioned)
-            self._paths.clear()
-            self.structure_version += 1
+            self.forest.clear()
 
     def copy(self) -> "TransformTree":
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
         twin = TransformTree(self.keep)
         with self._lock:
-            twin._frames = {child: history.copy() for child, history in self._frames.items()}
-            twin._names = self._names.copy()
+            twin.forest = self.forest.copy()
         return twin
 
     # Pictures

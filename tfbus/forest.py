@@ -1,0 +1,139 @@
+"""What a tree is made of: each frame's history, the names that are known, and the paths that have been found.
+
+No lock and no questions: `tfbus.tree` has those.
+"""
+
+from tfbus.errors import UnknownFrameError
+from tfbus.history import FrameHistory, Outcome
+from tfbus.names import FrameNames
+from tfbus.path import Path, find_path
+from tfbus.stamped import TransformStamped
+from tfbus.stamps import Latest
+
+_PATHS_KEPT = 10_000
+
+
+class Forest:
+    """All frames that have a parent.
+
+    Parameters
+    ----------
+    window : int or None
+        How much history to keep for each frame, in ns; None keeps everything.
+
+    Attributes
+    ----------
+    frames : dict of str to FrameHistory
+        By child.
+    names : FrameNames
+    paths : dict of (target, source) to Path
+        Those that hold at every stamp. Whatever could make one stale empties it.
+    structure_version : int
+        Grows whenever an existing frame gets another parent or kind, a longer past, or is removed: then any lookup may
+        have another answer.
+    edges_version : int
+        Grows whenever a frame gets its first parent: then frames may have become known, and trees joined.
+    """
+
+    __slots__ = ("_window", "edges_version", "frames", "names", "paths", "structure_version")
+
+    def __init__(self, window: int | None) -> None:
+        self._window = window
+        self.frames: dict[str, FrameHistory] = {}
+        self.names = FrameNames()
+        self.paths: dict[tuple[str, str], Path] = {}
+        self.structure_version = 0
+        self.edges_version = 0
+
+    def store(self, sample: TransformStamped) -> Outcome:
+        """Put a sample into its frame's history."""
+        parent, child, stamp, row, authority, static = sample._fields
+        history = self.frames.get(child)
+        if history is None:
+            history = self._add(child, parent, static)
+        if static:
+            outcome = history.insert_static(parent, stamp, row, authority)
+        else:
+            outcome = history.insert(parent, stamp, row, authority)
+        if history.changed:
+            self._restructure(history)
+        return outcome
+
+    def find_path(self, target: str, source: str, at: int | Latest) -> Path:
+        """The path between two frames at a stamp, or with the newest parents; remembered if it is that of every stamp.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError
+        """
+        path = self.paths.get((target, source))
+        if path is not None:
+            return path
+        self.check_known(target)
+        self.check_known(source)
+        path = find_path(self.frames, target, source, None if isinstance(at, Latest) else at)
+        if path.lasting:
+            if len(self.paths) >= _PATHS_KEPT:
+                self.paths.clear()
+            self.paths[target, source] = path
+        return path
+
+    def check_known(self, frame: str) -> None:
+        """Raise `UnknownFrameError` unless a sample names the frame."""
+        if frame not in self.names:
+            if not isinstance(frame, str):
+                raise TypeError(f"a frame name must be a str, not {frame!r}")
+            raise UnknownFrameError(frame=frame, known=self.names.sorted())
+
+    def remove(self, frame: str) -> None:
+        """Take a frame off its parent, if it has one, and forget its samples."""
+        if self.frames.pop(frame, None) is not None:
+            self.names.remove(frame)
+            self.paths.clear()
+            self.structure_version += 1
+
+    def clear(self) -> None:
+        """Drop all moving samples; static ones and names stay."""
+        for history in self.frames.values():
+            history.clear()
+            history.changed = False
+            self.names.update(history.child, history.mentioned)
+        self.paths.clear()
+        self.structure_version += 1
+
+    def copy(self) -> "Forest":
+        """An independent copy."""
+        twin = Forest(self._window)
+        twin.frames = {child: history.copy() for child, history in self.frames.items()}
+        twin.names = self.names.copy()
+        return twin
+
+    def _add(self, child: str, parent: str, static: bool) -> FrameHistory:
+        # A new edge hangs a whole tree under another one, so every path that there was is still the path.
+        has_children = child in self.names
+        history = self.frames[child] = FrameHistory(child, parent, static, self._window)
+        self.names.update(child, history.mentioned)
+        self.edges_version += 1
+        if has_children:
+            self._forget_empty_loop(history)
+        return history
+
+    def _restructure(self, history: FrameHistory) -> None:
+        """Forget what an insertion may have made stale."""
+        history.changed = False
+        self.paths.clear()
+        self.structure_version += 1
+        self.names.update(history.child, history.mentioned)
+        self._forget_empty_loop(history)
+
+    def _forget_empty_loop(self, history: FrameHistory) -> None:
+        """Drop emptied frames that now stand in a loop: their last parent is no longer the truth."""
+        walk = {history: None}
+        here = history
+        while (above := self.frames.get(here.parent)) is not None and above not in walk:
+            walk[above] = None
+            here = above
+        if above is history:
+            for edge in walk:
+                if edge is not history and not len(edge):
+                    self.remove(edge.child)
