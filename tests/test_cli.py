@@ -12,7 +12,7 @@ import pytest
 
 from tfbus import SimulatedClock, tutorial
 
-TFBUS = Path(sys.executable).with_name("tfbus")
+TFBUS = str(Path(sys.executable).with_name("tfbus"))
 BACKENDS = ["asyncio", "trio"]
 SIMULATED = "".join(
     f"[ INFO] {second}.000000000: base_laser: (1.00, 0.20. 0.00) -----> base_link: (1.10, 0.20, 0.20) "

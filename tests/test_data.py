@@ -179,3 +179,23 @@ def test_data_are_immutable_values(data: Any) -> None:
     assert replace(data, stamp=8) != data
     with pytest.raises(FrozenInstanceError):
         data.frame = "odom"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        PointStamped("camera", 0, (1.0, 2.0, 3.0)),
+        Vector3Stamped("camera", 0, (1.0, 2.0, 3.0)),
+        PoseStamped("camera", 0, Transform()),
+    ],
+)
+def test_data_of_another_frame_than_the_transforms_are_refused(
+    data: PointStamped | Vector3Stamped | PoseStamped,
+) -> None:
+    with pytest.raises(ValueError, match=r"the data are in frame 'camera', but the transform is from 'laser'"):
+        do_transform(data, TransformStamped("base", "laser", 0, Transform()))
+
+
+def test_digits_in_a_string_are_no_point() -> None:
+    with pytest.raises(TypeError, match="point must be three numbers, not '123'"):
+        PointStamped("map", 0, "123")  # type: ignore[arg-type]

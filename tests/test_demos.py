@@ -70,7 +70,8 @@ def test_the_demo_of_future_transforms_runs_as_a_script() -> None:
 def server() -> Iterator[str]:
     """The web application under a real server on loopback; its address."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        command = [sys.executable, "-m", "uvicorn", "web_app:app", "--fd", str(listener.fileno()), "--app-dir", DEMOS]
+        fd = str(listener.fileno())
+        command = [sys.executable, "-m", "uvicorn", "web_app:app", "--fd", fd, "--app-dir", str(DEMOS)]
         with subprocess.Popen(command, pass_fds=[listener.fileno()], stderr=subprocess.PIPE, text=True) as process:
             assert process.stderr is not None
             for line in process.stderr:

@@ -230,3 +230,8 @@ def test_a_tree_draws_its_own_edges() -> None:
     ]
     assert tree.to_dot().count("->") == 2
     assert set(parsed(tree.to_yaml())) == {"base_link", "lidar"}
+
+
+def test_a_slow_edge_does_not_look_like_a_dead_one() -> None:
+    slow = Edge("map", "dock", static=False, samples=2, oldest=0, newest=50 * SECOND, authority="")
+    assert "0.02 Hz" in describe([slow])

@@ -153,3 +153,9 @@ def test_latest_stays_the_one_and_only_when_pickled_or_copied() -> None:
     assert pickle.loads(pickle.dumps(LATEST)) is LATEST
     assert copy.deepcopy(LATEST) is LATEST
     assert repr(LATEST) == "LATEST"
+
+
+@pytest.mark.parametrize("seconds", [2, 2.0, Fraction(2), np.int64(2), np.float32(2.0)])
+def test_a_duration_is_any_real_number(seconds: float) -> None:
+    duration = as_duration(seconds, "timeout")
+    assert (type(duration), duration) == (float, 2.0)

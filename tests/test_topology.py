@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import moving, static
+from strategies import samples
 
 from tfbus import InvalidTransformError, TransformStamped
 from tfbus.once import OnceLogger
@@ -30,10 +31,10 @@ def has_circle(parents: dict[str, str]) -> bool:
     return False
 
 
-def newest_parents(samples: Iterable[TransformStamped]) -> dict[str, str]:
+def newest_parents(stored: Iterable[TransformStamped]) -> dict[str, str]:
     """What the newest sample of each child says, the last kind winning."""
     newest: dict[str, TransformStamped] = {}
-    for sample in samples:
+    for sample in stored:
         before = newest.get(sample.child)
         if before is None or before.static or sample.static or sample.stamp >= before.stamp:
             newest[sample.child] = sample
@@ -121,11 +122,7 @@ def test_dropping_leaves_out_only_the_offender(caplog: pytest.LogCaptureFixture)
     ], "what repeats is counted, and logged once"
 
 
-NAMES = st.sampled_from("abcde")
-ENDS = st.tuples(NAMES, NAMES).filter(lambda ends: ends[0] != ends[1])
-SAMPLES = st.builds(lambda ends, stamp: moving(ends[0], ends[1], stamp), ENDS, st.integers(0, 3)) | st.builds(
-    lambda ends, stamp: static(ends[0], ends[1], stamp=stamp), ENDS, st.integers(0, 3)
-)
+SAMPLES = samples(names=st.sampled_from("abcde"), at=st.integers(0, 3))
 
 
 @settings(deadline=None)

@@ -5,6 +5,7 @@ has every buffer insert it and wake its waiters, then calls the subscribers. The
 nothing can be lost between "sent" and "buffered".
 """
 
+import asyncio
 import logging
 from collections.abc import Iterable
 from threading import get_ident
@@ -118,12 +119,7 @@ class Bus:
         """
         if get_ident() == self._thread and self._on_a_loop:
             return
-        try:
-            anyio.get_current_task()
-        except RuntimeError:
-            on_a_loop = False
-        else:
-            on_a_loop = True
+        on_a_loop = _runs_a_loop()
         if get_ident() != self._thread:
             if self._on_a_loop or not on_a_loop:
                 raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
@@ -287,3 +283,14 @@ class Bus:
             stream.queue.discard_moving()
         for feed in self._feeds:
             feed.reset(before, after)
+
+
+def _runs_a_loop() -> bool:
+    """Whether this thread runs an event loop; of one that is in a bare asyncio callback, anyio does not know."""
+    for probe in (asyncio.get_running_loop, anyio.get_current_task):
+        try:
+            probe()
+        except RuntimeError:
+            continue
+        return True
+    return False

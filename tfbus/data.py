@@ -99,6 +99,8 @@ def _check_header(data: PointStamped | Vector3Stamped | PoseStamped) -> None:
 
 
 def _three_numbers(value: Any, name: str) -> Vector:
+    if isinstance(value, (str, bytes)):
+        raise TypeError(f"{name} must be three numbers, not {value!r}")
     if len(value) != 3:
         raise ValueError(f"{name} must be three numbers, got shape ({len(value)},)")
     x, y, z = value
@@ -119,22 +121,32 @@ def do_transform(data: Any, transform: TransformStamped) -> Any:  # noqa: ARG001
     ------
     TypeError
         If the type is not registered. The message says how to register it.
+    ValueError
+        If the data are not in the frame that the transform is from.
     """
     kind = type(data).__name__
     raise TypeError(f"cannot transform a {kind}: register a function with @do_transform.register({kind})")
 
 
+def _check_source(data: Stamped, transform: TransformStamped) -> None:
+    if data.frame != transform.child:
+        raise ValueError(f"the data are in frame {data.frame!r}, but the transform is from {transform.child!r}")
+
+
 @do_transform.register
 def _(data: PointStamped, transform: TransformStamped) -> PointStamped:
+    _check_source(data, transform)
     return PointStamped(transform.parent, transform.stamp, transform.transform.apply(data.point))
 
 
 @do_transform.register
 def _(data: Vector3Stamped, transform: TransformStamped) -> Vector3Stamped:
+    _check_source(data, transform)
     turn = Transform((0.0, 0.0, 0.0), transform.transform.rotation)
     return Vector3Stamped(transform.parent, transform.stamp, turn.apply(data.vector))
 
 
 @do_transform.register
 def _(data: PoseStamped, transform: TransformStamped) -> PoseStamped:
+    _check_source(data, transform)
     return PoseStamped(transform.parent, transform.stamp, transform.transform @ data.pose)

@@ -43,17 +43,16 @@ class Feed:
         if not blocked:
             self.tree.commit(batch)
             return
+        before = self.tree.commit(batch)
         forest = self.tree.forest
-        structure, edges = forest.structure_version, forest.edges_version
-        self.tree.commit(batch)
-        if forest.structure_version != structure:
+        if before is not None and forest.structure_version != before[0]:
             _wake(self.waiting.take_all())
             return
         for sample in batch:
             fields = sample._fields
             if fields[1] in blocked:
                 _wake(self.waiting.take(fields[1], fields[2]))
-        if forest.edges_version != edges:
+        if before is not None and forest.edges_version != before[1]:
             for sample in batch:
                 _wake(self.waiting.take(sample.parent, None))
 

@@ -8,7 +8,7 @@ from tfbus.history import FrameHistory, Outcome
 from tfbus.names import FrameNames
 from tfbus.path import Path, find_path
 from tfbus.stamped import TransformStamped
-from tfbus.stamps import Latest
+from tfbus.stamps import Latest, as_stamp
 
 _PATHS_KEPT = 10_000
 
@@ -65,13 +65,16 @@ class Forest:
         Raises
         ------
         UnknownFrameError, DisconnectedError
+        ValueError
+            If the stamp does not fit 64 bits.
         """
         path = self.paths.get((target, source))
         if path is not None:
             return path
+        instant = None if isinstance(at, Latest) else as_stamp(at)
         self.check_known(target)
         self.check_known(source)
-        path = find_path(self.frames, target, source, None if isinstance(at, Latest) else at)
+        path = find_path(self.frames, target, source, instant)
         if path.lasting:
             if len(self.paths) >= _PATHS_KEPT:
                 self.paths.clear()

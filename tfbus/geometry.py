@@ -134,7 +134,11 @@ def _numbers(value: object, length: int, name: str) -> tuple[float, ...]:
     if len(value) != length or (isinstance(value, np.ndarray) and value.ndim != 1):
         shape = getattr(value, "shape", (len(value),))
         raise InvalidTransformError(f"{name} must be {length} numbers, got shape {shape}", reason="wrong length")
-    if not all(map(math.isfinite, value)):
+    try:
+        finite = all(map(math.isfinite, value))
+    except OverflowError:
+        finite = False
+    if not finite:
         raise InvalidTransformError(f"{name} {value!r} is not finite", reason="not finite")
     return tuple(map(float, value))
 

@@ -27,6 +27,8 @@ class Path:
 
     Attributes
     ----------
+    up, down : tuple of steps
+        From source, and from target, to the common ancestor: moving edges, and the rows that static ones amount to.
     frames : tuple of str
         From target to source, the common ancestor once.
     moving : tuple of FrameHistory
@@ -35,12 +37,12 @@ class Path:
         Whether it is the path at every stamp, because no frame on it changes parent inside its window.
     """
 
-    __slots__ = ("_down", "_static", "_up", "frames", "lasting", "moving")
+    __slots__ = ("_static", "down", "frames", "lasting", "moving", "up")
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
         edges = ups + downs
-        self._up = _fold(ups)
-        self._down = _fold(downs)
+        self.up = _fold(ups)
+        self.down = _fold(downs)
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
         self.lasting = all(edge.parents is None for edge in edges)
@@ -59,9 +61,9 @@ class Path:
         ExtrapolationError
             If an edge does not cover it.
         """
-        if not self._down:
-            return climb(self._up, at)
-        return compose(invert(climb(self._down, at)), climb(self._up, at))
+        if not self.down:
+            return climb(self.up, at)
+        return compose(invert(climb(self.down, at)), climb(self.up, at))
 
     def newest_common(self) -> tuple[int, FrameHistory]:
         """The newest stamp that every moving edge has reached, and the edge that has come no further.

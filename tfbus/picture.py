@@ -43,7 +43,9 @@ def _rate(edge: Edge) -> str:
         return "static"
     if edge.newest is None:
         return "no samples"
-    return "one sample" if edge.rate is None else f"{edge.rate:.1f} Hz"
+    if edge.rate is None:
+        return "one sample"
+    return f"{edge.rate:.1f} Hz" if edge.rate >= 1.0 else f"{edge.rate:.2g} Hz"
 
 
 def _branches(edges: Sequence[Edge]) -> Iterator[tuple[str, Edge | None]]:

@@ -7,6 +7,7 @@ round trip through a float. A duration is a ``float`` of seconds, because nobody
 import math
 import operator
 from enum import Enum
+from numbers import Real
 from typing import Final
 
 SECOND: Final = 1_000_000_000
@@ -89,11 +90,16 @@ def as_duration(seconds: float, name: str) -> float:
     TypeError, ValueError
         If it is not a number, or negative or NaN. The message names `name` and the value.
     """
-    if isinstance(seconds, bool) or not isinstance(seconds, (int, float)):
+    if not is_real(seconds):
         raise TypeError(f"{name} must be a number of seconds, not {seconds!r}")
     if not seconds >= 0:
         raise ValueError(f"{name} must not be negative, got {seconds!r}")
     return float(seconds)
+
+
+def is_real(value: object) -> bool:
+    """Whether `value` is a real number of any type, numpy's included; a ``bool`` is none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def format_stamp(stamp: int) -> str:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Awaitable, Callable
 
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, is_real
 
 
 class Ticks:
@@ -29,11 +29,11 @@ class Ticks:
     """
 
     def __init__(self, hz: float, elapsed: Callable[[], int], sleep_until: Callable[[int], Awaitable[None]]) -> None:
-        if isinstance(hz, bool) or not isinstance(hz, (int, float)):
+        if not is_real(hz):
             raise TypeError(f"a rate must be a number in Hz, not {hz!r}")
         if not (math.isfinite(hz) and hz > 0):
             raise ValueError(f"a rate must be greater than zero and finite, got {hz!r} Hz")
-        self.hz = hz
+        self.hz = float(hz)
         self.skipped = 0
         self._elapsed = elapsed
         self._sleep_until = sleep_until

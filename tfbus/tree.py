@@ -13,7 +13,7 @@ from tfbus.errors import ExtrapolationError, FutureExtrapolationError, Transform
 from tfbus.forest import Forest
 from tfbus.geometry import Row, compose
 from tfbus.history import Edge, Outcome
-from tfbus.path import Path, find_path
+from tfbus.path import Path, climb, find_path
 from tfbus.picture import describe, to_dot, to_yaml
 from tfbus.stamped import Batch, TransformStamped, answer, as_batch
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds
@@ -105,9 +105,17 @@ class TransformTree:
             self.expired += 1
         return outcome
 
-    def commit(self, batch: Batch) -> None:
-        """Store a batch that somebody has judged already, such as the bus; what is too old expires."""
-        frames = self.forest.frames
+    def commit(self, batch: Batch) -> tuple[int, int] | None:
+        """Store a batch that somebody has judged already, such as the bus; what is too old expires.
+
+        Returns
+        -------
+        tuple of int, or None
+            The forest's structure and edges versions from before; None where they cannot have changed.
+        """
+        forest = self.forest
+        frames = forest.frames
+        before = None
         self._acquire()
         try:
             for sample in batch:
@@ -116,9 +124,11 @@ class TransformTree:
                 if history is not None and not static and history.append(parent, stamp, row, authority):
                     self.inserted += 1
                 else:
+                    before = before or (forest.structure_version, forest.edges_version)
                     self._store(sample)
         finally:
             self._release()
+        return before
 
     # Lookup
 
@@ -207,7 +217,7 @@ class TransformTree:
         if at is LATEST:
             return self._latest(path, target, source, not_before)
         try:
-            return at, path.row(at), False
+            return at, climb(path.up, at) if not path.down else path.row(at), False
         except ExtrapolationError:
             raise path.blocker(as_stamp(at)) from None
 

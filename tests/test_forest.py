@@ -1,0 +1,148 @@
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import moving, static
+from strategies import samples
+
+from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped, UnknownFrameError
+from tfbus.forest import Forest
+
+
+def forest(*batch: TransformStamped, window: int | None = None) -> Forest:
+    made = Forest(window)
+    for sample in batch:
+        made.store(sample)
+    return made
+
+
+def test_storing_tells_what_it_did() -> None:
+    known = forest(moving("a", "b", 10), window=5)
+    assert known.store(moving("a", "b", 4)) is Outcome.EXPIRED
+    assert known.store(moving("a", "b", 5)) is Outcome.INSERTED
+    assert known.store(moving("a", "b", 5)) is Outcome.REPLACED
+
+
+def test_a_path_that_holds_at_every_stamp_is_found_once() -> None:
+    known = forest(moving("a", "b", 0), static("b", "c"))
+    path = known.find_path("a", "c", LATEST)
+    assert known.find_path("a", "c", 12_345) is path
+    known.store(moving("a", "b", 1))
+    known.store(moving("elsewhere", "a", 1))
+    assert known.find_path("a", "c", 7) is path, "neither a newer sample nor a new root makes it another path"
+
+
+def test_a_path_that_holds_for_some_time_is_found_each_time() -> None:
+    known = forest(moving("a", "b", 0), moving("z", "b", 10))
+    assert known.find_path("a", "b", 5).frames == ("a", "b")
+    assert known.find_path("z", "b", 15).frames == ("z", "b")
+    with pytest.raises(DisconnectedError):
+        known.find_path("a", "b", 15)
+
+
+@settings(deadline=None)
+@given(st.lists(samples(names=st.sampled_from("abcd"), at=st.integers(0, 9)), max_size=15))
+def test_a_path_that_is_remembered_is_the_one_that_would_be_found(batch: list[TransformStamped]) -> None:
+    known = Forest(None)
+    for sample in batch:
+        known.store(sample)
+        for target in "abcd":
+            for source in "abcd":
+                assert frames(known, target, source) == frames(known.copy(), target, source)
+
+
+def frames(known: Forest, target: str, source: str) -> Any:
+    try:
+        return known.find_path(target, source, LATEST).frames
+    except (UnknownFrameError, DisconnectedError) as error:
+        return str(error)
+
+
+def test_the_paths_that_are_remembered_have_a_bound() -> None:
+    known = forest(*(static("root", f"frame {number}") for number in range(110)))
+    for target in range(110):
+        for source in range(110):
+            known.find_path(f"frame {target}", f"frame {source}", LATEST)
+            assert len(known.paths) <= 10_000
+
+
+# Versions, by which a feed decides who has to look again
+
+
+def versions(known: Forest) -> tuple[int, int]:
+    return known.structure_version, known.edges_version
+
+
+def test_more_of_the_same_changes_no_version() -> None:
+    known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"), window=15)
+    before = versions(known)
+    for sample in (moving("a", "b", 20), moving("a", "b", 15), moving("a", "b", 30), static("b", "c", stamp=9)):
+        known.store(sample)
+    assert versions(known) == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param(moving("z", "b", 20), id="another parent"),
+        pytest.param(moving("z", "b", 5), id="another parent in the past"),
+        pytest.param(static("a", "b"), id="now static"),
+        pytest.param(moving("b", "c", 5), id="now moving"),
+        pytest.param(static("b", "c", x=1.0), id="another static value"),
+        pytest.param(moving("a", "b", -5), id="a longer past"),
+    ],
+)
+def test_what_may_change_more_than_the_future_of_one_edge_changes_the_structure(change: TransformStamped) -> None:
+    known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"))
+    structure, edges = versions(known)
+    known.store(change)
+    assert known.structure_version > structure
+    assert known.edges_version == edges
+
+
+def test_the_end_of_an_old_parent_changes_the_structure() -> None:
+    known = forest(moving("old", "b", 0), moving("new", "b", 10), window=10)
+    before = known.structure_version
+    known.store(moving("new", "b", 11))
+    assert known.structure_version > before
+    assert "old" not in known.names
+
+
+def test_a_first_parent_changes_the_edges_and_leaves_the_structure() -> None:
+    known = forest(moving("a", "b", 0))
+    structure, edges = versions(known)
+    known.store(moving("root", "a", 0))
+    assert (known.structure_version, known.edges_version > edges) == (structure, True)
+
+
+def test_clearing_and_removing_change_the_structure() -> None:
+    known = forest(moving("a", "b", 0))
+    before = known.structure_version
+    known.clear()
+    cleared = known.structure_version
+    known.remove("b")
+    assert before < cleared < known.structure_version
+    removed = known.structure_version
+    known.remove("a")
+    assert known.structure_version == removed, "it had no parent"
+
+
+# What was emptied
+
+
+def test_an_emptied_frame_gives_way_to_news_that_it_contradicts() -> None:
+    known = forest(moving("map", "odom", 0), moving("odom", "base", 0), static("base", "camera"))
+    known.clear()
+    assert known.find_path("map", "camera", LATEST).frames == ("map", "odom", "base", "camera")
+    known.store(moving("base", "map", 1))
+    assert known.find_path("base", "map", LATEST).frames == ("base", "map")
+    assert sorted(known.frames) == ["camera", "map"]
+
+
+def test_an_emptied_frame_keeps_its_place_as_long_as_nothing_contradicts_it() -> None:
+    known = forest(moving("map", "odom", 0), moving("odom", "base", 0))
+    known.clear()
+    known.store(moving("odom", "base", 1))
+    known.store(moving("world", "map", 1))
+    assert known.find_path("world", "base", LATEST).frames == ("world", "map", "odom", "base")
