@@ -1,5 +1,7 @@
 """Short ways to write samples of which only the parent, the stamp and x matter."""
 
+from hypothesis import strategies as st
+
 from tfbus import Transform, TransformStamped
 
 
@@ -11,3 +13,12 @@ def moving(parent: str, child: str, stamp: int, x: float = 0.0, authority: str =
 def static(parent: str, child: str, x: float = 0.0, stamp: int = 0, authority: str = "") -> TransformStamped:
     """A static sample, `x` m along the first axis."""
     return TransformStamped(parent, child, stamp, Transform((x, 0.0, 0.0)), authority, static=True)
+
+
+def any_samples(names: str, last: int) -> st.SearchStrategy[TransformStamped]:
+    """Samples of either kind between any two of some one-letter frames, stamped 0 to `last`; quick to draw."""
+    ends = st.tuples(st.sampled_from(names), st.sampled_from(names)).filter(lambda pair: pair[0] != pair[1])
+    x = st.integers(0, 9).map(float)
+    kinds = st.sampled_from((moving, static))
+    stamps = st.integers(0, last)
+    return st.builds(lambda kind, pair, stamp, x: kind(*pair, stamp=stamp, x=x), kinds, ends, stamps, x)

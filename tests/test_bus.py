@@ -417,3 +417,30 @@ def test_a_long_run_keeps_memory_flat() -> None:
     statistics = bus.statistics()
     assert statistics.samples == 12_000
     assert sum(asdict(statistics.buffers[0])[outcome] for outcome in ("inserted", "replaced")) == 12_000
+
+
+@pytest.mark.anyio
+async def test_nothing_but_threadsafe_may_touch_a_bus_in_use_from_another_thread() -> None:
+    clock = SimulatedClock(start=10)
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 0))
+        bus.check_thread()
+        for touch in (
+            bus.close,
+            buffer.close,
+            partial(Buffer, bus),
+            partial(bus.subscribe, print),
+            bus.stream,
+            partial(bus.remove_frame, "base"),
+            partial(clock.set, 0),
+        ):
+            with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+                await anyio.to_thread.run_sync(touch)
+        assert bus.statistics().frames == 1
+        assert not bus.closed
+        assert await buffer.lookup("map", "base", 0)
+
+
+def test_a_misspelt_policy_for_invalid_samples_is_refused() -> None:
+    with Bus() as bus, pytest.raises(ValueError, match="invalid must be 'raise' or 'drop', not 'ignore'"):
+        bus.publish(moving("map", "base", 0), invalid="ignore")  # type: ignore[arg-type]

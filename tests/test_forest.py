@@ -1,12 +1,7 @@
-from typing import Any
-
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from samples import moving, static
-from strategies import samples
 
-from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped, UnknownFrameError
+from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped
 from tfbus.forest import Forest
 
 
@@ -39,24 +34,6 @@ def test_a_path_that_holds_for_some_time_is_found_each_time() -> None:
     assert known.find_path("z", "b", 15).frames == ("z", "b")
     with pytest.raises(DisconnectedError):
         known.find_path("a", "b", 15)
-
-
-@settings(deadline=None)
-@given(st.lists(samples(names=st.sampled_from("abcd"), at=st.integers(0, 9)), max_size=15))
-def test_a_path_that_is_remembered_is_the_one_that_would_be_found(batch: list[TransformStamped]) -> None:
-    known = Forest(None)
-    for sample in batch:
-        known.store(sample)
-        for target in "abcd":
-            for source in "abcd":
-                assert frames(known, target, source) == frames(known.copy(), target, source)
-
-
-def frames(known: Forest, target: str, source: str) -> Any:
-    try:
-        return known.find_path(target, source, LATEST).frames
-    except (UnknownFrameError, DisconnectedError) as error:
-        return str(error)
 
 
 def test_the_paths_that_are_remembered_have_a_bound() -> None:

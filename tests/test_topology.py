@@ -5,8 +5,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from samples import moving, static
-from strategies import samples
+from samples import any_samples, moving, static
 
 from tfbus import InvalidTransformError, TransformStamped
 from tfbus.once import OnceLogger
@@ -122,7 +121,7 @@ def test_dropping_leaves_out_only_the_offender(caplog: pytest.LogCaptureFixture)
     ], "what repeats is counted, and logged once"
 
 
-SAMPLES = samples(names=st.sampled_from("abcde"), at=st.integers(0, 3))
+SAMPLES = any_samples("abcde", last=3)
 
 
 @settings(deadline=None)

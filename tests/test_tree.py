@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from samples import moving, static
-from strategies import TODAY, samples
+from samples import any_samples, moving, static
+from strategies import TODAY
 
 from tfbus import (
     LATEST,
@@ -967,7 +967,7 @@ def test_a_random_balanced_tree_has_its_frames_at_their_depth(seed: int) -> None
 # What is remembered between lookups
 
 NAMES = "abcd"
-SAMPLES = samples(names=st.sampled_from(NAMES), at=st.integers(0, 20))
+SAMPLES = any_samples(NAMES, last=20)
 KEEPS = st.sampled_from([None, 0.0, 8e-9])
 
 

@@ -92,6 +92,8 @@ class Bus:
             self.check_thread()
         if self._closed:
             raise BusClosedError
+        if invalid != "raise" and invalid != "drop":
+            raise ValueError(f"invalid must be 'raise' or 'drop', not {invalid!r}")
         if type(samples) is TransformStamped:
             batch: Batch = (samples,)
         elif invalid == "raise":
@@ -137,7 +139,7 @@ class Bus:
         ------
         BusClosedError
         """
-        self._check_open()
+        self._check_usable()
         return self._subscribers.add(callback, tuple(self._topology.latched.values()))
 
     def stream(self, capacity: int = 1_000, overflow: Overflow = "conflate") -> Stream:
@@ -154,7 +156,7 @@ class Bus:
         ------
         BusClosedError
         """
-        self._check_open()
+        self._check_usable()
         stream = Stream(capacity, overflow, self.check_thread, self._detach_stream)
         if self._topology.latched:
             stream.put(tuple(self._topology.latched.values()))
@@ -171,14 +173,14 @@ class Bus:
         ------
         BusClosedError
         """
-        self._check_open()
+        self._check_usable()
         publisher = ThreadPublisher(capacity, self.check_thread, self._publish_from_thread, self._threads.remove)
         self._threads.append(publisher)
         return publisher
 
     def attach(self, feed: Feed) -> None:
         """Have a buffer's feed receive what is latched now and all that is published from now on."""
-        self._check_open()
+        self._check_usable()
         latched = tuple(self._topology.latched.values())
         self._feeds[feed] = self._samples - len(latched)
         if latched:
@@ -186,6 +188,7 @@ class Bus:
 
     def detach(self, feed: Feed) -> None:
         """Take a feed off the bus, if it is on it."""
+        self.check_thread()
         self._feeds.pop(feed, None)
 
     def remove_frame(self, frame: str) -> None:
@@ -198,7 +201,7 @@ class Bus:
         UnknownFrameError
             If nobody has published it.
         """
-        self._check_open()
+        self._check_usable()
         if frame not in (names := self._topology.names()):
             raise UnknownFrameError(frame=frame, known=tuple(names))
         self._topology.remove(frame)
@@ -234,6 +237,7 @@ class Bus:
         """
         if self._closed:
             return
+        self.check_thread()
         self._closed = True
         self._jumps.close()
         for publisher in self._threads:
@@ -251,7 +255,8 @@ class Bus:
     ) -> None:
         self.close()
 
-    def _check_open(self) -> None:
+    def _check_usable(self) -> None:
+        self.check_thread()
         if self._closed:
             raise BusClosedError
 
@@ -274,6 +279,7 @@ class Bus:
     def _clock_jumped(self, before: int, after: int) -> None:
         if after >= before:
             return
+        self.check_thread()
         self._resets += 1
         self._log.warning(("clock", before, after), "the clock jumped back: moving samples are dropped")
         self._topology.clear_moving()
