@@ -7,7 +7,7 @@ import anyio
 import anyio.lowlevel
 from anyio.abc import TaskGroup
 
-from tfbus import Transform, TransformStamped, from_seconds
+from tfbus import SystemClock, Transform, TransformStamped, from_seconds
 
 T = TypeVar("T")
 
@@ -22,6 +22,17 @@ async def settle() -> None:
     for _ in range(5):
         await anyio.lowlevel.checkpoint()
     await anyio.wait_all_tasks_blocked()
+
+
+class HandClock(SystemClock):
+    """A clock whose timeouts run out when the test cancels their scopes."""
+
+    def __init__(self) -> None:
+        self.scopes: list[anyio.CancelScope] = []
+
+    def move_on_after(self, seconds: float) -> anyio.CancelScope:  # noqa: ARG002
+        self.scopes.append(anyio.CancelScope())
+        return self.scopes[-1]
 
 
 class Asked(Generic[T]):

@@ -1,14 +1,13 @@
 import logging
 import math
 from collections.abc import Awaitable, Callable
-from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
 
 import anyio
 import anyio.lowlevel
 import pytest
-from asking import Asked, driving, settle
+from asking import Asked, HandClock, driving, settle
 from samples import moving, static
 
 from tfbus import (
@@ -25,7 +24,6 @@ from tfbus import (
     PointStamped,
     Question,
     SimulatedClock,
-    SystemClock,
     TransformBroadcaster,
     UnknownFrameError,
     Vector3Stamped,
@@ -38,17 +36,6 @@ def make(start: int = 0, keep: float | None = 10.0) -> tuple[SimulatedClock, Bus
     clock = SimulatedClock(start)
     bus = Bus(clock)
     return clock, bus, Buffer(bus, keep)
-
-
-class HandClock(SystemClock):
-    """A clock whose timeouts run out when the test says so."""
-
-    def __init__(self) -> None:
-        self.scopes: list[anyio.CancelScope] = []
-
-    def move_on_after(self, seconds: float) -> AbstractContextManager[anyio.CancelScope]:  # noqa: ARG002
-        self.scopes.append(anyio.CancelScope())
-        return self.scopes[-1]
 
 
 # Answers at once
@@ -530,20 +517,25 @@ async def test_a_long_wait_is_logged_once_a_cause(caplog: pytest.LogCaptureFixtu
     clock, bus, buffer = make()
     bus.publish(driving("map", "base", 0))
     async with anyio.create_task_group() as tasks:
-        for _ in range(3):
-            tasks.start_soon(buffer.lookup, "map", "basse")
+        tasks.start_soon(buffer.lookup, "map", "basse")
+        await clock.advance(0.5)
+        tasks.start_soon(buffer.lookup, "base", "basse", SECOND)
         tasks.start_soon(buffer.lookup, "map", "base", 60 * SECOND)
-        await clock.advance(4.999)
+        # This one is woken by every sample, and finds each of them too old.
+        tasks.start_soon(partial(buffer.lookup, "map", "base", max_age=0.4))
+        await clock.advance(4.499)
         assert caplog.messages == []
         await clock.advance(0.001)
-        assert len(caplog.messages) == 2
-        (misspelt,) = [message for message in caplog.messages if "'basse'" in message]
-        assert "'base'" in misspelt
-        for second in range(1, 30):
-            bus.publish(driving("map", "base", second))
+        (misspelt,) = caplog.messages
+        assert "'basse'" in misspelt
+        assert "did you mean 'base'" in misspelt
+        for second in range(5, 30):
+            bus.publish(driving("map", "base", second - 0.5))
             await clock.advance(1.0)
         assert len(caplog.messages) == 2
+        assert "newest sample is" in caplog.messages[1]
         assert {(record.name, record.levelno) for record in caplog.records} == {("tfbus", logging.WARNING)}
+        assert len(buffer.pending()) == 4
         tasks.cancel_scope.cancel()
 
 

@@ -330,6 +330,14 @@ def test_a_million_samples_take_no_more_than_the_window_and_its_slack() -> None:
     assert len(samples.origins) == len(samples.stamps)
 
 
+def test_the_window_is_kept_after_a_clear_too_though_time_begins_again() -> None:
+    samples = history(keep=1_000, stamps=[10**6])
+    samples.clear()
+    for stamp in range(10_000):
+        samples.insert("parent", stamp, row(1.0), "")
+        assert len(samples.stamps) < 1_100
+
+
 def test_parents_that_alternate_for_ever_take_no_more_than_the_window() -> None:
     samples = history(keep=1_000, stamps=[0])
     for stamp in range(1, 20_000):

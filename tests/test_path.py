@@ -1,3 +1,4 @@
+import math
 from collections.abc import Iterable
 from itertools import pairwise
 
@@ -94,6 +95,14 @@ def test_a_turn_about_a_fixed_axis_is_steady_whatever_its_size_and_the_signs_of_
     edge = moving("parent", "child", [(0, first), (1_000, second)])
     expected = Transform.from_axis_angle(axis, angle * thousandths / 1_000)
     assert from_row(climb((edge,), thousandths)).is_close(expected, rotation_tolerance=1e-9)
+
+
+@pytest.mark.parametrize("angle", [1e-7, 1e-4, 0.01, 0.02, 0.05, 0.1, 3.1, math.pi - 1e-7])
+def test_a_turn_is_as_steady_where_others_switch_to_a_straight_line(angle: float) -> None:
+    edge = moving("parent", "child", [(0, Transform()), (100, Transform.from_axis_angle((1.0, 2.0, 3.0), angle))])
+    for percent in range(101):
+        expected = Transform.from_axis_angle((1.0, 2.0, 3.0), angle * percent / 100)
+        assert from_row(climb((edge,), percent)).is_close(expected, rotation_tolerance=1e-9)
 
 
 def test_a_turn_too_small_for_its_cosine_is_still_halved() -> None:

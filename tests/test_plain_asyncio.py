@@ -3,12 +3,10 @@
 import asyncio
 import threading
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from functools import partial
 
-import anyio
 import pytest
-from asking import driving, settle
+from asking import HandClock, driving, settle
 from samples import moving, static
 
 from tfbus import (
@@ -18,21 +16,9 @@ from tfbus import (
     BusClosedError,
     LookupTimeoutError,
     SimulatedClock,
-    SystemClock,
     TransformBroadcaster,
     TransformStamped,
 )
-
-
-class HandClock(SystemClock):
-    """A clock whose timeouts run out when the test says so."""
-
-    def __init__(self) -> None:
-        self.scopes: list[anyio.CancelScope] = []
-
-    def move_on_after(self, seconds: float) -> AbstractContextManager[anyio.CancelScope]:  # noqa: ARG002
-        self.scopes.append(anyio.CancelScope())
-        return self.scopes[-1]
 
 
 def make() -> tuple[SimulatedClock, Bus, Buffer]:

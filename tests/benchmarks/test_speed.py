@@ -4,6 +4,7 @@ Timings on a shared machine drift, so what counts is the ratio of two sides that
 why there is a runner here, where pytest-benchmark would time one side. No test asserts a time.
 """
 
+import gc
 import itertools
 import json
 import subprocess
@@ -263,6 +264,7 @@ def test_publishing_past_waiters(table: Table) -> None:
 
     async def take_turns() -> None:
         async with crowd(partial(look_up_a, buffer)):
+            assert len(buffer.pending()) == CROWD
             for _ in range(ROUNDS):
                 passes = itertools.islice(chunks, cases.PASSES)
                 pairs = [[publish_all(bus, chunk) / len(chunk) for bus in buses] for chunk in passes]
@@ -296,14 +298,13 @@ def test_cancelling(table: Table, run: Run, anyio_backend: Backend) -> None:
 
 
 def test_memory(table: Table) -> None:
-    edges, samples = 20, 1_000
+    chain = "m" * 20
     bus = Bus()
     buffer = Buffer(bus)
     tracemalloc.start()
-    for i in range(edges):
-        for stamp in range(START, START + samples * cases.PERIOD, cases.PERIOD):
-            bus.publish(TransformStamped(BASE, f"f{i}", stamp, Transform(), AUTHORITY))
+    bus.publish(build(sample) for sample in cases.history(chain))
+    gc.collect()
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(buffer.tree.frames()) == edges + 1
-    table.add("memory a sample, 1,000 an edge", f"{size / edges / samples:.0f} B")
+    assert len(buffer.tree.frames()) == len(chain) + 1
+    table.add("memory a sample, 1,000 an edge", f"{size / len(chain) / 1_000:.0f} B")
