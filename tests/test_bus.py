@@ -426,8 +426,6 @@ async def test_nothing_but_threadsafe_may_touch_a_bus_in_use_from_another_thread
         bus.publish(moving("map", "base", 0))
         bus.check_thread()
         for touch in (
-            bus.close,
-            buffer.close,
             partial(Buffer, bus),
             partial(bus.subscribe, print),
             bus.stream,
@@ -444,3 +442,37 @@ async def test_nothing_but_threadsafe_may_touch_a_bus_in_use_from_another_thread
 def test_a_misspelt_policy_for_invalid_samples_is_refused() -> None:
     with Bus() as bus, pytest.raises(ValueError, match="invalid must be 'raise' or 'drop', not 'ignore'"):
         bus.publish(moving("map", "base", 0), invalid="ignore")  # type: ignore[arg-type]
+
+
+@pytest.mark.anyio
+async def test_closing_from_another_thread_is_refused_only_while_somebody_waits_on_the_loop() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(buffer.lookup, "map", "base")
+            await anyio.wait_all_tasks_blocked()
+            for close in (bus.close, buffer.close):
+                with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+                    await anyio.to_thread.run_sync(close)
+            assert len(buffer.pending()) == 1
+            tasks.cancel_scope.cancel()
+        await anyio.to_thread.run_sync(buffer.close)
+        await anyio.to_thread.run_sync(bus.close)
+        assert bus.closed
+
+
+def test_a_frame_that_only_a_buffer_still_lists_can_be_removed() -> None:
+    clock = SimulatedClock(start=10)
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 10))
+        clock.set(0)
+        assert buffer.tree.frames() == ["base", "map"]
+        bus.remove_frame("base")
+        assert buffer.tree.frames() == []
+        with pytest.raises(UnknownFrameError):
+            bus.remove_frame("base")
+
+
+def test_a_way_in_for_threads_that_is_never_entered_is_not_registered() -> None:
+    with Bus() as bus:
+        bus.threadsafe()
+        assert bus.statistics().queues == ()

@@ -22,6 +22,7 @@ from tfbus import (
     LATEST,
     SECOND,
     DisconnectedError,
+    Edge,
     ExtrapolationError,
     FutureExtrapolationError,
     InvalidTransformError,
@@ -485,6 +486,7 @@ def test_one_batch_may_turn_an_edge_round() -> None:
     assert tree.chain("world", "map") == ["world", "base", "map"]
     assert x_of(tree, "world", "map", 10) == 93.0
     assert x_of(tree, "base", "map", 10) == -7.0
+    assert x_of(tree, "map", "base", 0) == 5.0, "the past stays as it was"
 
 
 def test_a_loop_that_late_data_form_in_the_past_is_an_error_there_and_only_there() -> None:
@@ -698,6 +700,17 @@ def test_frames_are_those_that_any_sample_names_sorted() -> None:
     assert "moon" not in tree
 
 
+def test_edges_tell_what_there_is_of_each_frame_sorted_by_name() -> None:
+    tree = tree_of(
+        *over("map", "base", range(0, SECOND + 1, SECOND // 10)), static("base", "arm", authority="urdf"), keep=0.5
+    )
+    assert tree.edges() == [
+        Edge("base", "arm", static=True, samples=1, oldest=None, newest=None, authority="urdf"),
+        Edge("map", "base", static=False, samples=6, oldest=SECOND // 2, newest=SECOND, authority=""),
+    ]
+    assert tree.edges()[1].rate == 10.0
+
+
 @pytest.mark.parametrize("at", [LATEST, 5])
 def test_the_chain_goes_from_target_to_source_and_back(at: int | Latest) -> None:
     tree = tree_of(*(moving(parent, child, 5) for child, (parent, _) in CONFIGURATIONS["v"].items()))
@@ -722,6 +735,13 @@ def test_a_fixed_frame_that_is_target_or_source_holds_at_any_stamp() -> None:
     tree = tree_of(*over("map", "cart", [0, 10]))
     assert x_of(tree, "map", "cart", 10**6, source_at=4, fixed="map") == 4.0
     assert x_of(tree, "map", "cart", 4, source_at=10**6, fixed="cart") == 4.0
+
+
+def test_an_answer_between_two_instants_is_static_only_if_both_ways_are() -> None:
+    tree = tree_of(*over("map", "cart", [0, 10]), static("map", "wall", 50.0), static("map", "door", 20.0))
+    assert tree.lookup("wall", "door", 3, source_at=99, fixed="map").static
+    assert not tree.lookup("wall", "cart", 99, source_at=3, fixed="map").static
+    assert not tree.lookup("cart", "wall", 3, source_at=99, fixed="map").static
 
 
 @pytest.mark.parametrize("names", [("nobody", "b", "a"), ("a", "nobody", "b"), ("a", "b", "nobody")])

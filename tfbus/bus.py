@@ -38,8 +38,9 @@ class Bus:
 
     Notes
     -----
-    A bus may be made before an event loop runs. It belongs to the thread that made it, or to the thread whose event
-    loop uses it first; other threads publish through `threadsafe`.
+    A bus may be made before an event loop runs. It belongs to the thread that made it, until an event loop in another
+    thread uses it first; a loop has a claim on it once it has awaited a lookup, read a stream or entered `threadsafe`.
+    Other threads publish through `threadsafe`.
     """
 
     def __init__(self, clock: Clock | None = None) -> None:
@@ -174,9 +175,7 @@ class Bus:
         BusClosedError
         """
         self._check_usable()
-        publisher = ThreadPublisher(capacity, self.check_thread, self._publish_from_thread, self._threads.remove)
-        self._threads.append(publisher)
-        return publisher
+        return ThreadPublisher(capacity, self._attach_publisher, self._publish_from_thread, self._threads.remove)
 
     def attach(self, feed: Feed) -> None:
         """Have a buffer's feed receive what is latched now and all that is published from now on."""
@@ -188,7 +187,8 @@ class Bus:
 
     def detach(self, feed: Feed) -> None:
         """Take a feed off the bus, if it is on it."""
-        self.check_thread()
+        if len(feed.waiting):
+            self.check_thread()
         self._feeds.pop(feed, None)
 
     def remove_frame(self, frame: str) -> None:
@@ -199,10 +199,11 @@ class Bus:
         Raises
         ------
         UnknownFrameError
-            If nobody has published it.
+            If neither the bus nor a buffer knows it.
         """
         self._check_usable()
-        if frame not in (names := self._topology.names()):
+        names = self._topology.names()
+        if frame not in names and not any(frame in feed.tree for feed in self._feeds):
             raise UnknownFrameError(frame=frame, known=tuple(names))
         self._topology.remove(frame)
         for publisher in self._threads:
@@ -237,7 +238,8 @@ class Bus:
         """
         if self._closed:
             return
-        self.check_thread()
+        if any(stream.waiting for stream in self._streams) or any(len(feed.waiting) for feed in self._feeds):
+            self.check_thread()
         self._closed = True
         self._jumps.close()
         for publisher in self._threads:
@@ -259,6 +261,10 @@ class Bus:
         self.check_thread()
         if self._closed:
             raise BusClosedError
+
+    def _attach_publisher(self, publisher: ThreadPublisher) -> None:
+        self._check_usable()
+        self._threads.append(publisher)
 
     def _detach_stream(self, stream: Stream) -> None:
         if stream in self._streams:

@@ -74,7 +74,7 @@ class SystemClock:
 
     def move_on_after(self, seconds: float) -> AbstractContextManager[anyio.CancelScope]:
         """`anyio.move_on_after`."""
-        return anyio.move_on_after(seconds)
+        return anyio.move_on_after(as_duration(seconds, "seconds"))
 
     def on_jump(self, callback: JumpCallback) -> Registration:  # noqa: ARG002 - the protocol's signature
         """Never calls `callback`."""

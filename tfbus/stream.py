@@ -35,6 +35,11 @@ class Stream:
         """Moving samples that the reader was too slow for."""
         return self.queue.dropped
 
+    @property
+    def waiting(self) -> bool:
+        """Whether a reader waits for a batch."""
+        return self._reader is not None
+
     def put(self, batch: Batch) -> None:
         """Add a batch and wake the reader."""
         self.queue.put(batch)

@@ -21,8 +21,8 @@ class ThreadPublisher:
     ----------
     capacity : int
         How many moving samples may be pending; beyond that the oldest batches are dropped and counted.
-    check_thread : callable
-        Claims the bus for this event loop, or raises; called on the loop when the ``with`` begins.
+    attach : callable
+        Called on the loop when the ``with`` begins; raises if the bus is not for this loop.
     deliver : callable
         Publishes one batch; called on the loop.
     detach : callable
@@ -32,12 +32,12 @@ class ThreadPublisher:
     def __init__(
         self,
         capacity: int,
-        check_thread: Callable[[], object],
+        attach: Callable[["ThreadPublisher"], object],
         deliver: Callable[[Batch], object],
         detach: Callable[["ThreadPublisher"], object],
     ) -> None:
         self.queue = SampleQueue(capacity, "drop_oldest")
-        self._check_thread = check_thread
+        self._attach = attach
         self._lock = threading.Lock()
         self._deliver = deliver
         self._detach = detach
@@ -46,7 +46,7 @@ class ThreadPublisher:
         self._ended = False
 
     def __enter__(self) -> "ThreadPublisher":
-        self._check_thread()
+        self._attach(self)
         # anyio has no public call for this; both loops' own one is the only thing that wakes them from a thread.
         native = cast(Any, anyio.lowlevel.current_token().native_token)
         self._soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
