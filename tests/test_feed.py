@@ -1,13 +1,24 @@
+from functools import partial
+from itertools import product
+
 import pytest
-from samples import moving, static
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import any_samples, moving, static
 
 from tfbus import (
+    LATEST,
     BufferStatistics,
     ClockResetError,
     DisconnectedError,
     FutureExtrapolationError,
+    InvalidTransformError,
+    Latest,
+    PastExtrapolationError,
     Question,
     TransformLookupError,
+    TransformStamped,
+    TransformTree,
     UnknownFrameError,
 )
 from tfbus.feed import Feed
@@ -146,3 +157,41 @@ def test_every_sample_that_was_offered_is_counted_once() -> None:
     feed.receive(batch)
     feed.receive((moving("map", "a", 10**10), moving("map", "a", 6)))
     assert feed.statistics(6) == BufferStatistics(offered=6, inserted=3, replaced=2, expired=1, waiting=0)
+
+
+STAMPS: tuple[int | Latest, ...] = (LATEST, 5, 15)
+QUESTIONS = [
+    *(Question(target, source, at) for target, source, at in product("abcd", "abcd", STAMPS)),
+    *(Question(target, source, at, 10, fixed) for target, source, fixed, at in product("abc", "abc", "abc", STAMPS)),
+]
+
+
+def ask(feed: Feed, question: Question) -> None:
+    feed.tree.lookup(question.target, question.source, question.at, source_at=question.source_at, fixed=question.fixed)
+
+
+@settings(deadline=None)
+@given(st.lists(st.lists(any_samples("abcd", 20), min_size=1, max_size=3), max_size=8), st.sampled_from([None, 8e-9]))
+def test_whoever_is_not_woken_still_has_no_answer(batches: list[list[TransformStamped]], keep: float | None) -> None:
+    feed, judge = Feed(keep), TransformTree(keep)
+    asleep: set[Question] = set()
+    woken = list(QUESTIONS)
+    for batch in batches:
+        for question in woken:
+            try:
+                ask(feed, question)
+            except PastExtrapolationError:
+                continue
+            except TransformLookupError as error:
+                feed.waiting.park(Waiter(question, 0, partial(woken.append, question)), error)
+                asleep.add(question)
+        woken.clear()
+        try:
+            judge.insert_many(batch)
+        except InvalidTransformError:
+            continue
+        feed.receive(tuple(batch))
+        asleep.difference_update(woken)
+        for question in asleep:
+            with pytest.raises(TransformLookupError):
+                ask(feed, question)

@@ -6,7 +6,6 @@ Standard library only, because `tf2_peer.py` imports this under the system's Pyt
 import math
 import random
 from collections.abc import Callable
-from statistics import median
 from typing import NamedTuple
 
 AUTHORITY = "benchmark"
@@ -14,12 +13,9 @@ BASE = "base"
 KEEP = 10
 START = 1_000_000_000_000
 PERIOD = 10_000_000
-PASSES = 5
 BATCH = 20
 
 Vector = tuple[float, float, float]
-Figures = tuple[float, float]
-"""Seconds a call: the median and the least of some passes."""
 Pass = Callable[[], tuple[float, Vector]]
 """Makes all calls of a case: seconds a call, and a translation that shows that both sides did the same."""
 
@@ -37,16 +33,6 @@ class Sample(NamedTuple):
     translation: Vector
     rotation: tuple[float, float, float, float]
     static: bool = False
-
-
-def figures(seconds: list[float]) -> Figures:
-    return median(seconds), min(seconds)
-
-
-def measure(one_pass: Pass) -> tuple[Figures, Vector]:
-    """One round of a case."""
-    passes = [one_pass() for _ in range(PASSES)]
-    return figures([seconds for seconds, _ in passes]), passes[-1][1]
 
 
 def insertions(kind: str) -> list[Sample]:

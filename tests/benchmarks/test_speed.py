@@ -1,11 +1,10 @@
 """How fast it is, beside its peers: `pytest tests/benchmarks` ends with a table. The default run leaves this out.
 
-Timings on a shared machine drift, so what counts is the ratio of two sides that take turns, round by round; that is
-why there is a runner here, where pytest-benchmark would time one side. No test asserts a time.
+Timings on a shared machine drift, so what counts is the ratio of two sides that take turns: the peer has its turn in
+the setup of each of pytest-benchmark's rounds. No test asserts a time.
 """
 
 import gc
-import itertools
 import json
 import subprocess
 import tracemalloc
@@ -21,11 +20,11 @@ import anyio
 import anyio.lowlevel
 import cases
 import pytest
-from cases import AUTHORITY, BASE, START, Case, Figures, Pass, Vector
+from cases import AUTHORITY, BASE, START, Case, Pass, Vector
 
 from tfbus import LATEST, Buffer, Bus, Transform, TransformStamped
 
-ROUNDS = 9
+ROUNDS = 25
 FEW_ROUNDS = 5
 WAKE_UPS = 200
 CROWD = 10_000
@@ -33,7 +32,7 @@ SYSTEM_PYTHON = "/usr/bin/python3"
 
 Backend = tuple[str, dict[str, Any]]
 Run = Callable[[Callable[[], Awaitable[None]]], None]
-Ask = Callable[[Case], tuple[Figures, Vector]]
+Ask = Callable[[Case], tuple[float, Vector]]
 Calls = Sequence[TransformStamped | Sequence[TransformStamped]]
 
 
@@ -47,24 +46,23 @@ class Table:
         self._lines.append(f"{label:36} {ours:>17}   {peer:24} {ratio:18} {wanted}".rstrip())
 
     def compare(
-        self, label: str, ours: list[Figures], name: str, peer: list[Figures], wanted: str = "", unit: str = "us"
+        self, label: str, ours: list[float], name: str, peer: list[float], wanted: str = "", unit: str = "us"
     ) -> None:
-        ratios = [mine / other for (mine, _), (other, _) in zip(ours, peer, strict=True)]
+        """Add a line from the seconds a call of each round, ours and the peer's."""
+        ratios = [mine / other for mine, other in zip(ours, peer, strict=True)]
         ratio = f"{median(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f})"
         self.add(label, _show(ours, unit), f"{name} {_show(peer, unit)}", ratio, wanted)
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_sep("=", "speed")
-        terminalreporter.write_line(f"{ROUNDS} rounds: median and (least) time of a call, median ratio and (range)")
+        terminalreporter.write_line("median and (least) time of a call over the rounds, median ratio and (range)")
         for line in self._lines:
             terminalreporter.write_line(line)
 
 
-def _show(rounds: list[Figures], unit: str) -> str:
+def _show(rounds: list[float], unit: str) -> str:
     scale = {"us": 1e6, "ms": 1e3}[unit]
-    return (
-        f"{median(middle for middle, _ in rounds) * scale:.2f} ({min(least for _, least in rounds) * scale:.2f}) {unit}"
-    )
+    return f"{median(rounds) * scale:.2f} ({min(rounds) * scale:.2f}) {unit}"
 
 
 @pytest.fixture(scope="session")
@@ -87,10 +85,10 @@ def tf2() -> Iterator[Ask | str]:
         assert requests is not None
         assert replies is not None
 
-        def ask(case: Case) -> tuple[Figures, Vector]:
+        def ask(case: Case) -> tuple[float, Vector]:
             print(json.dumps(case), file=requests, flush=True)
-            figures, answer = json.loads(replies.readline())
-            return figures, answer
+            seconds, answer = json.loads(replies.readline())
+            return seconds, answer
 
         greeting = replies.readline().strip()
         yield ask if greeting == "ready" else f"{SYSTEM_PYTHON}: {greeting}"
@@ -167,15 +165,30 @@ def lookup(case: Case) -> Pass:
         ("lookup LATEST, 10 edges", Case("lookup latest", "mmmmmmmmmm"), ""),
     ],
 )
-def test_beside_tf2(table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
+def test_beside_tf2(benchmark: Any, table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
     one_pass = lookup(case) if case.chain else insert(case.kind)
+    peer: list[float] = []
+    expected: list[Vector] = []
+
+    def peers_turn() -> None:
+        if not isinstance(tf2, str):
+            seconds, translation = tf2(case)
+            peer.append(seconds)
+            expected.append(translation)
+
+    ours: list[float] = []
+
+    def our_turn() -> Vector:
+        seconds, translation = one_pass()
+        ours.append(seconds)
+        return translation
+
+    answer = benchmark.pedantic(our_turn, setup=peers_turn, rounds=ROUNDS)
     if isinstance(tf2, str):
-        table.add(label, _show([cases.measure(one_pass)[0]], "us"), "no tf2")
+        table.add(label, _show(ours, "us"), "no tf2")
         pytest.skip(f"no tf2 to measure beside ({tf2}); on Debian: apt-get install python3-tf2-ros")
-    rounds = [(cases.measure(one_pass), tf2(case)) for _ in range(ROUNDS)]
-    table.compare(label, [ours for (ours, _), _ in rounds], "tf2", [peer for _, (peer, _) in rounds], wanted)
-    (_, answer), (_, expected) = rounds[-1]
-    assert answer == pytest.approx(expected, abs=1e-6)
+    table.compare(label, ours, "tf2", peer, wanted)
+    assert answer == pytest.approx(expected[-1], abs=1e-6)
 
 
 def loop_name(backend: Backend) -> str:
@@ -224,14 +237,14 @@ def test_wake_up(table: Table, run: Run, anyio_backend: Backend) -> None:
         event = anyio.Event()
         return await wake_up(event.wait, lambda: event.statistics().tasks_waiting, event.set)
 
-    lookups: list[Figures] = []
-    events: list[Figures] = []
+    lookups: list[float] = []
+    events: list[float] = []
 
     async def take_turns() -> None:
         for _ in range(ROUNDS):
             pairs = [(await by_lookup(), await by_event()) for _ in range(WAKE_UPS)]
-            lookups.append(cases.figures([ours for ours, _ in pairs]))
-            events.append(cases.figures([peer for _, peer in pairs]))
+            lookups.append(median(ours for ours, _ in pairs))
+            events.append(median(peer for _, peer in pairs))
 
     run(take_turns)
     table.compare(f"wake-up, {loop_name(anyio_backend)}", lookups, "Event", events, "<= 2.5")
@@ -255,21 +268,20 @@ def look_up_a(buffer: Buffer, at: int) -> Awaitable[object]:
 def test_publishing_past_waiters(table: Table) -> None:
     buses = Bus(), Bus()
     buffer, _ = (Buffer(bus) for bus in buses)
-    samples = moving("b", 1 + ROUNDS * cases.PASSES * 2_000)
+    samples = moving("b", 1 + ROUNDS * 2_000)
     chunks = (samples[first : first + 2_000] for first in range(1, len(samples), 2_000))
     for bus in buses:
         bus.publish([*moving("a", 1), samples[0]])
-    crowded: list[Figures] = []
-    empty: list[Figures] = []
+    crowded: list[float] = []
+    empty: list[float] = []
 
     async def take_turns() -> None:
         async with crowd(partial(look_up_a, buffer)):
             assert len(buffer.pending()) == CROWD
-            for _ in range(ROUNDS):
-                passes = itertools.islice(chunks, cases.PASSES)
-                pairs = [[publish_all(bus, chunk) / len(chunk) for bus in buses] for chunk in passes]
-                crowded.append(cases.figures([first for first, _ in pairs]))
-                empty.append(cases.figures([second for _, second in pairs]))
+            for chunk in chunks:
+                with_crowd, without = (publish_all(bus, chunk) / len(chunk) for bus in buses)
+                crowded.append(with_crowd)
+                empty.append(without)
 
     anyio.run(take_turns)
     table.compare("publish on B while 10,000 wait on A", crowded, "none", empty, "<= 1.1")
@@ -279,13 +291,13 @@ def test_cancelling(table: Table, run: Run, anyio_backend: Backend) -> None:
     bus = Bus()
     buffer = Buffer(bus)
     bus.publish(moving("a", 1))
-    lookups: list[Figures] = []
-    sleepers: list[Figures] = []
+    lookups: list[float] = []
+    sleepers: list[float] = []
 
-    async def cancel(wait: Callable[[int], Any]) -> Figures:
+    async def cancel(wait: Callable[[int], Any]) -> float:
         async with crowd(wait):
             start = perf_counter()
-        return cases.figures([perf_counter() - start])
+        return perf_counter() - start
 
     async def take_turns() -> None:
         for _ in range(FEW_ROUNDS):

@@ -1,6 +1,6 @@
 """The real tf2's side of `test_speed.py`, under the Python that has `tf2_py` (Debian: python3-tf2-ros).
 
-Says ``ready``, or what is missing; then answers each `Case`, a JSON line, with the figures of one round.
+Says ``ready``, or what is missing; then answers each `Case`, a JSON line, with what one pass gives.
 """
 
 import json
@@ -8,7 +8,7 @@ import sys
 from time import perf_counter
 from typing import Any
 
-from cases import AUTHORITY, BASE, KEEP, Case, Pass, Sample, Vector, history, insertions, measure, questions
+from cases import AUTHORITY, BASE, KEEP, Case, Pass, Sample, Vector, history, insertions, questions
 
 try:
     import rospy  # type: ignore[import-not-found]
@@ -83,4 +83,4 @@ for line in sys.stdin:
     if line not in prepared:
         case = Case(*json.loads(line))
         prepared = {line: lookup(case) if case.chain else insert(case.kind)}
-    print(json.dumps(measure(prepared[line])), flush=True)
+    print(json.dumps(prepared[line]()), flush=True)
