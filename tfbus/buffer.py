@@ -94,7 +94,7 @@ class Buffer:
             As `TransformTree.lookup`.
         """
         not_before = None if max_age is None else self._not_before(max_age)
-        return self._feed.tree.lookup(target, source, at, source_at=source_at, fixed=fixed, not_before=not_before)
+        return self._feed.tree.answer(target, source, at, source_at, fixed, not_before)
 
     async def lookup(
         self,
@@ -278,13 +278,9 @@ class Buffer:
         latest = self._feed.last_reset
         if latest is not None and latest is not reset:
             raise ClockResetError(before=latest.before, after=latest.after)
-        return self._feed.tree.lookup(
-            question.target,
-            question.source,
-            question.at,
-            source_at=question.source_at,
-            fixed=question.fixed,
-            not_before=None if max_age is None else self._not_before(max_age),
+        not_before = None if max_age is None else self._not_before(max_age)
+        return self._feed.tree.answer(
+            question.target, question.source, question.at, question.source_at, question.fixed, not_before
         )
 
     def _not_before(self, max_age: float) -> int | None:

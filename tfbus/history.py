@@ -12,6 +12,7 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import Enum
 from struct import Struct
+from typing import final
 
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, PastExtrapolationError
 from tfbus.geometry import IDENTITY, Row
@@ -54,6 +55,7 @@ class Edge:
         return (self.samples - 1) * SECOND / (self.newest - self.oldest)
 
 
+@final
 class FrameHistory:
     """The samples of one child frame inside its window, or the one static sample that holds always.
 

@@ -109,9 +109,7 @@ def climb(steps: tuple[Step, ...], at: int) -> Row:
         return IDENTITY
     first = True
     for step in steps:
-        if isinstance(step, tuple):
-            ax, ay, az, ai, aj, ak, aw = step
-        else:
+        if type(step) is FrameHistory:
             i = bisect_left(step.stamps, at)
             try:
                 s0, ax, ay, az, ai, aj, ak, aw, s1, bx, by, bz, bi, bj, bk, bw = _unpack_pair(
@@ -147,6 +145,8 @@ def climb(steps: tuple[Step, ...], at: int) -> Row:
                     aj = keep * aj + turn * bj
                     ak = keep * ak + turn * bk
                     aw = keep * aw + turn * bw
+        else:
+            ax, ay, az, ai, aj, ak, aw = step
         if first:
             x, y, z, qx, qy, qz, qw = ax, ay, az, ai, aj, ak, aw
             first = False

@@ -127,7 +127,7 @@ class TransformStamped:
         return f"{self.parent} <- {self.child} {when}: {self.transform}"
 
 
-def answer(target: str, source: str, stamp: int, row: Row, static: bool) -> TransformStamped:
+def answer_of(target: str, source: str, stamp: int, row: Row, static: bool) -> TransformStamped:
     """A lookup's answer, of parts that are known to be good; nothing is checked."""
     sample = TransformStamped.__new__(TransformStamped)
     sample._fields = target, source, stamp, row, "", static
