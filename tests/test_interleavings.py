@@ -263,7 +263,9 @@ class Game:
         elif self.bus.closed:
             with pytest.raises(BusClosedError):
                 self.send(happening)
-        elif isinstance(happening, Remove) and not named(happening.frame, self.children):
+        elif isinstance(happening, Remove) and not named(
+            happening.frame, self.children.union(*(model.edges for model in attached))
+        ):
             with pytest.raises(UnknownFrameError):
                 self.send(happening)
         elif isinstance(happening, Remove):
