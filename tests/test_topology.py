@@ -1,6 +1,7 @@
 import logging
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -231,3 +232,18 @@ def test_after_a_clock_reset_only_static_edges_are_known() -> None:
     assert len(known) == 1
     batch = (moving("c", "a", 1),)
     assert known.take(batch, "raise") == batch
+
+
+def test_a_long_chain_in_one_batch_is_judged_link_by_link_and_not_pair_by_pair() -> None:
+    class Counting(dict[str, Any]):
+        asked = 0
+
+        def get(self, key: str, default: Any = None) -> Any:
+            self.asked += 1
+            return super().get(key, default)
+
+    edges = Counting()
+    links = 2_000
+    _, refused = admit(edges, [moving(f"f{i}", f"f{i + 1}", 0) for i in reversed(range(links))])
+    assert not refused
+    assert edges.asked < 10 * links

@@ -1172,3 +1172,10 @@ def test_other_threads_may_look_at_the_whole_tree_while_frames_come_and_go() -> 
             tree.insert_many([moving(parent, child, number) for parent, child in pairwise(["map", *frames])])
             for frame in frames:
                 tree.remove_frame(frame)
+
+
+def test_time_travel_to_the_latest_of_a_still_target_carries_the_stamp_of_the_source() -> None:
+    tree = TransformTree()
+    tree.insert_many([moving("map", "cart", 4, 4.0), moving("map", "cart", 6, 6.0)])
+    found = tree.lookup("map", "cart", source_at=5, fixed="map")
+    assert (found.stamp, found.static, found.transform.translation) == (5, False, (5.0, 0.0, 0.0))

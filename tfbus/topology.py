@@ -72,34 +72,35 @@ def _parent(edge: NewestEdge | None) -> str | None:
 
 def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
     """The children whose newest parent is another one after the batch, with that parent."""
-    newest: dict[str, tuple[str, bool, int | None]] = {}
+    parents: dict[str, str] = {}
+    stamps: dict[str, int | None] = {}
     for sample in batch:
         parent, child, stamp, _, _, static = sample._fields
-        edge = edges.get(child)
-        had = newest.get(child)
-        if had is None and edge is not None:
-            had = edge.parent, edge.static, edge.newest
+        if child not in stamps:
+            edge = edges.get(child)
+            stamps[child] = None if edge is None else edge.newest
+        newest = stamps[child]
         # The last kind wins; of moving samples, the newest stamp.
-        if had is None or static or had[1] or had[2] is None or stamp >= had[2]:
-            newest[child] = parent, static, None if static else stamp
-    return {child: parent for child, (parent, _, _) in newest.items() if parent != _parent(edges.get(child))}
+        if static or newest is None or stamp >= newest:
+            parents[child] = parent
+            stamps[child] = None if static else stamp
+    return {child: parent for child, parent in parents.items() if parent != _parent(edges.get(child))}
 
 
 def _find_loop(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> tuple[str, ...]:
     """A loop that runs through a changed child, from that child over its parents back to it; empty if there is none."""
+    rooted: set[str | None] = {None}
     for child in changes:
-        walk = [child]
-        seen = {child}
+        walk: dict[str, None] = {}
         here: str | None = child
-        while here is not None:
+        while here is not None and here not in rooted and here not in walk:
+            walk[here] = None
             here = changes[here] if here in changes else _parent(edges.get(here))
-            if here == child:
-                return (*walk, child)
-            if here in seen:
-                break
-            if here is not None:
-                seen.add(here)
-                walk.append(here)
+        # A walk may also end in a circle that is none of this batch's; what leads there is judged again.
+        if here in rooted:
+            rooted.update(walk)
+        elif here == child:
+            return (*walk, child)
     return ()
 
 
@@ -203,7 +204,6 @@ class Topology:
             kind = "static" if static else "moving"
             self._log.warning(("kind", child, authority), "frame %r is now %s, from %r", child, kind, authority)
             known.static = static
-            known.newest = None
         if static or known.newest is None or stamp >= known.newest:
             known.newest = None if static else stamp
             if known.parent != parent:

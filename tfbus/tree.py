@@ -160,7 +160,8 @@ class TransformTree:
         -------
         TransformStamped
             Parent is target and child is source; its stamp is `at`, or the one that `LATEST` found. An answer whose
-            whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples.
+            whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples. In time
+            travel, a `LATEST` that only static edges answer takes the stamp of source's leg.
 
         Raises
         ------
@@ -208,7 +209,9 @@ class TransformTree:
             # Waiting for this leg is no use if it cannot help the other one.
             self._answer(fixed, source, source_at, not_before)
             raise
-        _, fixed_from_source, still = self._answer(fixed, source, source_at, not_before)
+        source_stamp, fixed_from_source, still = self._answer(fixed, source, source_at, not_before)
+        if at is LATEST and static and not still:
+            stamp = source_stamp
         return stamp, compose(target_from_fixed, fixed_from_source), static and still
 
     def _answer(self, target: str, source: str, at: At, not_before: int | None) -> _Answer:
