@@ -24,8 +24,8 @@ def test_a_path_that_holds_at_every_stamp_is_found_once() -> None:
     path = known.find_path("a", "c", LATEST)
     assert known.find_path("a", "c", 12_345) is path
     known.store(moving("a", "b", 1))
-    known.store(moving("elsewhere", "a", 1))
-    assert known.find_path("a", "c", 7) is path, "neither a newer sample nor a new root makes it another path"
+    known.store(moving("elsewhere", "x", 1))
+    assert known.find_path("a", "c", 7) is path, "neither a newer sample nor a new frame makes it another path"
 
 
 def test_a_path_that_holds_for_some_time_is_found_each_time() -> None:
@@ -44,19 +44,16 @@ def test_the_paths_that_are_remembered_have_a_bound() -> None:
             assert len(known.paths) <= 10_000
 
 
-# Versions, by which a feed decides who has to look again
+# What is noted, by which a feed decides who has to look again
 
 
-def versions(known: Forest) -> tuple[int, int]:
-    return known.structure_version, known.edges_version
-
-
-def test_more_of_the_same_changes_no_version() -> None:
+def test_more_of_the_same_is_not_noted() -> None:
     known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"), window=15)
-    before = versions(known)
+    known.joined.clear()
+    known.changed.clear()
     for sample in (moving("a", "b", 20), moving("a", "b", 15), moving("a", "b", 30), static("b", "c", stamp=9)):
         known.store(sample)
-    assert versions(known) == before
+    assert (known.joined, known.changed) == (set(), set())
 
 
 @pytest.mark.parametrize(
@@ -66,43 +63,47 @@ def test_more_of_the_same_changes_no_version() -> None:
         pytest.param(moving("z", "b", 5), id="another parent in the past"),
         pytest.param(static("a", "b"), id="now static"),
         pytest.param(moving("b", "c", 5), id="now moving"),
-        pytest.param(static("b", "c", x=1.0), id="another static value"),
         pytest.param(moving("a", "b", -5), id="a longer past"),
     ],
 )
-def test_what_may_change_more_than_the_future_of_one_edge_changes_the_structure(change: TransformStamped) -> None:
+def test_what_may_change_more_than_the_future_of_one_edge_is_noted(change: TransformStamped) -> None:
     known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"))
-    structure, edges = versions(known)
+    known.changed.clear()
+    known.joined.clear()
     known.store(change)
-    assert known.structure_version > structure
-    assert known.edges_version == edges
+    assert known.changed == {change.child}
+    assert change.parent in known.joined
 
 
-def test_the_end_of_an_old_parent_changes_the_structure() -> None:
+@pytest.mark.parametrize("change", [moving("a", "b", 20), moving("a", "b", 5), static("b", "c", x=1.0)])
+def test_what_changes_no_path_is_not_noted(change: TransformStamped) -> None:
+    known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"))
+    known.changed.clear()
+    known.store(change)
+    assert known.changed == set()
+
+
+def test_the_end_of_an_old_parent_is_noted() -> None:
     known = forest(moving("old", "b", 0), moving("new", "b", 10), window=10)
-    before = known.structure_version
+    known.changed.clear()
     known.store(moving("new", "b", 11))
-    assert known.structure_version > before
+    assert known.changed == {"b"}
     assert "old" not in known.names
 
 
-def test_a_first_parent_changes_the_edges_and_leaves_the_structure() -> None:
+def test_a_first_parent_is_noted_and_so_is_a_root_that_gets_one() -> None:
     known = forest(moving("a", "b", 0))
-    structure, edges = versions(known)
+    assert (known.joined, known.changed) == ({"a"}, set())
+    known.joined.clear()
     known.store(moving("root", "a", 0))
-    assert (known.structure_version, known.edges_version > edges) == (structure, True)
+    assert (known.joined, known.changed) == ({"root"}, {"a"})
 
 
-def test_clearing_and_removing_change_the_structure() -> None:
-    known = forest(moving("a", "b", 0))
-    before = known.structure_version
-    known.clear()
-    cleared = known.structure_version
-    known.remove("b")
-    assert before < cleared < known.structure_version
-    removed = known.structure_version
-    known.remove("a")
-    assert known.structure_version == removed, "it had no parent"
+def test_below_a_frame_is_all_that_has_hung_under_it_within_the_window() -> None:
+    known = forest(moving("a", "b", 0), moving("b", "c", 0), moving("x", "c", 5), static("c", "d"), moving("x", "y", 0))
+    assert known.below({"b"}) == {"b", "c", "d"}
+    assert known.below({"x"}) == {"x", "c", "d", "y"}
+    assert known.below({"nowhere"}) == {"nowhere"}
 
 
 # What was emptied

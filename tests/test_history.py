@@ -58,7 +58,6 @@ def test_out_of_order_inside_the_window_gives_the_same_as_in_order(order: list[i
         shuffled.insert(parents[stamp], stamp, row(float(stamp * stamp)), parents[stamp])
 
     assert shuffled.edge() == in_order.edge()
-    assert shuffled.since() == in_order.since()
     assert set(shuffled.mentioned) == set(in_order.mentioned)
     for stamp in range(-1, 13):
         assert shuffled.covers(stamp) == in_order.covers(stamp)
@@ -149,15 +148,6 @@ def test_outside_the_window_the_parent_is_that_of_the_nearest_sample() -> None:
     samples = history(stamps=[10])
     samples.insert("new", 20, row(0.0), "")
     assert (samples.parent_at(-100), samples.parent_at(100)) == ("parent", "new")
-
-
-def test_since_is_where_the_newest_parent_began_to_hold_without_a_break() -> None:
-    samples = history(stamps=[1, 2])
-    assert samples.since() == 1
-    for stamp, parent in ((3, "new"), (4, "parent"), (5, "parent")):
-        samples.insert(parent, stamp, row(0.0), "")
-    assert samples.since() == 4
-    assert history().since() is None
 
 
 # The window's slack, a sixteenth, is ten here: what has left the window is still in memory when the parent changes.

@@ -167,9 +167,15 @@ class Model:
             return self.leg(ask.target, ask.source, ask.at, not_before)
         first = self.leg(ask.target, ask.fixed, ask.at, not_before)
         second = self.leg(ask.fixed, ask.source, ask.source_at, not_before)
-        if first[0] is State.ANSWER or (first[0] is State.FUTURE and second[0] is State.PAST):
-            return second[0], first[1], first[2] + second[2]
+        if first[0] is State.ANSWER or second[0] is State.PAST:
+            # Of a leg on which nothing moves, no stamp is the latest.
+            by_source = ask.at is None and not self.moves(ask.target, ask.fixed) and self.moves(ask.fixed, ask.source)
+            return second[0], (second if by_source else first)[1], first[2] + second[2]
         return first
+
+    def moves(self, target: str, source: str) -> bool:
+        """Whether anything on the way can move."""
+        return bool((set(self.climb(target)[:-1]) ^ set(self.climb(source)[:-1])) - {STATIC})
 
 
 @dataclass

@@ -54,7 +54,9 @@ def test_an_edge_that_closes_a_loop_is_refused_and_the_error_names_the_whole_loo
     assert error.reason == "cycle"
     assert (error.parent, error.child, error.authority) == (names[-1], names[0], "somebody")
     assert error.loop == (names[0], *reversed(names))
-    assert all(name in str(error) for name in (f"{names[-1]!r} -> {names[0]!r}", " -> ".join(error.loop)))
+    assert f"{names[-1]!r} -> {names[0]!r}" in str(error)
+    shown = error.loop if length < 10 else (*error.loop[:8], "(992 more)", names[0])
+    assert " -> ".join(shown) in str(error)
 
 
 def test_a_loop_of_static_edges_is_refused_too() -> None:

@@ -90,11 +90,6 @@ class Child:
             return self.parent
         return ([sample for sample in self.samples if sample.stamp <= at] or self.samples[:1])[-1].parent
 
-    def since(self) -> int:
-        """From when on the newest parent holds without a break."""
-        others = [sample.stamp for sample in self.samples if sample.parent != self.parent]
-        return min(sample.stamp for sample in self.samples if not others or sample.stamp > max(others))
-
     def matrix_at(self, at: int) -> Matrix:
         if self.static:
             return matrix_of(self.samples[0].transform)
@@ -270,9 +265,10 @@ class Model:
         try:
             return Answer(self.at_stamp(target, source, common), common, static=False)
         except Blocked as error:
-            needed = max(self.children[name].since() for name in moving)
-            if needed <= common:
-                raise AssertionError("a path whose edges all reach the common stamp has an answer there") from error
+            on_the_path = [self.children[name] for name in ups + downs]
+            lasting = all(len({sample.parent for sample in child.samples}) == 1 for child in on_the_path)
+            oldest = max(self.children[name].samples[0].stamp for name in moving)
+            needed = oldest if lasting else common + 1
             raise Blocked(*(self.children[name].facts(name, needed) for name in lagging)) from error
 
     def travel(self, target: str, source: str, at: At, source_at: At, fixed: str) -> Answer:

@@ -78,6 +78,8 @@ class TransformBroadcaster:
         if isinstance(sample, TransformStamped):
             return sample.replace(authority=self.authority)
         try:
+            if isinstance(sample, str):
+                raise TypeError
             parent, child, transform = sample
         except (TypeError, ValueError):
             raise TypeError(f"expected (parent, child, transform) or a TransformStamped, not {sample!r}") from None

@@ -9,7 +9,7 @@ import anyio
 import anyio.lowlevel
 
 from tfbus.bus import Bus
-from tfbus.data import Stamped, do_transform
+from tfbus.data import Stamped, check_registered, do_transform
 from tfbus.errors import (
     BusClosedError,
     ClockResetError,
@@ -93,7 +93,7 @@ class Buffer:
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
         """
-        not_before = None if max_age is None else self._not_before(max_age)
+        not_before = None if max_age is None else self._not_before(max_age, at, source_at)
         return self._feed.tree.answer(target, source, at, source_at, fixed, not_before)
 
     async def lookup(
@@ -157,7 +157,7 @@ class Buffer:
         except _MAY_COME as error:
             for name in (target, source, fixed):
                 if name is not None and not is_frame(name):
-                    raise UnknownFrameError(frame=name) from None
+                    raise UnknownFrameError(frame=name, known=self.tree.frames()) from None
             blocker = error
         self.bus.check_thread()
         return await self._wait(question, max_age, limit, reset, blocker)
@@ -187,12 +187,14 @@ class Buffer:
         TransformError
             As `lookup`.
         """
+        check_registered(data)
         found = await self.lookup(target, data.frame, data.stamp, timeout=timeout, max_age=max_age)
         moved: DataT = do_transform(data, found)
         return moved
 
     def transform_nowait(self, data: DataT, target: str, *, max_age: float | None = None) -> DataT:
         """As `transform`, or an error at once."""
+        check_registered(data)
         moved: DataT = do_transform(data, self.lookup_nowait(target, data.frame, data.stamp, max_age=max_age))
         return moved
 
@@ -278,12 +280,14 @@ class Buffer:
         latest = self._feed.last_reset
         if latest is not None and latest is not reset:
             raise ClockResetError(before=latest.before, after=latest.after)
-        not_before = None if max_age is None else self._not_before(max_age)
+        not_before = None if max_age is None else self._not_before(max_age, question.at, question.source_at)
         return self._feed.tree.answer(
             question.target, question.source, question.at, question.source_at, question.fixed, not_before
         )
 
-    def _not_before(self, max_age: float) -> int | None:
+    def _not_before(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> int | None:
+        if at is not LATEST and source_at is not LATEST:
+            raise TypeError("max_age goes with LATEST: an answer at a given stamp never gets newer")
         if as_duration(max_age, "max_age") == math.inf:
             return None
         return self._clock.now() - from_seconds(max_age)

@@ -244,6 +244,7 @@ class Bus:
         self._jumps.close()
         for publisher in self._threads:
             publisher.end()
+            publisher.discard()
         for stream in self._streams:
             stream.end()
         for feed in self._feeds:
@@ -289,6 +290,7 @@ class Bus:
         self._resets += 1
         self._log.warning(("clock", before, after), "the clock jumped back: moving samples are dropped")
         self._topology.clear_moving()
+        self._subscribers.discard_moving()
         for publisher in self._threads:
             publisher.discard()
         for stream in self._streams:

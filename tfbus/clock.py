@@ -92,8 +92,8 @@ class SimulatedClock:
 
     Between two timed tasks that are due, `advance` lets everything run until all tasks are blocked, so timed tasks run
     in order of their time, and of registration where that is equal, on every event loop. The order of several tasks
-    that one publish wakes, or that are started together, is the loop's own; trio shuffles it on purpose. Worker threads
-    and sockets count as blocked: simulated time is for one process.
+    that one publish or one `set` wakes, or that are started together, is the loop's own; trio shuffles it on purpose.
+    Worker threads and sockets count as blocked: simulated time is for one process.
 
     Parameters
     ----------
@@ -221,6 +221,8 @@ class SimulatedClock:
         self._now = after
         error = ClockResetError(before=before, after=after) if after < before else None
         for sleeper in self._stamp_sleepers:
+            if sleeper.event.is_set():
+                continue
             self._stop_timer(sleeper.timer)
             if error is not None or sleeper.stamp <= after:
                 sleeper.reset = error

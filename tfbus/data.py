@@ -99,12 +99,21 @@ def _check_header(data: PointStamped | Vector3Stamped | PoseStamped) -> None:
 
 
 def _three_numbers(value: Any, name: str) -> Vector:
-    if isinstance(value, (str, bytes)):
+    if isinstance(value, (str, bytes)) or not hasattr(value, "__len__"):
         raise TypeError(f"{name} must be three numbers, not {value!r}")
     if len(value) != 3:
         raise ValueError(f"{name} must be three numbers, got shape ({len(value)},)")
+    if any(isinstance(part, str) for part in value):
+        raise TypeError(f"{name} must be three numbers, not {value!r}")
     x, y, z = value
     return float(x), float(y), float(z)
+
+
+def check_registered(data: object) -> None:
+    """Raise `TypeError` unless `do_transform` knows the type of `data`; the message says how to register it."""
+    if do_transform.dispatch(type(data)) is do_transform.dispatch(object):
+        kind = type(data).__name__
+        raise TypeError(f"cannot transform a {kind}: register a function with @do_transform.register({kind})")
 
 
 @singledispatch
@@ -124,8 +133,7 @@ def do_transform(data: Any, transform: TransformStamped) -> Any:  # noqa: ARG001
     ValueError
         If the data are not in the frame that the transform is from.
     """
-    kind = type(data).__name__
-    raise TypeError(f"cannot transform a {kind}: register a function with @do_transform.register({kind})")
+    check_registered(data)
 
 
 def _check_source(data: Stamped, transform: TransformStamped) -> None:

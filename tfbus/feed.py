@@ -4,9 +4,11 @@ Sans-IO like the tree and the index that it joins: waking is calling what each w
 """
 
 from collections.abc import Iterable
+from contextlib import suppress
 
 from tfbus.errors import ClockResetError, UnknownFrameError
-from tfbus.stamped import Batch
+from tfbus.history import Outcome
+from tfbus.stamped import Batch, TransformStamped
 from tfbus.statistics import BufferStatistics
 from tfbus.tree import TransformTree
 from tfbus.waiting import Waiter, WaitingIndex
@@ -31,7 +33,7 @@ class Feed:
     """
 
     def __init__(self, keep: float | None) -> None:
-        self.tree = TransformTree(keep)
+        self.tree: TransformTree = _FedTree(keep)
         self.waiting = WaitingIndex()
         self.ended = ""
         self.last_reset: ClockResetError | None = None
@@ -40,33 +42,36 @@ class Feed:
     def receive(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake whom it can have unblocked."""
         blocked = self._blocked
-        if not blocked:
-            self.tree.commit(batch)
-            return
-        before = self.tree.commit(batch)
-        forest = self.tree.forest
-        if before is not None and forest.structure_version != before[0]:
-            _wake(self.waiting.take_all())
-            return
-        for sample in batch:
-            fields = sample._fields
-            if fields[1] in blocked:
-                _wake(self.waiting.take(fields[1], fields[2]))
-        if before is not None and forest.edges_version != before[1]:
+        plain = self.tree.commit(batch)
+        if blocked:
             for sample in batch:
-                _wake(self.waiting.take(sample.parent, None))
+                fields = sample._fields
+                if fields[1] in blocked:
+                    _wake(self.waiting.take(fields[1], fields[2]))
+        if not plain:
+            self._wake_for_the_shape()
+
+    def _wake_for_the_shape(self) -> None:
+        """Wake whom a new edge, another parent or kind, or a longer past can have unblocked."""
+        forest = self.tree.forest
+        if self._blocked:
+            for name in forest.joined:
+                _wake(self.waiting.take(name, None))
+            if forest.changed:
+                _wake(self.waiting.take_asking(forest.below(forest.changed)))
+        forest.forget_changes()
 
     def remove_frame(self, frame: str) -> None:
         """Forget a frame, if it is known; lookups that wait learn of it."""
         try:
-            self.tree.remove_frame(frame)
+            TransformTree.remove_frame(self.tree, frame)
         except UnknownFrameError:
             return
         _wake(self.waiting.take_all())
 
     def reset(self, before: int, after: int) -> None:
         """Drop moving samples: the clock has jumped back. Lookups that wait get a `ClockResetError`."""
-        self.tree.clear()
+        TransformTree.clear(self.tree)
         self.last_reset = ClockResetError(before=before, after=after)
         _wake(self.waiting.take_all())
 
@@ -81,6 +86,21 @@ class Feed:
         return BufferStatistics(offered, tree.inserted, tree.replaced, tree.expired, len(self.waiting))
 
 
+class _FedTree(TransformTree):
+    """A tree that only its bus changes: what somebody else put in would wake nobody."""
+
+    def insert_many(self, samples: Iterable[TransformStamped]) -> list[Outcome]:  # noqa: ARG002
+        raise RuntimeError("a bus feeds this tree: use bus.publish, or a copy() of the tree")
+
+    def remove_frame(self, frame: str) -> None:  # noqa: ARG002
+        raise RuntimeError("a bus feeds this tree: use bus.remove_frame, or a copy() of the tree")
+
+    def clear(self) -> None:
+        raise RuntimeError("a bus feeds this tree: clear a copy() of it")
+
+
 def _wake(waiters: Iterable[Waiter]) -> None:
     for waiter in waiters:
-        waiter.wake()
+        # The event loop of one that was never cancelled may be gone; the others are waiting all the same.
+        with suppress(RuntimeError):
+            waiter.wake()

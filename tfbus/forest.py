@@ -28,22 +28,22 @@ class Forest:
     names : FrameNames
     paths : dict of (target, source) to Path
         Those that hold at every stamp. Whatever could make one stale empties it.
-    structure_version : int
-        Grows whenever an existing frame gets another parent or kind, a longer past, or is removed: then any lookup may
-        have another answer.
-    edges_version : int
-        Grows whenever a frame gets its first parent: then frames may have become known, and trees joined.
+    changed : set of str
+        Frames that got another parent or kind, or a longer past: then a lookup from `below` them may have another
+        answer. Whoever acts on it clears it.
+    joined : set of str
+        Frames that became somebody's parent: then they may have become known. Cleared likewise.
     """
 
-    __slots__ = ("_window", "edges_version", "frames", "names", "paths", "structure_version")
+    __slots__ = ("_window", "changed", "frames", "joined", "names", "paths")
 
     def __init__(self, window: int | None) -> None:
         self._window = window
         self.frames: dict[str, FrameHistory] = {}
         self.names = FrameNames()
         self.paths: dict[tuple[str, str], Path] = {}
-        self.structure_version = 0
-        self.edges_version = 0
+        self.changed: set[str] = set()
+        self.joined: set[str] = set()
 
     def store(self, sample: TransformStamped) -> Outcome:
         """Put a sample into its frame's history."""
@@ -52,6 +52,9 @@ class Forest:
         if history is None:
             history = self._add(child, parent, static)
         if static:
+            if row != history.row:
+                # The paths hold what static edges amount to.
+                self.paths.clear()
             outcome = history.insert_static(parent, stamp, row, authority)
         else:
             outcome = history.insert(parent, stamp, row, authority)
@@ -93,7 +96,6 @@ class Forest:
         if self.frames.pop(frame, None) is not None:
             self.names.remove(frame)
             self.paths.clear()
-            self.structure_version += 1
 
     def clear(self) -> None:
         """Drop all moving samples; static ones and names stay."""
@@ -102,7 +104,25 @@ class Forest:
             history.changed = False
             self.names.update(history.child, history.mentioned)
         self.paths.clear()
-        self.structure_version += 1
+
+    def forget_changes(self) -> None:
+        """Clear what was noted for whoever waits."""
+        self.changed.clear()
+        self.joined.clear()
+
+    def below(self, frames: set[str]) -> set[str]:
+        """These frames and all that hang below them, by any parent that a sample in the window names."""
+        children: dict[str, list[str]] = {}
+        for child, history in self.frames.items():
+            for parent in history.mentioned:
+                children.setdefault(parent, []).append(child)
+        found = set(frames)
+        ahead = list(frames)
+        while ahead:
+            new = [child for child in children.get(ahead.pop(), ()) if child not in found]
+            found.update(new)
+            ahead += new
+        return found
 
     def copy(self) -> "Forest":
         """An independent copy."""
@@ -112,12 +132,14 @@ class Forest:
         return twin
 
     def _add(self, child: str, parent: str, static: bool) -> FrameHistory:
-        # A new edge hangs a whole tree under another one, so every path that there was is still the path.
         has_children = child in self.names
         history = self.frames[child] = FrameHistory(child, parent, static, self._window)
         self.names.update(child, history.mentioned)
-        self.edges_version += 1
+        self.joined.add(parent)
         if has_children:
+            # A root that gets a parent leaves the paths below it as they are, unless late samples formed a loop there.
+            self.paths.clear()
+            self.changed.add(child)
             self._forget_empty_loop(history)
         return history
 
@@ -125,7 +147,8 @@ class Forest:
         """Forget what an insertion may have made stale."""
         history.changed = False
         self.paths.clear()
-        self.structure_version += 1
+        self.changed.add(history.child)
+        self.joined.update(history.mentioned)
         self.names.update(history.child, history.mentioned)
         self._forget_empty_loop(history)
 

@@ -138,6 +138,8 @@ def _numbers(value: object, length: int, name: str) -> tuple[float, ...]:
         finite = all(map(math.isfinite, value))
     except OverflowError:
         finite = False
+    except TypeError:
+        raise TypeError(f"{name} must be {length} numbers, not {value!r}") from None
     if not finite:
         raise InvalidTransformError(f"{name} {value!r} is not finite", reason="not finite")
     return tuple(map(float, value))
@@ -316,8 +318,11 @@ class Transform:
                 raise ValueError(f"a point is three numbers, got shape ({len(points)},); points go in an array")
             x, y, z = points
             tx, ty, tz = self._row[:3]
-            rx, ry, rz = rotate(self.rotation, float(x), float(y), float(z))
-            return tx + rx, ty + ry, tz + rz
+            try:
+                rx, ry, rz = rotate(self.rotation, x, y, z)
+            except TypeError:
+                raise ValueError(f"a point is three numbers, not {points!r}; points go in an array") from None
+            return float(tx + rx), float(ty + ry), float(tz + rz)
         if points.ndim == 0 or points.shape[-1] != 3:
             raise ValueError(f"points must have shape (..., 3), got {points.shape}")
         dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(np.float64)

@@ -154,9 +154,11 @@ class FrameHistory:
             return False
         # Spelt out, because `*row` would build a list of the arguments first.
         x, y, z, qx, qy, qz, qw = row
+        record = _pack(stamp, x, y, z, qx, qy, qz, qw)
+        # No call before the last of the three, so that Ctrl-C cannot come between them.
+        self.records += record
+        self.origins += (origin,)
         stamps.append(stamp)
-        self.records += _pack(stamp, x, y, z, qx, qy, qz, qw)
-        self.origins.append(origin)
         self.horizon = stamp - self._keep
         if stamp > self._cut_after:
             self._cut()
@@ -174,9 +176,10 @@ class FrameHistory:
         self._origin = (parent, authority)
         if self.parents is not None:
             self.parents[parent] += 1
+        record = _pack(stamp, *row)
+        self.records += record
+        self.origins += (self._origin,)
         self.stamps.append(stamp)
-        self.records += _pack(stamp, *row)
-        self.origins.append(self._origin)
         self.horizon = stamp - self._keep
         if stamp > self._cut_after:
             self._cut()
@@ -185,7 +188,7 @@ class FrameHistory:
     def insert_static(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
         """Store the sample that holds at every stamp; moving samples are dropped."""
         fresh = self.static_stamp is None
-        if not self.static or (not fresh and (parent != self.parent or row != self.row)):
+        if not self.static or (not fresh and parent != self.parent):
             self.clear()
             self.changed = True
         self.static = True
@@ -212,15 +215,6 @@ class FrameHistory:
             return self.parent
         start = self.start
         return self.origins[max(bisect_right(self.stamps, stamp, start) - 1, start)][0]
-
-    def since(self) -> int | None:
-        """The stamp from which the newest parent has held without a break."""
-        if self.parents is None:
-            return self.oldest
-        first, start = len(self.origins) - 1, self.start
-        while first > start and self.origins[first - 1][0] == self.parent:
-            first -= 1
-        return self.stamps[first]
 
     def covers(self, stamp: int) -> bool:
         """Whether a lookup at `stamp` has an answer here."""
@@ -281,13 +275,12 @@ class FrameHistory:
             if replaces:
                 self._forget(self.origins[at][0])
             self.changed = True
-        width = RECORD_SIZE if replaces else 0
-        self.records[at * RECORD_SIZE : at * RECORD_SIZE + width] = _pack(stamp, *row)
-        if replaces:
-            self.origins[at] = (parent, authority)
-        else:
+        record = _pack(stamp, *row)
+        end = at + 1 if replaces else at
+        self.records[at * RECORD_SIZE : end * RECORD_SIZE] = record
+        self.origins[at:end] = ((parent, authority),)
+        if not replaces:
             stamps.insert(at, stamp)
-            self.origins.insert(at, (parent, authority))
         if at == len(stamps) - 1:
             self.parent, self.authority = self._origin = self.origins[at]
         self._settle_parents()

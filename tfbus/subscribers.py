@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
+from inspect import iscoroutinefunction
 from itertools import count
 
 from tfbus.once import OnceLogger
@@ -38,6 +39,8 @@ class Subscribers:
         """Register a callback, and call it with what is latched if that is anything."""
         if not callable(callback):
             raise TypeError(f"a subscriber must be callable, not {callback!r}")
+        if iscoroutinefunction(callback):
+            raise TypeError(f"a subscriber must not be async, as {callback!r} is: read a bus.stream() instead")
         key = next(self._keys)
         self.callbacks[key] = callback
         if latched:
@@ -65,6 +68,11 @@ class Subscribers:
             self._queued += 1
             return
         self._deliver_backlog()
+
+    def discard_moving(self) -> None:
+        """Take the moving samples out of what waits to be delivered: the clock has jumped back."""
+        batches = (tuple(sample for sample in batch if sample.static) for batch in self._backlog)
+        self._backlog = deque(batch for batch in batches if batch)
 
     def _deliver_backlog(self) -> None:
         try:

@@ -46,9 +46,9 @@ class ThreadPublisher:
         self._ended = False
 
     def __enter__(self) -> "ThreadPublisher":
-        self._attach(self)
         # anyio has no public call for this; both loops' own one is the only thing that wakes them from a thread.
         native = cast(Any, anyio.lowlevel.current_token().native_token)
+        self._attach(self)
         self._soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
         return self
 
@@ -109,8 +109,11 @@ class ThreadPublisher:
         with self._lock:
             # Re-armed before the queue is emptied: a sample that comes right behind it wakes the loop again.
             self._armed = True
-            batches = []
-            while (batch := self.queue.get()) is not None:
-                batches.append(batch)
-        for batch in batches:
+            pending = len(self.queue)
+        # One by one: what is delivered may make the clock jump, and that discards the rest.
+        for _ in range(pending):
+            with self._lock:
+                batch = self.queue.get()
+            if batch is None:
+                return
             self._deliver(batch)

@@ -13,6 +13,8 @@ from tfbus.errors import InvalidTransformError
 from tfbus.once import OnceLogger
 from tfbus.stamped import Batch, TransformStamped
 
+_SHOWN = 10
+
 
 class NewestEdge(Protocol):
     """The newest that is known of one child."""
@@ -26,13 +28,16 @@ class NewestEdge(Protocol):
     @property
     def newest(self) -> int | None: ...
 
+    @property
+    def authority(self) -> str: ...
+
 
 def admit(
     edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]
 ) -> tuple[Batch, list[InvalidTransformError]]:
     """Split a batch into the samples that leave a forest and the errors of those that do not.
 
-    Of the samples that close a loop, the last one in the batch is refused, until no loop is left.
+    Of the samples that close a loop, the last one in the batch is refused, and so on until no loop is left.
 
     Parameters
     ----------
@@ -40,24 +45,33 @@ def admit(
         A child that is neither static nor has a newest stamp counts as having no parent.
     batch : sequence of TransformStamped
     """
-    accepted = list(batch)
+    accepted: Sequence[TransformStamped] = batch
     refused: list[InvalidTransformError] = []
-    while loop := _find_loop(edges, changes := _changed_parents(edges, accepted)):
-        at, sample = next(
-            (at, sample)
-            for at, sample in reversed(list(enumerate(accepted)))
-            if sample.child in loop and changes.get(sample.child) == sample.parent
-        )
-        del accepted[at]
-        refused.append(_cycle(sample, loop))
+    while loops := _find_loops(edges, changes := _changed_parents(edges, accepted)):
+        loop_of = {frame: loop for loop in loops for frame in loop}
+        kept: list[TransformStamped] = []
+        for sample in reversed(accepted):
+            loop = loop_of.get(sample.child)
+            if loop is not None and changes.get(sample.child) == sample.parent:
+                refused.append(_cycle(edges, sample, loop))
+                for frame in loop:
+                    del loop_of[frame]
+            else:
+                kept.append(sample)
+        accepted = kept[::-1]
     return tuple(accepted), refused
 
 
-def _cycle(sample: TransformStamped, loop: tuple[str, ...]) -> InvalidTransformError:
+def _cycle(edges: Mapping[str, NewestEdge], sample: TransformStamped, loop: tuple[str, ...]) -> InvalidTransformError:
     start = loop.index(sample.child)
-    circle = (*loop[start:-1], *loop[: start + 1])
+    circle = (*loop[start:], *loop[: start + 1])
+    shown = (
+        circle if len(circle) <= _SHOWN else (*circle[: _SHOWN - 2], f"({len(circle) - _SHOWN + 1} more)", circle[-1])
+    )
+    others = sorted({edges[frame].authority for frame in loop if frame in edges and frame != sample.child} - {""})
     return InvalidTransformError(
-        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {' -> '.join(circle)}",
+        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {' -> '.join(shown)}"
+        + (f", with edges from {' and '.join(map(repr, others))}" if others else ""),
         reason="cycle",
         parent=sample.parent,
         child=sample.child,
@@ -87,21 +101,24 @@ def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformS
     return {child: parent for child, parent in parents.items() if parent != _parent(edges.get(child))}
 
 
-def _find_loop(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> tuple[str, ...]:
-    """A loop that runs through a changed child, from that child over its parents back to it; empty if there is none."""
-    rooted: set[str | None] = {None}
+def _find_loops(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> list[tuple[str, ...]]:
+    """The loops that run through a changed child, each from a frame over its parents; they share no frame."""
+    loops: list[tuple[str, ...]] = []
+    judged: set[str] = set()
     for child in changes:
         walk: dict[str, None] = {}
         here: str | None = child
-        while here is not None and here not in rooted and here not in walk:
+        while here is not None and here not in judged and here not in walk:
             walk[here] = None
             here = changes[here] if here in changes else _parent(edges.get(here))
-        # A walk may also end in a circle that is none of this batch's; what leads there is judged again.
-        if here in rooted:
-            rooted.update(walk)
-        elif here == child:
-            return (*walk, child)
-    return ()
+        if here in walk:
+            frames = list(walk)
+            circle = tuple(frames[frames.index(here) :])
+            # There may be others that are none of this batch's.
+            if not changes.keys().isdisjoint(circle):
+                loops.append(circle)
+        judged.update(walk)
+    return loops
 
 
 class _Newest:

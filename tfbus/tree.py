@@ -7,9 +7,15 @@ batch, so worker threads may read while the loop inserts.
 import math
 import threading
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any
 
-from tfbus.errors import ExtrapolationError, FutureExtrapolationError, TransformLookupError
+from tfbus.errors import (
+    DisconnectedError,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    TransformLookupError,
+)
 from tfbus.forest import Forest
 from tfbus.geometry import Row, compose
 from tfbus.history import Edge, Outcome
@@ -57,8 +63,6 @@ class TransformTree:
         seconds = None if keep is None else as_duration(keep, "keep")
         self.keep = keep
         self._lock = threading.Lock()
-        # Called in every lookup and insertion, where `with` would cost as much as a dozen multiplications.
-        self._acquire, self._release = self._lock.acquire, self._lock.release
         self.forest = Forest(None if seconds is None or seconds == math.inf else from_seconds(seconds))
         self.inserted = 0
         self.replaced = 0
@@ -93,7 +97,9 @@ class TransformTree:
             _, refused = admit(self.forest.frames, batch)
             if refused:
                 raise refused[0]
-            return [self._store(sample) for sample in batch]
+            outcomes = [self._store(sample) for sample in batch]
+            self.forest.forget_changes()
+            return outcomes
 
     def _store(self, sample: TransformStamped) -> Outcome:
         outcome = self.forest.store(sample)
@@ -105,30 +111,26 @@ class TransformTree:
             self.expired += 1
         return outcome
 
-    def commit(self, batch: Batch) -> tuple[int, int] | None:
+    def commit(self, batch: Batch) -> bool:
         """Store a batch that somebody has judged already, such as the bus; what is too old expires.
 
         Returns
         -------
-        tuple of int, or None
-            The forest's structure and edges versions from before; None where they cannot have changed.
+        bool
+            Whether every sample was just the next one of its frame, so that nothing but stamps has changed.
         """
-        forest = self.forest
-        frames = forest.frames
-        before = None
-        self._acquire()
-        try:
+        frames = self.forest.frames
+        plain = True
+        with self._lock:
             for sample in batch:
                 parent, child, stamp, row, authority, static = sample._fields
                 history = frames.get(child)
                 if history is not None and not static and history.append(parent, stamp, row, authority):
                     self.inserted += 1
                 else:
-                    before = before or (forest.structure_version, forest.edges_version)
+                    plain = False
                     self._store(sample)
-        finally:
-            self._release()
-        return before
+        return plain
 
     # Lookup
 
@@ -183,14 +185,11 @@ class TransformTree:
             raise TypeError("not_before goes with LATEST: an answer at a given stamp never gets newer")
         if type(at) is not int and at is not LATEST:
             at = as_stamp(at)
-        self._acquire()
-        try:
+        with self._lock:
             if source_at is None and fixed is None:
                 stamp, row, static = self._answer(target, source, at, not_before)
             else:
                 stamp, row, static = self._travel(target, source, at, source_at, fixed, not_before)
-        finally:
-            self._release()
         return answer_of(target, source, stamp, row, static)
 
     def _travel(
@@ -208,6 +207,10 @@ class TransformTree:
         except FutureExtrapolationError:
             # Waiting for this leg is no use if it cannot help the other one.
             self._answer(fixed, source, source_at, not_before)
+            raise
+        except DisconnectedError:
+            with suppress(DisconnectedError, FutureExtrapolationError):
+                self._answer(fixed, source, source_at, not_before)
             raise
         source_stamp, fixed_from_source, still = self._answer(fixed, source, source_at, not_before)
         if at is LATEST and static and not still:
@@ -239,10 +242,11 @@ class TransformTree:
             there = path if path.lasting else find_path(self.forest.frames, target, source, common)
             return common, there.row(common), False
         except TransformLookupError as error:
-            # The lagging edge has to come as far as the others still reach back.
-            needed = max(common if (since := edge.since()) is None else since for edge in path.moving)
-            if needed <= common:
-                raise
+            # The lagging edge has to come as far as the others still reach back; where a parent has changed, each step
+            # of it may do.
+            needed = common + 1
+            if path.lasting:
+                needed = max(common if edge.oldest is None else edge.oldest for edge in path.moving)
             raise lagging.missing(needed) from error
 
     def _newest_of(self, frame: str) -> int:

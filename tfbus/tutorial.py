@@ -4,6 +4,7 @@ A laser is mounted 0.1 m forward of the base's rotational centre and 0.2 m above
 listener takes a point in the laser's frame once a second and prints it in the base's.
 """
 
+import logging
 import math
 from collections.abc import Callable
 
@@ -14,8 +15,9 @@ from tfbus.buffer import Buffer
 from tfbus.bus import Bus
 from tfbus.clock import Clock, SimulatedClock
 from tfbus.data import PointStamped
-from tfbus.errors import TransformError
+from tfbus.errors import InvalidTransformError, TransformError
 from tfbus.geometry import Transform, Vector
+from tfbus.once import OnceLogger
 from tfbus.stamps import LATEST, SECOND, to_seconds
 
 BASE, LASER = "base_link", "base_laser"
@@ -26,10 +28,17 @@ Print = Callable[[str], object]
 
 
 async def broadcast(bus: Bus, rate: float = 100.0) -> None:
-    """Send the laser's transform `rate` times a second, each stamped with now, without drift and without end."""
+    """Send the laser's transform `rate` times a second, each stamped with now, without drift and without end.
+
+    A transform that the bus refuses, because of what somebody else has sent, is logged once and tried again.
+    """
     broadcaster = TransformBroadcaster(bus, authority="robot_tf_publisher")
+    log = OnceLogger(logging.getLogger("tfbus"))
     async for _ in bus.clock.ticks(rate):
-        broadcaster.send(BASE, LASER, BASE_FROM_LASER)
+        try:
+            broadcaster.send(BASE, LASER, BASE_FROM_LASER)
+        except InvalidTransformError as error:
+            log.warning(error.reason, "not sent: %s", error)
 
 
 async def listen(buffer: Buffer, rate: float = 1.0, *, lines: float = math.inf, output: Print = print) -> None:

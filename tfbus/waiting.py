@@ -119,7 +119,11 @@ class WaitingIndex:
             If `error` is of a kind that waiting cannot help.
         """
         waiter.names = blocking_frames(error)
-        if isinstance(error, FutureExtrapolationError):
+        cause = error.__cause__
+        if isinstance(cause, (UnknownFrameError, DisconnectedError, FutureExtrapolationError)):
+            # At the stamp that all have reached, something else is missing as well.
+            waiter.names = tuple(dict.fromkeys((*waiter.names, *blocking_frames(cause))))
+        if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
             needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp
             waiter.place = (-needed, -next(self._order), waiter)
             insort(self._under(error.child).places, waiter.place)
@@ -164,6 +168,17 @@ class WaitingIndex:
             ready.append(waiter)
         if not places:
             self.blocked.pop(frame, None)
+        return ready
+
+    def take_asking(self, frames: set[str]) -> list[Waiter]:
+        """Take out those whose question names one of these frames."""
+        ready = [
+            waiter
+            for waiter in self._waiters
+            if waiter.question.target in frames or waiter.question.source in frames or waiter.question.fixed in frames
+        ]
+        for waiter in ready:
+            self.remove(waiter)
         return ready
 
     def take_all(self) -> list[Waiter]:
