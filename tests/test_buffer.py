@@ -774,3 +774,27 @@ def test_a_buffer_may_be_built_before_a_loop_and_waited_on_in_several(
 
     for stamp in (1, 2, 3):
         run(partial(wait, stamp))
+
+
+async def test_an_unregistered_type_is_refused_before_anything_is_awaited() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        for wrong in (("map", 0), 5):
+            with pytest.raises(TypeError, match=r"@do_transform\.register"):
+                await buffer.transform(wrong, "map")  # type: ignore[type-var]
+            with pytest.raises(TypeError, match=r"@do_transform\.register"):
+                buffer.transform_nowait(wrong, "map")  # type: ignore[type-var]
+
+
+async def test_max_age_with_a_stamp_is_refused_by_its_own_name() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 0))
+        with pytest.raises(TypeError, match="max_age goes with LATEST"):
+            await buffer.lookup("map", "base", 0, max_age=1.0)
+
+
+async def test_a_name_that_no_frame_can_have_comes_with_close_matches() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 0))
+        with pytest.raises(UnknownFrameError) as caught:
+            await buffer.lookup("/map", "base")
+        assert caught.value.close_matches == ("map",)

@@ -454,3 +454,24 @@ async def test_the_system_clock_never_announces_a_jump() -> None:
     with SystemClock().on_jump(lambda before, after: jumps.append((before, after))):
         await settle()
     assert not jumps
+
+
+async def test_the_first_of_two_jumps_in_one_turn_decides_for_a_sleeper() -> None:
+    clock = SimulatedClock(start=10 * SECOND)
+    ended: list[str] = []
+
+    async def sleep(stamp: int) -> None:
+        try:
+            await clock.sleep_until(stamp)
+            ended.append("reached")
+        except ClockResetError:
+            ended.append("reset")
+
+    for first, second, end in ((0, 30 * SECOND, "reset"), (30 * SECOND, 0, "reached")):
+        clock.set(10 * SECOND)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(sleep, 20 * SECOND)
+            await anyio.wait_all_tasks_blocked()
+            clock.set(first)
+            clock.set(second)
+        assert ended.pop() == end

@@ -195,3 +195,92 @@ def test_whoever_is_not_woken_still_has_no_answer(batches: list[list[TransformSt
         for question in asleep:
             with pytest.raises(TransformLookupError):
                 ask(feed, question)
+
+
+@pytest.mark.parametrize(
+    ("before", "then", "target", "source", "at"),
+    [
+        pytest.param(
+            [moving("b", "a", 11), moving("a", "d", 15), moving("b", "d", 13)],
+            moving("b", "a", 14),
+            "d",
+            "b",
+            LATEST,
+            id="the parent changed between the common stamp and the newest",
+        ),
+        pytest.param(
+            [moving("a", "d", 13), moving("d", "c", 16), moving("c", "b", 18), moving("a", "b", 16)],
+            moving("a", "d", 18),
+            "b",
+            "d",
+            LATEST,
+            id="another edge is missing at the common stamp",
+        ),
+        pytest.param(
+            [moving("a", "b", 17), moving("d", "a", 16), moving("c", "b", 23)],
+            static("b", "d"),
+            "d",
+            "b",
+            22,
+            id="a root gets a parent below itself in the past",
+        ),
+    ],
+)
+def test_late_data_wake_whom_they_answer(
+    before: list[TransformStamped], then: TransformStamped, target: str, source: str, at: int | Latest
+) -> None:
+    feed = Feed(None)
+    for sample in before:
+        feed.receive((sample,))
+    with pytest.raises(TransformLookupError) as caught:
+        feed.tree.lookup(target, source, at)
+    woken: list[str] = []
+    feed.waiting.park(Waiter(Question(target, source, at), 0, partial(woken.append, source)), caught.value)
+    feed.receive((then,))
+    assert feed.tree.can_transform(target, source, at)
+    assert woken == [source]
+
+
+def test_a_parent_that_flips_wakes_nobody_who_asks_elsewhere() -> None:
+    feed = Feed(None)
+    feed.receive((moving("map", "a", 1), moving("map", "b", 1), static("map", "mount")))
+    woken: list[str] = []
+    for _ in range(100):
+        park(feed, "map", "a", 9, woken)
+    for stamp in range(2, 6):
+        feed.receive((moving("left" if stamp % 2 else "right", "b", stamp),))
+    feed.receive((moving("map", "b", 0),))
+    feed.receive((static("map", "mount", x=1.0),))
+    assert woken == []
+    assert len(feed.waiting) == 100
+
+
+def test_one_waiter_that_cannot_be_woken_does_not_keep_the_others_asleep() -> None:
+    feed = Feed(None)
+    feed.receive((moving("map", "a", 1),))
+    woken: list[str] = []
+
+    def gone() -> None:
+        raise RuntimeError("Event loop is closed")
+
+    with pytest.raises(TransformLookupError) as caught:
+        feed.tree.lookup("map", "a", 9)
+    feed.waiting.park(Waiter(Question("map", "a", 9), 0, gone), caught.value)
+    park(feed, "map", "a", 9, woken)
+    feed.receive((moving("map", "a", 9),))
+    assert woken == ["a"]
+
+
+def test_only_its_bus_changes_the_tree_of_a_buffer() -> None:
+    feed = Feed(None)
+    feed.receive((moving("map", "a", 1),))
+    for change in (
+        partial(feed.tree.insert, moving("map", "a", 2)),
+        partial(feed.tree.remove_frame, "a"),
+        feed.tree.clear,
+    ):
+        with pytest.raises(RuntimeError, match="a bus feeds this tree"):
+            change()
+    own = feed.tree.copy()
+    own.insert(moving("map", "a", 2))
+    assert (feed.tree.latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)

@@ -230,3 +230,27 @@ def test_only_callables_can_subscribe_and_only_on_an_open_bus() -> None:
     bus.close()
     with pytest.raises(BusClosedError):
         bus.subscribe(print)
+
+
+def test_an_async_subscriber_is_refused_because_nobody_would_await_it() -> None:
+    async def callback(batch: object) -> None: ...
+
+    with Bus() as bus, pytest.raises(TypeError, match=r"must not be async.*bus\.stream"):
+        bus.subscribe(callback)
+
+
+def test_what_waits_for_subscribers_when_the_clock_jumps_back_is_dropped() -> None:
+    clock = SimulatedClock(start=10)
+    seen: list[str] = []
+    with Bus(clock) as bus:
+
+        def callback(batch: tuple[TransformStamped, ...]) -> None:
+            seen.extend(sample.child for sample in batch)
+            if batch[0].child == "a":
+                bus.publish([moving("map", "b", 10)])
+                bus.publish([static("map", "c")])
+                clock.set(0)
+
+        bus.subscribe(callback)
+        bus.publish(moving("map", "a", 10))
+    assert seen == ["a", "c"]

@@ -80,3 +80,25 @@ async def test_a_wrong_transform_gives_a_wrong_point() -> None:
             lambda: tutorial.listen(buffer, lines=1, output=lines.append),
         )
     assert "base_link: (1.00, 0.20, 5.00)" in lines[0]
+
+
+async def test_a_broadcaster_that_is_refused_because_of_somebody_else_goes_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    clock = SimulatedClock()
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        TransformBroadcaster(bus, authority="intruder").send("base_laser", "base_link", Transform())
+
+        async def robot() -> None:
+            with clock.move_on_after(1.0):
+                await tutorial.broadcast(bus)
+            bus.remove_frame("base_link")
+            with clock.move_on_after(1.0):
+                await tutorial.broadcast(bus)
+
+        await simulate(clock, robot)
+        assert buffer.lookup_nowait("base_link", "base_laser").transform == tutorial.BASE_FROM_LASER
+    assert [record.getMessage() for record in caplog.records] == [
+        "not sent: the edge 'base_link' -> 'base_laser' would close a loop of parents: "
+        "base_laser -> base_link -> base_laser, with edges from 'intruder'"
+    ]
