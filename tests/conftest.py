@@ -1,5 +1,6 @@
 """Every async test runs on asyncio, on asyncio with uvloop, and on trio; no example of hypothesis has a deadline."""
 
+import os
 from collections.abc import Awaitable, Callable
 from typing import Any, TypeVar
 
@@ -7,7 +8,8 @@ import anyio
 import pytest
 from hypothesis import settings
 
-settings.register_profile("tfbus", deadline=None)
+# The same examples for every change that is to land; new ones wherever else the tests run.
+settings.register_profile("tfbus", deadline=None, derandomize="CI" in os.environ)
 settings.load_profile("tfbus")
 
 T = TypeVar("T")
