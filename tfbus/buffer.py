@@ -13,8 +13,6 @@ from tfbus.data import Stamped, check_registered, do_transform
 from tfbus.errors import (
     BusClosedError,
     ClockResetError,
-    DisconnectedError,
-    FutureExtrapolationError,
     LookupTimeoutError,
     TransformLookupError,
     UnknownFrameError,
@@ -24,12 +22,11 @@ from tfbus.once import OnceLogger
 from tfbus.stamped import TransformStamped, is_frame
 from tfbus.stamps import LATEST, Latest, as_duration, from_seconds
 from tfbus.tree import TransformTree
-from tfbus.waiting import PendingLookup, Question, Waiter, blocking_frames
+from tfbus.waiting import MAY_COME, PendingLookup, Question, Waiter, blocking_frames
 
 DataT = TypeVar("DataT", bound=Stamped)
 
 _REPORT_AFTER = 5.0
-_MAY_COME = (UnknownFrameError, DisconnectedError, FutureExtrapolationError)
 
 
 class Buffer:
@@ -154,7 +151,7 @@ class Buffer:
         question = Question(target, source, at, source_at, fixed)
         try:
             return self._read(question, max_age, reset)
-        except _MAY_COME as error:
+        except MAY_COME as error:
             for name in (target, source, fixed):
                 if name is not None and not is_frame(name):
                     raise UnknownFrameError(frame=name, known=self.tree.frames()) from None
@@ -248,12 +245,12 @@ class Buffer:
                     await self._park(question, since, blocker)
                     try:
                         return self._read(question, max_age, reset)
-                    except _MAY_COME as error:
+                    except MAY_COME as error:
                         blocker = error
             try:
                 # The data may have come in the very turn of the loop in which the time was up.
                 return self._read(question, max_age, reset)
-            except _MAY_COME as error:
+            except MAY_COME as error:
                 blocker = error
             if seconds >= limit:
                 break

@@ -159,8 +159,9 @@ class Bus:
         """
         self._check_usable()
         stream = Stream(capacity, overflow, self.check_thread, self._detach_stream)
-        if self._topology.latched:
-            stream.put(tuple(self._topology.latched.values()))
+        latched = tuple(self._topology.latched.values())
+        if latched:
+            stream.put(latched)
         self._streams.append(stream)
         return stream
 

@@ -14,6 +14,9 @@ from itertools import count
 from tfbus.errors import DisconnectedError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.stamps import STAMP_MIN, Latest
 
+MAY_COME = (UnknownFrameError, DisconnectedError, FutureExtrapolationError)
+"""The errors that waiting may help against."""
+
 _Place = tuple[int, int, "Waiter"]
 
 
@@ -120,7 +123,7 @@ class WaitingIndex:
         """
         waiter.names = blocking_frames(error)
         cause = error.__cause__
-        if isinstance(cause, (UnknownFrameError, DisconnectedError, FutureExtrapolationError)):
+        if isinstance(cause, MAY_COME):
             # At the stamp that all have reached, something else is missing as well.
             waiter.names = tuple(dict.fromkeys((*waiter.names, *blocking_frames(cause))))
         if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
@@ -182,7 +185,7 @@ class WaitingIndex:
         return ready
 
     def take_all(self) -> list[Waiter]:
-        """Take everybody out, as when the tree's shape has changed."""
+        """Take everybody out, as when a frame is removed, the clock jumps back, or nothing more will come."""
         ready = list(self._waiters)
         self._waiters.clear()
         self.blocked.clear()
