@@ -6,6 +6,7 @@ from typing import Any
 
 import anyio
 import anyio.lowlevel
+import numpy as np
 import pytest
 from asking import Asked, HandClock, driving, settle
 from samples import moving, static
@@ -19,14 +20,17 @@ from tfbus import (
     ClockResetError,
     DisconnectedError,
     FutureExtrapolationError,
+    LaserScan,
     LookupTimeoutError,
     PastExtrapolationError,
     PointStamped,
     Question,
     SimulatedClock,
     TransformBroadcaster,
+    TransformStamped,
     UnknownFrameError,
     Vector3Stamped,
+    do_transform,
 )
 
 pytestmark = pytest.mark.anyio
@@ -732,6 +736,112 @@ async def test_data_of_an_unknown_type_are_refused() -> None:
     bus.publish(static("map", "base"))
     with pytest.raises(TypeError, match=r"do_transform\.register"):
         await buffer.transform(Smell(), "base")
+
+
+async def test_transform_moves_data_to_another_instant_through_a_fixed_frame() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "base", 1), driving("map", "base", 6), static("base", "laser", x=0.5)])
+    # Seen at 2 s, at 3.5 m in map; at 5 s the base has driven 3 m on.
+    point = PointStamped("laser", 2 * SECOND, (1.0, 0.0, 0.0))
+    moved = await buffer.transform(point, "base", at=5 * SECOND, fixed="map")
+    assert moved == PointStamped("base", 5 * SECOND, (-1.5, 0.0, 0.0))
+    assert buffer.transform_nowait(point, "base", at=5 * SECOND, fixed="map") == moved
+    back = PointStamped("laser", 5 * SECOND, (-2.0, 0.0, 0.0))
+    assert buffer.transform_nowait(back, "laser", at=2 * SECOND, fixed="map").point == (1.0, 0.0, 0.0)
+
+
+async def test_transform_moves_data_to_the_latest_and_says_which_stamp_that_was() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
+    point = PointStamped("base", 2 * SECOND, (1.0, 0.0, 0.0))
+    moved = await buffer.transform(point, "base", at=LATEST, fixed="map")
+    assert moved == PointStamped("base", 6 * SECOND, (-3.0, 0.0, 0.0))
+    assert buffer.transform_nowait(point, "base", at=LATEST, fixed="map") == moved
+
+
+async def test_transform_moves_what_is_the_latest_to_a_given_stamp() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
+    newest = PointStamped("base", LATEST, (1.0, 0.0, 0.0))
+    moved = await buffer.transform(newest, "base", at=2 * SECOND, fixed="map")
+    assert moved == PointStamped("base", 2 * SECOND, (5.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("stamp", "at"), [(2, 5), (5, 2)], ids=["to the future", "to the past"])
+async def test_transform_to_another_instant_waits_for_both_ends(stamp: int, at: int) -> None:
+    _, bus, buffer = make()
+    bus.publish(driving("map", "base", 1))
+    point = PointStamped("base", stamp * SECOND, (1.0, 0.0, 0.0))
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.transform, point, "base", at=at * SECOND, fixed="map"))
+        await settle()
+        bus.publish(driving("map", "base", 3))
+        await settle()
+        assert not asked.ended
+        with pytest.raises(FutureExtrapolationError):
+            buffer.transform_nowait(point, "base", at=at * SECOND, fixed="map")
+        bus.publish(driving("map", "base", 5))
+        await settle()
+    assert asked.answer == PointStamped("base", at * SECOND, (1.0 + stamp - at, 0.0, 0.0))
+
+
+async def test_transform_to_another_instant_keeps_its_limits() -> None:
+    clock, bus, buffer = make()
+    bus.publish([driving("map", "base", 0), driving("map", "base", 2)])
+    await clock.advance(9.0)
+    point = PointStamped("base", SECOND, (0.0, 0.0, 0.0))
+    with pytest.raises(LookupTimeoutError):
+        await buffer.transform(point, "base", timeout=0, max_age=1.0, at=LATEST, fixed="map")
+    with pytest.raises(FutureExtrapolationError):
+        buffer.transform_nowait(point, "base", max_age=1.0, at=LATEST, fixed="map")
+    with pytest.raises(TypeError, match="max_age goes with LATEST"):
+        await buffer.transform(point, "base", max_age=1.0, at=2 * SECOND, fixed="map")
+
+
+@pytest.mark.parametrize("half", [{"at": 5}, {"at": LATEST}, {"fixed": "map"}], ids=["at", "at latest", "fixed"])
+async def test_half_a_journey_is_refused_before_anything_is_awaited(half: dict[str, Any]) -> None:
+    _, _, buffer = make()
+    point = PointStamped("nowhere", 0, (0.0, 0.0, 0.0))
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        with pytest.raises(TypeError, match="at and fixed go together"):
+            await buffer.transform(point, "map", **half)
+    with pytest.raises(TypeError, match="at and fixed go together"):
+        buffer.transform_nowait(point, "map", **half)
+
+
+class Message:
+    """As a message of ROS: its frame and stamp are in a header."""
+
+    header = ("base", 0)
+
+
+@do_transform.register
+def _(data: Message, transform: TransformStamped) -> Message:
+    assert transform.child == "base"
+    return data
+
+
+async def test_registered_data_without_frame_and_stamp_are_refused_with_the_way_out() -> None:
+    _, bus, buffer = make()
+    bus.publish(static("map", "base"))
+    way_out = "Message has no frame and stamp of its own: look the transform up and call do_transform"
+    with pytest.raises(TypeError, match=way_out):
+        await buffer.transform(Message(), "map")  # type: ignore[type-var]
+    with pytest.raises(TypeError, match=way_out):
+        buffer.transform_nowait(Message(), "map")  # type: ignore[type-var]
+    message = Message()
+    assert do_transform(message, await buffer.lookup("map", "base")) is message
+
+
+async def test_a_scan_is_refused_with_what_to_move_instead() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "laser", 1), driving("map", "laser", 3)])
+    scan = LaserScan("laser", 2 * SECOND, np.array([4.0]), angle_min=0.0, angle_increment=0.0)
+    with pytest.raises(TypeError, match=r"transform its to_points\(\) instead"):
+        await buffer.transform(scan, "map")
+    cloud = await buffer.transform(scan.to_points(), "map")
+    assert cloud.points.tolist() == [[6.0, 0.0, 0.0]]
 
 
 async def test_a_listener_once_a_second_follows_a_broadcaster_at_100_hz() -> None:

@@ -17,9 +17,16 @@ ABOVE_THE_ASYNC_LINE = [
     ("stamps", "once", "registration", "names", "statistics"),
     ("errors",),
     ("geometry",),
-    ("stamped", "history"),
-    ("data", "path", "picture", "topology", "sample_queue", "subscribers", "waiting"),
+    ("stamped", "history", "transform_array"),
+    ("data.header", "data.arrays"),
+    ("data.dispatch",),
+    ("data.points", "data.spatial", "data.clouds"),
+    ("data.scans",),
+    ("data", "path", "curve", "picture", "topology", "sample_queue", "subscribers", "waiting"),
     ("forest",),
+    ("resolve",),
+    ("batch", "velocity"),
+    ("reader",),
     ("tree",),
     ("feed",),
 ]
@@ -36,7 +43,7 @@ LAYERS = ABOVE_THE_ASYNC_LINE + BELOW_THE_ASYNC_LINE
 LAYER_OF = {module: layer for layer, modules in enumerate(LAYERS) for module in modules}
 
 EFFECTS = {"anyio", "asyncio", "sniffio", "socket", "threading", "time", "trio"}
-ALLOWED_EFFECTS = {"tree": {"threading"}}
+ALLOWED_EFFECTS = {"reader": {"threading"}}
 
 CORE = {"anyio", "numpy", "transforms3d"}
 EXTRAS = {"cyclopts", "hypothesis", "rich", "starlette", "uvicorn"}
@@ -44,7 +51,8 @@ ALLOWED_EXTRAS = {"cli": {"cyclopts"}}
 
 
 def module_name(path: Path) -> str:
-    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+    """Of a folder, the name is that of its ``__init__``; that of the package itself is ``__init__``."""
+    return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
 
 
 SOURCES = {module_name(path): path for path in PACKAGE.rglob("*.py")}

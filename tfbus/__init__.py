@@ -8,7 +8,20 @@ from tfbus.broadcaster import TransformBroadcaster
 from tfbus.buffer import Buffer
 from tfbus.bus import Bus
 from tfbus.clock import Clock, SimulatedClock, SystemClock
-from tfbus.data import PointStamped, PoseStamped, Stamped, Vector3Stamped, do_transform
+from tfbus.data import (
+    LaserScan,
+    PointCloud,
+    PointStamped,
+    Polygon,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    QuaternionStamped,
+    Stamped,
+    TwistStamped,
+    Vector3Stamped,
+    WrenchStamped,
+    do_transform,
+)
 from tfbus.errors import (
     BusClosedError,
     ClockResetError,
@@ -31,6 +44,7 @@ from tfbus.statistics import BufferStatistics, BusStatistics, QueueStatistics
 from tfbus.stream import Stream
 from tfbus.threadsafe import ThreadPublisher
 from tfbus.ticks import Ticks
+from tfbus.transform_array import TransformArray
 from tfbus.tree import TransformTree
 from tfbus.waiting import PendingLookup, Question
 
@@ -49,13 +63,18 @@ __all__ = [
     "ExtrapolationError",
     "FutureExtrapolationError",
     "InvalidTransformError",
+    "LaserScan",
     "Latest",
     "LookupTimeoutError",
     "Outcome",
     "PastExtrapolationError",
     "PendingLookup",
+    "PointCloud",
     "PointStamped",
+    "Polygon",
     "PoseStamped",
+    "PoseWithCovarianceStamped",
+    "QuaternionStamped",
     "Question",
     "QueueStatistics",
     "Registration",
@@ -66,13 +85,16 @@ __all__ = [
     "ThreadPublisher",
     "Ticks",
     "Transform",
+    "TransformArray",
     "TransformBroadcaster",
     "TransformError",
     "TransformLookupError",
     "TransformStamped",
     "TransformTree",
+    "TwistStamped",
     "UnknownFrameError",
     "Vector3Stamped",
+    "WrenchStamped",
     "do_transform",
     "from_seconds",
     "to_seconds",

@@ -160,17 +160,28 @@ class Buffer:
         return await self._wait(question, max_age, limit, reset, blocker)
 
     async def transform(
-        self, data: DataT, target: str, *, timeout: float | None = None, max_age: float | None = None
+        self,
+        data: DataT,
+        target: str,
+        *,
+        timeout: float | None = None,
+        max_age: float | None = None,
+        at: int | Latest | None = None,
+        fixed: str | None = None,
     ) -> DataT:
-        """`data` in the frame `target`, by the transform of its own stamp, as soon as that has arrived.
+        """`data` in the frame `target`, by the transform of their own stamp, as soon as that has arrived.
 
         Parameters
         ----------
-        data : PointStamped, Vector3Stamped, PoseStamped, or a type registered with `do_transform`
+        data : any type of `tfbus.data` but LaserScan, or a type registered with `do_transform`
             With `frame` and `stamp`; the stamp may be `LATEST`.
         target : str
         timeout, max_age : float, optional
             As `lookup`.
+        at : int or LATEST, optional
+            Move the data from their own stamp to this one (ns), through `fixed`.
+        fixed : str, optional
+            The frame that is held still between the two stamps.
 
         Returns
         -------
@@ -180,19 +191,27 @@ class Buffer:
         Raises
         ------
         TypeError
-            If `data` is of a type that is not registered.
+            If `data` are of a type that is not registered or has no frame and stamp, or only one of `at` and `fixed`
+            is given.
         TransformError
             As `lookup`.
         """
-        check_registered(data)
-        found = await self.lookup(target, data.frame, data.stamp, timeout=timeout, max_age=max_age)
-        moved: DataT = do_transform(data, found)
+        question = _question_of(data, target, at, fixed)
+        moved: DataT = do_transform(data, await self.lookup(**question, timeout=timeout, max_age=max_age))
         return moved
 
-    def transform_nowait(self, data: DataT, target: str, *, max_age: float | None = None) -> DataT:
+    def transform_nowait(
+        self,
+        data: DataT,
+        target: str,
+        *,
+        max_age: float | None = None,
+        at: int | Latest | None = None,
+        fixed: str | None = None,
+    ) -> DataT:
         """As `transform`, or an error at once."""
-        check_registered(data)
-        moved: DataT = do_transform(data, self.lookup_nowait(target, data.frame, data.stamp, max_age=max_age))
+        question = _question_of(data, target, at, fixed)
+        moved: DataT = do_transform(data, self.lookup_nowait(**question, max_age=max_age))
         return moved
 
     def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
@@ -299,3 +318,17 @@ class Buffer:
             _REPORT_AFTER,
             blocker,
         )
+
+
+def _question_of(data: Stamped, target: str, at: int | Latest | None, fixed: str | None) -> dict[str, Any]:
+    """What `lookup` has to be asked to move `data`."""
+    check_registered(data)
+    if not (hasattr(data, "frame") and hasattr(data, "stamp")):
+        kind = type(data).__name__
+        raise TypeError(f"a {kind} has no frame and stamp of its own: look the transform up and call do_transform")
+    question: dict[str, Any] = {"target": target, "source": data.frame, "at": data.stamp}
+    if at is None and fixed is None:
+        return question
+    if at is None or fixed is None:
+        raise TypeError("at and fixed go together: the data at their stamp, carried to `at` through the fixed frame")
+    return {**question, "at": at, "source_at": data.stamp, "fixed": fixed}

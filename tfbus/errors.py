@@ -50,7 +50,21 @@ class TransformError(Exception):
 
 
 class TransformLookupError(TransformError, LookupError):
-    """A transform was asked for that cannot be given, at least not now."""
+    """A transform was asked for that cannot be given, at least not now.
+
+    Attributes
+    ----------
+    index : int or None
+        Which of the stamps it was, where many were asked for at once.
+    """
+
+    index: int | None = None
+
+    def _why(self) -> str:
+        return super().__str__()
+
+    def __str__(self) -> str:
+        return self._why() if self.index is None else f"stamps[{self.index}]: {self._why()}"
 
 
 class UnknownFrameError(TransformLookupError):
@@ -74,7 +88,7 @@ class UnknownFrameError(TransformLookupError):
         """Known frames with a similar name, the most similar first."""
         return tuple(difflib.get_close_matches(self.frame, self._known))
 
-    def __str__(self) -> str:
+    def _why(self) -> str:
         hint = " or ".join(repr(name) for name in self.close_matches)
         return f"frame {self.frame!r} is not known" + (f", did you mean {hint}?" if hint else "")
 
@@ -148,7 +162,7 @@ class ExtrapolationError(TransformLookupError):
     def _gap(self) -> str:
         return "there is no sample in its window"
 
-    def __str__(self) -> str:
+    def _why(self) -> str:
         asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
         sender = f", from {self.authority!r}" if self.authority else ""
         return f"frame {self.child!r}: asked for {asked}, {self._gap()}{sender}"

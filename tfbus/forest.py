@@ -84,6 +84,10 @@ class Forest:
             self.paths[target, source] = path
         return path
 
+    def parent_changes(self) -> list[int]:
+        """Every stamp at which some frame changes its parent, in order: between two of them all paths stay."""
+        return sorted({stamp for history in self.frames.values() for stamp in history.parent_changes()})
+
     def check_known(self, frame: str) -> None:
         """Raise `UnknownFrameError` unless a sample names the frame."""
         if frame not in self.names:

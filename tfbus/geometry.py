@@ -5,7 +5,8 @@ neighbours cancel in ``map_from_base @ base_from_lidar``. Quaternions are ``(x, 
 conversions, has ``w`` first, so every crossing says ``wxyz``.
 
 Inside, a transform is one tuple of seven floats, a *row*: ``(tx, ty, tz, qx, qy, qz, qw)``. The functions on rows are
-the readable kernels; `tfbus.path` repeats their arithmetic in one loop for the lookup.
+the readable kernels; `tfbus.path` repeats their arithmetic in one loop for the lookup. `compose`, `invert` and `rotate`
+take arrays in place of floats as well.
 """
 
 import math
@@ -28,8 +29,15 @@ _ROUNDING = 1e-15
 
 IDENTITY: Row = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
+Columns: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]
+"""Rows side by side: each number an array, or a float where all rows have the same."""
 
-def compose(a: Row, b: Row) -> Row:
+
+@overload
+def compose(a: Row, b: Row) -> Row: ...
+@overload
+def compose(a: Columns, b: Columns) -> Columns: ...
+def compose(a: Columns, b: Columns) -> Columns:
     """The row of ``a @ b``: first `b`, then `a`."""
     ax, ay, az, ai, aj, ak, aw = a
     bx, by, bz, bi, bj, bk, bw = b
@@ -45,7 +53,11 @@ def compose(a: Row, b: Row) -> Row:
     )
 
 
-def invert(a: Row) -> Row:
+@overload
+def invert(a: Row) -> Row: ...
+@overload
+def invert(a: Columns) -> Columns: ...
+def invert(a: Columns) -> Columns:
     """The row of the inverse: the conjugate rotation, and the translation turned back by it."""
     ax, ay, az, ai, aj, ak, aw = a
     x, y, z = rotate((-ai, -aj, -ak, aw), ax, ay, az)
@@ -81,7 +93,11 @@ def interpolate(a: Row, b: Row, fraction: float) -> Row:
     )
 
 
-def rotate(rotation: Quaternion, x: float, y: float, z: float) -> Vector:
+@overload
+def rotate(rotation: Quaternion, x: float, y: float, z: float) -> Vector: ...
+@overload
+def rotate(rotation: tuple[Any, ...], x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]: ...
+def rotate(rotation: tuple[Any, ...], x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
     """A vector turned by a unit quaternion: v + 2 w (q x v) + 2 q x (q x v)."""
     qx, qy, qz, qw = rotation
     tx = 2.0 * (qy * z - qz * y)

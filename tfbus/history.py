@@ -12,7 +12,7 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import Enum
 from struct import Struct
-from typing import final
+from typing import NamedTuple, final
 
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, PastExtrapolationError
 from tfbus.geometry import IDENTITY, Row
@@ -53,6 +53,17 @@ class Edge:
         if self.oldest is None or self.newest is None or self.newest == self.oldest:
             return None
         return (self.samples - 1) * SECOND / (self.newest - self.oldest)
+
+
+class Samples(NamedTuple):
+    """Moving samples of one frame, in stamp order, readable by numpy as they are."""
+
+    stamps: "array[int]"
+    """ns."""
+    records: bytearray
+    """64 bytes each: the stamp, then the seven floats of the row."""
+    parents: list[str] | None
+    """One each; None where they are all the same."""
 
 
 @final
@@ -226,6 +237,21 @@ class FrameHistory:
         past = oldest is not None and isinstance(stamp, int) and stamp < oldest
         kind = PastExtrapolationError if past else FutureExtrapolationError
         return kind(child=self.child, stamp=stamp, oldest=oldest, newest=newest, authority=self.authority)
+
+    def parent_changes(self) -> list[int]:
+        """The stamps inside the window at which the parent is another one than before."""
+        if self.parents is None:
+            return []
+        parents = [parent for parent, _ in self.origins[self.start :]]
+        stamps = self.stamps[self.start :]
+        return [stamp for stamp, old, new in zip(stamps[1:], parents, parents[1:], strict=False) if new != old]
+
+    def between(self, low: int, high: int) -> Samples:
+        """Copies of the samples that the answers from stamp `low` to `high` are made of; both have to be covered."""
+        first = bisect_right(self.stamps, low) - 1
+        end = bisect_left(self.stamps, high) + 1
+        parents = None if self.parents is None else [parent for parent, _ in self.origins[first:end]]
+        return Samples(self.stamps[first:end], self.records[first * RECORD_SIZE : end * RECORD_SIZE], parents)
 
     def edge(self) -> Edge:
         """The facts of this frame's newest edge."""

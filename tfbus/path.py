@@ -65,6 +65,12 @@ class Path:
             return climb(self.up, at)
         return compose(invert(climb(self.down, at)), climb(self.up, at))
 
+    def rows(self, stamps: list[int]) -> list[Row]:
+        """As `row`, at some stamps."""
+        if not self.down:
+            return [climb(self.up, at) for at in stamps]
+        return [self.row(at) for at in stamps]
+
     def newest_common(self) -> tuple[int, FrameHistory]:
         """The newest stamp that every moving edge has reached, and the edge that has come no further.
 

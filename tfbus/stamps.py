@@ -6,9 +6,13 @@ round trip through a float. A duration is a ``float`` of seconds, because nobody
 
 import math
 import operator
+from collections.abc import Sequence
 from enum import Enum
 from numbers import Real
 from typing import Final
+
+import numpy as np
+import numpy.typing as npt
 
 SECOND: Final = 1_000_000_000
 """Nanoseconds in a second."""
@@ -80,6 +84,26 @@ def as_stamp(value: object) -> int:
     if not STAMP_MIN <= stamp <= STAMP_MAX:
         raise ValueError(f"stamp {stamp} does not fit 64-bit nanoseconds")
     return stamp
+
+
+def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Many stamps as an array of shape (n,), in ns; an array that is one already is not copied.
+
+    Raises
+    ------
+    TypeError
+        If one is not an integer. Floats are the usual mistake: convert each with `from_seconds`.
+    ValueError
+        If the shape is not (n,), or one does not fit a signed 64-bit integer.
+    """
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise ValueError(f"stamps must have shape (n,), got {array.shape}")
+    if array.dtype.kind not in "iu" or array.dtype == np.uint64:
+        # Not what numpy has made of a list: one large integer turns all the others into floats.
+        each = values if isinstance(values, Sequence) else array.tolist()
+        return np.array([as_stamp(value) for value in each], np.int64)
+    return array.astype(np.int64, copy=False)
 
 
 def as_duration(seconds: float, name: str) -> float:

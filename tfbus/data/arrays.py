@@ -1,0 +1,67 @@
+"""Arrays that stamped data hold: checked, and read-only."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A read-only view of an array, or the array itself if nobody can write to it as it is."""
+    if not array.flags.writeable:
+        return array
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
+    """An array of floats: floats of any size stay as they are, uncopied; integers become float64.
+
+    Raises
+    ------
+    TypeError
+        If they are not numbers. The message names `name` and the dtype.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind in "iu":
+        return array.astype(np.float64)
+    if array.dtype.kind != "f":
+        raise TypeError(f"{name} must be numbers, not of dtype {array.dtype}")
+    return array
+
+
+def as_points(value: npt.ArrayLike) -> npt.NDArray[Any]:
+    """Points as an array of shape (n, 3), as `as_floats`.
+
+    Raises
+    ------
+    ValueError
+        If it has another shape. The message has it.
+    TypeError
+        If they are not numbers.
+    """
+    array = as_floats(value, "points")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {array.shape}")
+    return array
+
+
+class Rebuilt:
+    """A dataclass that is copied and unpickled by building it again, for a pickled array comes back writable."""
+
+    __slots__ = ()
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        for name, value in values.items():
+            if isinstance(value, MappingProxyType):
+                values[name] = dict(value)
+        return _build, (type(self), values)
+
+
+def _build(kind: type, values: dict[str, Any]) -> Any:
+    return kind(**values)

@@ -1,0 +1,59 @@
+"""What all stamped data have in common: a frame, a stamp, and the checks of both."""
+
+import math
+from typing import Any, Protocol
+
+from tfbus.geometry import Vector
+from tfbus.stamped import check_frame
+from tfbus.stamps import LATEST, Latest, as_stamp
+
+
+class Stamped(Protocol):
+    """Anything with a frame and a stamp."""
+
+    @property
+    def frame(self) -> str:
+        """The frame that the data are in."""
+
+    @property
+    def stamp(self) -> int | Latest:
+        """ns, or `LATEST`."""
+
+
+def check_header(data: Stamped) -> None:
+    """Check frame and stamp of a frozen dataclass that is being built; its stamp becomes a plain ``int``.
+
+    Raises
+    ------
+    InvalidTransformError
+        If the frame is empty or starts with ``/``.
+    TypeError, ValueError
+        If the stamp is neither `LATEST` nor an integer of 64 bits.
+    """
+    check_frame(data.frame)
+    if data.stamp is not LATEST:
+        object.__setattr__(data, "stamp", as_stamp(data.stamp))
+
+
+def as_triple(value: Any, name: str) -> Vector:
+    """Three numbers as a tuple of floats; NaN and infinity are allowed, since sensors send them.
+
+    Raises
+    ------
+    ValueError
+        If there are not three. The message has the shape.
+    TypeError
+        If they are not numbers.
+    """
+    if isinstance(value, (str, bytes)) or not hasattr(value, "__len__"):
+        raise TypeError(f"{name} must be three numbers, not {value!r}")
+    shape = getattr(value, "shape", (len(value),))
+    if shape != (3,):
+        raise ValueError(f"{name} must be three numbers, got shape {shape}")
+    try:
+        # `float` would read digits in a string.
+        any(map(math.isnan, value))
+    except TypeError:
+        raise TypeError(f"{name} must be three numbers, not {value!r}") from None
+    x, y, z = value
+    return float(x), float(y), float(z)

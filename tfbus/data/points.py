@@ -1,0 +1,151 @@
+"""Points, directions, orientations and poses."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy.typing as npt
+
+from tfbus.data.arrays import Rebuilt, as_points, read_only
+from tfbus.data.dispatch import do_transform, moved_header
+from tfbus.data.header import as_triple, check_header
+from tfbus.geometry import Quaternion, Transform, Vector, as_rotation, rotate
+from tfbus.stamped import TransformStamped
+from tfbus.stamps import Latest
+
+
+@dataclass(frozen=True, slots=True)
+class PointStamped:
+    """A position.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    point : sequence of 3 floats
+        (x, y, z) in m. NaN is allowed: it is what a sensor sends for "nothing there".
+    """
+
+    frame: str
+    stamp: int | Latest
+    point: Vector
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        object.__setattr__(self, "point", as_triple(self.point, "point"))
+
+
+@dataclass(frozen=True, slots=True)
+class Vector3Stamped:
+    """A direction with a length, such as a velocity or a normal: a transform turns it and does not shift it.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    vector : sequence of 3 floats
+        (x, y, z) in whatever unit; it stays.
+    """
+
+    frame: str
+    stamp: int | Latest
+    vector: Vector
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        object.__setattr__(self, "vector", as_triple(self.vector, "vector"))
+
+
+@dataclass(frozen=True, slots=True)
+class QuaternionStamped:
+    """An orientation.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    quaternion : sequence of 4 floats
+        Unit quaternion (x, y, z, w): turns directions of the oriented body into `frame`. A norm within 1 % of one is
+        normalised; the sign stays as given.
+    """
+
+    frame: str
+    stamp: int | Latest
+    quaternion: Quaternion
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        object.__setattr__(self, "quaternion", as_rotation(self.quaternion, "quaternion"))
+
+
+@dataclass(frozen=True, slots=True)
+class PoseStamped:
+    """A position and an orientation.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    pose : Transform
+        Maps coordinates of the posed body into `frame`.
+    """
+
+    frame: str
+    stamp: int | Latest
+    pose: Transform
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        if not isinstance(self.pose, Transform):
+            raise TypeError(f"pose must be a Transform, not {self.pose!r}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Polygon(Rebuilt):
+    """The corners of an area, in order; the last one is joined to the first. Equal only to itself.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    points : array of shape (n, 3)
+        In m; copied, and read-only from then on. Floats keep their dtype, integers become float64.
+    """
+
+    frame: str
+    stamp: int | Latest
+    points: npt.NDArray[Any]
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        object.__setattr__(self, "points", read_only(as_points(self.points).copy()))
+
+
+@do_transform.register
+def _(data: PointStamped, transform: TransformStamped) -> PointStamped:
+    return PointStamped(*moved_header(data, transform), transform.transform.apply(data.point))
+
+
+@do_transform.register
+def _(data: Vector3Stamped, transform: TransformStamped) -> Vector3Stamped:
+    return Vector3Stamped(*moved_header(data, transform), rotate(transform.transform.rotation, *data.vector))
+
+
+@do_transform.register
+def _(data: QuaternionStamped, transform: TransformStamped) -> QuaternionStamped:
+    turned = transform.transform @ Transform(rotation=data.quaternion)
+    return QuaternionStamped(*moved_header(data, transform), turned.rotation)
+
+
+@do_transform.register
+def _(data: PoseStamped, transform: TransformStamped) -> PoseStamped:
+    return PoseStamped(*moved_header(data, transform), transform.transform @ data.pose)
+
+
+@do_transform.register
+def _(data: Polygon, transform: TransformStamped) -> Polygon:
+    return Polygon(*moved_header(data, transform), transform.transform.apply(data.points))

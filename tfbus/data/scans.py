@@ -1,0 +1,125 @@
+"""Scans of a planar laser, and the points that they saw."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.data.arrays import Rebuilt, as_floats, read_only
+from tfbus.data.clouds import PointCloud
+from tfbus.data.header import check_header
+from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserScan(Rebuilt):
+    """One sweep of a planar laser, with the fields of sensor_msgs/LaserScan. Equal only to itself.
+
+    Ray i goes in the plane z = 0 of `frame` at the angle ``angle_min + i * angle_increment``, counterclockwise from x
+    as seen from +z, at the instant ``stamp + i * time_increment``. A scan cannot be told in another frame, but
+    `to_points` can. The arrays are held as read-only views and not copied: whoever owns them must not change them.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns, of the first ray.
+    ranges : array of shape (n,)
+        In m. Floats keep their dtype, integers become float64. NaN, infinity, and what is outside the limits, is no
+        point.
+    angle_min, angle_increment : float
+        In rad; the increment is negative for a laser that sweeps clockwise.
+    angle_max : float, optional
+        In rad, of the last ray. It is not used: drivers round it differently. None computes it.
+    time_increment : float
+        From ray to ray, in s.
+    scan_time : float
+        From scan to scan, in s. It is not used.
+    range_min, range_max : float
+        The limits of a range that counts, in m, themselves included.
+    intensities : array of shape (n,), optional
+        In the units of the device. An empty one is none, as in the message.
+
+    Raises
+    ------
+    ValueError
+        If lengths differ, an angle or the time increment is not finite, all rays have the same angle, the limits are
+        the wrong way round, or the last ray is beyond stamps of 64 bits.
+    TypeError
+        If something is not a number.
+    """
+
+    frame: str
+    stamp: int | Latest
+    ranges: npt.NDArray[Any]
+    angle_min: float = field(kw_only=True)
+    angle_increment: float = field(kw_only=True)
+    angle_max: float | None = field(default=None, kw_only=True)
+    time_increment: float = field(default=0.0, kw_only=True)
+    scan_time: float = field(default=0.0, kw_only=True)
+    range_min: float = field(default=0.0, kw_only=True)
+    range_max: float = field(default=math.inf, kw_only=True)
+    intensities: npt.NDArray[Any] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        ranges = read_only(as_floats(self.ranges, "ranges"))
+        if ranges.ndim != 1:
+            raise ValueError(f"ranges must have shape (n,), got {ranges.shape}")
+        object.__setattr__(self, "ranges", ranges)
+        self._check_numbers(last=max(0, len(ranges) - 1))
+        if self.intensities is not None:
+            intensities = read_only(np.asarray(self.intensities))
+            if intensities.shape not in ((0,), ranges.shape):
+                raise ValueError(f"intensities must have shape {ranges.shape}, as the ranges, got {intensities.shape}")
+            object.__setattr__(self, "intensities", intensities if intensities.size else None)
+
+    def _check_numbers(self, last: int) -> None:
+        """Check everything but the arrays; `last` is the index of the last ray."""
+        for name in ("angle_min", "angle_increment", "time_increment", "scan_time", "range_min", "range_max"):
+            object.__setattr__(self, name, _number(getattr(self, name), name))
+        for name in ("angle_min", "angle_increment", "time_increment"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be finite, got {getattr(self, name)!r}")
+        if last and not self.angle_increment:
+            raise ValueError(f"angle_increment must not be 0 for a scan of {last + 1} rays")
+        if not self.range_min <= self.range_max:
+            raise ValueError(f"range_min must not be above range_max, got {self.range_min!r} and {self.range_max!r}")
+        computed = self.angle_min + last * self.angle_increment
+        angle_max = computed if self.angle_max is None else _number(self.angle_max, "angle_max")
+        object.__setattr__(self, "angle_max", angle_max)
+        sweep = from_seconds(last * self.time_increment)
+        if not isinstance(self.stamp, Latest):
+            as_stamp(self.stamp + sweep)
+
+    def to_points(self) -> PointCloud:
+        """What the rays hit, as a new cloud in the same frame, with the same stamp.
+
+        Returns
+        -------
+        PointCloud
+            Points of shape (m, 3), in the dtype of the ranges, of the m rays whose range counts. `stamps` are those of
+            the rays; None where the scan's is `LATEST`. The field "index" has the index of each ray in the scan, and
+            "intensities" what the scan has of them; both are named as in laser_geometry.
+        """
+        ranges = self.ranges
+        index = np.flatnonzero(np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max))
+        angles = self.angle_min + index * self.angle_increment
+        points = np.zeros((len(index), 3), ranges.dtype)
+        points[:, 0] = ranges[index] * np.cos(angles)
+        points[:, 1] = ranges[index] * np.sin(angles)
+        stamps = None
+        if not isinstance(self.stamp, Latest):
+            stamps = self.stamp + np.rint(index * self.time_increment * SECOND).astype(np.int64)
+        fields = {"index": index}
+        if self.intensities is not None:
+            fields["intensities"] = self.intensities[index]
+        return PointCloud(self.frame, self.stamp, points, stamps, fields)
+
+
+def _number(value: object, name: str) -> float:
+    if not is_real(value):
+        raise TypeError(f"{name} must be a number, not {value!r}")
+    return float(value)  # type: ignore[arg-type]

@@ -1,0 +1,148 @@
+"""Six numbers at once, three of translation and three of rotation: uncertain poses, velocities, and forces."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.data.arrays import Rebuilt, as_floats, read_only
+from tfbus.data.dispatch import do_transform, moved_header
+from tfbus.data.header import as_triple, check_header
+from tfbus.geometry import Transform, Vector, rotate
+from tfbus.stamped import TransformStamped
+from tfbus.stamps import Latest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseWithCovarianceStamped(Rebuilt):
+    """A pose and how uncertain it is. Equal only to itself.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    pose : Transform
+        Maps coordinates of the posed body into `frame`.
+    covariance : array of shape (6, 6), or 36 numbers row by row
+        Of (x, y, z, rotation about x, y, z) in m and rad, about the fixed axes of `frame`: the order of
+        geometry_msgs/PoseWithCovariance. Copied as float64, and read-only from then on. Only the shape is checked,
+        since messages write NaN or -1 for "unknown".
+
+    Notes
+    -----
+    A transform turns both sides, S -> diag(R, R) S diag(R, R)^T, as tf2_geometry_msgs does: the error is one of the
+    pose's own origin, so that no lever arm couples its halves, and the transform counts as certain. NaN stays in its
+    own 3x3 block. A -1 for "unknown" is turned like any number: look at it before.
+    """
+
+    frame: str
+    stamp: int | Latest
+    pose: Transform
+    covariance: npt.NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        if not isinstance(self.pose, Transform):
+            raise TypeError(f"pose must be a Transform, not {self.pose!r}")
+        covariance: npt.NDArray[Any] = as_floats(self.covariance, "covariance").astype(np.float64)
+        if covariance.shape not in ((6, 6), (36,)):
+            raise ValueError(f"covariance must have shape (6, 6) or (36,), got {covariance.shape}")
+        object.__setattr__(self, "covariance", read_only(covariance.reshape(6, 6)))
+
+
+@dataclass(frozen=True, slots=True)
+class TwistStamped:
+    """How a body moves, told at the origin of a frame that is fixed to it.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    linear : sequence of 3 floats
+        Velocity, in m/s along the axes of `frame`, of the body's point that is at the origin of `frame`.
+    angular : sequence of 3 floats
+        Angular velocity in rad/s about the axes of `frame`.
+
+    Notes
+    -----
+    A transform tells the same motion at the origin of another frame, and assumes that this one is fixed to the same
+    body: with R and t of target_from_source, angular' = R angular and linear' = R linear + t x angular'. This is the
+    adjoint map of Lynch and Park, "Modern Robotics", 2017, section 3.3.2, who write the angular part first.
+    """
+
+    frame: str
+    stamp: int | Latest
+    linear: Vector
+    angular: Vector
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        object.__setattr__(self, "linear", as_triple(self.linear, "linear"))
+        object.__setattr__(self, "angular", as_triple(self.angular, "angular"))
+
+
+@dataclass(frozen=True, slots=True)
+class WrenchStamped:
+    """A force and a torque on a body, told at the origin of a frame.
+
+    Parameters
+    ----------
+    frame : str
+    stamp : int or LATEST
+        ns.
+    force : sequence of 3 floats
+        In N along the axes of `frame`.
+    torque : sequence of 3 floats
+        In N m about the origin and along the axes of `frame`.
+
+    Notes
+    -----
+    A transform tells the same load at the origin of another frame: with R and t of target_from_source,
+    force' = R force and torque' = R torque + t x force'. This is the adjoint map of Lynch and Park, "Modern Robotics",
+    2017, section 3.4, who write the torque first; tf2 does the same in C++, and leaves out the lever arm in Python.
+    """
+
+    frame: str
+    stamp: int | Latest
+    force: Vector
+    torque: Vector
+
+    def __post_init__(self) -> None:
+        check_header(self)
+        object.__setattr__(self, "force", as_triple(self.force, "force"))
+        object.__setattr__(self, "torque", as_triple(self.torque, "torque"))
+
+
+@do_transform.register
+def _(data: PoseWithCovarianceStamped, transform: TransformStamped) -> PoseWithCovarianceStamped:
+    header = moved_header(data, transform)
+    turn = transform.transform.matrix()[:3, :3]
+    blocks = data.covariance.reshape(2, 3, 2, 3).swapaxes(1, 2)
+    turned = (turn @ blocks @ turn.T).swapaxes(1, 2).reshape(6, 6)
+    return PoseWithCovarianceStamped(*header, transform.transform @ data.pose, turned)
+
+
+@do_transform.register
+def _(data: TwistStamped, transform: TransformStamped) -> TwistStamped:
+    header = moved_header(data, transform)
+    linear, angular = _shifted(data.linear, data.angular, transform.transform)
+    return TwistStamped(*header, linear, angular)
+
+
+@do_transform.register
+def _(data: WrenchStamped, transform: TransformStamped) -> WrenchStamped:
+    header = moved_header(data, transform)
+    torque, force = _shifted(data.torque, data.force, transform.transform)
+    return WrenchStamped(*header, force, torque)
+
+
+def _shifted(moment: Vector, line: Vector, target_from_source: Transform) -> tuple[Vector, Vector]:
+    """A moment about the origin and the vector it belongs to, turned, and taken about the target's origin."""
+    turn = target_from_source.rotation
+    tx, ty, tz = target_from_source.translation
+    x, y, z = rotate(turn, *line)
+    mx, my, mz = rotate(turn, *moment)
+    return (mx + ty * z - tz * y, my + tz * x - tx * z, mz + tx * y - ty * x), (x, y, z)

@@ -1,0 +1,255 @@
+"""What a tree is asked: where one frame is, seen from another, at one stamp or at many, and how it moves."""
+
+import threading
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.batch import OutOfRange, finish, finish_points, survey, take
+from tfbus.data import PointCloud, TwistStamped
+from tfbus.errors import TransformLookupError
+from tfbus.forest import Forest
+from tfbus.resolve import GO_TOGETHER, At, resolve, resolve_travel
+from tfbus.stamped import TransformStamped, answer_of
+from tfbus.stamps import LATEST, as_stamp, as_stamps
+from tfbus.transform_array import TransformArray
+from tfbus.velocity import twist
+
+
+class TreeReader:
+    """The questions about transforms that a `TransformTree` answers.
+
+    The lock is held for one lookup, or while the samples for many are copied; never while numpy works on them.
+    """
+
+    def __init__(self, forest: Forest) -> None:
+        self._lock = threading.Lock()
+        self.forest = forest
+
+    def lookup(
+        self,
+        target: str,
+        source: str,
+        at: At = LATEST,
+        *,
+        source_at: At | None = None,
+        fixed: str | None = None,
+        not_before: int | None = None,
+    ) -> TransformStamped:
+        """Where `source` is, seen from `target`: the transform that maps source's data into target.
+
+        Parameters
+        ----------
+        target, source : str
+        at : int or LATEST
+            ns. `LATEST` is the newest stamp that every moving edge on the path can answer.
+        source_at : int or LATEST, optional
+            Take source at this stamp instead, and carry it to `at` through `fixed`.
+        fixed : str, optional
+            The frame that is held still between the two stamps.
+        not_before : int, optional
+            Count a `LATEST` answer older than this (ns) as not yet arrived.
+
+        Returns
+        -------
+        TransformStamped
+            Parent is target and child is source; its stamp is `at`, or the one that `LATEST` found. An answer whose
+            whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples. In time
+            travel, a `LATEST` that only static edges answer takes the stamp of source's leg.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError, FutureExtrapolationError
+            If it cannot be answered now, but may be later.
+        PastExtrapolationError
+            If it is older than an edge's window.
+        TypeError
+            If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
+            `not_before` comes without a `LATEST`.
+        """
+        return self.answer(target, source, at, source_at, fixed, not_before)
+
+    def answer(
+        self, target: str, source: str, at: At, source_at: At | None, fixed: str | None, not_before: int | None
+    ) -> TransformStamped:
+        """As `lookup`, without keywords: every one of them would cost a twentieth of a lookup."""
+        if not_before is not None and at is not LATEST and source_at is not LATEST:
+            raise TypeError("not_before goes with LATEST: an answer at a given stamp never gets newer")
+        if type(at) is not int and at is not LATEST:
+            at = as_stamp(at)
+        with self._lock:
+            if source_at is None and fixed is None:
+                stamp, row, static = resolve(self.forest, target, source, at, not_before)
+            else:
+                stamp, row, static = resolve_travel(self.forest, target, source, at, source_at, fixed, not_before)
+        return answer_of(target, source, stamp, row, static)
+
+    def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
+        """Whether `lookup` with the same arguments has an answer now."""
+        try:
+            self.lookup(target, source, at, **question)
+        except TransformLookupError:
+            return False
+        return True
+
+    def lookup_many(
+        self,
+        target: str,
+        source: str,
+        stamps: npt.ArrayLike,
+        *,
+        source_at: npt.ArrayLike | None = None,
+        fixed: str | None = None,
+        out_of_range: OutOfRange = "raise",
+    ) -> TransformArray:
+        """As `lookup`, at many stamps at once.
+
+        Parameters
+        ----------
+        target, source : str
+        stamps : integer array of shape (n,)
+            ns, in any order.
+        source_at : int, or integer array of shape (n,), optional
+            Take source at these stamps instead, and carry it to `stamps` through `fixed`.
+        fixed : str, optional
+            The frame that is held still between the two stamps.
+        out_of_range : {"raise", "nan"}
+            What becomes of stamps without an answer: an error that names the first, or NaN in their places.
+
+        Returns
+        -------
+        TransformArray
+            One transform a stamp, in the order of `stamps`.
+
+        Raises
+        ------
+        UnknownFrameError
+        DisconnectedError
+            If there is no path at some stamp; with ``"nan"``, only if there is none at any.
+        ExtrapolationError
+            If a stamp is outside an edge's window; `index` says which.
+        TypeError
+            If stamps are not integers, or only one of `source_at` and `fixed` is given.
+        ValueError
+            If shapes do not agree.
+        """
+        asked = as_stamps(stamps)
+        if (source_at is None) != (fixed is None):
+            raise TypeError(GO_TOGETHER)
+        source_stamps = None if source_at is None else _as_many(source_at, len(asked))
+        with self._lock:
+            taken = take(self.forest, target, source, asked, source_stamps, fixed)
+        return finish(taken, out_of_range)
+
+    def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
+        """A cloud from a moving sensor, as if all points had been seen at once, at the stamp of the cloud.
+
+        Each point goes by the transform of its own stamp into `fixed`, and from there into `target` at the stamp of the
+        cloud.
+
+        Parameters
+        ----------
+        cloud : PointCloud
+            With a stamp for each point. If its own is `LATEST`, that of the newest point is meant.
+        target : str
+            The frame of the result; often that of the cloud.
+        fixed : str
+            The frame that stands still meanwhile, such as ``"odom"``.
+        out_of_range : {"raise", "nan"}
+            As for `lookup_many`; points without an answer become NaN.
+
+        Returns
+        -------
+        PointCloud
+            In `target`, without stamps for the points, of the same float type and with the same fields.
+
+        Raises
+        ------
+        TransformLookupError
+            As for `lookup_many`.
+        ValueError
+            If the points have no stamps.
+        """
+        if cloud.stamps is None:
+            raise ValueError("the points of the cloud have no stamps")
+        at = cloud.stamp
+        if at is LATEST and len(cloud):
+            at = int(cloud.stamps.max())
+        with self._lock:
+            stamp, target_from_fixed, _ = resolve(self.forest, target, fixed, at, None)
+            self.forest.check_known(cloud.frame)
+            found = survey(self.forest, fixed, cloud.frame, cloud.stamps)
+        points = finish_points(found, cloud.points, target_from_fixed, out_of_range)
+        return PointCloud(target, stamp, points, fields=cloud.fields)
+
+    def twist(self, frame: str, reference: str, at: At = LATEST, *, expressed_in: str | None = None) -> TwistStamped:
+        """How `frame` moves, seen from `reference`: the derivative of what `lookup` interpolates.
+
+        Parameters
+        ----------
+        frame, reference : str
+        at : int or LATEST
+            ns. `LATEST` is the newest stamp at which all that is needed can be answered.
+        expressed_in : str, optional
+            The frame along whose axes the velocities are told; by default `reference`.
+
+        Returns
+        -------
+        TwistStamped
+            Its frame is `expressed_in`. `linear` is the velocity of the origin of `frame` in m/s, whatever the axes;
+            `angular` the angular velocity in rad/s. At a sample it is the derivative from before, at the first of an
+            edge's window that from after. An edge that has just been reparented and waits for its next sample stands
+            still.
+
+        Raises
+        ------
+        TransformLookupError
+            As `lookup`; and `FutureExtrapolationError` on an edge that has a single sample.
+
+        Notes
+        -----
+        With ``expressed_in=frame`` it is the twist of the body that the frame is fixed to, which `do_transform` carries
+        to other frames of the same body. tf2's `lookupVelocity` gives other numbers: it rotates what is in the
+        observer's axes once more by the body's rotation.
+        """
+        axes = reference if expressed_in is None else expressed_in
+        if at is not LATEST:
+            at = as_stamp(at)
+        with self._lock:
+            stamp, linear, angular = twist(self.forest, frame, reference, at, axes)
+        return TwistStamped(axes, stamp, linear, angular)
+
+    def latest_common_stamp(self, target: str, source: str) -> int | None:
+        """The stamp that `LATEST` means for these two frames, in ns; None where the whole path is static.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError, FutureExtrapolationError
+            As `lookup`.
+        """
+        with self._lock:
+            path = self.forest.find_path(target, source, LATEST)
+            return path.newest_common()[0] if path.moving else None
+
+    def chain(self, target: str, source: str, at: At = LATEST) -> list[str]:
+        """The frames on the path, from target to source, both included.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError
+        """
+        if at is not LATEST:
+            at = as_stamp(at)
+        with self._lock:
+            return list(self.forest.find_path(target, source, at).frames)
+
+
+def _as_many(source_at: npt.ArrayLike, count: int) -> npt.NDArray[np.int64]:
+    """As many stamps as there are questions, from one for all or one for each."""
+    if np.ndim(source_at) == 0:
+        return np.full(count, as_stamp(source_at))
+    stamps = as_stamps(source_at)
+    if len(stamps) != count:
+        raise ValueError(f"source_at must be one stamp, or have shape ({count},) as stamps has, got {stamps.shape}")
+    return stamps

@@ -1,0 +1,88 @@
+"""What a question amounts to: which stamp `LATEST` means, and the row along the path. The caller holds the lock."""
+
+from contextlib import suppress
+
+from tfbus.errors import DisconnectedError, ExtrapolationError, FutureExtrapolationError, TransformLookupError
+from tfbus.forest import Forest
+from tfbus.geometry import Row, compose
+from tfbus.path import Path, climb, find_path
+from tfbus.stamps import LATEST, Latest, as_stamp
+
+At = int | Latest
+Resolved = tuple[int, Row, bool]
+"""Stamp in ns, row, and whether the whole path is static."""
+
+GO_TOGETHER = "source_at and fixed go together: source at its stamp, carried through the fixed frame"
+
+
+def resolve(forest: Forest, target: str, source: str, at: At, not_before: int | None) -> Resolved:
+    """Source in target at one stamp. The errors are those of `TransformTree.lookup`."""
+    path = forest.paths.get((target, source))
+    if path is None:
+        path = forest.find_path(target, source, at)
+    if not path.moving:
+        if isinstance(at, Latest):
+            at = path.static_stamp if len(path.frames) > 1 else _newest_of(forest, target)
+        return as_stamp(at), path.row(0), True
+    if at is LATEST:
+        return _resolve_latest(forest, path, not_before)
+    try:
+        return at, climb(path.up, at) if not path.down else path.row(at), False
+    except ExtrapolationError:
+        raise path.blocker(as_stamp(at)) from None
+
+
+def _resolve_latest(forest: Forest, path: Path, not_before: int | None) -> Resolved:
+    """As `resolve`, at the newest stamp that every moving edge has reached."""
+    common, lagging = path.newest_common()
+    if not_before is not None and common < not_before:
+        raise lagging.missing(not_before)
+    try:
+        there = path
+        if not path.lasting:
+            there = find_path(forest.frames, path.frames[0], path.frames[-1], common)
+        return common, there.row(common), False
+    except TransformLookupError as error:
+        # The lagging edge has to come as far as the others still reach back; where a parent has changed, each step of
+        # it may do.
+        needed = common + 1
+        if path.lasting:
+            needed = max(common if edge.oldest is None else edge.oldest for edge in path.moving)
+        raise lagging.missing(needed) from error
+
+
+def resolve_travel(
+    forest: Forest,
+    target: str,
+    source: str,
+    at: At,
+    source_at: At | None,
+    fixed: str | None,
+    not_before: int | None,
+) -> Resolved:
+    """As `resolve`, with source at its own stamp, carried through the fixed frame."""
+    if source_at is None or fixed is None:
+        raise TypeError(GO_TOGETHER)
+    if source_at is not LATEST:
+        source_at = as_stamp(source_at)
+    for name in (target, source, fixed):
+        forest.check_known(name)
+    try:
+        stamp, target_from_fixed, static = resolve(forest, target, fixed, at, not_before)
+    except FutureExtrapolationError:
+        # Waiting for this leg is no use if it cannot help the other one.
+        resolve(forest, fixed, source, source_at, not_before)
+        raise
+    except DisconnectedError:
+        with suppress(DisconnectedError, FutureExtrapolationError):
+            resolve(forest, fixed, source, source_at, not_before)
+        raise
+    source_stamp, fixed_from_source, still = resolve(forest, fixed, source, source_at, not_before)
+    if at is LATEST and static and not still:
+        stamp = source_stamp
+    return stamp, compose(target_from_fixed, fixed_from_source), static and still
+
+
+def _newest_of(forest: Forest, frame: str) -> int:
+    history = forest.frames.get(frame)
+    return 0 if history is None else history.static_stamp or history.newest or 0

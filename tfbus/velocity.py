@@ -1,0 +1,118 @@
+"""How fast a frame moves: the analytic derivative of what the lookup interpolates.
+
+Between two samples the origin moves on a straight line at a constant velocity, and slerp turns at a constant angular
+velocity about an axis that stands still in the parent. At a sample the derivative is the one from before; at the first
+sample of a window, or of a new parent, it is the one from after.
+"""
+
+import math
+from bisect import bisect_left
+from typing import NamedTuple
+
+from tfbus.forest import Forest
+from tfbus.geometry import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
+from tfbus.history import RECORD, RECORD_SIZE, FrameHistory
+from tfbus.path import Path, Step, climb
+from tfbus.resolve import At, resolve
+from tfbus.stamps import LATEST, SECOND
+
+STILL: Vector = (0.0, 0.0, 0.0)
+
+
+class Motion(NamedTuple):
+    """Where a frame is and how it moves, seen from another; everything along that one's axes."""
+
+    row: Row
+    linear: Vector
+    """Velocity of the frame's origin in m/s."""
+    angular: Vector
+    """Angular velocity in rad/s."""
+
+
+def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tuple[int, Vector, Vector]:
+    """The stamp, and a frame's linear and angular velocity seen from `reference`, along the axes of a third frame.
+
+    The errors are those of `TransformTree.twist`. The caller holds the lock.
+    """
+    stamp, _, static = resolve(forest, reference, frame, at, None)
+    if at is LATEST:
+        other, _, still = resolve(forest, axes, reference, at, None)
+        stamp = other if static else stamp if still else min(stamp, other)
+    axes_from_reference = resolve(forest, axes, reference, stamp, None)[1]
+    _, linear, angular = _motion(forest.find_path(reference, frame, stamp), stamp)
+    turn = axes_from_reference[3:]
+    return stamp, rotate(turn, *linear), rotate(turn, *angular)
+
+
+def _motion(path: Path, at: int) -> Motion:
+    """How the source of a path moves, seen from its target.
+
+    Both ends are seen from the common ancestor first. Then the target's own motion is taken off, as in Craig,
+    "Introduction to Robotics", 3rd edition, section 5.3, and what is left is told along the target's axes.
+    """
+    above, below = _climb(path.up, at), _climb(path.down, at)
+    arm = _difference(above.row[:3], below.row[:3])
+    linear = _difference(_difference(above.linear, below.linear), _cross(below.angular, arm))
+    angular = _difference(above.angular, below.angular)
+    back = invert(below.row)
+    turn = back[3:]
+    return Motion(compose(back, above.row), rotate(turn, *linear), rotate(turn, *angular))
+
+
+def _climb(steps: tuple[Step, ...], at: int) -> Motion:
+    """The motion of the first step's child, seen from the last step's parent."""
+    row, linear, angular = Motion(IDENTITY, STILL, STILL)
+    for step in steps:
+        here = _edge_motion(step, at) if isinstance(step, FrameHistory) else Motion(step, STILL, STILL)
+        turn = here.row[3:]
+        arm = rotate(turn, *row[:3])
+        linear = _sum(_sum(here.linear, _cross(here.angular, arm)), rotate(turn, *linear))
+        angular = _sum(here.angular, rotate(turn, *angular))
+        row = compose(here.row, row)
+    return Motion(row, linear, angular)
+
+
+def _edge_motion(edge: FrameHistory, at: int) -> Motion:
+    row = climb((edge,), at)
+    i = bisect_left(edge.stamps, at)
+    if edge.stamps[i] == at and not _joined(edge, i):
+        i += 1
+        if not _joined(edge, i):
+            # A lone sample says where the frame is, but not where it is going.
+            raise edge.missing(at + 1)
+    elif edge.parents is not None and edge.origins[i - 1][0] != edge.origins[i][0]:
+        return Motion(row, STILL, STILL)
+    stamp, ax, ay, az, *before = RECORD.unpack_from(edge.records, (i - 1) * RECORD_SIZE)
+    until, bx, by, bz, *after = RECORD.unpack_from(edge.records, i * RECORD_SIZE)
+    rate = SECOND / (until - stamp)
+    linear = (bx - ax) * rate, (by - ay) * rate, (bz - az) * rate
+    return Motion(row, linear, _turn_rate(tuple(before), tuple(after), rate))
+
+
+def _joined(edge: FrameHistory, i: int) -> bool:
+    """Whether there is a segment from the sample before to this one: both in the window, with the same parent."""
+    if not edge.start < i < len(edge.stamps):
+        return False
+    return edge.parents is None or edge.origins[i - 1][0] == edge.origins[i][0]
+
+
+def _turn_rate(before: Quaternion, after: Quaternion, rate: float) -> Vector:
+    """The constant angular velocity that turns one rotation into the next along the shorter arc, in the parent."""
+    x, y, z, w = compose((0.0, 0.0, 0.0, *after), invert((0.0, 0.0, 0.0, *before)))[3:]
+    sine = math.hypot(x, y, z)
+    if sine == 0.0:
+        return STILL
+    scale = 2.0 * math.atan2(sine, abs(w)) / sine * (-rate if w < 0.0 else rate)
+    return x * scale, y * scale, z * scale
+
+
+def _sum(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _difference(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
