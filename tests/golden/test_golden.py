@@ -1,0 +1,56 @@
+"""tfbus answers what the real tf2 answered, or what is stated beside that: see README.md."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import bags
+import pytest
+import recording_files
+from deviations import DEVIATIONS
+from steps import Step
+from tfbus_replay import disagreements
+
+PATHS = sorted(recording_files.FOLDER.glob("*.json"))
+BAG_THEMES = {"pr2_tf", "turtlesim"}
+THEMES = {path.stem: recording_files.read(path) for path in PATHS}
+
+
+def replays() -> list[Any]:
+    """Every recorded scenario; one on a bag only where the bag is."""
+    found = []
+    for theme, scenarios in THEMES.items():
+        bag = f"{theme}.bag"
+        skip = pytest.mark.skipif(
+            theme in BAG_THEMES and not bags.is_there(bag), reason=f"{bag} is not in ../shared/data beside the checkout"
+        )
+        found += [pytest.param(scenario, id=f"{theme}: {scenario['scenario']}", marks=skip) for scenario in scenarios]
+    return found
+
+
+@pytest.mark.parametrize("recorded", replays())
+def test_tfbus_answers_what_tf2_did_or_deviates_as_stated(recorded: Step) -> None:
+    assert list(disagreements(recorded)) == []
+
+
+def test_every_deviation_is_in_the_table_and_has_cases_and_nothing_else_is() -> None:
+    table = (Path(__file__).parent / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+?) \| (ros2|design) \|.*\| ([^|]+?) \| ([^|]+?) \|$", table, re.MULTILINE)
+    listed = {name: (expected_by, reason, cases) for name, expected_by, reason, cases in rows}
+    assert len(listed) == len(rows)
+    stated: dict[str, tuple[str, str, set[str]]] = {}
+    for theme, scenarios in THEMES.items():
+        for step in (step for scenario in scenarios for step in scenario["steps"] if "deviation" in step):
+            facts = step["expected_by"], step["reason"]
+            assert stated.setdefault(step["deviation"], (*facts, set()))[:2] == facts
+            stated[step["deviation"]][2].add(theme)
+    assert listed == {name: (by, reason, ", ".join(sorted(themes))) for name, (by, reason, themes) in stated.items()}
+    assert {name: (by, reason) for name, (by, reason, _) in stated.items()} == DEVIATIONS
+
+
+def test_the_recordings_hold_thousands_of_questions_to_at_least_a_hundred_random_trees() -> None:
+    by_hand = {"changes", "latest", "names", "shapes", "values", "windows"}
+    assert set(THEMES) == by_hand | BAG_THEMES | {"random"}
+    questions = [step for scenario in THEMES["random"] for step in scenario["steps"] if step.keys() & {"lookup", "can"}]
+    assert len(THEMES["random"]) >= 100
+    assert len(questions) >= 3_000

@@ -1,0 +1,18 @@
+"""What tfbus calls what tf2 answers; there is nothing for what tfbus has no counterpart of."""
+
+TRANSLATION = {
+    "LookupException": "UnknownFrameError",
+    "ConnectivityException": "DisconnectedError",
+    "TransformException: disconnected": "DisconnectedError",
+    "ExtrapolationException: future": "FutureExtrapolationError",
+    "ExtrapolationException: past": "PastExtrapolationError",
+    "ExtrapolationException: one sample, asked for the future": "FutureExtrapolationError",
+    "ExtrapolationException: one sample, asked for the past": "PastExtrapolationError",
+    "ExtrapolationException: no samples": "FutureExtrapolationError",
+    "TF_OLD_DATA": "expired",
+    "TF_SELF_TRANSFORM": "invalid",
+    "TF_NO_CHILD_FRAME_ID": "invalid",
+    "TF_NO_FRAME_ID": "invalid",
+    "TF_NAN_INPUT": "invalid",
+    "TF_DENORMALIZED_QUATERNION": "invalid",
+}
