@@ -1,8 +1,11 @@
-"""Short ways to write samples of which only the parent, the stamp and x matter."""
+"""Short ways to write samples of which only the parent, the stamp and x matter, and to ask for that x."""
+
+from collections.abc import Iterable
+from typing import Any
 
 from hypothesis import strategies as st
 
-from tfbus import Transform, TransformStamped
+from tfbus import LATEST, Latest, Transform, TransformStamped, TransformTree
 
 
 def moving(parent: str, child: str, stamp: int, x: float = 0.0, authority: str = "") -> TransformStamped:
@@ -15,6 +18,11 @@ def static(parent: str, child: str, x: float = 0.0, stamp: int = 0, authority: s
     return TransformStamped(parent, child, stamp, Transform((x, 0.0, 0.0)), authority, static=True)
 
 
+def over(parent: str, child: str, stamps: Iterable[int], speed: float = 1.0) -> list[TransformStamped]:
+    """Samples at some stamps, x going at `speed` m a ns."""
+    return [moving(parent, child, stamp, speed * stamp) for stamp in stamps]
+
+
 def any_samples(names: str, last: int) -> st.SearchStrategy[TransformStamped]:
     """Samples of either kind between any two of some one-letter frames, stamped 0 to `last`; quick to draw."""
     ends = st.tuples(st.sampled_from(names), st.sampled_from(names)).filter(lambda pair: pair[0] != pair[1])
@@ -22,3 +30,15 @@ def any_samples(names: str, last: int) -> st.SearchStrategy[TransformStamped]:
     kinds = st.sampled_from((moving, static))
     stamps = st.integers(0, last)
     return st.builds(lambda kind, pair, stamp, x: kind(*pair, stamp=stamp, x=x), kinds, ends, stamps, x)
+
+
+def tree_of(*batch: TransformStamped, keep: float | None = 10.0) -> TransformTree:
+    """A tree with a batch in it."""
+    tree = TransformTree(keep)
+    tree.insert_many(batch)
+    return tree
+
+
+def x_of(tree: TransformTree, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> float:
+    """What a lookup tells of x, in m."""
+    return tree.lookup(target, source, at, **question).transform.translation[0]

@@ -191,3 +191,94 @@ def test_a_closed_bus_refuses_every_way_of_sending() -> None:
         broadcaster.send_all([("map", "a", HERE)])
     with pytest.raises(BusClosedError):
         broadcaster.send_static("map", "a", HERE)
+
+
+# Owning
+
+
+def test_an_owned_frame_is_reserved_meanwhile_and_removed_at_the_end() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    arm, other = TransformBroadcaster(bus, "arm"), TransformBroadcaster(bus, "other")
+    with arm.owning("tool0", "tool1"):
+        for name in ("tool0", "tool1"):
+            arm.send_static("flange", name, HERE)
+            with pytest.raises(InvalidTransformError, match="reserved for 'arm'") as caught:
+                other.send("flange", name, HERE)
+            assert (caught.value.reason, caught.value.authority, caught.value.owner) == ("reserved", "other", "arm")
+        assert buffer.can_transform("tool0", "tool1")
+    assert buffer.tree.frames() == []
+    assert Buffer(bus).tree.frames() == []
+    other.send("flange", "tool0", HERE)
+    assert buffer.can_transform("flange", "tool0")
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, GeneratorExit])
+def test_whatever_ends_the_block_the_frame_is_gone(error: type[BaseException]) -> None:
+    bus = Bus(SimulatedClock())
+    arm = TransformBroadcaster(bus, "arm")
+    with pytest.raises(error), arm.owning("tool0"):
+        arm.send_static("flange", "tool0", HERE)
+        raise error
+    assert bus.statistics().frames == 0
+    bus.reserve("tool0", "other").close()
+
+
+async def test_cancellation_removes_the_frame_too() -> None:
+    bus = Bus(SimulatedClock())
+    arm = TransformBroadcaster(bus, "arm")
+
+    async def work() -> None:
+        with arm.owning("tool0"):
+            arm.send_static("flange", "tool0", HERE)
+            await anyio.sleep_forever()
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(work)
+        await settle()
+        assert bus.statistics().frames == 1
+        tasks.cancel_scope.cancel()
+    assert bus.statistics().frames == 0
+
+
+def test_a_frame_that_was_never_published_or_is_gone_already_makes_no_trouble() -> None:
+    bus = Bus(SimulatedClock())
+    arm = TransformBroadcaster(bus, "arm")
+    with arm.owning("tool0", "tool1", "tool2"):
+        arm.send_static("flange", "tool1", HERE)
+        arm.send_static("flange", "tool2", HERE)
+        bus.remove_frame("tool1")
+    assert bus.statistics().frames == 0
+
+
+def test_the_bus_may_be_closed_before_the_block_ends() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    arm = TransformBroadcaster(bus, "arm")
+    with arm.owning("tool0"):
+        arm.send_static("flange", "tool0", HERE)
+        bus.close()
+    assert buffer.can_transform("flange", "tool0"), "nothing changes any more on a closed bus"
+
+
+def test_of_several_frames_all_are_reserved_or_none() -> None:
+    bus = Bus(SimulatedClock())
+    arm, other = TransformBroadcaster(bus, "arm"), TransformBroadcaster(bus, "other")
+    arm.send_static("flange", "tool0", HERE)
+    block = arm.owning("tool0", "tool1")
+    with other.owning("tool1"), pytest.raises(InvalidTransformError, match="'tool1' is reserved for 'other'"), block:
+        pytest.fail("the block began")
+    assert bus.statistics().frames == 1, "what could not be owned is not removed either"
+    other.send("flange", "tool0", HERE)
+
+
+def test_owning_needs_a_frame() -> None:
+    with pytest.raises(TypeError, match="at least one frame"), TransformBroadcaster(Bus()).owning():
+        pytest.fail("the block began")
+
+
+def test_nothing_is_owned_before_the_block_begins() -> None:
+    bus = Bus(SimulatedClock())
+    block = TransformBroadcaster(bus, "arm").owning("tool0")
+    with bus.reserve("tool0", "other"), pytest.raises(InvalidTransformError), block:
+        pytest.fail("the block began")

@@ -1,3 +1,4 @@
+import sys
 import tracemalloc
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import asdict
@@ -20,6 +21,7 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
+from tfbus.ownership import OnConflict
 
 pytestmark = pytest.mark.anyio
 
@@ -227,6 +229,158 @@ def test_only_what_was_published_can_be_removed() -> None:
     assert caught.value.close_matches == ("base",)
 
 
+def test_a_removed_frame_is_gone_from_streams_threads_queues_and_what_waits_for_subscribers() -> None:
+    bus = Bus(SimulatedClock())
+    batches: list[Batch] = []
+
+    def remove_once(batch: Batch) -> None:
+        if batch[0].child == "a":
+            bus.publish([moving("map", "b", 1), moving("map", "c", 1)])
+            bus.remove_frame("b")
+
+    bus.subscribe(remove_once)
+    bus.subscribe(batches.append)
+    with bus.stream(overflow="drop_oldest") as stream:
+        bus.publish(moving("map", "a", 1))
+        assert len(stream.queue) == 2
+        assert [queue.dropped for queue in bus.statistics().queues] == [1]
+    assert batches == [(moving("map", "a", 1),), (moving("map", "c", 1),)]
+
+
+async def test_a_waiter_learns_that_a_frame_was_removed() -> None:
+    bus = Bus(SimulatedClock())
+    with Buffer(bus) as buffer:
+        bus.publish([driving("map", "base", 1.0), static("base", "laser")])
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, partial(buffer.lookup, "map", "laser", 2_000_000_000))
+            await settle()
+            (before,) = buffer.pending()
+            assert isinstance(before.blocked_by, FutureExtrapolationError)
+            bus.remove_frame("laser")
+            await settle()
+            (after,) = buffer.pending()
+            assert isinstance(after.blocked_by, UnknownFrameError)
+            assert after.blocked_by.frame == "laser"
+            bus.publish([driving("map", "base", 2.0), static("base", "laser")])
+            await settle()
+            assert asked.answer.stamp == 2_000_000_000
+
+
+def test_removing_a_frame_looks_at_no_other() -> None:
+    bus = Bus(SimulatedClock())
+    with Buffer(bus), bus.stream(), bus.events():
+        bus.publish(moving("map", f"frame {number}", 1) for number in range(2_000))
+        visited = 0
+
+        def count(*_: object) -> None:
+            nonlocal visited
+            visited += 1
+
+        sys.setprofile(count)
+        try:
+            bus.remove_frame("frame 7")
+        finally:
+            sys.setprofile(None)
+    assert visited < 200
+
+
+# Authorities
+
+
+def test_the_first_authority_keeps_a_child_and_another_one_hears_of_it() -> None:
+    bus = Bus(SimulatedClock(), on_conflict="reject")
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "odom", 1, 1.0, authority="slam"))
+    with pytest.raises(
+        InvalidTransformError, match="'slam', who was first: no sample of it is taken from ''"
+    ) as caught:
+        bus.publish([moving("map", "new", 2), moving("map", "odom", 2, 2.0)])
+    assert (caught.value.reason, caught.value.owner, caught.value.authority) == ("authority", "slam", "")
+    assert buffer.tree.frames() == ["map", "odom"]
+    bus.publish([moving("map", "new", 2), moving("map", "odom", 2, 2.0)], invalid="drop")
+    assert buffer.lookup_nowait("map", "odom").transform.translation == (1.0, 0.0, 0.0)
+    assert buffer.can_transform("map", "new")
+    assert bus.statistics().rejected == {"authority": 2}
+    assert bus.statistics().authority_conflicts == 0
+
+
+@pytest.mark.parametrize("free", [lambda bus: bus.remove_frame("odom"), lambda bus: bus.clock.set(0)])
+def test_a_frame_that_is_forgotten_is_free_for_the_next_authority(free: Callable[[Bus], object]) -> None:
+    bus = Bus(SimulatedClock(start=5), on_conflict="reject")
+    bus.publish(moving("map", "odom", 5, authority="slam"))
+    free(bus)
+    bus.publish(moving("map", "odom", 1, authority="odometry"))
+    with pytest.raises(InvalidTransformError, match="'odometry', who was first"):
+        bus.publish(moving("map", "odom", 6, authority="slam"))
+
+
+@pytest.mark.parametrize("policy", ["last", "reject"])
+@pytest.mark.parametrize("make", [moving, static])
+def test_from_a_reservation_on_only_the_new_authority_may_publish(
+    policy: OnConflict, make: Callable[..., TransformStamped]
+) -> None:
+    bus = Bus(SimulatedClock(), on_conflict=policy)
+    old, new = (make("map", "odom", stamp=3, authority=name) for name in ("odometry", "slam"))
+    bus.publish(old)
+    bus.publish(old)
+    with bus.reserve("odom", authority="slam"):
+        for samples in (old, [moving("map", "base", 4), old]):
+            with pytest.raises(InvalidTransformError) as caught:
+                bus.publish(samples)
+            assert (caught.value.reason, caught.value.owner, caught.value.authority) == ("reserved", "slam", "odometry")
+        bus.publish(new)
+        bus.publish(new)
+        with pytest.raises(InvalidTransformError):
+            bus.publish(old)
+        assert bus.statistics().authority_conflicts == 0, "a reservation is a handover, and no quarrel"
+    assert bus.statistics().frames == 1
+    assert bus.statistics().rejected == {"reserved": 3}
+    if policy == "last":
+        bus.publish(old)
+        assert bus.statistics().authority_conflicts == 1
+    else:
+        with pytest.raises(InvalidTransformError, match="'slam', who was first"):
+            bus.publish(old)
+
+
+def test_a_reservation_that_nobody_used_leaves_all_as_it_was() -> None:
+    bus = Bus(SimulatedClock(), on_conflict="reject")
+    bus.publish(moving("map", "odom", 1, authority="odometry"))
+    with bus.reserve("odom", authority="slam"):
+        pass
+    bus.publish(moving("map", "odom", 2, authority="odometry"))
+    bus.publish(moving("map", "odom", 3, authority="odometry"))
+    assert bus.statistics().samples == 3
+
+
+def test_a_reservation_outlives_the_removal_of_its_frame_and_the_bus() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.reserve("odom", authority="slam"):
+        bus.publish(moving("map", "odom", 1, authority="slam"))
+        bus.remove_frame("odom")
+        with pytest.raises(InvalidTransformError, match="reserved for 'slam'"):
+            bus.publish(moving("map", "odom", 1, authority="odometry"))
+        bus.close()
+
+
+def test_a_quarrel_fills_neither_the_log_nor_the_events(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    bus = Bus(SimulatedClock())
+    with bus.events() as events:
+        for stamp in range(1_000):
+            parent, authority = (("map", "slam"), ("world", "gps"))[stamp % 2]
+            bus.publish(moving(parent, "odom", stamp, authority=authority))
+        assert len(events.queue) == 4, "a new frame, the conflict, and what each of the two claims"
+    statistics = bus.statistics()
+    assert (statistics.authority_conflicts, statistics.reparented) == (999, 999)
+    assert len(caplog.messages) == 3
+
+
+def test_a_misspelt_policy_for_conflicts_is_refused() -> None:
+    with pytest.raises(ValueError, match="on_conflict must be 'last' or 'reject', not 'first'"):
+        Bus(on_conflict="first")  # type: ignore[arg-type]
+
+
 # Latched statics
 
 
@@ -307,6 +461,8 @@ CALLS: list[Callable[[Bus], object]] = [
     lambda bus: bus.subscribe(print),
     lambda bus: bus.stream(),
     lambda bus: bus.threadsafe(),
+    lambda bus: bus.events(),
+    lambda bus: bus.reserve("map", authority="slam"),
     lambda bus: Buffer(bus),
     lambda bus: TransformBroadcaster(bus).send_static("map", "a", moving("map", "a", 1).transform),
 ]
@@ -417,6 +573,47 @@ def test_a_long_run_keeps_memory_flat() -> None:
     statistics = bus.statistics()
     assert statistics.samples == 12_000
     assert sum(asdict(statistics.buffers[0])[outcome] for outcome in ("inserted", "replaced")) == 12_000
+
+
+def test_frames_that_come_and_go_keep_memory_flat(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("CRITICAL", logger="tfbus")
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    ours, theirs = TransformBroadcaster(bus, "tools"), TransformBroadcaster(bus, "rogue")
+    transform = static("map", "hand").transform
+    ours.send_static("map", "hand", transform)
+
+    def come_and_go(numbers: range) -> None:
+        for number in numbers:
+            name = f"object {number}"
+            if number % 3 == 0:
+                with ours.owning(name):
+                    ours.send_static("hand", name, transform)
+                    buffer.lookup_nowait("map", name)
+            elif number % 3 == 1:
+                with bus.reserve(name, authority="tools"):
+                    ours.send("hand", name, transform)
+                    buffer.lookup_nowait("map", name)
+                    bus.remove_frame(name)
+            else:
+                ours.send_static("hand", name, transform)
+                theirs.send("map", name, transform)
+                buffer.lookup_nowait("map", name)
+                bus.remove_frame(name)
+
+    with bus.stream(capacity=10, overflow="drop_oldest"), bus.stream(), bus.events(capacity=10):
+        come_and_go(range(2_000))
+        tracemalloc.start()
+        try:
+            come_and_go(range(2_000, 4_000))
+            before, _ = tracemalloc.get_traced_memory()
+            come_and_go(range(4_000, 20_000))
+            after, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert after - before < 20_000, "not two bytes a name"
+    assert bus.statistics().frames == 1
+    assert buffer.tree.frames() == ["hand", "map"]
 
 
 @pytest.mark.anyio

@@ -1,5 +1,7 @@
 """The demos as a user runs them."""
 
+import cmath
+import math
 import re
 import runpy
 import socket
@@ -64,6 +66,87 @@ def test_the_demo_of_future_transforms_runs_as_a_script() -> None:
     )
     assert done.returncode == 0
     assert len(done.stdout.splitlines()) == 3
+
+
+def test_the_demo_of_a_drop_out_tells_how_far_off_each_answer_is() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "drop_out.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+    held, straight, refused, nearest = done.stdout.splitlines()
+    # The chord of the turn since the sample, on a circle of radius 2 m and with 4 s a turn.
+    assert f"{4 * math.sin(math.pi / 4 * 0.2):.2f} m off (extrapolated by 0.20 s, gap 0.00 s)" in held
+    assert f"{2 - 2 * math.cos(math.pi / 4):.2f} m off (extrapolated by 0.00 s, gap 1.00 s)" in straight
+    assert "between samples at 2.000 s and 3.000 s, which are 1 s apart" in refused
+    assert f"{4 * math.sin(math.pi / 4 * 0.1):.2f} m off (extrapolated by 0.10 s, gap 0.00 s)" in nearest
+
+
+@pytest.mark.anyio
+async def test_one_robot_sees_the_gripper_of_another_with_the_same_frames(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = SimulatedClock()
+    demo = load("two_robots.py")
+    await simulate(clock, lambda: demo["main"](clock))
+    *moments, heading, first, _, _, last = capsys.readouterr().out.splitlines()
+    assert len(moments) == 3
+    for seconds, line in zip((0.2, 0.6, 1.0), moments, strict=True):
+        # The map's plane as complex numbers; each robot looks along its circle.
+        angles = cmath.exp(0.5j * seconds), cmath.exp(1j * seconds)
+        camera, gripper = 2 * angles[0] + 0.2j * angles[0], 3 * angles[1] + 0.5j * angles[1]
+        seen = (gripper - camera) / (1j * angles[0])
+        assert line == (
+            f"after {seconds} s, gripper in map: ({gripper.real:.3f}, {gripper.imag:.3f}, 0.400); "
+            f"robot2/gripper in robot1/camera: ({seen.real:.3f}, {seen.imag:.3f}, -0.600)"
+        )
+    assert heading == "'robot2/gripper' in 'robot1/camera', latest: 1.000 s"
+    assert re.fullmatch(r"  robot1/camera -> robot1/base_link +static +from 'robot1'", first)
+    assert re.fullmatch(r"  robot2/base_link <- robot2/gripper +static +from 'robot2'", last)
+
+
+def test_the_demo_of_two_robots_runs_as_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "two_robots.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) == 8
+
+
+def test_the_demo_of_a_watch_redraws_no_more_than_can_be_seen() -> None:
+    done = subprocess.run([sys.executable, DEMOS / "watch.py"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0
+    *redrawn, summary = done.stdout.splitlines()
+    numbers = [re.findall(r"\d+\.\d+", line) for line in redrawn]
+    # In a hurry ten times a second, with the sample of the turn before; then whenever 0.1 m is full at 2.4 mm a sample.
+    hurried = [(0.0, 0.0), *((k / 10, 1.5 * (k / 10 - 0.01)) for k in range(1, 11))]
+    crept = [(2.36 + 0.42 * k, 1.5 + 0.24 * (0.36 + 0.42 * k)) for k in range(7)]
+    expected = [[f"{time:.2f}", f"{x:.3f}"] for time, x in hurried + crept]
+    assert numbers == expected
+    # While a redraw is held back, all samples but the last go by: of 9 at first, of 10 in a hurry, of 9 in a creep.
+    assert summary == f"redrawn {len(expected)} times; {8 + 9 * 10 + 7 * 8} updates went by unseen"
+
+
+@pytest.mark.anyio
+async def test_the_demo_of_a_message_filter_places_five_detections_and_tells_of_the_other_two(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = SimulatedClock()
+    demo = load("message_filter.py")
+    await simulate(clock, lambda: demo["main"](clock))
+    lines = capsys.readouterr().out.splitlines()
+    # At t s the robot is at t m, and what it sees is 2 m ahead; odometry is 80 ms late.
+    placed = [f"x = {2.5 + 0.1 * tick:.3f} m, 80 ms after it was seen" for tick in range(5)]
+    assert [line for line in lines if line.startswith("x")] == placed
+    old, unknown = (line for line in lines if line.startswith("dropped"))
+    assert old.startswith("dropped, too old: frame 'camera': asked for -59.300 s, oldest sample is -0.080 s")
+    assert unknown.endswith("frame 'arm_camera' is not known, did you mean 'camera'?")
+    assert lines[-1] == "7 detections, 5 placed, dropped: {'too old': 1, 'unknown frame': 1}"
+
+
+def test_the_demo_of_a_message_filter_runs_as_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "message_filter.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1].startswith("7 detections")
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from tfbus import (
     DisconnectedError,
     ExtrapolationError,
     FutureExtrapolationError,
+    GapError,
     InvalidTransformError,
     LookupTimeoutError,
     PastExtrapolationError,
@@ -68,6 +69,21 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
             authority="odometry",
         ),
         "frame 'base_link': asked for 1.000 s, oldest sample is 2.500 s (1.5 s too early), from 'odometry'",
+    ),
+    (
+        GapError(
+            child="base_link",
+            stamp=from_seconds(3),
+            oldest=from_seconds(2.5),
+            newest=from_seconds(12.5),
+            authority="odometry",
+            slack=from_seconds(0.05),
+            before=from_seconds(2.5),
+            after=from_seconds(4.5),
+            max_gap=from_seconds(0.5),
+        ),
+        "frame 'base_link': asked for 3.000 s within 50 ms, between samples at 2.500 s and 4.500 s, "
+        "which are 2 s apart (at most 500 ms), from 'odometry'",
     ),
     (
         LookupTimeoutError(target="map", source="base_link", timeout=0.25, missing=SHORT),
@@ -198,6 +214,7 @@ def test_an_extrapolation_error_holds_its_facts() -> None:
         "oldest": 2_090_000_000,
         "newest": 12_090_000_000,
         "authority": "odometry",
+        "slack": 0,
     }
 
 
@@ -213,7 +230,7 @@ def test_the_other_errors_hold_their_facts() -> None:
     late = LookupTimeoutError(target="t", source="s", timeout=0.5, missing=SHORT)
     assert facts(late) == {"target": "t", "source": "s", "timeout": 0.5}
     invalid = InvalidTransformError(
-        "no", reason="cycle", parent="b", child="a", authority="odometry", loop=("a", "b", "a")
+        "no", reason="cycle", parent="b", child="a", authority="odometry", loop=("a", "b", "a"), owner="slam"
     )
     assert facts(invalid) == {
         "reason": "cycle",
@@ -221,6 +238,7 @@ def test_the_other_errors_hold_their_facts() -> None:
         "child": "a",
         "authority": "odometry",
         "loop": ("a", "b", "a"),
+        "owner": "slam",
     }
     assert facts(ClockResetError(before=9, after=3)) == {"before": 9, "after": 3}
 
@@ -331,3 +349,18 @@ def test_a_timeout_is_caught_as_what_it_is_before_os_error() -> None:
         raise LookupTimeoutError(target="map", source="tool0", timeout=1.0, missing=SHORT) from SHORT
     assert isinstance(caught.value, OSError)
     assert caught.value.__cause__ is SHORT
+
+
+LOOKUP_ERRORS = [error for error, _ in ONE_OF_EACH if isinstance(error, TransformLookupError)]
+
+
+@pytest.mark.parametrize("error", LOOKUP_ERRORS, ids=lambda error: type(error).__name__)
+def test_where_many_stamps_were_asked_for_an_error_says_which_it_was(error: TransformLookupError) -> None:
+    assert error.index is None
+    one_of_many = copy.copy(error)
+    one_of_many.index = 17
+    assert str(one_of_many) == f"stamps[17]: {error}"
+    assert error.index is None
+    for twin in (pickle.loads(pickle.dumps(one_of_many)), copy.deepcopy(one_of_many)):
+        assert_same_error(twin, one_of_many)
+        assert twin.index == 17

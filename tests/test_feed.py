@@ -105,17 +105,29 @@ def test_who_asks_below_a_frame_looks_again_when_it_changes_what_its_past_sample
     assert woken == ["a"]
 
 
-def test_a_removed_frame_wakes_everybody() -> None:
+def test_a_removed_frame_wakes_who_asks_for_it_or_below_it() -> None:
     feed = Feed(None)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 1), moving("map", "b", 1)))
-    park(feed, "map", "a", 9, woken)
-    park(feed, "map", "b", 9, woken)
+    feed.receive((moving("map", "a", 1), moving("map", "b", 1), moving("b", "c", 1)))
+    for source in "abc":
+        park(feed, "map", source, 9, woken)
     feed.remove_frame("nobody")
     assert woken == []
     feed.remove_frame("b")
-    assert sorted(woken) == ["a", "b"]
-    assert feed.tree.frames() == ["a", "map"]
+    assert sorted(woken) == ["b", "c"]
+    assert feed.tree.frames() == ["a", "b", "c", "map"]
+    feed.remove_frame("a")
+    assert sorted(woken) == ["a", "b", "c"]
+    assert feed.tree.frames() == ["b", "c"]
+
+
+def test_a_root_that_goes_with_its_last_child_wakes_who_asks_for_it() -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("map", "a", 1), moving("world", "b", 1)))
+    park(feed, "map", "b", 9, woken)
+    feed.remove_frame("a")
+    assert woken == ["b"]
 
 
 def test_a_reset_drops_moving_samples_keeps_statics_and_wakes_everybody() -> None:
@@ -284,3 +296,19 @@ def test_only_its_bus_changes_the_tree_of_a_buffer() -> None:
     own = feed.tree.copy()
     own.insert(moving("map", "a", 2))
     assert (feed.tree.latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)
+
+
+def test_whoever_asks_hears_of_each_end_or_at_once_of_one_that_was() -> None:
+    feed = Feed(10.0)
+    heard: list[str] = []
+    early = feed.on_end(lambda: heard.append("early"))
+    gone = feed.on_end(lambda: heard.append("gone"))
+    gone.close()
+    assert heard == []
+    feed.end("the bus is closed")
+    assert heard == ["early"]
+    feed.on_end(lambda: heard.append("late"))
+    assert heard == ["early", "late"]
+    early.close()
+    feed.end("the buffer is closed")
+    assert heard == ["early", "late", "late"]

@@ -124,3 +124,23 @@ def test_an_emptied_frame_keeps_its_place_as_long_as_nothing_contradicts_it() ->
     known.store(moving("odom", "base", 1))
     known.store(moving("world", "map", 1))
     assert known.find_path("world", "base", LATEST).frames == ("world", "map", "odom", "base")
+
+
+# Many stamps
+
+
+def test_the_parents_of_all_frames_change_at_these_stamps_in_order() -> None:
+    known = forest(*(moving(parent, "b", at) for parent, at in (("a", 0), ("z", 30), ("a", 50))), static("b", "s"))
+    assert known.parent_changes() == [30, 50]
+    for sample in (moving("a", "c", 5), moving("b", "c", 10), moving("a", "d", 20), moving("z", "d", 30)):
+        known.store(sample)
+    assert known.parent_changes() == [10, 30, 50], "a stamp at which two frames change counts once"
+
+
+def test_a_copy_with_shorter_windows_knows_the_frames_that_are_left_in_them() -> None:
+    known = forest(moving("old", "b", 0), moving("a", "b", 10), static("a", "c"), window=100)
+    short = known.within(5)
+    assert (short.names.sorted(), known.names.sorted()) == (("a", "b", "c"), ("a", "b", "c", "old"))
+    assert (short.window, short.changed, short.joined) == (5, set(), set())
+    short.store(moving("a", "b", 20))
+    assert (len(short.frames["b"]), len(known.frames["b"])) == (1, 2)

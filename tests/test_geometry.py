@@ -14,7 +14,7 @@ from strategies import angles, rotations, small_angles, transforms, unit_vectors
 from transforms3d import affines, axangles, euler, quaternions
 
 from tfbus import InvalidTransformError, Transform, TransformError
-from tfbus.geometry import Quaternion, Vector
+from tfbus.geometry import Columns, Quaternion, Vector, compose, invert, rotate
 
 HALF = math.sqrt(0.5)
 QUARTER_TURN_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)
@@ -648,3 +648,39 @@ def test_the_repr_makes_the_same_transform(a: Transform) -> None:
 def test_an_integer_beyond_every_float_is_not_finite() -> None:
     with pytest.raises(InvalidTransformError, match="not finite"):
         Transform((10**400, 0, 0))
+
+
+# Columns: many rows at once
+
+
+def columns_of(many: list[Transform]) -> Columns:
+    x, y, z, qx, qy, qz, qw = np.array([(*t.translation, *t.rotation) for t in many]).T
+    return x, y, z, qx, qy, qz, qw
+
+
+def rows_of(columns: Columns) -> list[list[float]]:
+    rows: list[list[float]] = np.array(columns).T.tolist()
+    return rows
+
+
+@given(st.lists(st.tuples(transforms(), transforms()), min_size=1, max_size=4))
+def test_columns_compose_and_invert_to_the_bit_as_their_rows_do(both: list[tuple[Transform, Transform]]) -> None:
+    a, b = columns_of([one for one, _ in both]), columns_of([other for _, other in both])
+    products = [one @ other for one, other in both]
+    assert rows_of(compose(a, b)) == rows_of(columns_of(products))
+    assert rows_of(invert(a)) == rows_of(columns_of([one.inverse() for one, _ in both]))
+
+
+@given(transforms(), st.lists(transforms(), min_size=1, max_size=4))
+def test_a_row_composes_with_columns_from_either_side(one: Transform, many: list[Transform]) -> None:
+    row: Columns = (*one.translation, *one.rotation)
+    columns = columns_of(many)
+    assert rows_of(compose(row, columns)) == rows_of(columns_of([one @ other for other in many]))
+    assert rows_of(compose(columns, row)) == rows_of(columns_of([other @ one for other in many]))
+
+
+@given(st.lists(st.tuples(rotations(), vectors()), min_size=1, max_size=4))
+def test_columns_of_vectors_are_turned_to_the_bit_as_each(both: list[tuple[Quaternion, Vector]]) -> None:
+    turns, points = np.array([turn for turn, _ in both]).T, np.array([point for _, point in both]).T
+    found = np.array(rotate((*turns,), *points)).T.tolist()
+    assert found == [list(rotate(turn, *point)) for turn, point in both]

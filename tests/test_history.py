@@ -1,13 +1,15 @@
 import random
 from collections.abc import Iterable
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tfbus import LATEST, SECOND, FutureExtrapolationError, Latest, Outcome, PastExtrapolationError
 from tfbus.geometry import Row
-from tfbus.history import RECORD, FrameHistory
+from tfbus.history import RECORD, FrameHistory, Samples
 from tfbus.path import climb
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
@@ -308,6 +310,38 @@ def test_a_copy_shares_nothing() -> None:
     assert samples.newest == 30
 
 
+def test_a_copy_with_another_window_begins_with_what_counts_and_forgets_by_its_own_window() -> None:
+    samples = history(keep=160, stamps=range(0, 170, 5))
+    assert (samples.oldest, samples.stamps[0]) == (5, 0), "one sample that does not count any more is still there"
+    long, short = samples.within(None), samples.within(100)
+    assert (long.oldest, short.oldest) == (5, 65)
+    assert long.insert("parent", 1, row(1.0), "") is INSERTED
+    assert samples.insert("parent", 1, row(1.0), "") is EXPIRED
+    assert short.insert("parent", 64, row(1.0), "") is EXPIRED
+    short.insert("parent", 170, row(170.0), "")
+    assert (short.oldest, long.oldest, samples.newest) == (70, 1, 165)
+
+
+def test_a_copy_with_a_shorter_window_knows_no_parent_that_has_left_it() -> None:
+    samples = history(keep=100, stamps=[0, 10])
+    samples.insert("other", 20, row(20.0), "sender")
+    both, one = samples.within(20), samples.within(5)
+    assert (set(both.mentioned), set(one.mentioned)) == ({"parent", "other"}, {"other"})
+    assert (one.parents, one.changed) == (None, False)
+    assert set(samples.mentioned) == {"parent", "other"}
+
+
+def test_a_static_sample_and_an_empty_history_fit_any_window() -> None:
+    fixed = FrameHistory("child", "parent", static=True, keep=10)
+    fixed.insert_static("parent", 3, row(1.0), "sender")
+    assert fixed.within(0).edge() == fixed.edge()
+    emptied = history(stamps=[10])
+    emptied.clear()
+    twin = emptied.within(5)
+    assert (len(twin), twin.parent) == (0, "parent")
+    assert twin.insert("parent", 1, row(1.0), "") is INSERTED
+
+
 def test_a_million_samples_take_no_more_than_the_window_and_its_slack() -> None:
     samples = history(keep=1_000, stamps=[0])
     pose = row(1.0)
@@ -334,3 +368,71 @@ def test_parents_that_alternate_for_ever_take_no_more_than_the_window() -> None:
         samples.insert(f"parent {stamp % 2}", stamp, row(0.0), "")
         assert len(samples.stamps) <= 1_001
     assert set(samples.mentioned) == {"parent 0", "parent 1"}
+
+
+# What many lookups take
+
+
+def test_the_parent_changes_at_the_first_sample_that_names_another() -> None:
+    samples = history(stamps=[10, 20])
+    assert samples.parent_changes() == []
+    for stamp, parent in ((30, "p"), (40, "p"), (50, "q"), (60, "p")):
+        samples.insert(parent, stamp, row(0.0), "")
+    assert samples.parent_changes() == [30, 50, 60]
+    samples.insert("q", 25, row(0.0), "")
+    assert samples.parent_changes() == [25, 30, 50, 60]
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 30), st.sampled_from("pq")), min_size=1, max_size=20), st.sampled_from([5, None])
+)
+def test_between_two_changes_the_parent_stays(samples: list[tuple[int, str]], keep: int | None) -> None:
+    made = FrameHistory("child", "p", static=False, keep=keep)
+    for stamp, parent in samples:
+        made.insert(parent, stamp, row(0.0), "")
+    every = [made.parent_at(stamp) for stamp in range(-1, 32)]
+    assert made.parent_changes() == [at for at in range(31) if every[at] != every[at + 1]]
+
+
+def numpy_rows(samples: Samples) -> npt.NDArray[np.float64]:
+    return np.frombuffer(samples.records, np.float64).reshape(-1, 8)[:, 1:]
+
+
+@settings(deadline=None)
+@given(st.permutations(range(8)), st.integers(0, 70), st.integers(0, 70))
+def test_between_two_stamps_numpy_reads_what_was_put_in(order: list[int], one: int, other: int) -> None:
+    low, high = sorted((one, other))
+    samples = FrameHistory("child", "parent", static=False, keep=None)
+    for number in order:
+        samples.insert("parent", 10 * number, (number, 0.1, -0.2, 0.5, 0.5, -0.5, 0.5), "")
+    taken = samples.between(low, high)
+    # From the last sample not after the first stamp, to the first sample not before the last stamp.
+    numbers = range(low // 10, -(-high // 10) + 1)
+    assert np.frombuffer(taken.stamps, np.int64).tolist() == [10 * number for number in numbers]
+    assert numpy_rows(taken).tolist() == [[number, 0.1, -0.2, 0.5, 0.5, -0.5, 0.5] for number in numbers]
+    assert taken.parents is None
+
+
+def test_what_is_taken_is_a_copy_so_that_the_history_can_grow_while_numpy_looks_at_it() -> None:
+    samples = history(stamps=[10, 20, 30])
+    taken = samples.between(10, 30)
+    stamps, rows = np.frombuffer(taken.stamps, np.int64), numpy_rows(taken)
+    samples.insert("parent", 40, row(40.0), "")
+    samples.insert("parent", 20, row(-1.0), "")
+    samples.clear()
+    assert (stamps.tolist(), rows[:, 0].tolist()) == ([10, 20, 30], [10.0, 20.0, 30.0])
+
+
+def test_each_sample_is_taken_with_its_parent_where_there_are_several() -> None:
+    samples = history(stamps=[10, 20])
+    for stamp in (30, 40, 50):
+        samples.insert("new", stamp, row(0.0), "")
+    taken = samples.between(15, 35)
+    assert (list(taken.stamps), taken.parents) == ([10, 20, 30, 40], ["parent", "parent", "new", "new"])
+
+
+def test_nothing_is_taken_that_has_left_the_window() -> None:
+    # The window's slack, a sixteenth, is ten here: what has left the window is still in memory.
+    samples = history(keep=160, stamps=range(166))
+    assert list(samples.between(5, 6).stamps) == [5, 6]

@@ -233,18 +233,16 @@ class Game:
         self.check_statistics()
 
     def ask(self, ask: Ask, tasks: TaskGroup) -> Waiting:
-        seconds = {"at": ask.at, "source_at": ask.source_at}
-        stamps = {name: LATEST if value is None else value * SECOND for name, value in seconds.items()}
-        if ask.fixed is None:
-            del stamps["source_at"]
+        at, source_at = (LATEST if seconds is None else seconds * SECOND for seconds in (ask.at, ask.source_at))
         lookup = partial(
             self.buffers[ask.buffer].lookup,
             ask.target,
             ask.source,
+            at,
+            source_at=None if ask.fixed is None else source_at,
             fixed=ask.fixed,
             max_age=ask.max_age,
             timeout=ask.timeout,
-            **stamps,
         )
         return Waiting(ask, Asked(tasks, lookup), self.elapsed + (math.inf if ask.timeout is None else ask.timeout))
 

@@ -2,7 +2,7 @@ import logging
 
 import pytest
 
-from tfbus.once import OnceLogger
+from tfbus.once import Once, OnceLogger
 
 LOGGER = logging.getLogger("tests.once")
 
@@ -55,3 +55,11 @@ def test_memory_is_bounded_and_the_oldest_of_a_thousand_keys_is_forgotten_first(
     once.warning(1, "the oldest that is remembered")
     once.warning(0, "the forgotten one")
     assert caplog.messages == ["the forgotten one"]
+
+
+def test_a_key_is_the_first_of_its_kind_until_it_is_forgotten() -> None:
+    once = Once(remembered=2)
+    assert [once.first(key) for key in "aabb"] == [True, False, True, False]
+    assert once.first("c")
+    assert not once.first("b")
+    assert once.first("a")

@@ -332,3 +332,24 @@ def test_a_path_has_an_answer_exactly_where_every_moving_edge_has_one(windows: l
         with pytest.raises(ExtrapolationError):
             path.row(at)
         assert isinstance(path.blocker(at), PastExtrapolationError) == any(at < low for low, _ in windows)
+
+
+@pytest.mark.parametrize(("target", "source"), ["ac", "ca", "ab", "bd", "cd", "aa"])
+def test_a_row_at_each_of_some_stamps_is_the_row_at_each(target: str, source: str) -> None:
+    frames = forest(
+        moving("a", "b", [(0, at_x(0.0)), (10, at_x(10.0))]),
+        moving("b", "c", [(0, Transform((1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))), (10, at_x(4.0))]),
+        static("a", "d", at_x(8.0)),
+    )
+    path = find_path(frames, target, source, None)
+    assert path.rows([7, 0, 10, 7]) == [path.row(at) for at in (7, 0, 10, 7)]
+    assert path.rows([]) == []
+
+
+def test_rows_are_given_only_where_every_edge_has_one() -> None:
+    frames = forest(moving("a", "b", [(0, at_x(0.0)), (10, at_x(1.0))]))
+    for target, source in ("ab", "ba"):
+        path = find_path(frames, target, source, None)
+        with pytest.raises(FutureExtrapolationError) as caught:
+            path.rows([5, 11, -1])
+        assert caught.value.stamp == 11

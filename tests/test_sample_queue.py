@@ -116,16 +116,17 @@ def test_an_emptied_queue_has_its_whole_capacity_again() -> None:
 
 
 @pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])
-def test_a_forgotten_child_is_taken_out_without_counting_as_dropped(overflow: Overflow) -> None:
+def test_of_a_forgotten_child_the_moving_samples_count_as_dropped(overflow: Overflow) -> None:
     queue = SampleQueue(2, overflow)
     queue.put((moving("map", "a", 1), static("map", "s")))
     queue.put((moving("map", "b", 1),))
     queue.forget("a")
     queue.forget("s")
+    queue.forget("never heard of")
     assert emptied(queue) == [(moving("map", "b", 1),)]
-    assert queue.dropped == 0
+    assert queue.dropped == 1
     queue.put((moving("map", "c", 1), moving("map", "d", 1)))
-    assert queue.dropped == 0
+    assert queue.dropped == 1, "there is room for two again"
 
 
 @pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])

@@ -1,6 +1,7 @@
 import copy
 import math
 import pickle
+from array import array
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from strategies import TODAY, stamps
 
 from tfbus import LATEST, SECOND, from_seconds, to_seconds
-from tfbus.stamps import as_duration, as_stamp, format_duration, format_stamp
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, as_stamp, as_stamps, format_duration, format_stamp
 
 HUGE = pytest.param(10**400, id="huge")
 UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": SECOND}
@@ -159,3 +160,69 @@ def test_latest_stays_the_one_and_only_when_pickled_or_copied() -> None:
 def test_a_duration_is_any_real_number(seconds: float) -> None:
     duration = as_duration(seconds, "timeout")
     assert (type(duration), duration) == (float, 2.0)
+
+
+# Many
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [5, -1, 5],
+        (5, -1, 5),
+        range(5, 8),
+        [np.int8(5), 7],
+        np.array([5, -1], np.int16),
+        np.array([5, 200], np.uint8),
+        np.array([5, 2**62], np.uint64),
+        np.array([5, -1], ">i8"),
+        np.array([5, -1], object),
+        np.arange(10)[::-3],
+        array("q", [5, -1]),
+        [],
+        np.array([]),
+        [STAMP_MIN, STAMP_MAX],
+    ],
+)
+def test_any_integers_become_an_array_of_stamps(values: Any) -> None:
+    found = as_stamps(values)
+    assert (found.dtype, found.shape) == (np.dtype(np.int64), (len(values),))
+    assert found.tolist() == [int(value) for value in values]
+
+
+def test_what_is_an_array_of_stamps_already_is_not_copied() -> None:
+    values = np.arange(5)
+    assert as_stamps(values) is values
+
+
+@pytest.mark.parametrize("bad", [1.5, 1.0, None, "1", True, np.True_, LATEST, np.float64(1.0), [1]])
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_what_is_not_an_integer_is_no_stamp_beside_others_either(bad: object, place: int) -> None:
+    values: list[Any] = [5, 6]
+    values.insert(place, bad)
+    for sequence in (values, tuple(values)):
+        with pytest.raises(TypeError, match="int of nanoseconds"):
+            as_stamps(sequence)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.bool_, np.complex128, "M8[s]", "U3"])
+def test_an_array_of_anything_else_is_no_array_of_stamps(dtype: Any) -> None:
+    with pytest.raises(TypeError, match="int of nanoseconds"):
+        as_stamps(np.array([1, 0], np.int64).astype(dtype))
+
+
+def test_the_float_among_many_is_named_with_the_way_to_convert_it() -> None:
+    with pytest.raises(TypeError, match=r"from_seconds\(2\.5\)"):
+        as_stamps([1, 2.5])
+
+
+@pytest.mark.parametrize("values", [[2**63], [-1, 2**63], [2**64, 0], np.array([0, 2**63], np.uint64)])
+def test_many_stamps_fit_64_bits_each(values: Any) -> None:
+    with pytest.raises(ValueError, match="64-bit"):
+        as_stamps(values)
+
+
+@pytest.mark.parametrize("values", [5, [[5], [6]], np.zeros((2, 0), np.int64), np.array(5)])
+def test_many_stamps_are_a_row(values: Any) -> None:
+    with pytest.raises(ValueError, match=r"shape \(n,\), got \("):
+        as_stamps(values)

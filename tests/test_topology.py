@@ -9,12 +9,14 @@ from hypothesis import strategies as st
 from samples import any_samples, moving, static
 
 from tfbus import InvalidTransformError, TransformStamped
+from tfbus.announcer import Announcer
 from tfbus.once import OnceLogger
+from tfbus.ownership import Ownership
 from tfbus.topology import Topology, admit
 
 
 def topology(*batches: Sequence[TransformStamped]) -> Topology:
-    made = Topology(OnceLogger(logging.getLogger("tfbus")))
+    made = Topology(OnceLogger(logging.getLogger("tfbus")), Ownership("last"), Announcer(lambda: 0))
     for batch in batches:
         made.take(tuple(batch), "raise")
     return made

@@ -32,6 +32,7 @@ from tfbus import (
     TransformTree,
     UnknownFrameError,
 )
+from tfbus.batch import FEW
 
 Matrix = npt.NDArray[np.float64]
 At = int | Latest
@@ -431,6 +432,22 @@ class TreeMachine(RuleBasedStateMachine):
             assert facts_raised(travel) in blocked.acceptable
         else:
             assert_same(travel(), expected)
+
+    @rule(ends=questions, data=st.data(), times=st.sampled_from((1, FEW)))
+    def ask_for_many_at_once(self, ends: tuple[str, str], data: st.DataObject, times: int) -> None:
+        drawn = [self.draw_stamp(data) for _ in range(4)]
+        stamps = [at for at in drawn if not isinstance(at, Latest)]
+        lookup_many = partial(self.tree.lookup_many, *ends, stamps * times)
+        try:
+            self.model.check_known(*ends)
+            expected = [self.model.lookup(*ends, at) for at in stamps]
+        except Circle:
+            assert_it_ends(lookup_many)
+        except Blocked as blocked:
+            assert facts_raised(lookup_many) in blocked.acceptable
+        else:
+            matrices = [answer.matrix for answer in expected] * times
+            assert np.allclose(lookup_many().matrices(), np.reshape(matrices, (-1, 4, 4)), rtol=0, atol=1e-9)
 
     @rule(ends=questions, data=st.data())
     def ask_for_the_chain(self, ends: tuple[str, str], data: st.DataObject) -> None:

@@ -28,6 +28,7 @@ from tfbus.errors import (
     DisconnectedError,
     ExtrapolationError,
     FutureExtrapolationError,
+    GapError,
     InvalidTransformError,
     LookupTimeoutError,
     PastExtrapolationError,
@@ -35,8 +36,25 @@ from tfbus.errors import (
     TransformLookupError,
     UnknownFrameError,
 )
+from tfbus.event_stream import EventStream
+from tfbus.events import (
+    AuthorityConflict,
+    ClockReset,
+    Event,
+    FrameAdded,
+    FrameLive,
+    FrameRemoved,
+    FrameStale,
+    KindChanged,
+    Reparented,
+    SampleRejected,
+    SubscriberFailed,
+)
+from tfbus.explanation import ExplainedEdge, Explanation
 from tfbus.geometry import Transform
 from tfbus.history import Edge, Outcome
+from tfbus.message_filter import MessageFilter
+from tfbus.policy import Hold
 from tfbus.registration import Registration
 from tfbus.stamped import TransformStamped
 from tfbus.stamps import LATEST, SECOND, Latest, from_seconds, to_seconds
@@ -47,25 +65,40 @@ from tfbus.ticks import Ticks
 from tfbus.transform_array import TransformArray
 from tfbus.tree import TransformTree
 from tfbus.waiting import PendingLookup, Question
+from tfbus.watch import Watch
 
 __all__ = [
     "LATEST",
     "SECOND",
+    "AuthorityConflict",
     "Buffer",
     "BufferStatistics",
     "Bus",
     "BusClosedError",
     "BusStatistics",
     "Clock",
+    "ClockReset",
     "ClockResetError",
     "DisconnectedError",
     "Edge",
+    "Event",
+    "EventStream",
+    "ExplainedEdge",
+    "Explanation",
     "ExtrapolationError",
+    "FrameAdded",
+    "FrameLive",
+    "FrameRemoved",
+    "FrameStale",
     "FutureExtrapolationError",
+    "GapError",
+    "Hold",
     "InvalidTransformError",
+    "KindChanged",
     "LaserScan",
     "Latest",
     "LookupTimeoutError",
+    "MessageFilter",
     "Outcome",
     "PastExtrapolationError",
     "PendingLookup",
@@ -78,9 +111,12 @@ __all__ = [
     "Question",
     "QueueStatistics",
     "Registration",
+    "Reparented",
+    "SampleRejected",
     "SimulatedClock",
     "Stamped",
     "Stream",
+    "SubscriberFailed",
     "SystemClock",
     "ThreadPublisher",
     "Ticks",
@@ -94,6 +130,7 @@ __all__ = [
     "TwistStamped",
     "UnknownFrameError",
     "Vector3Stamped",
+    "Watch",
     "WrenchStamped",
     "do_transform",
     "from_seconds",

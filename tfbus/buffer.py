@@ -1,32 +1,27 @@
 """A tree that a bus feeds, and lookups that wait for what is still missing."""
 
-import logging
-import math
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Any, TypeVar
 
-import anyio
-import anyio.lowlevel
-
 from tfbus.bus import Bus
-from tfbus.data import Stamped, check_registered, do_transform
-from tfbus.errors import (
-    BusClosedError,
-    ClockResetError,
-    LookupTimeoutError,
-    TransformLookupError,
-    UnknownFrameError,
-)
+from tfbus.data import Stamped, do_transform
+from tfbus.data_question import question_of
+from tfbus.errors import TransformLookupError
+from tfbus.explanation import Explanation
 from tfbus.feed import Feed
-from tfbus.once import OnceLogger
-from tfbus.stamped import TransformStamped, is_frame
-from tfbus.stamps import LATEST, Latest, as_duration, from_seconds
+from tfbus.picture import describe
+from tfbus.policy import Hold, policy_of
+from tfbus.prefix import Prefix
+from tfbus.registration import Registration
+from tfbus.stamped import TransformStamped
+from tfbus.stamps import LATEST, Latest
 from tfbus.tree import TransformTree
-from tfbus.waiting import MAY_COME, PendingLookup, Question, Waiter, blocking_frames
+from tfbus.waiting import PendingLookup, Question
+from tfbus.waiting_room import WaitingRoom
+from tfbus.watch import Watch
 
 DataT = TypeVar("DataT", bound=Stamped)
-
-_REPORT_AFTER = 5.0
 
 
 class Buffer:
@@ -38,24 +33,57 @@ class Buffer:
         It feeds the buffer from now on, what is latched included, and holds it until `close`.
     keep : float or None
         How much history to keep for each frame, in s before that frame's newest stamp; None keeps everything.
+    prefix : str, optional
+        What the bus has before the names of this buffer's frames, such as ``"robot1/"``, so that several robots with
+        the same frames can share a bus. All methods take and give names without it.
+    shared : iterable of str
+        Names that have no prefix, because they are the same for everybody, such as ``{"map"}``.
+    prefill : Buffer or TransformTree, optional
+        Start with a copy of its history, as far as `keep` reaches. If it is a buffer on the same bus, this one then
+        answers as if it had been there all along. Otherwise, what is latched on this bus comes on top, and the stamps
+        of both have to be of one time: a sample older than the window that it falls into expires as always.
 
     Raises
     ------
     BusClosedError
         If the bus is closed.
     ValueError
-        If `keep` is negative.
+        If `keep` is negative; if the prefix, or a shared name, is empty or starts with a slash, or a shared name
+        starts with the prefix.
+    TypeError
+        If an argument is of another type.
 
     Notes
     -----
     `lookup_nowait` and `tree` may be used from any thread; what is awaited, only on the bus's event loop.
+
+    With a prefix, another robot's frames have no name here: to ask for them, use a buffer without one. `tree` and all
+    errors have the names of the bus; pictures and explanations write a frame that is somebody else's with a slash
+    in front.
     """
 
-    def __init__(self, bus: Bus, keep: float | None = 10.0) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keep: float | None = 10.0,
+        *,
+        prefix: str | None = None,
+        shared: Iterable[str] = (),
+        prefill: "Buffer | TransformTree | None" = None,
+    ) -> None:
         self.bus = bus
         self._clock = bus.clock
+        self._prefix = None if prefix is None else Prefix(prefix, shared)
         self._feed = Feed(keep)
-        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._room = WaitingRoom(self._feed, bus.clock, bus.check_thread, self._prefix)
+        answer = self._feed.tree.answer
+        self._answer = answer if self._prefix is None else self._prefix.around(answer)
+        if prefill is not None:
+            tree = prefill.tree if isinstance(prefill, Buffer) else prefill
+            if not isinstance(tree, TransformTree):
+                raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
+            bus.check_thread()
+            self._feed.prefill(tree)
         bus.attach(self._feed)
 
     @property
@@ -72,6 +100,9 @@ class Buffer:
         max_age: float | None = None,
         source_at: int | Latest | None = None,
         fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> TransformStamped:
         """Where `source` is, seen from `target`, or an error at once. See `TransformTree.lookup`.
 
@@ -82,7 +113,7 @@ class Buffer:
             ns.
         max_age : float, optional
             Count a `LATEST` answer older than this many s as not yet arrived.
-        source_at, fixed
+        source_at, fixed, tolerance, max_gap, extrapolate
             As `TransformTree.lookup`.
 
         Raises
@@ -90,8 +121,12 @@ class Buffer:
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
         """
-        not_before = None if max_age is None else self._not_before(max_age, at, source_at)
-        return self._feed.tree.answer(target, source, at, source_at, fixed, not_before)
+        not_before = None if max_age is None else self._room.not_before(max_age, at, source_at)
+        policy = None
+        if tolerance != 0.0 or max_gap is not None or extrapolate is not None:
+            # Not called for nothing, which would cost a twentieth of a lookup.
+            policy = policy_of(tolerance, max_gap, extrapolate)
+        return self._answer(target, source, at, source_at, fixed, not_before, policy)
 
     async def lookup(
         self,
@@ -103,6 +138,9 @@ class Buffer:
         max_age: float | None = None,
         source_at: int | Latest | None = None,
         fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> TransformStamped:
         """Where `source` is, seen from `target`, as soon as that can be answered.
 
@@ -124,6 +162,8 @@ class Buffer:
             Take source at this stamp instead, and carry it to `at` through `fixed`.
         fixed : str, optional
             The frame that is held still between the two stamps.
+        tolerance, max_gap, extrapolate
+            As `TransformTree.lookup`. The wait ends at the first moment at which they allow an answer.
 
         Returns
         -------
@@ -136,6 +176,8 @@ class Buffer:
             If the timeout ran out; its ``__cause__`` says what was still missing.
         PastExtrapolationError
             If it is older than an edge's window.
+        GapError
+            If it lies in a gap that is too long.
         BusClosedError
             If it cannot be answered and nothing more will come.
         ClockResetError
@@ -145,19 +187,9 @@ class Buffer:
         TypeError
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
-        limit = math.inf if timeout is None else as_duration(timeout, "timeout")
-        reset = self._feed.last_reset
-        await anyio.lowlevel.checkpoint()
-        question = Question(target, source, at, source_at, fixed)
-        try:
-            return self._read(question, max_age, reset)
-        except MAY_COME as error:
-            for name in (target, source, fixed):
-                if name is not None and not is_frame(name):
-                    raise UnknownFrameError(frame=name, known=self.tree.frames()) from None
-            blocker = error
-        self.bus.check_thread()
-        return await self._wait(question, max_age, limit, reset, blocker)
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        question = Question(target, source, at, source_at, fixed, max_age, policy)
+        return await self._room.wait(self._on_bus(question), timeout)
 
     async def transform(
         self,
@@ -168,6 +200,9 @@ class Buffer:
         max_age: float | None = None,
         at: int | Latest | None = None,
         fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> DataT:
         """`data` in the frame `target`, by the transform of their own stamp, as soon as that has arrived.
 
@@ -182,6 +217,8 @@ class Buffer:
             Move the data from their own stamp to this one (ns), through `fixed`.
         fixed : str, optional
             The frame that is held still between the two stamps.
+        tolerance, max_gap, extrapolate
+            As `lookup`. The data do not say what was done; where that matters, look the transform up.
 
         Returns
         -------
@@ -196,8 +233,8 @@ class Buffer:
         TransformError
             As `lookup`.
         """
-        question = _question_of(data, target, at, fixed)
-        moved: DataT = do_transform(data, await self.lookup(**question, timeout=timeout, max_age=max_age))
+        question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        moved: DataT = do_transform(data, await self._room.wait(self._on_bus(question), timeout))
         return moved
 
     def transform_nowait(
@@ -208,10 +245,13 @@ class Buffer:
         max_age: float | None = None,
         at: int | Latest | None = None,
         fixed: str | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> DataT:
         """As `transform`, or an error at once."""
-        question = _question_of(data, target, at, fixed)
-        moved: DataT = do_transform(data, self.lookup_nowait(**question, max_age=max_age))
+        question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        moved: DataT = do_transform(data, self._room.ask(self._on_bus(question)))
         return moved
 
     def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
@@ -222,20 +262,122 @@ class Buffer:
             return False
         return True
 
+    def watch(
+        self,
+        target: str,
+        source: str,
+        *,
+        min_translation: float = 0.0,
+        min_rotation: float = 0.0,
+        max_rate: float | None = None,
+        max_age: float | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> Watch:
+        """The answer at `LATEST` whenever it has changed: ``with buffer.watch(...) as w: async for transform in w``.
+
+        It starts with the present answer and then compares with the last one that it gave. A slow reader gets what is
+        newest when it reads, and nobody is woken by an insertion elsewhere in the tree. While there is no answer it
+        waits, as `lookup` does, and goes on with the next one. Of the errors of `lookup` none is raised: at `LATEST`
+        nothing is too old or in a gap for good, it only waits for the edge that lags.
+
+        Parameters
+        ----------
+        target, source : str
+        min_translation : float
+            Give an answer when source has moved by so many m.
+        min_rotation : float
+            Give an answer when it has turned by so many rad. With both, either will do; without any, every answer with
+            another stamp or value is given.
+        max_rate : float, optional
+            Give no more than this many answers per s on the bus's clock. Only the last, after the end, may come sooner.
+        max_age : float, optional
+            Count an answer that is older than this many s as none. It does not end by itself what was given already.
+        tolerance, max_gap, extrapolate
+            As `lookup`.
+
+        Returns
+        -------
+        Watch
+            It belongs to the buffer until it is closed. When the clock jumps back, it raises `ClockResetError` once and
+            starts over; when it, the buffer or the bus is closed, it ends, after what had changed before.
+
+        Raises
+        ------
+        UnknownFrameError
+            If a name cannot be that of a frame: empty, or with a leading slash.
+        TypeError, ValueError
+            If a threshold is negative or an angle of more than pi, a rate is not greater than zero, or something is not
+            a number.
+        """
+        self.bus.check_thread()
+        question = Question(target, source, LATEST, max_age=max_age, policy=policy_of(tolerance, max_gap, extrapolate))
+        return Watch(
+            self._on_bus(question),
+            min_translation,
+            min_rotation,
+            max_rate,
+            self._feed,
+            self._room,
+            self._clock,
+            self.bus.check_thread,
+        )
+
+    def explain(
+        self,
+        target: str,
+        source: str,
+        at: int | Latest = LATEST,
+        *,
+        max_age: float | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> Explanation:
+        """How `lookup_nowait` with these arguments comes to its answer, or all that keeps it from one.
+
+        See `TransformTree.explain`; ages are counted from the clock's now.
+        """
+        asked = self._on_bus(Question(target, source, at))
+        found = self.tree.explain(
+            asked.target,
+            asked.source,
+            at,
+            not_before=None if max_age is None else self._room.not_before(max_age, at, None),
+            tolerance=tolerance,
+            max_gap=max_gap,
+            extrapolate=extrapolate,
+            now=self._clock.now(),
+        )
+        return found if self._prefix is None else self._prefix.explanation(found, target, source)
+
     def pending(self) -> tuple[PendingLookup, ...]:
-        """The lookups that wait now, with what blocks each."""
-        return self._feed.waiting.pending()
+        """The lookups that wait now, and the watches without an answer, with what blocks each."""
+        pending = self._feed.waiting.pending()
+        return pending if self._prefix is None else tuple(map(self._prefix.pending, pending))
 
     def describe(self) -> str:
         """The tree as text, with each edge's rate, age, span and authority, and the lookups that wait."""
-        lines = [self.tree.describe(self._clock.now())]
+        edges = self.tree.edges()
+        if self._prefix is not None:
+            edges = sorted(map(self._prefix.edge, edges), key=lambda edge: edge.child)
+        lines = [describe(edges, self._clock.now())]
         lines += [f"waiting: {pending}" for pending in self.pending()]
         return "\n".join(lines)
+
+    def on_close(self, callback: Callable[[], object]) -> Registration:
+        """Call `callback` each time this buffer or its bus is closed, and now if one is. It must not raise."""
+        return self._feed.on_end(callback)
 
     def close(self) -> None:
         """Leave the bus; lookups that wait end with `BusClosedError`. What is buffered can still be looked up."""
         self.bus.detach(self._feed)
         self._feed.end("the buffer is closed")
+
+    def _on_bus(self, question: Question) -> Question:
+        """A question with the names that the bus has."""
+        return question if self._prefix is None else self._prefix.question(question)
 
     def __enter__(self) -> "Buffer":
         return self
@@ -244,91 +386,3 @@ class Buffer:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
-
-    async def _wait(
-        self,
-        question: Question,
-        max_age: float | None,
-        limit: float,
-        reset: ClockResetError | None,
-        blocker: TransformLookupError,
-    ) -> TransformStamped:
-        """Park under what is missing, read again when woken, and so on until there is an answer or the time is up."""
-        since = self._clock.now()
-        quiet = min(limit, _REPORT_AFTER)
-        for late, seconds in ((False, quiet), (True, limit - quiet)):
-            with self._clock.move_on_after(seconds):
-                while True:
-                    if late:
-                        self._report(question, blocker)
-                    await self._park(question, since, blocker)
-                    try:
-                        return self._read(question, max_age, reset)
-                    except MAY_COME as error:
-                        blocker = error
-            try:
-                # The data may have come in the very turn of the loop in which the time was up.
-                return self._read(question, max_age, reset)
-            except MAY_COME as error:
-                blocker = error
-            if seconds >= limit:
-                break
-        raise LookupTimeoutError(
-            target=question.target, source=question.source, timeout=limit, missing=blocker
-        ) from blocker
-
-    async def _park(self, question: Question, since: int, blocker: TransformLookupError) -> None:
-        """Wait until something comes that can have removed what blocks a lookup."""
-        if self._feed.ended:
-            raise BusClosedError(self._feed.ended) from blocker
-        woken = anyio.Event()
-        waiter = Waiter(question, since, woken.set)
-        self._feed.waiting.park(waiter, blocker)
-        try:
-            await woken.wait()
-        except BaseException:
-            # Cancelled; whoever wakes a waiter has taken it out already.
-            self._feed.waiting.remove(waiter)
-            raise
-
-    def _read(self, question: Question, max_age: float | None, reset: ClockResetError | None) -> TransformStamped:
-        """As `lookup_nowait`, for a lookup that began when the clock's last jump back was `reset`."""
-        latest = self._feed.last_reset
-        if latest is not None and latest is not reset:
-            raise ClockResetError(before=latest.before, after=latest.after)
-        not_before = None if max_age is None else self._not_before(max_age, question.at, question.source_at)
-        return self._feed.tree.answer(
-            question.target, question.source, question.at, question.source_at, question.fixed, not_before
-        )
-
-    def _not_before(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> int | None:
-        if at is not LATEST and source_at is not LATEST:
-            raise TypeError("max_age goes with LATEST: an answer at a given stamp never gets newer")
-        if as_duration(max_age, "max_age") == math.inf:
-            return None
-        return self._clock.now() - from_seconds(max_age)
-
-    def _report(self, question: Question, blocker: TransformLookupError) -> None:
-        """Log what blocks a lookup that has waited for long."""
-        self._log.warning(
-            (type(blocker), blocking_frames(blocker)),
-            "a lookup of %r in %r has waited for more than %g s: %s",
-            question.source,
-            question.target,
-            _REPORT_AFTER,
-            blocker,
-        )
-
-
-def _question_of(data: Stamped, target: str, at: int | Latest | None, fixed: str | None) -> dict[str, Any]:
-    """What `lookup` has to be asked to move `data`."""
-    check_registered(data)
-    if not (hasattr(data, "frame") and hasattr(data, "stamp")):
-        kind = type(data).__name__
-        raise TypeError(f"a {kind} has no frame and stamp of its own: look the transform up and call do_transform")
-    question: dict[str, Any] = {"target": target, "source": data.frame, "at": data.stamp}
-    if at is None and fixed is None:
-        return question
-    if at is None or fixed is None:
-        raise TypeError("at and fixed go together: the data at their stamp, carried to `at` through the fixed frame")
-    return {**question, "at": at, "source_at": data.stamp, "fixed": fixed}

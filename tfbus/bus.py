@@ -5,19 +5,21 @@ has every buffer insert it and wake its waiters, then calls the subscribers. The
 nothing can be lost between "sent" and "buffered".
 """
 
-import asyncio
 import logging
 from collections.abc import Iterable
 from threading import get_ident
 from types import TracebackType
 from typing import Literal
 
-import anyio
-
+from tfbus.announcer import Announcer
+from tfbus.claim import Claim
 from tfbus.clock import Clock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError
+from tfbus.event_stream import EventStream
+from tfbus.events import ClockReset
 from tfbus.feed import Feed
 from tfbus.once import OnceLogger
+from tfbus.ownership import OnConflict, Ownership
 from tfbus.registration import Registration
 from tfbus.sample_queue import Overflow
 from tfbus.stamped import Batch, TransformStamped, as_batch
@@ -35,6 +37,14 @@ class Bus:
     ----------
     clock : Clock, optional
         Where stamps, timeouts and timed tasks take their time from; by default a `SystemClock`.
+    on_conflict : {"last", "reject"}
+        What happens to samples of a child that another authority has published before: they are taken and reported,
+        or refused until the frame is removed. No authority, ``""``, is one like any other.
+
+    Raises
+    ------
+    ValueError
+        If `on_conflict` is none of them.
 
     Notes
     -----
@@ -43,21 +53,21 @@ class Bus:
     Other threads publish through `threadsafe`.
     """
 
-    def __init__(self, clock: Clock | None = None) -> None:
+    def __init__(self, clock: Clock | None = None, on_conflict: OnConflict = "last") -> None:
         self.clock: Clock = SystemClock() if clock is None else clock
-        self._thread = get_ident()
-        self._on_a_loop = False
+        self._claim = Claim()
         self._closed = False
         self._log = OnceLogger(logging.getLogger("tfbus"))
-        self._topology = Topology(self._log)
-        self._subscribers = Subscribers(self._log)
+        self._events: list[EventStream] = []
+        self._announcer = Announcer(self.clock.now, self._events)
+        self._topology = Topology(self._log, Ownership(on_conflict), self._announcer)
+        self._subscribers = Subscribers(self._log, self._announcer)
         self._feeds: dict[Feed, int] = {}
         self._streams: list[Stream] = []
         self._threads: list[ThreadPublisher] = []
         self._samples = 0
         self._resets = 0
         self._jumps = self.clock.on_jump(self._clock_jumped)
-        self.check_thread()
 
     @property
     def closed(self) -> bool:
@@ -75,13 +85,15 @@ class Bus:
         ----------
         samples : TransformStamped or iterable of them
         invalid : {"raise", "drop"}
-            What to do with a sample that would close a loop of parents: refuse the whole batch, or leave that sample
-            out and count it. ``"drop"`` is for those who pass on what others have sent.
+            What to do with a sample that would close a loop of parents, or whose authority may not publish the child:
+            refuse the whole batch, or leave that sample out and count it. ``"drop"`` is for those who pass on what
+            others have sent.
 
         Raises
         ------
         InvalidTransformError
-            If a sample would close a loop of parents. Nothing is stored.
+            If a sample would close a loop of parents, its child is reserved for another authority, or comes from
+            another one with ``on_conflict="reject"``. Nothing is stored.
         TypeError
             If something in it is not a `TransformStamped`.
         BusClosedError
@@ -89,7 +101,7 @@ class Bus:
         RuntimeError
             If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
         """
-        if get_ident() != self._thread:
+        if get_ident() != self._claim.thread:
             self.check_thread()
         if self._closed:
             raise BusClosedError
@@ -112,6 +124,9 @@ class Bus:
             feed.receive(batch)
         for stream in self._streams:
             stream.put(batch)
+        if self._events:
+            for events in self._events:
+                events.arrived(batch)
         if callbacks:
             self._subscribers.deliver(batch)
 
@@ -120,14 +135,7 @@ class Bus:
 
         The first event loop to use a bus that another thread has made takes it over.
         """
-        if get_ident() == self._thread and self._on_a_loop:
-            return
-        on_a_loop = _runs_a_loop()
-        if get_ident() != self._thread:
-            if self._on_a_loop or not on_a_loop:
-                raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
-            self._thread = get_ident()
-        self._on_a_loop = self._on_a_loop or on_a_loop
+        self._claim.check()
 
     def subscribe(self, callback: BatchCallback) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
@@ -165,6 +173,47 @@ class Bus:
         self._streams.append(stream)
         return stream
 
+    def events(self, capacity: int = 1_000, stale_after: float | None = 1.0) -> EventStream:
+        """What happens besides samples: ``with bus.events() as events: async for event in events``.
+
+        It begins with a `FrameAdded` for each frame that has a parent by now. What is rejected, and each failure of a
+        subscriber, is one event; of two authorities that argue about a frame, each pair is told once, and each parent
+        and kind that one of them claims, until the frame is removed. The counters count every time.
+
+        Parameters
+        ----------
+        capacity : int
+            How many events may wait for the reader; then the oldest are dropped and counted.
+        stale_after : float or None
+            A moving frame is stale when its newest stamp is more than this many s behind the clock, and live again when
+            it is not; None for no such events. It is worked out while somebody reads, without a timer of its own.
+
+        Raises
+        ------
+        ValueError
+            If `capacity` is less than one, or `stale_after` negative.
+        BusClosedError
+        """
+        self._check_usable()
+        events = EventStream(capacity, stale_after, self._topology, self.clock, self.check_thread, self._detach_events)
+        self._events.append(events)
+        return events
+
+    def reserve(self, frame: str, authority: str) -> Registration:
+        """Let only `authority` publish a frame, whatever `on_conflict` says, until the registration is closed.
+
+        What another authority has published of it stays; from now on it is refused, with ``reason="reserved"``. One
+        authority may reserve a frame several times.
+
+        Raises
+        ------
+        InvalidTransformError
+            If another authority has reserved it, or the name cannot be that of a frame.
+        BusClosedError
+        """
+        self._check_usable()
+        return self._topology.reserve(frame, authority)
+
     def threadsafe(self, capacity: int = 10_000) -> ThreadPublisher:
         """A way in for other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
 
@@ -188,7 +237,7 @@ class Bus:
 
     def detach(self, feed: Feed) -> None:
         """Take a feed off the bus, if it is on it."""
-        if len(feed.waiting):
+        if feed.anyone_waits:
             self.check_thread()
         self._feeds.pop(feed, None)
 
@@ -203,10 +252,12 @@ class Bus:
             If neither the bus nor a buffer knows it.
         """
         self._check_usable()
-        names = self._topology.names()
-        if frame not in names and not any(frame in feed.tree for feed in self._feeds):
-            raise UnknownFrameError(frame=frame, known=tuple(names))
+        if frame not in self._topology and not any(frame in feed.tree for feed in self._feeds):
+            names = self._topology.names()
+            if frame not in names:
+                raise UnknownFrameError(frame=frame, known=tuple(names))
         self._topology.remove(frame)
+        self._subscribers.forget(frame)
         for publisher in self._threads:
             publisher.forget(frame)
         for stream in self._streams:
@@ -229,6 +280,7 @@ class Bus:
             queues=(
                 *(stream.queue.statistics("stream") for stream in self._streams),
                 *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
+                *(events.queue.statistics() for events in self._events),
             ),
         )
 
@@ -239,15 +291,16 @@ class Bus:
         """
         if self._closed:
             return
-        if any(stream.waiting for stream in self._streams) or any(len(feed.waiting) for feed in self._feeds):
+        readers: list[Stream | EventStream] = [*self._streams, *self._events]
+        if any(reader.waiting for reader in readers) or any(feed.anyone_waits for feed in self._feeds):
             self.check_thread()
         self._closed = True
         self._jumps.close()
         for publisher in self._threads:
             publisher.end()
             publisher.discard()
-        for stream in self._streams:
-            stream.end()
+        for reader in readers:
+            reader.end()
         for feed in self._feeds:
             feed.end("the bus is closed")
 
@@ -272,12 +325,18 @@ class Bus:
         if stream in self._streams:
             self._streams.remove(stream)
 
+    def _detach_events(self, events: EventStream) -> None:
+        if events in self._events:
+            self._events.remove(events)
+
     def _well_typed(self, samples: object) -> Batch:
         """The samples of a batch; whatever else is in it is counted."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
         batch = tuple(thing for thing in things if isinstance(thing, TransformStamped))
         if len(batch) < len(things):
-            self._topology.rejected["not a sample"] += len(things) - len(batch)
+            for thing in things:
+                if not isinstance(thing, TransformStamped):
+                    self._topology.reject("not a sample", TypeError(f"expected a TransformStamped, not {thing!r}"))
         return batch
 
     def _publish_from_thread(self, batch: Batch) -> None:
@@ -286,11 +345,14 @@ class Bus:
 
     def _clock_jumped(self, before: int, after: int) -> None:
         if after >= before:
+            for events in self._events:
+                events.wake()
             return
         self.check_thread()
         self._resets += 1
         self._log.warning(("clock", before, after), "the clock jumped back: moving samples are dropped")
         self._topology.clear_moving()
+        self._announcer.tell(ClockReset(after, before))
         self._subscribers.discard_moving()
         for publisher in self._threads:
             publisher.discard()
@@ -298,14 +360,3 @@ class Bus:
             stream.queue.discard_moving()
         for feed in self._feeds:
             feed.reset(before, after)
-
-
-def _runs_a_loop() -> bool:
-    """Whether this thread runs an event loop; of one that is in a bare asyncio callback, anyio does not know."""
-    for probe in (asyncio.get_running_loop, anyio.get_current_task):
-        try:
-            probe()
-        except RuntimeError:
-            continue
-        return True
-    return False

@@ -13,6 +13,9 @@ from tfbus.history import Samples
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
+_STRAIGHT = 1e-9
+"""In place of an angle that rounds to zero: its own cosine is one to the last digit, so the arc is a straight line."""
+
 
 class Curve:
     """One edge's interpolation at given stamps, prepared.
@@ -33,16 +36,15 @@ class Curve:
             first, self._segments = self._segments, None
         last = np.minimum(first + 1, len(its_stamps) - 1)
         if samples.parents is not None:
-            parents = np.unique(samples.parents, return_inverse=True)[1]
+            parents = np.array(samples.parents, object)
             last = np.where(parents[first] == parents[last], last, first)
         a, b = rows[first].T, rows[last].T
         duration = _nanoseconds(its_stamps[first], its_stamps[last])
-        duration[first == last] = 1.0
+        duration[first == last] = np.inf
         dot = (a[3:] * b[3:]).sum(axis=0)
         cosine = np.minimum(np.abs(dot), 1.0)
-        angle = np.arccos(cosine)
+        angle = np.maximum(np.arccos(cosine), _STRAIGHT)
         sine = np.sin(angle)
-        sine[sine == 0.0] = np.inf
         self._table = np.empty((15, len(first)))
         self._table[:7] = a
         self._table[7:10] = (b[:3] - a[:3]) / duration

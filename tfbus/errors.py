@@ -9,8 +9,9 @@
             ExtrapolationError                 .child .stamp .oldest .newest .authority
                 FutureExtrapolationError                                      waiting may help
                 PastExtrapolationError                                        waiting cannot help: raised at once
+                GapError                   .before .after .max_gap            waiting cannot help: raised at once
             LookupTimeoutError (TimeoutError)  __cause__ says what was still missing
-        InvalidTransformError (ValueError)     .reason .parent .child .authority .loop
+        InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         ClockResetError                        .before .after
         BusClosedError
 
@@ -68,7 +69,7 @@ class TransformLookupError(TransformError, LookupError):
 
 
 class UnknownFrameError(TransformLookupError):
-    """No sample has named this frame. Waiting may help.
+    """No sample in the tree names this frame. Waiting may help.
 
     Attributes
     ----------
@@ -147,10 +148,19 @@ class ExtrapolationError(TransformLookupError):
         The edge's window in ns; None when it is empty.
     authority : str
         Who sent its newest sample; may be empty.
+    slack : int
+        How far from a sample the answer was allowed to be, in ns.
     """
 
     def __init__(
-        self, *, child: str, stamp: int | Latest, oldest: int | None, newest: int | None, authority: str = ""
+        self,
+        *,
+        child: str,
+        stamp: int | Latest,
+        oldest: int | None,
+        newest: int | None,
+        authority: str = "",
+        slack: int = 0,
     ) -> None:
         super().__init__()
         self.child = child
@@ -158,12 +168,15 @@ class ExtrapolationError(TransformLookupError):
         self.oldest = oldest
         self.newest = newest
         self.authority = authority
+        self.slack = slack
 
     def _gap(self) -> str:
         return "there is no sample in its window"
 
     def _why(self) -> str:
         asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
+        if self.slack:
+            asked += f" within {format_duration(self.slack)}"
         sender = f", from {self.authority!r}" if self.authority else ""
         return f"frame {self.child!r}: asked for {asked}, {self._gap()}{sender}"
 
@@ -188,6 +201,30 @@ class PastExtrapolationError(ExtrapolationError):
         return f"oldest sample is {format_stamp(self.oldest)} ({early} too early)"
 
 
+class GapError(ExtrapolationError):
+    """The stamp lies between two samples that are further apart than `max_gap`. Waiting cannot help.
+
+    Attributes
+    ----------
+    before, after : int
+        The stamps of the two samples, in ns.
+    max_gap : int
+        In ns.
+    """
+
+    def __init__(self, *, before: int, after: int, max_gap: int, **facts: Any) -> None:
+        super().__init__(**facts)
+        self.before = before
+        self.after = after
+        self.max_gap = max_gap
+
+    def _gap(self) -> str:
+        return (
+            f"between samples at {format_stamp(self.before)} and {format_stamp(self.after)}, which are "
+            f"{format_duration(self.after - self.before)} apart (at most {format_duration(self.max_gap)})"
+        )
+
+
 class LookupTimeoutError(TransformLookupError, TimeoutError):
     """An awaited lookup ran out of time; ``__cause__`` is the error that it still had.
 
@@ -210,7 +247,7 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
 
 
 class InvalidTransformError(TransformError, ValueError):
-    """A sample that can never be right; nothing of it was stored.
+    """A sample that is wrong, or that its sender has no right to; nothing of it was stored.
 
     Attributes
     ----------
@@ -221,6 +258,8 @@ class InvalidTransformError(TransformError, ValueError):
         The sample, as far as it is known where the error is raised.
     loop : tuple of str
         For ``"cycle"``, the whole loop from child to parent, its first frame repeated at the end.
+    owner : str or None
+        For ``"authority"`` and ``"reserved"``, the authority that has the right to the child.
     """
 
     def __init__(
@@ -232,6 +271,7 @@ class InvalidTransformError(TransformError, ValueError):
         child: str | None = None,
         authority: str | None = None,
         loop: tuple[str, ...] = (),
+        owner: str | None = None,
     ) -> None:
         super().__init__(message)
         self.reason = reason
@@ -239,6 +279,7 @@ class InvalidTransformError(TransformError, ValueError):
         self.child = child
         self.authority = authority
         self.loop = loop
+        self.owner = owner
 
 
 class ClockResetError(TransformError):

@@ -1,21 +1,23 @@
-"""What a bus sees of a buffer: it puts batches into the tree and wakes the lookups that they can have unblocked.
+"""What a bus sees of a buffer: it puts batches into the tree and wakes the lookups and watches that they concern.
 
-Sans-IO like the tree and the index that it joins: waking is calling what each waiter brought along.
+Sans-IO like the tree and the indexes that it joins: waking is calling what each waiter brought along.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 from tfbus.errors import ClockResetError, UnknownFrameError
 from tfbus.history import Outcome
+from tfbus.registration import Registration
 from tfbus.stamped import Batch, TransformStamped
 from tfbus.statistics import BufferStatistics
 from tfbus.tree import TransformTree
 from tfbus.waiting import Waiter, WaitingIndex
+from tfbus.watching import Watched, WatchingIndex
 
 
 class Feed:
-    """A tree and the lookups that wait for it.
+    """A tree, the lookups that wait for it, and the watches that follow it.
 
     Parameters
     ----------
@@ -26,6 +28,7 @@ class Feed:
     ----------
     tree : TransformTree
     waiting : WaitingIndex
+    watching : WatchingIndex
     ended : str
         Why nothing more will come; empty while it may.
     last_reset : ClockResetError or None
@@ -35,12 +38,19 @@ class Feed:
     def __init__(self, keep: float | None) -> None:
         self.tree: TransformTree = _FedTree(keep)
         self.waiting = WaitingIndex()
+        self.watching = WatchingIndex()
         self.ended = ""
         self.last_reset: ClockResetError | None = None
         self._blocked = self.waiting.blocked
+        self._watched = self.watching.under
+        self._at_end: dict[Registration, Callable[[], object]] = {}
+
+    def prefill(self, tree: TransformTree) -> None:
+        """Start with what another tree holds, as far back as this one keeps it; before anything is received."""
+        TransformTree.adopt(self.tree, tree)
 
     def receive(self, batch: Batch) -> None:
-        """Insert a batch that the bus has judged, and wake whom it can have unblocked."""
+        """Insert a batch that the bus has judged, and wake whom it can have unblocked and who watches it."""
         blocked = self._blocked
         plain = self.tree.commit(batch)
         if blocked:
@@ -48,6 +58,8 @@ class Feed:
                 fields = sample._fields
                 if fields[1] in blocked:
                     _wake(self.waiting.take(fields[1], fields[2]))
+        if self._watched:
+            _wake(self.watching.flag([sample._fields[1] for sample in batch]))
         if not plain:
             self._wake_for_the_shape()
 
@@ -57,28 +69,53 @@ class Feed:
         if self._blocked:
             for name in forest.joined:
                 _wake(self.waiting.take(name, None))
-            if forest.changed:
-                _wake(self.waiting.take_asking(forest.below(forest.changed)))
+        if forest.changed and (self._blocked or self._watched):
+            concerned = forest.below(forest.changed)
+            _wake(self.waiting.take_asking(concerned))
+            _wake(self.watching.flag_asking(concerned))
         forest.forget_changes()
 
     def remove_frame(self, frame: str) -> None:
-        """Forget a frame, if it is known; lookups that wait learn of it."""
+        """Forget a frame, if it is known; lookups that wait learn of it, and who watches it."""
+        forest = self.tree.forest
+        parents = forest.frames[frame].mentioned if frame in forest.frames else ()
         try:
             TransformTree.remove_frame(self.tree, frame)
         except UnknownFrameError:
             return
-        _wake(self.waiting.take_all())
+        if self._blocked:
+            gone = {name for name in parents if name not in forest.names}
+            below = forest.below({frame}) if frame in forest.names else {frame}
+            _wake(self.waiting.take_asking(below | gone))
+        _wake(self.watching.flag((frame,)))
 
     def reset(self, before: int, after: int) -> None:
-        """Drop moving samples: the clock has jumped back. Lookups that wait get a `ClockResetError`."""
+        """Drop moving samples: the clock has jumped back. Lookups that wait get a `ClockResetError`, and watches."""
         TransformTree.clear(self.tree)
         self.last_reset = ClockResetError(before=before, after=after)
         _wake(self.waiting.take_all())
+        _wake(self.watching.reset(self.last_reset))
 
     def end(self, reason: str) -> None:
         """Wake every waiter for the last time: nothing more will come."""
         self.ended = self.ended or reason
         _wake(self.waiting.take_all())
+        _wake(self.watching.end())
+        for callback in tuple(self._at_end.values()):
+            callback()
+
+    def on_end(self, callback: Callable[[], object]) -> Registration:
+        """Call `callback` when nothing more will come, or now if that is so, until the registration is closed."""
+        registration = Registration(lambda: self._at_end.pop(registration, None))
+        self._at_end[registration] = callback
+        if self.ended:
+            callback()
+        return registration
+
+    @property
+    def anyone_waits(self) -> bool:
+        """Whether a task waits for something to come."""
+        return len(self.waiting) > 0 or self.watching.anyone_waits
 
     def statistics(self, offered: int) -> BufferStatistics:
         """Counters; how many samples it was offered, the bus knows."""
@@ -98,8 +135,11 @@ class _FedTree(TransformTree):
     def clear(self) -> None:
         raise RuntimeError("a bus feeds this tree: clear a copy() of it")
 
+    def adopt(self, other: TransformTree) -> None:  # noqa: ARG002
+        raise RuntimeError("a bus feeds this tree: have another one adopt it")
 
-def _wake(waiters: Iterable[Waiter]) -> None:
+
+def _wake(waiters: Iterable[Waiter | Watched]) -> None:
     for waiter in waiters:
         # The event loop of one that was never cancelled may be gone; the others are waiting all the same.
         with suppress(RuntimeError):

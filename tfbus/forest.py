@@ -23,6 +23,7 @@ class Forest:
 
     Attributes
     ----------
+    window : int or None
     frames : dict of str to FrameHistory
         By child.
     names : FrameNames
@@ -35,10 +36,10 @@ class Forest:
         Frames that became somebody's parent: then they may have become known. Cleared likewise.
     """
 
-    __slots__ = ("_window", "changed", "frames", "joined", "names", "paths")
+    __slots__ = ("changed", "frames", "joined", "names", "paths", "window")
 
     def __init__(self, window: int | None) -> None:
-        self._window = window
+        self.window = window
         self.frames: dict[str, FrameHistory] = {}
         self.names = FrameNames()
         self.paths: dict[tuple[str, str], Path] = {}
@@ -130,14 +131,22 @@ class Forest:
 
     def copy(self) -> "Forest":
         """An independent copy."""
-        twin = Forest(self._window)
+        twin = Forest(self.window)
         twin.frames = {child: history.copy() for child, history in self.frames.items()}
         twin.names = self.names.copy()
         return twin
 
+    def within(self, window: int | None) -> "Forest":
+        """An independent copy of what the windows hold, with windows of this length from now on."""
+        twin = Forest(window)
+        for child, history in self.frames.items():
+            short = twin.frames[child] = history.within(window)
+            twin.names.update(child, short.mentioned)
+        return twin
+
     def _add(self, child: str, parent: str, static: bool) -> FrameHistory:
         has_children = child in self.names
-        history = self.frames[child] = FrameHistory(child, parent, static, self._window)
+        history = self.frames[child] = FrameHistory(child, parent, static, self.window)
         self.names.update(child, history.mentioned)
         self.joined.add(parent)
         if has_children:

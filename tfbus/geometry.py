@@ -25,7 +25,7 @@ Numbers: TypeAlias = Sequence[float] | npt.NDArray[Any]
 Row: TypeAlias = tuple[float, float, float, float, float, float, float]
 
 NORM_TOLERANCE = 0.01
-_ROUNDING = 1e-15
+ROUNDING = 1e-15
 
 IDENTITY: Row = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -132,7 +132,7 @@ def as_rotation(value: object, name: str) -> Quaternion:
     """
     x, y, z, w = _numbers(value, 4, name)
     square = x * x + y * y + z * z + w * w
-    if abs(square - 1.0) <= _ROUNDING:
+    if abs(square - 1.0) <= ROUNDING:
         return x, y, z, w
     norm = math.sqrt(square)
     if norm == 0.0:
@@ -272,9 +272,9 @@ class Transform:
         x, y, z, w = self.rotation
         low, high = math.hypot(x + z, w - y), math.hypot(x - z, w + y)
         half_sum, half_difference = math.atan2(x + z, w - y), math.atan2(x - z, w + y)
-        if low <= _ROUNDING:
+        if low <= ROUNDING:
             half_sum = half_difference
-        elif high <= _ROUNDING:
+        elif high <= ROUNDING:
             half_difference = half_sum
         roll = math.remainder(half_sum + half_difference, math.tau)
         yaw = math.remainder(half_sum - half_difference, math.tau)
@@ -318,7 +318,7 @@ class Transform:
         Parameters
         ----------
         points : sequence of 3 floats, or array of shape (..., 3)
-            In m. Arrays of float32 stay float32; integers become float64.
+            In m. Arrays of float32 stay float32; integers become float64. What is not finite stays so, or NaN.
 
         Returns
         -------
@@ -343,8 +343,9 @@ class Transform:
             raise ValueError(f"points must have shape (..., 3), got {points.shape}")
         dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(np.float64)
         rotation = quaternions.quat2mat(self.as_wxyz()).T.astype(dtype)
-        moved: npt.NDArray[Any] = points @ rotation
-        moved += np.asarray(self.translation, dtype)
+        with np.errstate(invalid="ignore"):
+            moved: npt.NDArray[Any] = points @ rotation
+            moved += np.asarray(self.translation, dtype)
         return moved
 
     def interpolate(self, other: "Transform", fraction: float) -> "Transform":

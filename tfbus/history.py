@@ -184,7 +184,7 @@ class FrameHistory:
         if parent != self.parent:
             self._reparent(parent)
         self.authority = authority
-        self._origin = (parent, authority)
+        self._origin = self._shared(parent, authority)
         if self.parents is not None:
             self.parents[parent] += 1
         record = _pack(stamp, *row)
@@ -231,12 +231,12 @@ class FrameHistory:
         """Whether a lookup at `stamp` has an answer here."""
         return self.static or (bool(self.stamps) and self.stamps[self.start] <= stamp <= self.stamps[-1])
 
-    def missing(self, stamp: int | Latest) -> ExtrapolationError:
-        """The error that says why `stamp` is not covered."""
+    def missing(self, stamp: int | Latest, slack: int = 0) -> ExtrapolationError:
+        """The error that says why `stamp` is not covered, nor any sample within `slack` ns of it."""
         oldest, newest = self.oldest, self.newest
         past = oldest is not None and isinstance(stamp, int) and stamp < oldest
         kind = PastExtrapolationError if past else FutureExtrapolationError
-        return kind(child=self.child, stamp=stamp, oldest=oldest, newest=newest, authority=self.authority)
+        return kind(child=self.child, stamp=stamp, oldest=oldest, newest=newest, authority=self.authority, slack=slack)
 
     def parent_changes(self) -> list[int]:
         """The stamps inside the window at which the parent is another one than before."""
@@ -266,6 +266,18 @@ class FrameHistory:
         twin.records = self.records[:]
         twin.origins = self.origins[:]
         twin.parents = None if self.parents is None else self.parents.copy()
+        return twin
+
+    def within(self, keep: int | None) -> "FrameHistory":
+        """An independent copy of the samples in the window, with a window of another length from now on."""
+        twin = self.copy()
+        twin._keep = FOREVER if keep is None else keep
+        if twin.stamps:
+            horizon = twin.stamps[-1] - twin._keep
+            twin.horizon = max(self.horizon, horizon)
+            twin._cut()
+            twin.horizon = horizon
+            twin.changed = False
         return twin
 
     def _become_moving(self, parent: str) -> None:
@@ -304,13 +316,18 @@ class FrameHistory:
         record = _pack(stamp, *row)
         end = at + 1 if replaces else at
         self.records[at * RECORD_SIZE : end * RECORD_SIZE] = record
-        self.origins[at:end] = ((parent, authority),)
+        self.origins[at:end] = (self._shared(parent, authority),)
         if not replaces:
             stamps.insert(at, stamp)
         if at == len(stamps) - 1:
             self.parent, self.authority = self._origin = self.origins[at]
         self._settle_parents()
         return Outcome.REPLACED if replaces else Outcome.INSERTED
+
+    def _shared(self, parent: str, authority: str) -> tuple[str, str]:
+        """An origin; the very tuple of the newest sample if it is equal, because one for each would take 56 bytes."""
+        origin = parent, authority
+        return self._origin if self._origin == origin else origin
 
     def _cut(self) -> None:
         """Cut off what has left the window; with one parent throughout, again when a sixteenth more has."""

@@ -31,18 +31,21 @@ class Path:
         From source, and from target, to the common ancestor: moving edges, and the rows that static ones amount to.
     frames : tuple of str
         From target to source, the common ancestor once.
+    root : str
+        The common ancestor.
     moving : tuple of FrameHistory
         The edges that are not static.
     lasting : bool
         Whether it is the path at every stamp, because no frame on it changes parent inside its window.
     """
 
-    __slots__ = ("_static", "down", "frames", "lasting", "moving", "up")
+    __slots__ = ("_static", "down", "frames", "lasting", "moving", "root", "up")
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
         edges = ups + downs
         self.up = _fold(ups)
         self.down = _fold(downs)
+        self.root = root
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
         self.lasting = all(edge.parents is None for edge in edges)

@@ -39,13 +39,18 @@ def _facts(edge: Edge, now: int) -> str:
 
 
 def _rate(edge: Edge) -> str:
-    if edge.static:
+    return format_rate(edge.static, edge.newest, edge.rate)
+
+
+def format_rate(static: bool, newest: int | None, rate: float | None) -> str:
+    """How often samples come, for people: ``static``, ``10.0 Hz``, ``one sample``."""
+    if static:
         return "static"
-    if edge.newest is None:
+    if newest is None:
         return "no samples"
-    if edge.rate is None:
+    if rate is None:
         return "one sample"
-    return f"{edge.rate:.1f} Hz" if edge.rate >= 1.0 else f"{edge.rate:.2g} Hz"
+    return f"{rate:.1f} Hz" if rate >= 1.0 else f"{rate:.2g} Hz"
 
 
 def _branches(edges: Sequence[Edge]) -> Iterator[tuple[str, Edge | None]]:

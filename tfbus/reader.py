@@ -9,12 +9,17 @@ import numpy.typing as npt
 from tfbus.batch import OutOfRange, finish, finish_points, survey, take
 from tfbus.data import PointCloud, TwistStamped
 from tfbus.errors import TransformLookupError
+from tfbus.explanation import Explanation, explain
 from tfbus.forest import Forest
+from tfbus.placement import Leniency
+from tfbus.policy import Hold, Policy, policy_of
 from tfbus.resolve import GO_TOGETHER, At, resolve, resolve_travel
-from tfbus.stamped import TransformStamped, answer_of
+from tfbus.stamped import TransformStamped, answer_of, qualified_answer
 from tfbus.stamps import LATEST, as_stamp, as_stamps
 from tfbus.transform_array import TransformArray
 from tfbus.velocity import twist
+
+_AT_LATEST_ONLY = "not_before goes with LATEST: an answer at a given stamp never gets newer"
 
 
 class TreeReader:
@@ -36,6 +41,9 @@ class TreeReader:
         source_at: At | None = None,
         fixed: str | None = None,
         not_before: int | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> TransformStamped:
         """Where `source` is, seen from `target`: the transform that maps source's data into target.
 
@@ -50,13 +58,20 @@ class TreeReader:
             The frame that is held still between the two stamps.
         not_before : int, optional
             Count a `LATEST` answer older than this (ns) as not yet arrived.
+        tolerance : float
+            Where an edge does not cover the stamp, let its nearest sample within so many s stand in.
+        max_gap : float, optional
+            Refuse to interpolate between samples that are more than so many s apart.
+        extrapolate : Hold, optional
+            Let an edge's newest sample stand in for the stamps after it, for a while.
 
         Returns
         -------
         TransformStamped
             Parent is target and child is source; its stamp is `at`, or the one that `LATEST` found. An answer whose
             whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples. In time
-            travel, a `LATEST` that only static edges answer takes the stamp of source's leg.
+            travel, a `LATEST` that only static edges answer takes the stamp of source's leg. With a tolerance, a gap or
+            a hold, `extrapolated_by` and `gap` say what was done.
 
         Raises
         ------
@@ -64,26 +79,41 @@ class TreeReader:
             If it cannot be answered now, but may be later.
         PastExtrapolationError
             If it is older than an edge's window.
+        GapError
+            If it lies in a gap that is too long.
         TypeError
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
             `not_before` comes without a `LATEST`.
         """
-        return self.answer(target, source, at, source_at, fixed, not_before)
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        return self.answer(target, source, at, source_at, fixed, not_before, policy)
 
     def answer(
-        self, target: str, source: str, at: At, source_at: At | None, fixed: str | None, not_before: int | None
+        self,
+        target: str,
+        source: str,
+        at: At,
+        source_at: At | None,
+        fixed: str | None,
+        not_before: int | None,
+        policy: Policy | None,
     ) -> TransformStamped:
         """As `lookup`, without keywords: every one of them would cost a twentieth of a lookup."""
         if not_before is not None and at is not LATEST and source_at is not LATEST:
-            raise TypeError("not_before goes with LATEST: an answer at a given stamp never gets newer")
+            raise TypeError(_AT_LATEST_ONLY)
         if type(at) is not int and at is not LATEST:
             at = as_stamp(at)
+        lenient = None if policy is None else Leniency(policy)
         with self._lock:
             if source_at is None and fixed is None:
-                stamp, row, static = resolve(self.forest, target, source, at, not_before)
+                stamp, row, static = resolve(self.forest, target, source, at, not_before, lenient)
             else:
-                stamp, row, static = resolve_travel(self.forest, target, source, at, source_at, fixed, not_before)
-        return answer_of(target, source, stamp, row, static)
+                stamp, row, static = resolve_travel(
+                    self.forest, target, source, at, source_at, fixed, not_before, lenient
+                )
+        if lenient is None:
+            return answer_of(target, source, stamp, row, static)
+        return qualified_answer(target, source, stamp, row, static, lenient.extrapolated_by, lenient.gap)
 
     def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
@@ -92,6 +122,40 @@ class TreeReader:
         except TransformLookupError:
             return False
         return True
+
+    def explain(
+        self,
+        target: str,
+        source: str,
+        at: At = LATEST,
+        *,
+        not_before: int | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+        now: int | None = None,
+    ) -> Explanation:
+        """How `lookup` with these arguments comes to its answer, or all that keeps it from one; made to be printed.
+
+        Parameters
+        ----------
+        target, source, at, not_before, tolerance, max_gap, extrapolate
+            As `lookup`. Each leg of a time travel is a question of its own.
+        now : int, optional
+            The stamp that ages are counted from, in ns; by default the newest in the tree.
+
+        Raises
+        ------
+        TypeError
+            As `lookup`. What a lookup has no answer to is no error here.
+        """
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        if not_before is not None and at is not LATEST:
+            raise TypeError(_AT_LATEST_ONLY)
+        if at is not LATEST:
+            at = as_stamp(at)
+        with self._lock:
+            return explain(self.forest, target, source, at, not_before, policy, now)
 
     def lookup_many(
         self,
@@ -102,6 +166,9 @@ class TreeReader:
         source_at: npt.ArrayLike | None = None,
         fixed: str | None = None,
         out_of_range: OutOfRange = "raise",
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
     ) -> TransformArray:
         """As `lookup`, at many stamps at once.
 
@@ -116,11 +183,13 @@ class TreeReader:
             The frame that is held still between the two stamps.
         out_of_range : {"raise", "nan"}
             What becomes of stamps without an answer: an error that names the first, or NaN in their places.
+        tolerance, max_gap, extrapolate
+            As `lookup`.
 
         Returns
         -------
         TransformArray
-            One transform a stamp, in the order of `stamps`.
+            One transform a stamp, in the order of `stamps`; its `extrapolated_by` and `gap` say what was done.
 
         Raises
         ------
@@ -138,8 +207,9 @@ class TreeReader:
         if (source_at is None) != (fixed is None):
             raise TypeError(GO_TOGETHER)
         source_stamps = None if source_at is None else _as_many(source_at, len(asked))
+        policy = policy_of(tolerance, max_gap, extrapolate)
         with self._lock:
-            taken = take(self.forest, target, source, asked, source_stamps, fixed)
+            taken = take(self.forest, target, source, asked, source_stamps, fixed, policy)
         return finish(taken, out_of_range)
 
     def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
@@ -157,7 +227,7 @@ class TreeReader:
         fixed : str
             The frame that stands still meanwhile, such as ``"odom"``.
         out_of_range : {"raise", "nan"}
-            As for `lookup_many`; points without an answer become NaN.
+            As for `lookup_many`; points without an answer become NaN. The stamp of the cloud itself has to be covered.
 
         Returns
         -------
@@ -199,13 +269,14 @@ class TreeReader:
         TwistStamped
             Its frame is `expressed_in`. `linear` is the velocity of the origin of `frame` in m/s, whatever the axes;
             `angular` the angular velocity in rad/s. At a sample it is the derivative from before, at the first of an
-            edge's window that from after. An edge that has just been reparented and waits for its next sample stands
-            still.
+            edge's window or of a new parent that from after. From the last sample with one parent to the first with
+            another an edge stands still.
 
         Raises
         ------
         TransformLookupError
-            As `lookup`; and `FutureExtrapolationError` on an edge that has a single sample.
+            As `lookup`; and `FutureExtrapolationError` at an edge's newest sample if it is the only one, or the only
+            one with its parent.
 
         Notes
         -----

@@ -2,10 +2,17 @@
 
 from contextlib import suppress
 
-from tfbus.errors import DisconnectedError, ExtrapolationError, FutureExtrapolationError, TransformLookupError
+from tfbus.errors import (
+    DisconnectedError,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    GapError,
+    TransformLookupError,
+)
 from tfbus.forest import Forest
 from tfbus.geometry import Row, compose
 from tfbus.path import Path, climb, find_path
+from tfbus.placement import Leniency
 from tfbus.stamps import LATEST, Latest, as_stamp
 
 At = int | Latest
@@ -15,7 +22,9 @@ Resolved = tuple[int, Row, bool]
 GO_TOGETHER = "source_at and fixed go together: source at its stamp, carried through the fixed frame"
 
 
-def resolve(forest: Forest, target: str, source: str, at: At, not_before: int | None) -> Resolved:
+def resolve(
+    forest: Forest, target: str, source: str, at: At, not_before: int | None, lenient: Leniency | None = None
+) -> Resolved:
     """Source in target at one stamp. The errors are those of `TransformTree.lookup`."""
     path = forest.paths.get((target, source))
     if path is None:
@@ -25,14 +34,16 @@ def resolve(forest: Forest, target: str, source: str, at: At, not_before: int | 
             at = path.static_stamp if len(path.frames) > 1 else _newest_of(forest, target)
         return as_stamp(at), path.row(0), True
     if at is LATEST:
-        return _resolve_latest(forest, path, not_before)
+        return _resolve_latest(forest, path, not_before, lenient)
+    if lenient is not None:
+        return at, lenient.row(path, as_stamp(at)), False
     try:
         return at, climb(path.up, at) if not path.down else path.row(at), False
     except ExtrapolationError:
         raise path.blocker(as_stamp(at)) from None
 
 
-def _resolve_latest(forest: Forest, path: Path, not_before: int | None) -> Resolved:
+def _resolve_latest(forest: Forest, path: Path, not_before: int | None, lenient: Leniency | None) -> Resolved:
     """As `resolve`, at the newest stamp that every moving edge has reached."""
     common, lagging = path.newest_common()
     if not_before is not None and common < not_before:
@@ -41,14 +52,16 @@ def _resolve_latest(forest: Forest, path: Path, not_before: int | None) -> Resol
         there = path
         if not path.lasting:
             there = find_path(forest.frames, path.frames[0], path.frames[-1], common)
-        return common, there.row(common), False
+        return common, there.row(common) if lenient is None else lenient.row(there, common), False
     except TransformLookupError as error:
-        # The lagging edge has to come as far as the others still reach back; where a parent has changed, each step of
-        # it may do.
+        # The lagging edge has to come as far as the others still reach back, or out of a gap of theirs; where a parent
+        # has changed, each step of it may do.
         needed = common + 1
-        if path.lasting:
+        if isinstance(error, GapError):
+            needed = error.after
+        elif path.lasting:
             needed = max(common if edge.oldest is None else edge.oldest for edge in path.moving)
-        raise lagging.missing(needed) from error
+        raise lagging.missing(needed, 0 if lenient is None else lenient.policy.tolerance) from error
 
 
 def resolve_travel(
@@ -59,6 +72,7 @@ def resolve_travel(
     source_at: At | None,
     fixed: str | None,
     not_before: int | None,
+    lenient: Leniency | None = None,
 ) -> Resolved:
     """As `resolve`, with source at its own stamp, carried through the fixed frame."""
     if source_at is None or fixed is None:
@@ -68,16 +82,16 @@ def resolve_travel(
     for name in (target, source, fixed):
         forest.check_known(name)
     try:
-        stamp, target_from_fixed, static = resolve(forest, target, fixed, at, not_before)
+        stamp, target_from_fixed, static = resolve(forest, target, fixed, at, not_before, lenient)
     except FutureExtrapolationError:
         # Waiting for this leg is no use if it cannot help the other one.
-        resolve(forest, fixed, source, source_at, not_before)
+        resolve(forest, fixed, source, source_at, not_before, lenient)
         raise
     except DisconnectedError:
         with suppress(DisconnectedError, FutureExtrapolationError):
-            resolve(forest, fixed, source, source_at, not_before)
+            resolve(forest, fixed, source, source_at, not_before, lenient)
         raise
-    source_stamp, fixed_from_source, still = resolve(forest, fixed, source, source_at, not_before)
+    source_stamp, fixed_from_source, still = resolve(forest, fixed, source, source_at, not_before, lenient)
     if at is LATEST and static and not still:
         stamp = source_stamp
     return stamp, compose(target_from_fixed, fixed_from_source), static and still

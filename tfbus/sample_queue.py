@@ -10,6 +10,14 @@ from tfbus.statistics import QueueStatistics
 Overflow = Literal["conflate", "drop_oldest"]
 
 
+def check_capacity(capacity: object) -> None:
+    """Raise `TypeError` or `ValueError` unless a queue can hold that many."""
+    if isinstance(capacity, bool) or not isinstance(capacity, int):
+        raise TypeError(f"capacity must be an int, not {capacity!r}")
+    if capacity < 1:
+        raise ValueError(f"capacity must be at least 1, got {capacity}")
+
+
 class SampleQueue:
     """Batches in the order they came, or the newest sample of each child.
 
@@ -27,14 +35,11 @@ class SampleQueue:
     Attributes
     ----------
     dropped : int
-        Moving samples lost to the capacity, or discarded.
+        Moving samples lost to the capacity, or discarded with their frame or their time.
     """
 
     def __init__(self, capacity: int, overflow: Overflow) -> None:
-        if isinstance(capacity, bool) or not isinstance(capacity, int):
-            raise TypeError(f"capacity must be an int, not {capacity!r}")
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}")
+        check_capacity(capacity)
         if overflow not in ("conflate", "drop_oldest"):
             raise ValueError(f"overflow must be 'conflate' or 'drop_oldest', not {overflow!r}")
         self.capacity = capacity
@@ -73,8 +78,15 @@ class SampleQueue:
         return batch
 
     def forget(self, child: str) -> None:
-        """Take out every sample of a frame that has been removed."""
-        self._keep_only(lambda sample: sample.child != child)
+        """Take out every sample of a frame that has been removed; moving ones count as dropped."""
+        pending = self._newest.pop(child, None)
+        if pending is not None and not pending.static:
+            self._moving -= 1
+            self.dropped += 1
+        if any(sample.child == child for batch in self._batches for sample in batch):
+            before = self._moving
+            self._keep_only(lambda sample: sample.child != child)
+            self.dropped += before - self._moving
 
     def discard_moving(self) -> None:
         """Take out every moving sample, as when the clock jumps back; they count as dropped."""

@@ -5,7 +5,7 @@ from typing import Any
 
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry import Row, Transform, from_row
-from tfbus.stamps import as_stamp, format_stamp
+from tfbus.stamps import as_stamp, format_duration, format_stamp
 
 Fields = tuple[str, str, int, Row, str, bool]
 
@@ -98,6 +98,16 @@ class TransformStamped:
         """Whether it holds at every stamp."""
         return self._fields[5]
 
+    @property
+    def extrapolated_by(self) -> int:
+        """How far an answer is from a sample that stood in for its stamp, in ns; never more than the policy allows."""
+        return 0
+
+    @property
+    def gap(self) -> int | None:
+        """How far two samples are apart that an answer was interpolated between, in ns; None without a policy."""
+        return None
+
     def replace(self, **changes: Any) -> "TransformStamped":
         """A copy with some fields changed, checked again."""
         parent, child, stamp, row, authority, static = self._fields
@@ -127,11 +137,51 @@ class TransformStamped:
         return f"{self.parent} <- {self.child} {when}: {self.transform}"
 
 
+class QualifiedTransform(TransformStamped):
+    """The answer of a lookup that was given a policy: it says what was done."""
+
+    __slots__ = ("_done",)
+    _done: tuple[int, int]
+
+    @property
+    def extrapolated_by(self) -> int:
+        """How far the stamp is from the sample that stood in for it, in ns, on the edge where that is furthest."""
+        return self._done[0]
+
+    @property
+    def gap(self) -> int:
+        """How far two samples are apart that were interpolated between, in ns, on the edge where that is furthest."""
+        return self._done[1]
+
+    def __str__(self) -> str:
+        held = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
+        return super().__str__() + held
+
+
 def answer_of(target: str, source: str, stamp: int, row: Row, static: bool) -> TransformStamped:
     """A lookup's answer, of parts that are known to be good; nothing is checked."""
     sample = TransformStamped.__new__(TransformStamped)
     sample._fields = target, source, stamp, row, "", static
     return sample
+
+
+def qualified_answer(
+    target: str, source: str, stamp: int, row: Row, static: bool, extrapolated_by: int, gap: int
+) -> QualifiedTransform:
+    """As `answer_of`, with what a policy did."""
+    sample = QualifiedTransform.__new__(QualifiedTransform)
+    sample._fields = target, source, stamp, row, "", static
+    sample._done = extrapolated_by, gap
+    return sample
+
+
+def renamed(answer: TransformStamped, target: str, source: str) -> TransformStamped:
+    """An answer under other names of its two frames."""
+    twin = type(answer).__new__(type(answer))
+    twin._fields = target, source, *answer._fields[2:]
+    if isinstance(answer, QualifiedTransform) and isinstance(twin, QualifiedTransform):
+        twin._done = answer._done
+    return twin
 
 
 def is_frame(name: object) -> bool:

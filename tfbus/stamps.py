@@ -96,7 +96,8 @@ def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
     ValueError
         If the shape is not (n,), or one does not fit a signed 64-bit integer.
     """
-    array = np.asarray(values)
+    # In a list, numpy would turn what stands beside an integer into one too.
+    array = np.asarray(values, object if isinstance(values, (list, tuple)) else None)
     if array.ndim != 1:
         raise ValueError(f"stamps must have shape (n,), got {array.shape}")
     if array.dtype.kind not in "iu" or array.dtype == np.uint64:

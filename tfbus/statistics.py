@@ -17,7 +17,7 @@ class BufferStatistics:
 
 @dataclass(frozen=True, slots=True)
 class QueueStatistics:
-    """One bounded queue: a stream, or the samples of other threads."""
+    """One bounded queue: a stream, the samples of other threads, or events."""
 
     kind: str
     overflow: str

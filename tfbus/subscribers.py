@@ -5,9 +5,11 @@ from collections.abc import Callable
 from inspect import iscoroutinefunction
 from itertools import count
 
+from tfbus.announcer import Announcer
+from tfbus.events import SubscriberFailed
 from tfbus.once import OnceLogger
 from tfbus.registration import Registration
-from tfbus.stamped import Batch
+from tfbus.stamped import Batch, TransformStamped
 
 BatchCallback = Callable[[Batch], object]
 
@@ -26,8 +28,9 @@ class Subscribers:
         Exceptions that subscribers raised.
     """
 
-    def __init__(self, log: OnceLogger) -> None:
+    def __init__(self, log: OnceLogger, news: Announcer) -> None:
         self._log = log
+        self._announcer = news
         self.callbacks: dict[int, BatchCallback] = {}
         self._keys = count()
         self._backlog: deque[Batch] = deque()
@@ -71,7 +74,14 @@ class Subscribers:
 
     def discard_moving(self) -> None:
         """Take the moving samples out of what waits to be delivered: the clock has jumped back."""
-        batches = (tuple(sample for sample in batch if sample.static) for batch in self._backlog)
+        self._keep_only(lambda sample: sample.static)
+
+    def forget(self, child: str) -> None:
+        """Take the samples of a removed frame out of what waits to be delivered."""
+        self._keep_only(lambda sample: sample.child != child)
+
+    def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
+        batches = (tuple(filter(wanted, batch)) for batch in self._backlog)
         self._backlog = deque(batch for batch in batches if batch)
 
     def _deliver_backlog(self) -> None:
@@ -93,6 +103,8 @@ class Subscribers:
         except Exception as error:  # noqa: BLE001 - a subscriber is somebody else's code
             self.failures += 1
             self._log.warning(("subscriber", key), "the subscriber %s raised", _name(callback), exc_info=error)
+            if self._announcer:
+                self._announcer.tell(SubscriberFailed(self._announcer.now(), _name(callback), error))
 
 
 def _name(callback: BatchCallback | None) -> str:

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import InvalidTransformError
-from tfbus.geometry import NORM_TOLERANCE, Columns, Transform, compose, from_row, invert, rotate
+from tfbus.geometry import NORM_TOLERANCE, ROUNDING, Columns, Transform, compose, from_row, invert, rotate
 
 Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
 
 
 class TransformArray:
@@ -24,13 +25,13 @@ class TransformArray:
     translations : array of shape (n, 3)
         In m.
     rotations : array of shape (n, 4)
-        Unit quaternions (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given. A row of NaN
-        means that there is no transform.
+        Unit quaternions (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given. NaN throughout,
+        in a translation and its rotation, means that there is no transform.
 
     Raises
     ------
     InvalidTransformError
-        If the shapes are wrong, or a row is infinite or too far from a unit quaternion.
+        If the shapes are wrong, or a row is not finite, or too far from a unit quaternion.
 
     Examples
     --------
@@ -43,8 +44,9 @@ class TransformArray:
     """
 
     __array_ufunc__ = None
-    __slots__ = ("_columns",)
+    __slots__ = ("_columns", "_done")
     _columns: Floats
+    _done: Integers | None
 
     def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike) -> None:
         moves = np.asarray(translations, np.float64)
@@ -54,15 +56,20 @@ class TransformArray:
                 f"translations and rotations must have shapes (n, 3) and (n, 4), got {moves.shape} and {turns.shape}",
                 reason="wrong length",
             )
-        norms = np.linalg.norm(turns, axis=1)
-        wrong = np.isinf(moves).any(axis=1) | (np.abs(norms - 1.0) > NORM_TOLERANCE)
+        with np.errstate(over="ignore"):
+            norms = np.sqrt(np.square(turns).sum(axis=1))
+        missing = np.isnan(moves).all(axis=1) & np.isnan(turns).all(axis=1)
+        wrong = ~(missing | (np.isfinite(moves).all(axis=1) & (np.abs(norms - 1.0) <= NORM_TOLERANCE)))
         if wrong.any():
             i = int(wrong.argmax())
             raise InvalidTransformError(
                 f"transform {i} is not rigid: translation {moves[i]}, rotation {turns[i]}",
                 reason="not a unit quaternion",
             )
-        self._columns = _frozen(np.vstack((moves.T, turns.T / norms)))
+        norms[np.abs(norms - 1.0) <= ROUNDING] = 1.0
+        self._columns = np.vstack((moves.T, turns.T / norms))
+        self._columns.flags.writeable = False
+        self._done = None
 
     @property
     def translations(self) -> Floats:
@@ -78,6 +85,16 @@ class TransformArray:
     def valid(self) -> npt.NDArray[np.bool_]:
         """Whether each is a transform, not NaN: a new array of shape (n,)."""
         return np.asarray(np.isfinite(self._columns).all(axis=0))
+
+    @property
+    def extrapolated_by(self) -> Integers:
+        """As `TransformStamped.extrapolated_by`, of each: a read-only array of shape (n,) in ns."""
+        return np.zeros(len(self), np.int64) if self._done is None else self._done[0]
+
+    @property
+    def gap(self) -> Integers | None:
+        """As `TransformStamped.gap`, of each: a read-only array of shape (n,) in ns; None without a policy."""
+        return None if self._done is None else self._done[1]
 
     def matrices(self) -> Floats:
         """New homogeneous matrices of shape (n, 4, 4)."""
@@ -111,7 +128,8 @@ class TransformArray:
             raise ValueError(f"points must have shape ({len(self)}, 3), one for each transform, got {array.shape}")
         dtype = array.dtype if np.issubdtype(array.dtype, np.floating) else np.dtype(np.float64)
         moved = np.empty(array.shape, dtype)
-        moved.T[:] = move((*self._columns,), *array.T.astype(np.float64))
+        with np.errstate(invalid="ignore"):
+            moved.T[:] = move((*self._columns,), *array.T.astype(np.float64))
         return moved
 
     def inverse(self) -> "TransformArray":
@@ -138,12 +156,16 @@ class TransformArray:
 
         Raises
         ------
+        IndexError
+            If there is none at the index, or the index has more dimensions than one.
         InvalidTransformError
             If the one that is asked for is NaN.
         """
         columns = self._columns[:, index]
-        if columns.ndim != 1:
-            return from_columns(columns)
+        if columns.ndim > 2:
+            raise IndexError(f"index {index!r} does not leave transforms in a row")
+        if columns.ndim == 2:
+            return from_columns(columns, None if self._done is None else self._done[:, index])
         x, y, z, qx, qy, qz, qw = columns.tolist()
         if x != x:
             raise InvalidTransformError(f"transform {index} is NaN: it has no value", reason="not finite")
@@ -156,13 +178,20 @@ class TransformArray:
         return f"<TransformArray of {len(self)}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return from_columns, (self._columns,)
+        return from_columns, (self._columns, self._done)
 
 
-def from_columns(columns: Floats) -> TransformArray:
-    """The transforms of an array of shape (7, n) that is known to be good; it belongs to them from now on."""
+def from_columns(columns: Floats, done: Integers | None = None) -> TransformArray:
+    """The transforms of an array of shape (7, n) that is known to be good, with what a policy did, of shape (2, n).
+
+    The arrays belong to the transforms from now on.
+    """
     transforms = TransformArray.__new__(TransformArray)
-    transforms._columns = _frozen(columns)
+    columns.flags.writeable = False
+    transforms._columns = columns
+    if done is not None:
+        done.flags.writeable = False
+    transforms._done = done
     return transforms
 
 
@@ -180,8 +209,3 @@ def _columns_of(other: object, count: int) -> Columns | None:
     if len(other) != count:
         raise ValueError(f"{count} and {len(other)} transforms cannot be combined one by one")
     return (*other._columns,)
-
-
-def _frozen(columns: Floats) -> Floats:
-    columns.flags.writeable = False
-    return columns

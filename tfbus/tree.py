@@ -182,6 +182,13 @@ class TransformTree(TreeReader):
             twin.forest = self.forest.copy()
         return twin
 
+    def adopt(self, other: "TransformTree") -> None:
+        """Hold a copy of what another tree holds, as far back as this one keeps it, instead of its own samples."""
+        with other._lock:
+            forest = other.forest.within(self.forest.window)
+        with self._lock:
+            self.forest = forest
+
     # Pictures
 
     def describe(self, now: int | None = None) -> str:

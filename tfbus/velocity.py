@@ -9,6 +9,7 @@ import math
 from bisect import bisect_left
 from typing import NamedTuple
 
+from tfbus.errors import PastExtrapolationError
 from tfbus.forest import Forest
 from tfbus.geometry import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
 from tfbus.history import RECORD, RECORD_SIZE, FrameHistory
@@ -34,18 +35,31 @@ def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tupl
 
     The errors are those of `TransformTree.twist`. The caller holds the lock.
     """
-    stamp, _, static = resolve(forest, reference, frame, at, None)
-    if at is LATEST:
-        other, _, still = resolve(forest, axes, reference, at, None)
-        stamp = other if static else stamp if still else min(stamp, other)
-    axes_from_reference = resolve(forest, axes, reference, stamp, None)[1]
-    _, linear, angular = _motion(forest.find_path(reference, frame, stamp), stamp)
-    turn = axes_from_reference[3:]
+    stamp = _common_stamp(forest, frame, reference, axes) if at is LATEST else at
+    resolve(forest, reference, frame, stamp, None)
+    turn = resolve(forest, axes, reference, stamp, None)[1][3:]
+    linear, angular = _motion(forest.find_path(reference, frame, stamp), stamp)
     return stamp, rotate(turn, *linear), rotate(turn, *angular)
 
 
-def _motion(path: Path, at: int) -> Motion:
-    """How the source of a path moves, seen from its target.
+def _common_stamp(forest: Forest, frame: str, reference: str, axes: str) -> int:
+    """The newest stamp at which both the frame and the axes are known; that of static samples if nothing moves."""
+    stamp, _, static = resolve(forest, reference, frame, LATEST, None)
+    other, _, still = resolve(forest, axes, reference, LATEST, None)
+    if still or static or stamp == other:
+        return stamp if still else other
+    (lagging_end, ahead_end), common = ((frame, axes), stamp) if stamp < other else ((axes, frame), other)
+    try:
+        resolve(forest, reference, ahead_end, common, None)
+    except PastExtrapolationError as error:
+        # As for one path, the edge that lags has to come as far as the others still reach back.
+        lagging = forest.find_path(reference, lagging_end, LATEST).newest_common()[1]
+        raise lagging.missing(common if error.oldest is None else error.oldest) from error
+    return common
+
+
+def _motion(path: Path, at: int) -> tuple[Vector, Vector]:
+    """The linear and angular velocity of a path's source, seen from its target.
 
     Both ends are seen from the common ancestor first. Then the target's own motion is taken off, as in Craig,
     "Introduction to Robotics", 3rd edition, section 5.3, and what is left is told along the target's axes.
@@ -54,9 +68,8 @@ def _motion(path: Path, at: int) -> Motion:
     arm = _difference(above.row[:3], below.row[:3])
     linear = _difference(_difference(above.linear, below.linear), _cross(below.angular, arm))
     angular = _difference(above.angular, below.angular)
-    back = invert(below.row)
-    turn = back[3:]
-    return Motion(compose(back, above.row), rotate(turn, *linear), rotate(turn, *angular))
+    turn = invert(below.row)[3:]
+    return rotate(turn, *linear), rotate(turn, *angular)
 
 
 def _climb(steps: tuple[Step, ...], at: int) -> Motion:
@@ -77,10 +90,10 @@ def _edge_motion(edge: FrameHistory, at: int) -> Motion:
     i = bisect_left(edge.stamps, at)
     if edge.stamps[i] == at and not _joined(edge, i):
         i += 1
-        if not _joined(edge, i):
+        if i == len(edge.stamps):
             # A lone sample says where the frame is, but not where it is going.
             raise edge.missing(at + 1)
-    elif edge.parents is not None and edge.origins[i - 1][0] != edge.origins[i][0]:
+    if not _joined(edge, i):
         return Motion(row, STILL, STILL)
     stamp, ax, ay, az, *before = RECORD.unpack_from(edge.records, (i - 1) * RECORD_SIZE)
     until, bx, by, bz, *after = RECORD.unpack_from(edge.records, i * RECORD_SIZE)
@@ -98,11 +111,15 @@ def _joined(edge: FrameHistory, i: int) -> bool:
 
 def _turn_rate(before: Quaternion, after: Quaternion, rate: float) -> Vector:
     """The constant angular velocity that turns one rotation into the next along the shorter arc, in the parent."""
-    x, y, z, w = compose((0.0, 0.0, 0.0, *after), invert((0.0, 0.0, 0.0, *before)))[3:]
+    x, y, z, _ = compose((0.0, 0.0, 0.0, *after), invert((0.0, 0.0, 0.0, *before)))[3:]
     sine = math.hypot(x, y, z)
     if sine == 0.0:
         return STILL
-    scale = 2.0 * math.atan2(sine, abs(w)) / sine * (-rate if w < 0.0 else rate)
+    # Added up as the lookup does it, for where this is all rounding it decides which way a half turn goes.
+    ai, aj, ak, aw = before
+    bi, bj, bk, bw = after
+    dot = ai * bi + aj * bj + ak * bk + aw * bw
+    scale = 2.0 * math.atan2(sine, abs(dot)) / sine * (-rate if dot < 0.0 else rate)
     return x * scale, y * scale, z * scale
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import count
 
 from tfbus.errors import DisconnectedError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus.policy import Policy
 from tfbus.stamps import STAMP_MIN, Latest
 
 MAY_COME = (UnknownFrameError, DisconnectedError, FutureExtrapolationError)
@@ -22,13 +23,15 @@ _Place = tuple[int, int, "Waiter"]
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What a lookup asks: its arguments, stamps in ns."""
+    """What a lookup asks: its arguments, stamps in ns, `max_age` in s."""
 
     target: str
     source: str
     at: int | Latest
     source_at: int | Latest | None = None
     fixed: str | None = None
+    max_age: float | None = None
+    policy: Policy | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +130,7 @@ class WaitingIndex:
             # At the stamp that all have reached, something else is missing as well.
             waiter.names = tuple(dict.fromkeys((*waiter.names, *blocking_frames(cause))))
         if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
-            needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp
+            needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp - error.slack
             waiter.place = (-needed, -next(self._order), waiter)
             insort(self._under(error.child).places, waiter.place)
         else:

@@ -14,6 +14,7 @@ KEEP = 10
 START = 1_000_000_000_000
 PERIOD = 10_000_000
 BATCH = 20
+MANY = 10_000
 
 Vector = tuple[float, float, float]
 Pass = Callable[[], tuple[float, Vector]]
@@ -54,10 +55,12 @@ def history(chain: str) -> list[Sample]:
     return samples
 
 
-def questions() -> list[int]:
+def questions(kind: str) -> list[int]:
     """Stamps at which every moving edge of a `history` has to interpolate."""
     rng = random.Random(3)
-    return [rng.randrange(START + PERIOD, START + 999 * PERIOD) for _ in range(2_000)]
+    count = MANY if kind.startswith("many") else 2_000
+    stamps = [rng.randrange(START + PERIOD, START + 999 * PERIOD) for _ in range(count)]
+    return sorted(stamps) if kind == "many, sorted" else stamps
 
 
 def _trajectory(rng: random.Random, parent: str, child: str, count: int, *, static: bool = False) -> list[Sample]:

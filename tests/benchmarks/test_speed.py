@@ -5,13 +5,10 @@ the setup of each of pytest-benchmark's rounds. No test asserts a time.
 """
 
 import gc
-import json
-import subprocess
 import tracemalloc
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import partial
-from pathlib import Path
 from statistics import median
 from time import perf_counter
 from typing import Any
@@ -20,83 +17,21 @@ import anyio
 import anyio.lowlevel
 import cases
 import pytest
+from beside import Ask, Table, build, show
 from cases import AUTHORITY, BASE, START, Case, Pass, Vector
 
 from tfbus import LATEST, Buffer, Bus, Transform, TransformStamped
+
+pytest_plugins = ["side_by_side"]
 
 ROUNDS = 25
 FEW_ROUNDS = 5
 WAKE_UPS = 200
 CROWD = 10_000
-SYSTEM_PYTHON = "/usr/bin/python3"
 
 Backend = tuple[str, dict[str, Any]]
 Run = Callable[[Callable[[], Awaitable[None]]], None]
-Ask = Callable[[Case], tuple[float, Vector]]
 Calls = Sequence[TransformStamped | Sequence[TransformStamped]]
-
-
-class Table:
-    """What was measured, shown at the end of the run."""
-
-    def __init__(self) -> None:
-        self._lines: list[str] = []
-
-    def add(self, label: str, ours: str, peer: str = "", ratio: str = "", wanted: str = "") -> None:
-        self._lines.append(f"{label:36} {ours:>17}   {peer:24} {ratio:18} {wanted}".rstrip())
-
-    def compare(
-        self, label: str, ours: list[float], name: str, peer: list[float], wanted: str = "", unit: str = "us"
-    ) -> None:
-        """Add a line from the seconds a call of each round, ours and the peer's."""
-        ratios = [mine / other for mine, other in zip(ours, peer, strict=True)]
-        ratio = f"{median(ratios):.2f} ({min(ratios):.2f}-{max(ratios):.2f})"
-        self.add(label, _show(ours, unit), f"{name} {_show(peer, unit)}", ratio, wanted)
-
-    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        terminalreporter.write_sep("=", "speed")
-        terminalreporter.write_line("median and (least) time of a call over the rounds, median ratio and (range)")
-        for line in self._lines:
-            terminalreporter.write_line(line)
-
-
-def _show(rounds: list[float], unit: str) -> str:
-    scale = {"us": 1e6, "ms": 1e3}[unit]
-    return f"{median(rounds) * scale:.2f} ({min(rounds) * scale:.2f}) {unit}"
-
-
-@pytest.fixture(scope="session")
-def table(request: pytest.FixtureRequest) -> Table:
-    table = Table()
-    table.add("", "tfbus", "peer", "ratio", "wanted")
-    request.config.pluginmanager.register(table)
-    return table
-
-
-@pytest.fixture(scope="session")
-def tf2() -> Iterator[Ask | str]:
-    """Has the real tf2, in a process of its own, measure one round of a case; or says why there is none."""
-    if not Path(SYSTEM_PYTHON).exists():
-        yield f"no {SYSTEM_PYTHON}"
-        return
-    script = Path(__file__).with_name("tf2_peer.py")
-    with subprocess.Popen([SYSTEM_PYTHON, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
-        requests, replies = process.stdin, process.stdout
-        assert requests is not None
-        assert replies is not None
-
-        def ask(case: Case) -> tuple[float, Vector]:
-            print(json.dumps(case), file=requests, flush=True)
-            seconds, answer = json.loads(replies.readline())
-            return seconds, answer
-
-        greeting = replies.readline().strip()
-        yield ask if greeting == "ready" else f"{SYSTEM_PYTHON}: {greeting}"
-
-
-def build(sample: cases.Sample) -> TransformStamped:
-    transform = Transform(sample.translation, sample.rotation)
-    return TransformStamped(sample.parent, sample.child, sample.stamp, transform, AUTHORITY, sample.static)
 
 
 def publish_all(bus: Bus, calls: Calls) -> float:
@@ -137,7 +72,7 @@ def lookup(case: Case) -> Pass:
     bus = Bus()
     buffer = Buffer(bus, 2 * cases.KEEP)
     bus.publish(build(sample) for sample in cases.history(case.chain))
-    stamps = [LATEST if case.kind == "lookup latest" else stamp for stamp in cases.questions()]
+    stamps = [LATEST if case.kind == "lookup latest" else stamp for stamp in cases.questions(case.kind)]
     source = f"f{len(case.chain) - 1}"
 
     def one_pass() -> tuple[float, Vector]:
@@ -185,7 +120,7 @@ def test_beside_tf2(benchmark: Any, table: Table, tf2: Ask | str, label: str, ca
 
     answer = benchmark.pedantic(our_turn, setup=peers_turn, rounds=ROUNDS)
     if isinstance(tf2, str):
-        table.add(label, _show(ours, "us"), "no tf2")
+        table.add(label, show(ours, "us"), "no tf2")
         pytest.skip(f"no tf2 to measure beside ({tf2}); on Debian: apt-get install python3-tf2-ros")
     table.compare(label, ours, "tf2", peer, wanted)
     assert answer == pytest.approx(expected[-1], abs=1e-6)

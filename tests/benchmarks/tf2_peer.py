@@ -1,4 +1,4 @@
-"""The real tf2's side of `test_speed.py`, under the Python that has `tf2_py` (Debian: python3-tf2-ros).
+"""The real tf2's side of the benchmarks, under the Python that has `tf2_py` (Debian: python3-tf2-ros).
 
 Says ``ready``, or what is missing; then answers each `Case`, a JSON line, with what one pass gives.
 """
@@ -64,7 +64,8 @@ def lookup(case: Case) -> Pass:
     core = tf2_py.BufferCore(rospy.Duration(2 * KEEP))
     for sample in history(case.chain):
         (core.set_transform_static if sample.static else core.set_transform)(build(sample), AUTHORITY)
-    times = [rospy.Time() if case.kind == "lookup latest" else rospy.Time(*time_parts(stamp)) for stamp in questions()]
+    stamps = questions(case.kind)
+    times = [rospy.Time() if case.kind == "lookup latest" else rospy.Time(*time_parts(stamp)) for stamp in stamps]
     source = f"f{len(case.chain) - 1}"
 
     def one_pass() -> tuple[float, Vector]:

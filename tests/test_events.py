@@ -1,0 +1,73 @@
+import pickle
+from dataclasses import FrozenInstanceError
+from typing import get_args
+
+import pytest
+
+from tfbus import (
+    SECOND,
+    AuthorityConflict,
+    ClockReset,
+    Event,
+    FrameAdded,
+    FrameLive,
+    FrameRemoved,
+    FrameStale,
+    InvalidTransformError,
+    KindChanged,
+    Reparented,
+    SampleRejected,
+    SubscriberFailed,
+)
+
+AT = 12 * SECOND + 500_000_000
+ONE_OF_EACH: list[tuple[Event, str]] = [
+    (FrameAdded(AT, "tool", "arm", "cell", static=False), "moving frame 'tool' is new under 'arm', from 'cell'"),
+    (FrameAdded(AT, "tool", "arm", "", static=True), "static frame 'tool' is new under 'arm', from ''"),
+    (FrameRemoved(AT, "tool"), "frame 'tool' was removed"),
+    (Reparented(AT, "cup", "hand", "table", "cell"), "frame 'cup' moves from 'table' to 'hand', says 'cell'"),
+    (KindChanged(AT, "cup", static=True, authority="cell"), "frame 'cup' is now static, says 'cell'"),
+    (KindChanged(AT, "cup", static=False, authority="cell"), "frame 'cup' is now moving, says 'cell'"),
+    (
+        AuthorityConflict(AT, "odom", "slam", "odometry"),
+        "frame 'odom' comes from two authorities, 'slam' and 'odometry'",
+    ),
+    (
+        SampleRejected(AT, "cycle", "a", "b", "rogue", InvalidTransformError("no\nloops", reason="cycle")),
+        "a sample from 'rogue' was rejected: no loops",
+    ),
+    (
+        SampleRejected(AT, "not a sample", None, None, None, TypeError("what is 7?")),
+        "a sample was rejected: what is 7?",
+    ),
+    (
+        FrameStale(AT, "base", 12 * SECOND, "odometry"),
+        "frame 'base' is stale, its newest sample from 'odometry' is 500 ms old",
+    ),
+    (FrameLive(AT, "base", AT, "odometry"), "frame 'base' is live again, from 'odometry'"),
+    (ClockReset(AT, 90 * SECOND), "the clock jumped back from 90.000 s"),
+    (SubscriberFailed(AT, "print", OSError("full")), "the subscriber print raised OSError('full')"),
+]
+
+
+def test_there_is_one_of_each() -> None:
+    assert {type(event) for event, _ in ONE_OF_EACH} == set(get_args(Event))
+
+
+@pytest.mark.parametrize(("event", "text"), ONE_OF_EACH)
+def test_an_event_reads_as_one_line_that_begins_with_its_stamp(event: Event, text: str) -> None:
+    assert str(event) == f"12.500 s: {text}"
+
+
+@pytest.mark.parametrize(("event", "text"), ONE_OF_EACH)
+def test_an_event_is_a_value(event: Event, text: str) -> None:
+    with pytest.raises(FrozenInstanceError):
+        event.stamp = 0  # type: ignore[misc]
+    assert not hasattr(event, "__dict__")
+    assert str(pickle.loads(pickle.dumps(event))) == f"12.500 s: {text}"
+    assert len({event, event}) == 1
+
+
+def test_two_rejections_for_the_same_reason_are_equal_whatever_their_errors() -> None:
+    first, second = (SampleRejected(AT, "cycle", "a", "b", "rogue", ValueError(text)) for text in ("one", "two"))
+    assert first == second

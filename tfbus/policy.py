@@ -1,0 +1,68 @@
+"""What counts as answerable, beyond what lies between two samples.
+
+Without a policy nothing is extrapolated, and any two samples are interpolated between, however far apart they are.
+"""
+
+import math
+from dataclasses import dataclass
+
+from tfbus.stamps import STAMP_MAX, as_duration, from_seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Let an edge's newest sample stand in for the stamps after it.
+
+    Parameters
+    ----------
+    max_age : float
+        For how long, in s.
+    """
+
+    max_age: float
+
+    def __post_init__(self) -> None:
+        as_duration(self.max_age, "max_age")
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """How far an answer may depart from its stamp; all in ns. `policy_of` makes one from what users write.
+
+    Parameters
+    ----------
+    tolerance : int
+        How far the nearest sample may be from a stamp that is not covered.
+    max_gap : int or None
+        How far two samples may be apart that are interpolated between; None for any distance.
+    hold : int
+        For how long a sample may stand in for the stamps after it.
+    """
+
+    tolerance: int = 0
+    max_gap: int | None = None
+    hold: int = 0
+
+
+def policy_of(tolerance: float, max_gap: float | None, extrapolate: Hold | None) -> Policy | None:
+    """The policy that three arguments in s make; None if they allow and refuse nothing.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one is not a duration, or `extrapolate` not a `Hold`.
+    """
+    if tolerance == 0.0 and max_gap is None and extrapolate is None:
+        return None
+    if extrapolate is not None and not isinstance(extrapolate, Hold):
+        raise TypeError(f"extrapolate must be a Hold, not {extrapolate!r}")
+    return Policy(
+        _nanoseconds(tolerance, "tolerance"),
+        None if max_gap is None else _nanoseconds(max_gap, "max_gap"),
+        0 if extrapolate is None else _nanoseconds(extrapolate.max_age, "max_age"),
+    )
+
+
+def _nanoseconds(seconds: float, name: str) -> int:
+    duration = as_duration(seconds, name)
+    return STAMP_MAX if duration == math.inf else from_seconds(duration)
