@@ -18,7 +18,7 @@ from tfbus import (
     PastExtrapolationError,
     TransformTree,
 )
-from tfbus.history import FrameHistory
+from tfbus.history import FrameHistory, Samples
 from tfbus.placement import Place, place, place_many
 from tfbus.policy import Policy
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
@@ -33,6 +33,11 @@ def history(samples: Iterable[int] | dict[int, str], keep: int | None = None) ->
     for stamp, parent in parents.items():
         made.insert(parent, stamp, ROW, "odometry")
     return made
+
+
+def around(edge: FrameHistory, asked: list[int]) -> Samples:
+    """What is copied for some questions, by the first and the last."""
+    return edge.between(min(asked, default=0), max(asked, default=0))
 
 
 def rule(stamps: list[int], at: int, policy: Policy) -> Place | None:
@@ -72,7 +77,7 @@ def test_many_stamps_are_placed_as_one_by_one(
     stamps: set[int], policy: Policy, asked: list[int], keep: int | None
 ) -> None:
     edge = history(sorted(stamps), keep)
-    read_at, away, gap = place_many(edge, np.array(asked, np.int64), policy)
+    read_at, away, gap = place_many(around(edge, asked), np.array(asked, np.int64), policy)
     for i, at in enumerate(asked):
         try:
             found = place(edge, at, policy)
@@ -86,7 +91,7 @@ def test_many_stamps_are_placed_as_one_by_one(
 def test_no_sample_with_another_parent_stands_in(parents: dict[int, str], policy: Policy) -> None:
     edge = history(dict(sorted(parents.items())))
     asked = np.arange(-60, 61)
-    read_at, away, _ = place_many(edge, asked, policy)
+    read_at, away, _ = place_many(around(edge, asked.tolist()), asked, policy)
     for i, at in enumerate(asked.tolist()):
         try:
             found = place(edge, at, policy)
@@ -103,7 +108,7 @@ def test_stamps_further_apart_than_a_signed_number_says_are_not_near() -> None:
     policy = Policy(tolerance=5, max_gap=5)
     with pytest.raises(GapError):
         place(edge, 0, policy)
-    _, away, _ = place_many(edge, np.array([0, STAMP_MAX - 5, STAMP_MIN + 6]), policy)
+    _, away, _ = place_many(edge.between(STAMP_MIN, STAMP_MAX), np.array([0, STAMP_MAX - 5, STAMP_MIN + 6]), policy)
     assert away.tolist() == [-1, 5, -1]
 
 

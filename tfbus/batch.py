@@ -1,94 +1,164 @@
 """One question at many stamps.
 
-While the tree is locked, `survey` finds the paths and copies the samples that they need, as blocks of memory. All
-arithmetic comes after that, in numpy, in chunks that stay in the cache.
+While the tree is locked, `take` finds the paths that hold between the first stamp and the last, and copies the samples
+on them, as blocks of memory. All that numpy does comes after that, in chunks that stay in the cache. Which error the
+first stamp without an answer gets, the scalar lookup is asked afterwards.
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from itertools import repeat
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.curve import Curve, Floats, Stamps
-from tfbus.errors import (
-    DisconnectedError,
-    ExtrapolationError,
-    FutureExtrapolationError,
-    TransformLookupError,
-)
+from tfbus.errors import DisconnectedError
 from tfbus.forest import Forest
 from tfbus.geometry import IDENTITY, Columns, Row, compose, invert
 from tfbus.history import FrameHistory, Samples
 from tfbus.path import Path, Step
-from tfbus.placement import place_all, place_path
+from tfbus.placement import place_many
 from tfbus.policy import Policy
 from tfbus.resolve import resolve, resolve_travel
 from tfbus.transform_array import TransformArray, from_columns, move
-
-OutOfRange = Literal["raise", "nan"]
-Places = slice | npt.NDArray[np.intp]
 
 FEW = 40
 """Up to so many stamps are answered faster one by one."""
 _CHUNK = 2048
 
+OutOfRange = Literal["raise", "nan"]
+Places = slice | npt.NDArray[np.intp]
 
-class Survey:
-    """What the answers at many stamps are made of, taken from a forest.
+
+class Leg(NamedTuple):
+    """Where a source is, seen from a target, at many stamps."""
+
+    target: str
+    source: str
+    stamps: Stamps
+
+    def ends(self) -> tuple[int, int] | None:
+        """The first and the last stamp; None if there are none."""
+        return (int(self.stamps.min()), int(self.stamps.max())) if len(self.stamps) else None
+
+
+class Route(NamedTuple):
+    """A path with copies of the samples on its moving edges; of static ones, the row that they amount to."""
+
+    up: tuple[Samples | Row, ...]
+    down: tuple[Samples | Row, ...]
+
+    @property
+    def moving(self) -> list[Samples]:
+        """The moving edges, in the order up, then down."""
+        return [step for step in (*self.up, *self.down) if isinstance(step, Samples)]
+
+    def covers(self, stamps: Stamps) -> bool:
+        """Whether each edge covers all of some stamps."""
+        low, high = stamps.min(), stamps.max()
+        return all(edge.stamps and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
+
+
+class Taken(NamedTuple):
+    """What the answers between two stamps are made of."""
+
+    changes: list[int]
+    """The stamps, in ns, at which the path may change."""
+    routes: list[Route | None]
+    """One before the first change, and one from each on; None where the frames are not connected."""
+
+
+def take(forest: Forest, target: str, source: str, stamps: tuple[int, int] | None) -> Taken:
+    """Take what the transforms from source to target need, from a first stamp to a last; None for no stamps.
+
+    The caller holds the lock.
+
+    Raises
+    ------
+    UnknownFrameError
+    """
+    forest.check_known(target)
+    forest.check_known(source)
+    if stamps is None:
+        return Taken([], [None])
+    low, high = stamps
+    paths: list[Path | None] = [_path(forest, target, source, low)]
+    changes: list[int] = []
+    if paths[0] is None or not paths[0].lasting:
+        changes = [stamp for stamp in forest.parent_changes() if low < stamp <= high]
+        paths += [_path(forest, target, source, stamp) for stamp in changes]
+    routes: dict[tuple[tuple[Step, ...], tuple[Step, ...]], Route] = {}
+    for path in paths:
+        if path is not None and (path.up, path.down) not in routes:
+            up = tuple(_copy(step, low, high) for step in path.up)
+            down = tuple(_copy(step, low, high) for step in path.down)
+            routes[path.up, path.down] = Route(up, down)
+    return Taken(changes, [None if path is None else routes[path.up, path.down] for path in paths])
+
+
+def _path(forest: Forest, target: str, source: str, at: int) -> Path | None:
+    try:
+        return forest.find_path(target, source, at)
+    except DisconnectedError:
+        return None
+
+
+def _copy(step: Step, low: int, high: int) -> Samples | Row:
+    return step.between(low, high) if isinstance(step, FrameHistory) else step
+
+
+class Answers:
+    """The answers at many stamps, worked out piece by piece when they are read.
+
+    Parameters
+    ----------
+    taken : Taken
+    leg : Leg
+    policy : Policy or None
 
     Attributes
     ----------
-    fault : TransformLookupError or None
-        Why the first of the stamps that have no answer has none, with its `index`.
-    severed : TransformLookupError or None
-        The fault, if there is no path at any of the stamps.
+    first_missing : int or None
+        The first place without an answer.
+    connected : bool
+        Whether the frames are connected at any of the stamps, or there are none.
     done : integer array of shape (2, n), or None
-        What the policy did at each stamp: `extrapolated_by` and `gap`, in ns.
+        What the policy did at each stamp, `extrapolated_by` and `gap` in ns; None without one.
     """
 
-    def __init__(self, count: int, policy: Policy | None = None) -> None:
-        self.fault: TransformLookupError | None = None
-        self.severed: TransformLookupError | None = None
-        self.done = None if policy is None else np.zeros((2, count), np.int64)
-        self._policy = policy
-        self._count = count
-        self._stretches: list[_Stretch] = []
+    def __init__(self, taken: Taken, leg: Leg, policy: Policy | None) -> None:
+        stamps = leg.stamps
+        self._count = len(stamps)
+        self._pieces: list[_Piece] = []
+        self.first_missing: int | None = None
+        self.connected = not len(stamps)
+        self.done = None if policy is None else np.zeros((2, len(stamps)), np.int64)
+        for places, route in _by_route(taken, stamps) if len(stamps) else ():
+            if route is None:
+                self._miss(places, np.zeros(len(stamps[places]), np.bool_))
+            else:
+                self.connected = True
+                self._add(places, stamps[places], route, policy)
 
-    def add(self, places: npt.NDArray[np.intp] | None, stamps: Stamps, path: Path) -> None:
-        """Take what stamps on one path need, with their places unless they are all; without those it does not cover."""
-        read_at: list[Stamps] | None = None
-        if self._policy is None or self.done is None:
-            covered = _covered(path, stamps)
+    def _add(self, places: Places, stamps: Stamps, route: Route, policy: Policy | None) -> None:
+        read_at = [stamps] * len(route.moving)
+        if policy is None:
+            known = None if route.covers(stamps) else _covered(route, stamps)
         else:
-            read_at, covered, done = place_path(path, stamps, self._policy)
-            self.done[:, slice(None) if places is None else places] = done
-        if covered is not None:
-            places = np.arange(len(stamps)) if places is None else places
-            first = int(covered.argmin())
-            self.report(int(places[first]), self._why(path, int(stamps[first])))
-            places, stamps = places[covered], stamps[covered]
-            read_at = None if read_at is None else [its[covered] for its in read_at]
+            known, read_at, done = _placed(route, stamps, policy)
+            assert self.done is not None
+            self.done[:, places] = done
+        if known is not None and not known.all():
+            self._miss(places, known)
+            places = np.arange(self._count)[places][known]
+            read_at = [its[known] for its in read_at]
+            stamps = stamps[known]
         if len(stamps):
-            self._stretches.append(_Stretch(places, stamps, path, read_at))
+            self._pieces.append(_Piece(places, len(stamps), route, read_at))
 
-    def _why(self, path: Path, at: int) -> ExtrapolationError:
-        """What a lookup at a stamp that has no answer would raise."""
-        if self._policy is None:
-            return path.blocker(at)
-        try:
-            place_all(path.moving, at, self._policy)
-        except ExtrapolationError as error:
-            return error
-        raise AssertionError(f"{at} has an answer")
-
-    def report(self, place: int, error: TransformLookupError) -> None:
-        """Take note that the stamp at this place has no answer."""
-        error.index = place
-        if self.fault is None or self.fault.index is None or place < self.fault.index:
-            self.fault = error
+    def _miss(self, places: Places, known: npt.NDArray[np.bool_]) -> None:
+        first = int(np.arange(self._count)[places][known.argmin()])
+        self.first_missing = first if self.first_missing is None else min(first, self.first_missing)
 
     def columns(self) -> Floats:
         """All answers, shape (7, n); NaN where there is none."""
@@ -112,214 +182,93 @@ class Survey:
         return moved
 
     def _chunks(self) -> Iterator[tuple[Places, Columns]]:
-        for stretch in self._stretches:
-            yield from stretch.chunks()
+        for piece in self._pieces:
+            yield from piece.chunks()
 
 
-class Answers(NamedTuple):
-    """A few answers that are all there already; otherwise like a `Survey`."""
-
-    rows: list[Row]
-    fault: None = None
-    severed: None = None
-    done: None = None
-
-    def columns(self) -> Floats:
-        """All answers, shape (7, n)."""
-        return np.array(self.rows, np.float64).reshape(-1, 7).T
-
-
-class Journey(NamedTuple):
-    """Answers in two legs, through a fixed frame."""
-
-    target_from_fixed: Survey
-    fixed_from_source: Survey
-
-    @property
-    def fault(self) -> TransformLookupError | None:
-        """As that of `Survey`: of the leg whose own comes first; at the same stamp, as `resolve_travel` chooses."""
-        first, second = (leg.fault for leg in self)
-        if first is None or second is None or first.index != second.index:
-            faults = [fault for fault in (first, second) if fault is not None]
-            return min(faults, key=lambda fault: fault.index or 0, default=None)
-        may_come = DisconnectedError, FutureExtrapolationError
-        over = isinstance(first, DisconnectedError) and not isinstance(second, may_come)
-        return second if over or isinstance(first, FutureExtrapolationError) else first
-
-    @property
-    def severed(self) -> TransformLookupError | None:
-        """As that of `Survey`: of the first leg that has one."""
-        return self.target_from_fixed.severed or self.fixed_from_source.severed
-
-    @property
-    def done(self) -> Stamps | None:
-        """As that of `Survey`: of both legs the greater."""
-        first, second = (leg.done for leg in self)
-        return None if first is None or second is None else np.maximum(first, second)
-
-    def columns(self) -> Floats:
-        """All answers, shape (7, n); NaN where there is none."""
-        first, second = (leg.columns() for leg in self)
-        return np.stack(compose((*first,), (*second,)))
-
-
-def take(
-    forest: Forest,
-    target: str,
-    source: str,
-    stamps: Stamps,
-    source_stamps: Stamps | None,
-    fixed: str | None,
-    policy: Policy | None,
-) -> Survey | Answers | Journey:
-    """Take from a forest what the answers at many stamps need. The caller holds the lock.
-
-    Raises
-    ------
-    UnknownFrameError
-    """
-    for name in (target, source) if fixed is None else (target, source, fixed):
-        forest.check_known(name)
-    if len(stamps) <= FEW and policy is None:
-        with suppress(ExtrapolationError, DisconnectedError):
-            return Answers(_resolve_few(forest, target, source, stamps, source_stamps, fixed))
-    if source_stamps is None or fixed is None:
-        return survey(forest, target, source, stamps, policy)
-    return Journey(survey(forest, target, fixed, stamps, policy), survey(forest, fixed, source, source_stamps, policy))
-
-
-def finish(taken: Survey | Answers | Journey, out_of_range: OutOfRange) -> TransformArray:
-    """The answers. The lock is not needed any more.
-
-    Raises
-    ------
-    TransformLookupError
-        The fault, if there is one; for ``"nan"``, only if there is no path at any of the stamps.
-    """
-    _check(taken, out_of_range)
-    return from_columns(taken.columns(), taken.done)
-
-
-def finish_points(found: Survey, points: npt.NDArray[Any], then: Row, out_of_range: OutOfRange) -> npt.NDArray[Any]:
-    """Points of shape (n, 3), each moved by its answer and then by another transform; errors as for `finish`."""
-    _check(found, out_of_range)
-    return found.apply(points, then)
-
-
-def _check(taken: Survey | Answers | Journey, out_of_range: OutOfRange) -> None:
-    if out_of_range not in ("raise", "nan"):
-        raise ValueError(f"out_of_range must be 'raise' or 'nan', not {out_of_range!r}")
-    fault = taken.fault if out_of_range == "raise" else taken.severed
-    if fault is not None:
-        raise fault
-
-
-def survey(forest: Forest, target: str, source: str, stamps: Stamps, policy: Policy | None = None) -> Survey:
-    """Take what the transforms from source to target at many stamps need. The caller holds the lock.
-
-    Raises
-    ------
-    UnknownFrameError
-    """
-    found = Survey(len(stamps), policy)
-    if not len(stamps):
-        return found
-    with suppress(DisconnectedError):
-        path = forest.find_path(target, source, int(stamps[0]))
-        if path.lasting:
-            found.add(None, stamps, path)
-            return found
-    changes = np.array(forest.parent_changes(), np.int64)
-    _, firsts, periods = np.unique(changes.searchsorted(stamps, "right"), return_index=True, return_inverse=True)
-    routes: dict[tuple[tuple[Step, ...], tuple[Step, ...]], tuple[Path, list[int]]] = {}
-    for period, first in enumerate(firsts.tolist()):
-        try:
-            path = forest.find_path(target, source, int(stamps[first]))
-        except DisconnectedError as error:
-            found.report(first, error)
-        else:
-            routes.setdefault((path.up, path.down), (path, []))[1].append(period)
-    if not routes:
-        found.severed = found.fault
-    for path, its_periods in routes.values():
-        places = np.flatnonzero(np.isin(periods, its_periods))
-        found.add(places, stamps[places], path)
-    return found
-
-
-def _resolve_few(
+def resolve_few(
     forest: Forest, target: str, source: str, stamps: Stamps, source_stamps: Stamps | None, fixed: str | None
 ) -> list[Row]:
+    """The answers, one by one; errors as for the scalar lookup. The caller holds the lock."""
     if source_stamps is not None:
+        for name in (target, source, fixed):
+            if name is not None:
+                forest.check_known(name)
         both = zip(stamps.tolist(), source_stamps.tolist(), strict=True)
         return [resolve_travel(forest, target, source, at, then, fixed, None)[1] for at, then in both]
     path = forest.paths.get((target, source))
     if path is not None:
         return path.rows(stamps.tolist())
+    forest.check_known(target)
+    forest.check_known(source)
     return [resolve(forest, target, source, at, None)[1] for at in stamps.tolist()]
 
 
-def _covered(path: Path, stamps: Stamps) -> npt.NDArray[np.bool_] | None:
-    """Which stamps every edge covers; None for all."""
-    ends = int(stamps.min()), int(stamps.max())
-    if all(edge.covers(end) for edge in path.moving for end in ends):
-        return None
+def join(legs: list[Answers]) -> TransformArray:
+    """The answers of one leg, or of two that meet in a fixed frame."""
+    columns = legs[0].columns()
+    done = legs[0].done
+    for leg in legs[1:]:
+        columns = np.stack(compose((*columns,), (*leg.columns(),)))
+        done = None if done is None or leg.done is None else np.maximum(done, leg.done)
+    return from_columns(columns, done)
+
+
+def _by_route(taken: Taken, stamps: Stamps) -> list[tuple[Places, Route | None]]:
+    """The places of the stamps that each route is for."""
+    if not taken.changes:
+        return [(slice(len(stamps)), taken.routes[0])]
+    different = list({id(route): route for route in taken.routes}.values())
+    which = np.array([next(i for i, its in enumerate(different) if its is route) for route in taken.routes])
+    its_route = which[np.array(taken.changes, np.int64).searchsorted(stamps, "right")]
+    return [(np.flatnonzero(its_route == i), route) for i, route in enumerate(different)]
+
+
+def _covered(route: Route, stamps: Stamps) -> npt.NDArray[np.bool_]:
     covered = np.ones(len(stamps), np.bool_)
-    for edge in path.moving:
-        if edge.oldest is None or edge.newest is None:
+    for samples in route.moving:
+        if not samples.stamps:
             covered[:] = False
         else:
-            covered &= (edge.oldest <= stamps) & (stamps <= edge.newest)
+            covered &= (samples.stamps[0] <= stamps) & (stamps <= samples.stamps[-1])
     return covered
 
 
-class _Stretch:
-    """Stamps that share one path, and copies of the samples that they need."""
+def _placed(route: Route, stamps: Stamps, policy: Policy) -> tuple[npt.NDArray[np.bool_], list[Stamps], Stamps]:
+    """Which stamps have an answer, where to read each edge for them, and what that takes."""
+    known = np.ones(len(stamps), np.bool_)
+    read_at: list[Stamps] = []
+    done = np.zeros((2, len(stamps)), np.int64)
+    for samples in route.moving:
+        here, away, gap = place_many(samples, stamps, policy)
+        read_at.append(here)
+        known &= away >= 0
+        np.maximum(done, (away, gap), out=done)
+    done[:, ~known] = 0
+    return known, read_at, done
 
-    def __init__(
-        self, places: npt.NDArray[np.intp] | None, stamps: Stamps, path: Path, read_at: list[Stamps] | None
-    ) -> None:
+
+class _Piece:
+    """The answers that share one route."""
+
+    def __init__(self, places: Places, count: int, route: Route, read_at: list[Stamps]) -> None:
         self._places = places
-        self._count = len(stamps)
-        reads = repeat(_Reading(stamps)) if read_at is None else map(_Reading, read_at)
-        self._up = [_take(step, reads) for step in path.up]
-        self._down = [_take(step, reads) for step in path.down]
+        self._count = count
+        self._route = route
+        self._read_at = read_at
 
     def chunks(self) -> Iterator[tuple[Places, Columns]]:
-        up = [_prepared(leg) for leg in self._up]
-        down = [_prepared(leg) for leg in self._down]
+        ahead = iter(self._read_at)
+        up, down = (
+            [Curve(step, next(ahead)) if isinstance(step, Samples) else step for step in steps]
+            for steps in (self._route.up, self._route.down)
+        )
         for start in range(0, self._count, _CHUNK):
-            part = slice(start, start + _CHUNK)
+            part = slice(start, min(start + _CHUNK, self._count))
             columns = _climb(up, part)
             if down:
                 columns = compose(invert(_climb(down, part)), columns)
-            yield part if self._places is None else self._places[part], columns
-
-
-class _Reading:
-    """The stamps that an edge is read at, and their range."""
-
-    def __init__(self, stamps: Stamps) -> None:
-        self.stamps = stamps
-        self.low, self.high = int(stamps.min()), int(stamps.max())
-
-
-class _Leg(NamedTuple):
-    """Samples of a moving edge, and the stamps that it is read at."""
-
-    samples: Samples
-    stamps: Stamps
-
-
-def _take(step: Step, reads: Iterator[_Reading]) -> _Leg | Row:
-    if not isinstance(step, FrameHistory):
-        return step
-    reading = next(reads)
-    return _Leg(step.between(reading.low, reading.high), reading.stamps)
-
-
-def _prepared(leg: _Leg | Row) -> Curve | Row:
-    return Curve(leg.samples, leg.stamps) if isinstance(leg, _Leg) else leg
+            yield part if isinstance(self._places, slice) else self._places[part], columns
 
 
 def _climb(legs: Sequence[Curve | Row], part: slice) -> Columns:

@@ -247,9 +247,10 @@ class FrameHistory:
         return [stamp for stamp, old, new in zip(stamps[1:], parents, parents[1:], strict=False) if new != old]
 
     def between(self, low: int, high: int) -> Samples:
-        """Copies of the samples that the answers from stamp `low` to `high` are made of; both have to be covered."""
-        first = bisect_right(self.stamps, low) - 1
-        end = bisect_left(self.stamps, high) + 1
+        """Copies of the samples from stamp `low` to `high`, and of the nearest one on either side."""
+        start = self.start
+        first = max(bisect_right(self.stamps, low) - 1, start)
+        end = max(bisect_left(self.stamps, high), start) + 1
         parents = None if self.parents is None else [parent for parent, _ in self.origins[first:end]]
         return Samples(self.stamps[first:end], self.records[first * RECORD_SIZE : end * RECORD_SIZE], parents)
 

@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, GapError
 from tfbus.geometry import IDENTITY, Row, compose, invert
-from tfbus.history import FrameHistory
+from tfbus.history import FrameHistory, Samples
 from tfbus.path import Path, Step, climb
 from tfbus.policy import Policy
-from tfbus.stamps import STAMP_MIN
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 Stamps = npt.NDArray[np.int64]
 
@@ -57,7 +57,7 @@ def place(edge: FrameHistory, at: int, policy: Policy) -> Place:
         oldest=edge.oldest,
         newest=edge.newest,
         authority=edge.authority,
-        slack=policy.tolerance,
+        slack=patience,
         before=before,
         after=after,
         max_gap=policy.max_gap,
@@ -95,10 +95,9 @@ def _decisive(error: ExtrapolationError) -> int:
     return STAMP_MIN if error.newest is None else error.newest
 
 
-def place_many(edge: FrameHistory, stamps: Stamps, policy: Policy) -> tuple[Stamps, Stamps, Stamps]:
-    """As `place`, for many stamps: where to read, extrapolated by, and gap; `extrapolated_by` is -1 for nowhere."""
-    start = edge.start
-    own = np.array(edge.stamps[start:], np.int64)
+def place_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps, Stamps, Stamps]:
+    """As `place`, for many stamps: where to read, `extrapolated_by` (-1 for nowhere), and `gap`, each of shape (n,)."""
+    own = np.frombuffer(samples.stamps, np.int64)
     if not len(own):
         return stamps, np.full(len(stamps), -1), np.zeros(len(stamps), np.int64)
     i = own.searchsorted(stamps)
@@ -113,39 +112,14 @@ def place_many(edge: FrameHistory, stamps: Stamps, policy: Policy) -> tuple[Stam
     alone = ~(exact | between)
     by_before = alone & has_before & (late <= max(policy.tolerance, policy.hold))
     by_after = alone & has_after & (early <= policy.tolerance) & ~(by_before & (late <= early))
-    if edge.parents is not None:
-        by_after &= np.array([_same_parent(edge, start + int(k)) for k in i.clip(0, len(own) - 1)])
-    by_before &= ~by_after
+    if samples.parents is not None:
+        parents = np.array(samples.parents, object)
+        same = np.concatenate(([True], parents[1:] == parents[:-1]))
+        by_after &= same[i.clip(0, len(own) - 1)]
     read_at = np.where(by_after, after, np.where(by_before, before, stamps))
     away = np.where(by_after, early, np.where(by_before, late, 0)).astype(np.int64)
     away[alone & ~by_before & ~by_after] = -1
-    return read_at, away, np.where(between, gap, 0).astype(np.int64)
-
-
-def place_path(path: Path, stamps: Stamps, policy: Policy) -> tuple[list[Stamps], npt.NDArray[np.bool_] | None, Stamps]:
-    """Where to read each moving edge of a path for many stamps.
-
-    Returns
-    -------
-    list of arrays of shape (n,)
-        The stamps for each edge of `path.moving`.
-    array of bool of shape (n,), or None
-        Which stamps have an answer; None for all.
-    array of shape (2, n)
-        `extrapolated_by` and `gap`, as `TransformStamped` has them; 0 where there is no answer.
-    """
-    read_at: list[Stamps] = []
-    done = np.zeros((2, len(stamps)), np.int64)
-    answered = np.ones(len(stamps), np.bool_)
-    for edge in path.moving:
-        here, away, gap = place_many(edge, stamps, policy)
-        read_at.append(here)
-        answered &= away >= 0
-        np.maximum(done, (away, gap), out=done)
-    if answered.all():
-        return read_at, None, done
-    done[:, ~answered] = 0
-    return read_at, answered, done
+    return read_at, away, np.minimum(np.where(between, gap, 0), STAMP_MAX).astype(np.int64)
 
 
 class Leniency:

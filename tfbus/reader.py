@@ -1,14 +1,16 @@
 """What a tree is asked: where one frame is, seen from another, at one stamp or at many, and how it moves."""
 
 import threading
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.batch import OutOfRange, finish, finish_points, survey, take
+from tfbus.batch import FEW, Answers, Leg, OutOfRange, join, resolve_few, take
 from tfbus.data import PointCloud, TwistStamped
-from tfbus.errors import TransformLookupError
+from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError
 from tfbus.explanation import Explanation, explain
 from tfbus.forest import Forest
 from tfbus.placement import Leniency
@@ -16,7 +18,7 @@ from tfbus.policy import Hold, Policy, policy_of
 from tfbus.resolve import GO_TOGETHER, At, resolve, resolve_travel
 from tfbus.stamped import TransformStamped, answer_of, qualified_answer
 from tfbus.stamps import LATEST, as_stamp, as_stamps
-from tfbus.transform_array import TransformArray
+from tfbus.transform_array import TransformArray, from_rows
 from tfbus.velocity import twist
 
 _AT_LATEST_ONLY = "not_before goes with LATEST: an answer at a given stamp never gets newer"
@@ -208,9 +210,53 @@ class TreeReader:
             raise TypeError(GO_TOGETHER)
         source_stamps = None if source_at is None else _as_many(source_at, len(asked))
         policy = policy_of(tolerance, max_gap, extrapolate)
-        with self._lock:
-            taken = take(self.forest, target, source, asked, source_stamps, fixed, policy)
-        return finish(taken, out_of_range)
+        _check_out_of_range(out_of_range)
+        if len(asked) <= FEW and policy is None:
+            try:
+                with self._lock:
+                    rows = resolve_few(self.forest, target, source, asked, source_stamps, fixed)
+            except (ExtrapolationError, DisconnectedError):
+                pass
+            else:
+                return from_rows(rows)
+
+        def ask(place: int) -> None:
+            source_stamp = None if source_stamps is None else int(source_stamps[place])
+            self.answer(target, source, int(asked[place]), source_stamp, fixed, None, policy)
+
+        legs = [Leg(target, source, asked)]
+        if source_stamps is not None and fixed is not None:
+            legs = [Leg(target, fixed, asked), Leg(fixed, source, source_stamps)]
+        return join(self._work_out(legs, ask, policy, out_of_range))
+
+    def _work_out(
+        self, legs: list[Leg], ask: Callable[[int], object], policy: Policy | None, out_of_range: OutOfRange
+    ) -> list[Answers]:
+        """The answers on each leg; `ask` is called for a place without one, and raises the scalar lookup's error."""
+        while True:
+            ends = [leg.ends() for leg in legs]
+            with self._lock:
+                taken = [take(self.forest, leg.target, leg.source, end) for leg, end in zip(legs, ends, strict=True)]
+            answers = [Answers(its, leg, policy) for its, leg in zip(taken, legs, strict=True)]
+            missing = [its.first_missing for its in answers if its.first_missing is not None]
+            if not missing:
+                return answers
+            cut_off = [leg for its, leg in zip(answers, legs, strict=True) if not its.connected]
+            if out_of_range == "nan" and not cut_off:
+                return answers
+            first = min(missing)
+            try:
+                if out_of_range == "raise":
+                    ask(first)
+                else:
+                    self._ask_again(cut_off[0], first)
+            except TransformLookupError as error:
+                error.index = first
+                raise
+            # What was missing has come meanwhile.
+
+    def _ask_again(self, leg: Leg, place: int) -> None:
+        self.answer(leg.target, leg.source, int(leg.stamps[place]), None, None, None, None)
 
     def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
         """A cloud from a moving sensor, as if all points had been seen at once, at the stamp of the cloud.
@@ -246,12 +292,12 @@ class TreeReader:
         at = cloud.stamp
         if at is LATEST and len(cloud):
             at = int(cloud.stamps.max())
-        with self._lock:
-            stamp, target_from_fixed, _ = resolve(self.forest, target, fixed, at, None)
-            self.forest.check_known(cloud.frame)
-            found = survey(self.forest, fixed, cloud.frame, cloud.stamps)
-        points = finish_points(found, cloud.points, target_from_fixed, out_of_range)
-        return PointCloud(target, stamp, points, fields=cloud.fields)
+        _check_out_of_range(out_of_range)
+        found = self.answer(target, fixed, at, None, None, None, None)
+        leg = Leg(fixed, cloud.frame, cloud.stamps)
+        (answers,) = self._work_out([leg], partial(self._ask_again, leg), None, out_of_range)
+        points = answers.apply(cloud.points, found.transform._row)
+        return PointCloud(target, found.stamp, points, fields=cloud.fields)
 
     def twist(self, frame: str, reference: str, at: At = LATEST, *, expressed_in: str | None = None) -> TwistStamped:
         """How `frame` moves, seen from `reference`: the derivative of what `lookup` interpolates.
@@ -314,6 +360,11 @@ class TreeReader:
             at = as_stamp(at)
         with self._lock:
             return list(self.forest.find_path(target, source, at).frames)
+
+
+def _check_out_of_range(value: OutOfRange) -> None:
+    if value not in ("raise", "nan"):
+        raise ValueError(f"out_of_range must be 'raise' or 'nan', not {value!r}")
 
 
 def _as_many(source_at: npt.ArrayLike, count: int) -> npt.NDArray[np.int64]:

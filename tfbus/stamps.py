@@ -6,7 +6,6 @@ round trip through a float. A duration is a ``float`` of seconds, because nobody
 
 import math
 import operator
-from collections.abc import Sequence
 from enum import Enum
 from numbers import Real
 from typing import Final
@@ -96,14 +95,20 @@ def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
     ValueError
         If the shape is not (n,), or one does not fit a signed 64-bit integer.
     """
-    # In a list, numpy would turn what stands beside an integer into one too.
-    array = np.asarray(values, object if isinstance(values, (list, tuple)) else None)
+    if isinstance(values, (list, tuple)):
+        if set(map(type, values)) == {int}:
+            try:
+                return np.array(values, np.int64)
+            except OverflowError:
+                pass
+        # In any other list, numpy would turn what stands beside an integer into one too, or all into floats.
+        array = np.asarray(values, object)
+    else:
+        array = np.asarray(values)
     if array.ndim != 1:
         raise ValueError(f"stamps must have shape (n,), got {array.shape}")
     if array.dtype.kind not in "iu" or array.dtype == np.uint64:
-        # Not what numpy has made of a list: one large integer turns all the others into floats.
-        each = values if isinstance(values, Sequence) else array.tolist()
-        return np.array([as_stamp(value) for value in each], np.int64)
+        return np.array([as_stamp(value) for value in array.tolist()], np.int64)
     return array.astype(np.int64, copy=False)
 
 

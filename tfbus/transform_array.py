@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import InvalidTransformError
-from tfbus.geometry import NORM_TOLERANCE, ROUNDING, Columns, Transform, compose, from_row, invert, rotate
+from tfbus.geometry import NORM_TOLERANCE, ROUNDING, Columns, Row, Transform, compose, from_row, invert, rotate
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -88,12 +88,12 @@ class TransformArray:
 
     @property
     def extrapolated_by(self) -> Integers:
-        """As `TransformStamped.extrapolated_by`, of each: a read-only array of shape (n,) in ns."""
+        """As `TransformStamped.extrapolated_by`, of each: an array of shape (n,) in ns."""
         return np.zeros(len(self), np.int64) if self._done is None else self._done[0]
 
     @property
     def gap(self) -> Integers | None:
-        """As `TransformStamped.gap`, of each: a read-only array of shape (n,) in ns; None without a policy."""
+        """As `TransformStamped.gap`, of each: an array of shape (n,) in ns, 2^63 - 1 at most; None without a policy."""
         return None if self._done is None else self._done[1]
 
     def matrices(self) -> Floats:
@@ -179,6 +179,13 @@ class TransformArray:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return from_columns, (self._columns, self._done)
+
+
+def from_rows(rows: list[Row]) -> TransformArray:
+    """The transforms of rows that are known to be good."""
+    array = np.array(rows) if rows else np.empty((0, 7))
+    array.flags.writeable = False
+    return from_columns(array.T)
 
 
 def from_columns(columns: Floats, done: Integers | None = None) -> TransformArray:

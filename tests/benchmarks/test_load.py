@@ -28,7 +28,7 @@ PROBE = 0.001
 
 
 async def broadcast(bus: Bus, number: int, count: list[int]) -> None:
-    """A tenth of all frames at 50 Hz, each broadcaster at another part of the period; half of them hang on the others."""
+    """A tenth of all frames at 50 Hz, each broadcaster at a time of its own; half of them hang on the other half."""
     broadcaster = TransformBroadcaster(bus, authority=f"broadcaster {number}")
     await bus.clock.sleep(number / BROADCASTERS / RATE)
     async for _ in bus.clock.ticks(RATE):
