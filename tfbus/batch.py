@@ -133,12 +133,15 @@ class Answers:
         self.first_missing: int | None = None
         self.connected = not len(stamps)
         self.done = None if policy is None else np.zeros((2, len(stamps)), np.int64)
-        for places, route in _by_route(taken, stamps) if len(stamps) else ():
+        for places, route in _by_route(taken, stamps):
+            its_stamps = stamps[places]
+            if not len(its_stamps):
+                continue
             if route is None:
-                self._miss(places, np.zeros(len(stamps[places]), np.bool_))
+                self._miss(places, np.zeros(len(its_stamps), np.bool_))
             else:
                 self.connected = True
-                self._add(places, stamps[places], route, policy)
+                self._add(places, its_stamps, route, policy)
 
     def _add(self, places: Places, stamps: Stamps, route: Route, policy: Policy | None) -> None:
         read_at = [stamps] * len(route.moving)
