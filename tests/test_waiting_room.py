@@ -8,6 +8,7 @@ import pytest
 from asking import Asked, driving, settle
 
 from tfbus import (
+    SECOND,
     Buffer,
     Bus,
     FutureExtrapolationError,
@@ -79,6 +80,24 @@ async def test_a_gap_that_has_closed_behind_a_wait_ends_it() -> None:
             await settle()
         assert isinstance(asked.error, GapError)
         assert not buffer.pending()
+
+
+@pytest.mark.parametrize("end", ["the lagging edge comes out of the gap", "a late sample fills the gap"])
+async def test_latest_in_the_gap_of_another_edge_waits_for_either_end_of_it(end: str) -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        # map -> base lags at 1.5 s, where base -> arm has a gap from 1 s to 2 s.
+        bus.publish([driving("map", "base", 1.5), driving("base", "arm", 1.0), driving("base", "arm", 2.0)])
+        async with anyio.create_task_group() as tasks:
+            asked: Asked[TransformStamped] = Asked(tasks, partial(buffer.lookup, "map", "arm", max_gap=0.6))
+            await settle()
+            assert not asked.ended
+            if end == "the lagging edge comes out of the gap":
+                bus.publish(driving("map", "base", 2.0))
+            else:
+                bus.publish(driving("base", "arm", 1.4))
+            await settle()
+            assert asked.ended
+    assert asked.answer.transform.translation[0] == pytest.approx(4.0 if asked.answer.stamp == 2 * SECOND else 3.0)
 
 
 async def test_a_timeout_says_how_near_a_sample_would_have_done() -> None:

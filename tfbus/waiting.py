@@ -11,7 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
 
-from tfbus.errors import DisconnectedError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus.errors import (
+    DisconnectedError,
+    FutureExtrapolationError,
+    GapError,
+    TransformLookupError,
+    UnknownFrameError,
+)
 from tfbus.policy import Policy
 from tfbus.stamps import STAMP_MIN, Latest
 
@@ -126,9 +132,10 @@ class WaitingIndex:
         """
         waiter.names = blocking_frames(error)
         cause = error.__cause__
-        if isinstance(cause, MAY_COME):
-            # At the stamp that all have reached, something else is missing as well.
-            waiter.names = tuple(dict.fromkeys((*waiter.names, *blocking_frames(cause))))
+        if isinstance(cause, (*MAY_COME, GapError)):
+            # At the stamp that all have reached, something else is missing as well; late data may bring it.
+            also = (cause.child,) if isinstance(cause, GapError) else blocking_frames(cause)
+            waiter.names = tuple(dict.fromkeys((*waiter.names, *also)))
         if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
             needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp - error.slack
             waiter.place = (-needed, -next(self._order), waiter)
