@@ -1,9 +1,11 @@
 """Lookups that wait under a policy end at the first moment at which it allows an answer."""
 
+import gc
 from functools import partial
 from typing import Any
 
 import anyio
+import anyio.lowlevel
 import pytest
 from asking import Asked, driving, settle
 
@@ -131,3 +133,35 @@ async def test_a_policy_that_makes_no_sense_is_refused_before_anything_waits() -
             await buffer.lookup("map", "base", extrapolate=0.5)  # type: ignore[arg-type]
         with pytest.raises(ValueError, match="max_gap"):
             buffer.lookup_nowait("map", "base", max_gap=-1.0)
+
+
+@pytest.mark.parametrize("source", ["base", "arm"])
+async def test_a_lookup_that_has_waited_leaves_nothing_to_the_garbage_collector(source: str) -> None:
+    with Bus() as bus, Buffer(bus, keep=None) as buffer:
+        bus.publish([driving("map", "base", 0.0), driving("base", "arm", 0.0), driving("base", "arm", 90.0)])
+
+        async def wait(seconds: float) -> None:
+            async with anyio.create_task_group() as tasks:
+                asked: Asked[TransformStamped] = Asked(
+                    tasks, partial(buffer.lookup, "map", source, from_seconds(seconds), timeout=5.0)
+                )
+                while not buffer.pending():
+                    await anyio.lowlevel.checkpoint()
+                bus.publish(driving("map", "base", seconds))
+            assert asked.answer.stamp == from_seconds(seconds)
+
+        await wait(1.0)
+        gc.collect()
+        gc.disable()
+        try:
+            for seconds in range(2, 12):
+                await wait(float(seconds))
+            gc.set_debug(gc.DEBUG_SAVEALL)
+            gc.collect()
+            # The task groups and scopes of the test, and the loop's own, may leave some; the lookups must not.
+            left = [thing for thing in gc.garbage if type(thing).__module__.startswith("tfbus")]
+        finally:
+            gc.set_debug(0)
+            gc.garbage.clear()
+            gc.enable()
+        assert left == []

@@ -40,7 +40,9 @@ def resolve(
     try:
         return at, climb(path.up, at) if not path.down else path.row(at), False
     except ExtrapolationError:
-        raise path.blocker(as_stamp(at)) from None
+        # Another edge may decide; and the error that is raised for good keeps none of this alive.
+        pass
+    raise path.blocker(as_stamp(at))
 
 
 def _resolve_latest(forest: Forest, path: Path, not_before: int | None, lenient: Leniency | None) -> Resolved:

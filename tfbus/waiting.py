@@ -92,6 +92,19 @@ def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
     raise TypeError(f"waiting cannot help against {error!r}")
 
 
+def without_traceback(error: TransformLookupError) -> TransformLookupError:
+    """An error to be kept while a lookup waits.
+
+    A traceback holds the frames that it has been through, the waiting one among them, which holds the error: every wait
+    would leave a cycle for the garbage collector, and that stops the loop for 100 ms now and then.
+    """
+    here: BaseException | None = error
+    while here is not None:
+        here.__traceback__ = None
+        here = here.__cause__
+    return error
+
+
 class _Blocked:
     """The waiters under one frame: by the stamp that its edge must reach, and those that need any sample of it.
 
@@ -162,6 +175,7 @@ class WaitingIndex:
                 blocked.for_any.pop(waiter, None)
             if not blocked.places and not blocked.for_any:
                 del self.blocked[name]
+        waiter.place = None
 
     def take(self, frame: str, stamp: int | None) -> list[Waiter]:
         """Take out those that a sample of `frame` can have unblocked: who needs any, or its stamp or an older one.
@@ -177,6 +191,8 @@ class WaitingIndex:
         places = blocked.places
         while stamp is not None and places and -places[-1][0] <= stamp:
             waiter = places.pop()[2]
+            # It holds the waiter, which would be a cycle for the garbage collector.
+            waiter.place = None
             del self._waiters[waiter]
             ready.append(waiter)
         if not places:
@@ -197,6 +213,8 @@ class WaitingIndex:
     def take_all(self) -> list[Waiter]:
         """Take everybody out, as when a frame is removed, the clock jumps back, or nothing more will come."""
         ready = list(self._waiters)
+        for waiter in ready:
+            waiter.place = None
         self._waiters.clear()
         self.blocked.clear()
         return ready

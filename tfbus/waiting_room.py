@@ -20,7 +20,7 @@ from tfbus.once import OnceLogger
 from tfbus.prefix import Prefix
 from tfbus.stamped import TransformStamped, is_frame
 from tfbus.stamps import LATEST, Latest, as_duration, from_seconds
-from tfbus.waiting import MAY_COME, Question, Waiter, blocking_frames
+from tfbus.waiting import MAY_COME, Question, Waiter, blocking_frames, without_traceback
 
 REPORT_AFTER = 5.0
 """A wait that is longer than this, in s, is logged."""
@@ -84,7 +84,7 @@ class WaitingRoom:
             for name in (question.target, question.source, question.fixed):
                 if name is not None and not is_frame(name):
                     raise UnknownFrameError(frame=name, known=self._feed.tree.frames()) from None
-            blocker = error
+            blocker = without_traceback(error)
         self._check_thread()
         since = self._clock.now()
         quiet = min(limit, REPORT_AFTER)
@@ -97,12 +97,12 @@ class WaitingRoom:
                     try:
                         return self._read(question, reset)
                     except MAY_COME as error:
-                        blocker = error
+                        blocker = without_traceback(error)
             try:
                 # The data may have come in the very turn of the loop in which the time was up.
                 return self._read(question, reset)
             except MAY_COME as error:
-                blocker = error
+                blocker = without_traceback(error)
             if seconds >= limit:
                 break
         raise LookupTimeoutError(

@@ -12,7 +12,7 @@ from tfbus.errors import ClockResetError, TransformLookupError, UnknownFrameErro
 from tfbus.feed import Feed
 from tfbus.stamped import TransformStamped, is_frame
 from tfbus.stamps import SECOND, STAMP_MAX, is_real, to_seconds
-from tfbus.waiting import MAY_COME, Question, Waiter
+from tfbus.waiting import MAY_COME, Question, Waiter, without_traceback
 from tfbus.waiting_room import REPORT_AFTER, WaitingRoom
 from tfbus.watching import Watched
 
@@ -114,7 +114,7 @@ class Watch:
             try:
                 answer = self._look()
             except MAY_COME as error:
-                blocker = error
+                blocker = without_traceback(error)
             else:
                 if self._is_change(answer):
                     self._last = answer
