@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from stamped_data import HOLDERS, ONE_OF_EACH, SCAN, VALUES, arrays_of, contents, name_of
+from stamped_data import ANSWER, HOLDERS, ONE_OF_EACH, SCAN, VALUES, arrays_of, contents, name_of
 
-from tfbus import LaserScan, PointCloud, Polygon, PoseWithCovarianceStamped, Transform
+from tfbus import LaserScan, PointCloud, Polygon, PoseWithCovarianceStamped, Transform, do_transform
 
 COPIES = [
     pytest.param(copy.copy, id="copy"),
@@ -16,6 +16,9 @@ COPIES = [
     pytest.param(lambda data: pickle.loads(pickle.dumps(data)), id="pickle"),
     pytest.param(lambda data: replace(data, stamp=data.stamp), id="replace"),
 ]
+
+OWNERS = [data for data in HOLDERS if isinstance(data, (Polygon, PoseWithCovarianceStamped))]
+"""Data that copy the array that they are given."""
 
 POINTS_OF = [
     pytest.param(lambda values: Polygon("map", 0, values).points, id="polygon"),
@@ -38,6 +41,14 @@ def test_copies_have_the_same_contents_and_are_read_only_too(data: Any, twin_of:
     assert type(twin) is type(data)
     assert contents(twin) == contents(data)
     assert not any(array.flags.writeable for array in arrays_of(twin))
+
+
+@pytest.mark.parametrize("made", [*COPIES, pytest.param(lambda data: do_transform(data, ANSWER), id="moved")])
+@pytest.mark.parametrize("data", OWNERS, ids=name_of)
+def test_nobody_can_make_a_copied_array_writable_again(data: Any, made: Callable[[Any], Any]) -> None:
+    for array in arrays_of(data) + arrays_of(made(data)):
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            array.flags.writeable = True
 
 
 @pytest.mark.parametrize("data", HOLDERS, ids=name_of)

@@ -38,6 +38,15 @@ def test_a_missing_point_stays_missing_and_leaves_the_others() -> None:
     assert np.isnan(moved.points).tolist() == [[True] * 3, [False] * 3]
 
 
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_an_infinite_point_stays_not_finite_without_a_warning(dtype: Any) -> None:
+    points = np.array([(np.inf, 0, 0), (0, -np.inf, 0), (np.inf, -np.inf, np.nan), (1, 2, 3)], dtype)
+    for rotation in ((0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (0.1, -0.7, 0.1, -0.7)):
+        answer = TransformStamped("A", "B", 0, Transform((1.0, 2.0, 3.0), rotation))
+        moved = do_transform(PointCloud("B", 0, points), answer)
+        assert np.isfinite(moved.points).all(axis=1).tolist() == [False, False, False, True]
+
+
 def test_stamps_and_fields_are_carried_along_uncopied() -> None:
     moved = do_transform(CLOUD, ANSWER)
     assert moved.stamps is CLOUD.stamps

@@ -80,7 +80,23 @@ def test_another_number_of_numbers_is_refused_with_the_shape(build: Any, numbers
         build(numbers)
 
 
-@pytest.mark.parametrize("wrong", ["123", b"123", 5, None, ["1", "2", "3"], [None, 1.0, 2.0], [[1.0], [2.0], [3.0]]])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "123",
+        b"123",
+        5,
+        None,
+        ["1", "2", "3"],
+        (math.nan, "1", "2"),
+        [1.0, math.nan, None],
+        [None, 1.0, 2.0],
+        [[1.0], [2.0], [3.0]],
+        {1.0, 2.0, 3.0},
+        {1.0: 0, 2.0: 0, 3.0: 0},
+        np.array(["nan", "1", "2"]),
+    ],
+)
 @pytest.mark.parametrize("build", TRIPLES)
 def test_what_is_no_number_is_refused_with_what_was_given(build: Any, wrong: Any) -> None:
     with pytest.raises(TypeError, match="must be three numbers, not") as caught:

@@ -66,6 +66,15 @@ def test_a_range_at_a_limit_that_was_rounded_to_float32_counts() -> None:
     assert len(scan_of(ranges, range_min=0.1, range_max=30.1).to_points()) == 2
 
 
+@pytest.mark.parametrize(("dtype", "beyond"), [(np.float32, 1e300), (np.float16, 1e5), (np.float16, 1e300)])
+def test_a_limit_beyond_all_numbers_of_the_size_of_the_ranges_is_one_all_the_same(dtype: Any, beyond: float) -> None:
+    ranges = np.array([1.0, math.inf, np.finfo(dtype).max, math.nan, -1.0], dtype)
+    index = scan_of(ranges, range_max=beyond).to_points().fields["index"]
+    assert index.tolist() == [0, 2]
+    assert scan_of(ranges, range_min=-beyond).to_points().fields["index"].tolist() == [0, 2, 4]
+    assert len(scan_of(ranges, range_min=beyond).to_points()) == 0
+
+
 @pytest.mark.parametrize("ranges", [[], [math.nan, math.inf]])
 def test_a_scan_that_saw_nothing_is_an_empty_cloud(ranges: list[float]) -> None:
     cloud = scan_of(ranges, intensities=np.zeros(len(ranges))).to_points()

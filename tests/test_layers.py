@@ -14,7 +14,7 @@ PACKAGE = Path(tfbus.__file__).parent
 
 # A module imports only from the lines before its own.
 ABOVE_THE_ASYNC_LINE = [
-    ("stamps", "once", "registration", "names", "statistics"),
+    ("stamps", "once", "registration", "names", "statistics", "read_only"),
     ("errors", "policy", "events"),
     ("geometry", "drops", "pending_messages"),
     ("stamped", "history", "transform_array"),

@@ -110,6 +110,14 @@ def test_stamps_further_apart_than_a_signed_number_says_are_not_near() -> None:
         place(edge, 0, policy)
     _, away, _ = place_many(edge.between(STAMP_MIN, STAMP_MAX), np.array([0, STAMP_MAX - 5, STAMP_MIN + 6]), policy)
     assert away.tolist() == [-1, 5, -1]
+    for sample, at in ((STAMP_MIN, STAMP_MAX), (STAMP_MAX, STAMP_MIN)):
+        assert place_many(history([sample]).between(at, at), np.array([at]), policy)[1].tolist() == [-1]
+
+
+def test_of_many_stamps_a_gap_is_told_as_far_as_a_signed_number_says() -> None:
+    edge = history([STAMP_MIN, STAMP_MAX])
+    assert place(edge, 0, Policy()).gap == STAMP_MAX - STAMP_MIN
+    assert place_many(edge.between(0, 0), np.array([0]), Policy())[2].tolist() == [STAMP_MAX]
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,12 @@
 import math
 import random
+import sys
+import threading
 from array import array
 from collections.abc import Callable
 from functools import partial
 from itertools import permutations, product
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -739,6 +742,58 @@ def test_many_lookups_find_the_frames_whole_while_another_thread_inserts() -> No
             tree.insert_many(moving("body", side, stamp, float(stamp)) for side in ("left", "right"))
 
 
+class NumpyFreeLock:
+    """A lock that notes the functions which work on arrays while it is held."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.taken = 0
+        self.seen: list[str] = []
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        self.taken += 1
+        sys.setprofile(self._note)
+
+    def __exit__(self, *_: object) -> None:
+        sys.setprofile(None)
+        self._lock.release()
+
+    def _note(self, frame: FrameType, event: str, called: Any) -> None:
+        at_hand = frame.f_locals.values() if event == "return" else [getattr(called, "__self__", None)]
+        if any(isinstance(value, np.ndarray) for value in at_hand):
+            self.seen.append(frame.f_code.co_qualname)
+
+
+STAMPS = np.arange(10_000) % 2_001 * 10
+LOCKED_QUESTIONS: list[Any] = [
+    pytest.param(lambda tree: tree.lookup_many("map", "cart", STAMPS), id="plain"),
+    pytest.param(lambda tree: tree.lookup_many("cart", "map", STAMPS + 50, tolerance=1.0, max_gap=1.0), id="policy"),
+    pytest.param(lambda tree: tree.lookup_many("map", "guest", STAMPS), id="reparented"),
+    pytest.param(lambda tree: tree.lookup_many("map", "guest", STAMPS, tolerance=1.0), id="reparented with a policy"),
+    pytest.param(lambda tree: tree.lookup_many("map", "cart", STAMPS - 50, out_of_range="nan"), id="nan"),
+    pytest.param(
+        lambda tree: tree.lookup_many("cart", "cart", STAMPS, source_at=STAMPS[::-1], fixed="map"), id="time travel"
+    ),
+    pytest.param(lambda tree: tree.deskew(scan(np.zeros((10_000, 3)), STAMPS), "cart", "map"), id="deskew"),
+    pytest.param(
+        lambda tree: tree.deskew(scan(np.zeros((10_000, 3)), STAMPS - 50, 0), "cart", "map", out_of_range="nan"),
+        id="deskew with nan",
+    ),
+]
+
+
+@pytest.mark.parametrize("ask", LOCKED_QUESTIONS)
+def test_no_array_is_worked_on_while_the_tree_is_locked(ask: Callable[[TransformTree], object]) -> None:
+    tree = tree_of(*over("map", "cart", range(0, 20_001, 10)), static("cart", "lidar"))
+    tree.insert_many([*over("cart", "guest", range(0, 10_000, 10)), *over("map", "guest", range(10_000, 20_001, 10))])
+    watched: Any = tree
+    watched._lock = lock = NumpyFreeLock()
+    ask(tree)
+    assert lock.taken
+    assert lock.seen == []
+
+
 def test_a_subscriber_may_ask_for_many_lookups_with_what_it_was_just_sent() -> None:
     bus = Bus()
     seen: list[list[float]] = []
@@ -881,6 +936,15 @@ def test_a_missing_point_stays_missing_and_spoils_no_other() -> None:
     found = tree.deskew(scan([(0, 0, 0), nowhere, (0, 0, 0)], [0, 5, SECOND]), "odom", "odom")
     assert found.points[[0, 2]].tolist() == pytest.approx(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
     assert np.isnan(found.points[1]).any()
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_an_infinite_point_stays_not_finite_without_a_warning(dtype: Any) -> None:
+    tree = along(lambda time: Transform.from_axis_angle((1, 2, 3), time, (time, 0.0, 0.0)))
+    points = np.array([(np.inf, 0, 0), (0, -np.inf, 0), (np.inf, -np.inf, np.nan), (1, 2, 3)], dtype)
+    for target in ("odom", "cart"):
+        found = tree.deskew(scan(points, [0, 5, SECOND, SECOND // 2]), target, "odom")
+        assert np.isfinite(found.points).all(axis=1).tolist() == [False, False, False, True]
 
 
 def test_points_that_cannot_be_placed_are_an_error_that_names_the_first_or_nan() -> None:

@@ -2,14 +2,16 @@ import threading
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
 import anyio
 import anyio.to_thread
 import pytest
 from asking import Asked, settle
 from samples import moving, static
+from threads import threads_that
 
-from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, ThreadPublisher, TransformStamped
+from tfbus import LATEST, Buffer, Bus, BusClosedError, PointStamped, SimulatedClock, ThreadPublisher, TransformStamped
 
 pytestmark = pytest.mark.anyio
 
@@ -321,3 +323,32 @@ async def test_worker_threads_may_read_while_the_loop_publishes() -> None:
             bus.publish(moving("map", "a", stamp, float(stamp)))
         stop.set()
     assert wrong == []
+
+
+@pytest.mark.parametrize("names", [{}, {"prefix": "robot/", "shared": {"map"}}], ids=["whole names", "prefix"])
+async def test_all_that_only_reads_may_be_asked_by_threads_while_lookups_wait_and_are_woken(names: Any) -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus, keep=1e-6, **names)
+    frame = names.get("prefix", "") + "a"
+    bus.publish(moving("map", frame, 0))
+
+    def ask() -> None:
+        seen = buffer.lookup_nowait("map", "a", max_age=1.0)
+        moved = buffer.transform_nowait(PointStamped("a", LATEST, (0.0, 0.0, 0.0)), "map")
+        told = buffer.explain("map", "a")
+        assert seen.transform.translation[0] == seen.stamp
+        assert moved.point[0] == moved.stamp
+        assert told.answerable
+        assert buffer.can_transform("map", "a", tolerance=0.1)
+        assert not buffer.can_transform("map", "b")
+        waiting = buffer.pending()
+        assert {pending.question.source for pending in waiting} <= {"a"}
+        assert "a" in buffer.describe()
+
+    with threads_that(ask):
+        for stamp in range(1, 500):
+            async with anyio.create_task_group() as tasks:
+                for _ in range(3):
+                    tasks.start_soon(buffer.lookup, "map", "a", stamp)
+                await settle()
+                bus.publish([moving("map", frame, stamp, float(stamp)), moving("map", f"other{stamp % 7}", stamp)])

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
-from strategies import transforms, vectors
+from samples import over, tree_of
+from strategies import rotations, transforms, vectors
 
 from tfbus import InvalidTransformError, Transform, TransformArray
-from tfbus.geometry import Vector
+from tfbus.batch import FEW
+from tfbus.geometry import Quaternion, Vector
 
 ONE = (0.0, 0.0, 0.0, 1.0)
 HALF_TURN_ABOUT_Z = (0.0, 0.0, 1.0, 0.0)
@@ -60,6 +62,19 @@ def test_a_norm_within_one_percent_is_normalised_and_the_sign_stays(poses: list[
     rotations = np.array([pose.rotation for pose in poses])
     found = TransformArray([pose.translation for pose in poses], rotations * norm)
     np.testing.assert_allclose(found.rotations, rotations, rtol=0, atol=1e-15)
+
+
+# By their squares, the first two are units but for rounding; the third is not, though its norm would be.
+@example([((0.0, 0.0, 0.0), (-0.49, -0.01, -0.1, 0.8659099260315708))], 1.0)
+@example([((0.0, 0.0, 0.0), (0.9474015346938999, 0.006046331364519918, 0.29874456871007093, -0.114653637547647))], 1.0)
+@example([((0.0, 0.0, 0.0), (0.08, 0.88, -0.24, 0.401995024844837))], 1.0)
+@given(st.lists(st.tuples(vectors(), rotations()), min_size=1, max_size=5), st.just(1.0) | st.floats(0.991, 1.009))
+def test_rotations_are_kept_or_normalised_to_the_last_digit_as_in_a_transform(
+    parts: list[tuple[Vector, Quaternion]], norm: float
+) -> None:
+    scaled = [(move, tuple(norm * part for part in turn)) for move, turn in parts]
+    found = TransformArray([move for move, _ in scaled], [turn for _, turn in scaled])
+    assert list(found) == [Transform(*each) for each in scaled]
 
 
 @pytest.mark.parametrize(
@@ -113,6 +128,9 @@ OTHERS = [
     pytest.param(lambda steps: steps, id="as made"),
     pytest.param(lambda steps: steps[::2], id="slice"),
     pytest.param(lambda steps: steps[np.array([0, 2])], id="indices"),
+    pytest.param(lambda steps: steps[[0, 2]], id="list"),
+    pytest.param(lambda steps: steps[steps.valid], id="mask"),
+    pytest.param(lambda steps: copy.deepcopy(steps[[0, 2]]), id="copy of some"),
     pytest.param(lambda steps: steps.inverse(), id="inverse"),
     pytest.param(lambda steps: steps @ steps, id="product"),
 ]
@@ -120,10 +138,16 @@ OTHERS = [
 
 @pytest.mark.parametrize("made", DUPLICATES + OTHERS)
 def test_transforms_cannot_be_changed_however_they_were_made(made: Callable[[TransformArray], TransformArray]) -> None:
-    steps = made(ahead(0.0, 1.0, 2.0))
-    for part in (steps.translations, steps.rotations):
-        with pytest.raises(ValueError, match="read-only"):
-            part[0, 0] = 5.0
+    tree = tree_of(*over("a", "b", [0, 10, 20]))
+    few, many = (tree.lookup_many("a", "b", [0, 5, 20] * count) for count in (1, FEW))
+    lenient = tree.lookup_many("a", "b", [0, 5, 30], tolerance=1.0)
+    for steps in map(made, (ahead(0.0, 1.0, 2.0), few, many, lenient)):
+        for array in (steps.translations, steps.rotations, steps.extrapolated_by, steps.gap):
+            if array is not None:
+                with pytest.raises(ValueError, match="read-only"):
+                    array[...] = 5
+                with pytest.raises(ValueError, match="WRITEABLE"):
+                    array.flags.writeable = True
     for name in ("translations", "rotations", "valid", "something"):
         with pytest.raises(AttributeError):
             setattr(steps, name, None)
@@ -173,21 +197,29 @@ def test_a_slice_a_mask_or_indices_take_some_as_in_numpy(index: slice | npt.NDAr
     assert taken.rotations.shape == (len(taken), 4)
 
 
-@pytest.mark.parametrize("index", [np.array([[0, 1]]), None, True])
-def test_transforms_stay_in_a_row(index: Any) -> None:
-    with pytest.raises(IndexError, match="index"):
+@pytest.mark.parametrize(
+    "index", [(), (0,), (0, 1), (slice(2),), np.array([[0, 1]]), [0, 2], np.array([True]), None, True, 0.0, "0"]
+)
+def test_what_takes_no_transforms_in_a_row_is_refused_with_what_does(index: Any) -> None:
+    with pytest.raises(IndexError) as caught:
         ahead(1.0, 2.0)[index]
+    assert str(caught.value) == (
+        f"index {index!r} does not fit 2 transforms: give an int, a slice, or a mask or indices in a list or an array"
+    )
 
 
 @pytest.mark.parametrize("count", [0, 2])
 @pytest.mark.parametrize("beyond", [2, -3])
 def test_there_is_nothing_beyond_either_end(count: int, beyond: int) -> None:
-    with pytest.raises(IndexError):
+    with pytest.raises(IndexError, match=f"index {beyond} does not fit {count} transforms"):
         ahead(*range(count))[beyond]
 
 
-def test_a_numpy_integer_is_an_index_too() -> None:
-    assert ahead(3.0, 4.0)[np.int64(1)] == Transform((4.0, 0.0, 0.0))  # type: ignore[call-overload]
+def test_a_numpy_integer_and_a_list_are_indices_too() -> None:
+    steps = ahead(3.0, 4.0)
+    assert steps[np.argmax([0.5, 1.5])].translation == (4.0, 0.0, 0.0)
+    assert steps[[1, 0]].translations[:, 0].tolist() == [4.0, 3.0]
+    assert steps[[False, True]].translations[:, 0].tolist() == [4.0]
 
 
 def test_where_there_is_no_transform_none_is_valid_and_none_is_given() -> None:
@@ -247,6 +279,14 @@ def test_points_of_float32_lose_no_more_than_their_own_rounding() -> None:
     assert moved[0, 0] == pytest.approx(0.1, abs=1e-9)
     near = TransformArray([[-1e6, 0.0, 0.0]], [ONE]).apply(np.array([[1e6 + 0.25, 0.0, 0.0]], np.float32))
     assert near.tolist() == [[0.25, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_an_infinite_point_stays_not_finite_without_a_warning(dtype: Any) -> None:
+    points = np.array([(np.inf, 0, 0), (0, -np.inf, 0), (np.inf, -np.inf, np.nan), (1, 2, 3)], dtype)
+    for rotation in (ONE, HALF_TURN_ABOUT_Z, (0.1, -0.7, 0.1, -0.7)):
+        moved = TransformArray([(1.0, 2.0, 3.0)] * 4, [rotation] * 4).apply(points)
+        assert np.isfinite(moved).all(axis=1).tolist() == [False, False, False, True]
 
 
 @pytest.mark.parametrize("shape", [(3,), (3, 3), (2, 2), (1, 3), (2, 3, 1), (0, 3)])

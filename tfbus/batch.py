@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.curve import Curve, Floats, Stamps
+from tfbus.curve import Curve, Floats
 from tfbus.errors import DisconnectedError
 from tfbus.forest import Forest
 from tfbus.geometry import IDENTITY, Columns, Row, compose, invert
@@ -20,6 +20,7 @@ from tfbus.path import Path, Step
 from tfbus.placement import place_many
 from tfbus.policy import Policy
 from tfbus.resolve import resolve, resolve_travel
+from tfbus.stamps import Stamps
 from tfbus.transform_array import TransformArray, from_columns, move
 
 FEW = 40

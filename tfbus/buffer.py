@@ -55,7 +55,8 @@ class Buffer:
 
     Notes
     -----
-    `lookup_nowait` and `tree` may be used from any thread; what is awaited, only on the bus's event loop.
+    What only reads may be used from any thread, at any time; what is awaited, watched or closed, only on the bus's
+    event loop.
 
     With a prefix, another robot's frames have no name here: to ask for them, use a buffer without one. `tree` and all
     errors have the names of the bus; pictures and explanations write a frame that is somebody else's with a slash
@@ -249,7 +250,15 @@ class Buffer:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> DataT:
-        """As `transform`, or an error at once."""
+        """As `transform`, or an error at once.
+
+        Raises
+        ------
+        TransformLookupError
+            As `lookup_nowait`, if there is no answer now.
+        TypeError
+            As `transform`.
+        """
         question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
         moved: DataT = do_transform(data, self._room.ask(self._on_bus(question)))
         return moved

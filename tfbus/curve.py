@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from tfbus.geometry import Columns
 from tfbus.history import Samples
+from tfbus.stamps import Stamps
 
 Floats = npt.NDArray[np.float64]
-Stamps = npt.NDArray[np.int64]
 
 _STRAIGHT = 1e-9
 """In place of an angle that rounds to zero: its own cosine is one to the last digit, so the arc is a straight line."""

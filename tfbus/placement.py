@@ -5,16 +5,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, GapError
 from tfbus.geometry import IDENTITY, Row, compose, invert
 from tfbus.history import FrameHistory, Samples
 from tfbus.path import Path, Step, climb
 from tfbus.policy import Policy
-from tfbus.stamps import STAMP_MAX, STAMP_MIN
-
-Stamps = npt.NDArray[np.int64]
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Stamps
 
 
 class Place(NamedTuple):
@@ -101,9 +98,10 @@ def place_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps
     if not len(own):
         return stamps, np.full(len(stamps), -1), np.zeros(len(stamps), np.int64)
     i = own.searchsorted(stamps)
-    before, after = own[np.maximum(i - 1, 0)], own[np.minimum(i, len(own) - 1)]
+    following = np.minimum(i, len(own) - 1)
+    before, after = own[np.maximum(i - 1, 0)], own[following]
     has_before, has_after = i > 0, i < len(own)
-    exact = has_after & (after == stamps)
+    exact = after == stamps
     # Unsigned, because two stamps may be further apart than a signed difference can say.
     late, early, gap = (difference.view(np.uint64) for difference in (stamps - before, after - stamps, after - before))
     between = has_before & has_after & ~exact
@@ -115,7 +113,7 @@ def place_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps
     if samples.parents is not None:
         parents = np.array(samples.parents, object)
         same = np.concatenate(([True], parents[1:] == parents[:-1]))
-        by_after &= same[i.clip(0, len(own) - 1)]
+        by_after &= same[following]
     read_at = np.where(by_after, after, np.where(by_before, before, stamps))
     away = np.where(by_after, early, np.where(by_before, late, 0)).astype(np.int64)
     away[alone & ~by_before & ~by_after] = -1

@@ -11,7 +11,9 @@ from tfbus.stamps import STAMP_MAX, as_duration, from_seconds
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Let an edge's newest sample stand in for the stamps after it.
+    """Let a sample stand in for the stamps after it, up to the edge's next sample.
+
+    It does so where an edge has no sample after the stamp, or none that `max_gap` lets it interpolate to.
 
     Parameters
     ----------
@@ -32,7 +34,7 @@ class Policy:
     Parameters
     ----------
     tolerance : int
-        How far the nearest sample may be from a stamp that is not covered.
+        How far the nearest sample may be from a stamp that is not covered, or in a gap that is too long.
     max_gap : int or None
         How far two samples may be apart that are interpolated between; None for any distance.
     hold : int

@@ -61,11 +61,13 @@ class TreeReader:
         not_before : int, optional
             Count a `LATEST` answer older than this (ns) as not yet arrived.
         tolerance : float
-            Where an edge does not cover the stamp, let its nearest sample within so many s stand in.
+            Where an edge does not cover the stamp, or only by a gap that is too long, let its nearest sample within so
+            many s stand in.
         max_gap : float, optional
             Refuse to interpolate between samples that are more than so many s apart.
         extrapolate : Hold, optional
-            Let an edge's newest sample stand in for the stamps after it, for a while.
+            Where an edge has no sample after the stamp, or none that `max_gap` lets it interpolate to, let the one
+            before it stand in, for a while.
 
         Returns
         -------
@@ -313,10 +315,10 @@ class TreeReader:
         Returns
         -------
         TwistStamped
-            Its frame is `expressed_in`. `linear` is the velocity of the origin of `frame` in m/s, whatever the axes;
-            `angular` the angular velocity in rad/s. At a sample it is the derivative from before, at the first of an
-            edge's window or of a new parent that from after. From the last sample with one parent to the first with
-            another an edge stands still.
+            Its frame is `expressed_in`, but `linear` is the velocity of the origin of `frame` in m/s, whatever the
+            axes; `angular` is the angular velocity in rad/s. At a sample it is the derivative from before, at the first
+            of an edge's window or of a new parent that from after. From the last sample with one parent to the first
+            with another an edge stands still.
 
         Raises
         ------
@@ -326,9 +328,12 @@ class TreeReader:
 
         Notes
         -----
-        With ``expressed_in=frame`` it is the twist of the body that the frame is fixed to, which `do_transform` carries
-        to other frames of the same body. tf2's `lookupVelocity` gives other numbers: it rotates what is in the
-        observer's axes once more by the body's rotation.
+        Move only an answer with ``expressed_in=frame`` by `do_transform`: it is the twist of the body that the frame is
+        fixed to, told at the frame's own origin, and can be told at other frames of that body. In other axes, as by
+        default, it is not told at the origin of its frame, and `do_transform` would give a wrong velocity.
+
+        tf2's `lookupVelocity` gives other numbers: it rotates what is in the observer's axes once more by the body's
+        rotation.
         """
         axes = reference if expressed_in is None else expressed_in
         if at is not LATEST:

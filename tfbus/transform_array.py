@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry import NORM_TOLERANCE, ROUNDING, Columns, Row, Transform, compose, from_row, invert, rotate
+from tfbus.read_only import locked
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -57,7 +58,8 @@ class TransformArray:
                 reason="wrong length",
             )
         with np.errstate(over="ignore"):
-            norms = np.sqrt(np.square(turns).sum(axis=1))
+            squares = np.square(turns).sum(axis=1)
+        norms = np.sqrt(squares)
         missing = np.isnan(moves).all(axis=1) & np.isnan(turns).all(axis=1)
         wrong = ~(missing | (np.isfinite(moves).all(axis=1) & (np.abs(norms - 1.0) <= NORM_TOLERANCE)))
         if wrong.any():
@@ -66,19 +68,18 @@ class TransformArray:
                 f"transform {i} is not rigid: translation {moves[i]}, rotation {turns[i]}",
                 reason="not a unit quaternion",
             )
-        norms[np.abs(norms - 1.0) <= ROUNDING] = 1.0
-        self._columns = np.vstack((moves.T, turns.T / norms))
-        self._columns.flags.writeable = False
+        norms[np.abs(squares - 1.0) <= ROUNDING] = 1.0
+        self._columns = locked(np.vstack((moves.T, turns.T / norms)))
         self._done = None
 
     @property
     def translations(self) -> Floats:
-        """(x, y, z) of each in m: a read-only array of shape (n, 3)."""
+        """(x, y, z) of each in m: a read-only array of shape (n, 3), a view of columns and so not C-contiguous."""
         return self._columns[:3].T
 
     @property
     def rotations(self) -> Floats:
-        """The unit quaternion (x, y, z, w) of each: a read-only array of shape (n, 4)."""
+        """The unit quaternion (x, y, z, w) of each: a read-only array of shape (n, 4), a view as `translations`."""
         return self._columns[3:].T
 
     @property
@@ -88,12 +89,15 @@ class TransformArray:
 
     @property
     def extrapolated_by(self) -> Integers:
-        """As `TransformStamped.extrapolated_by`, of each: an array of shape (n,) in ns."""
-        return np.zeros(len(self), np.int64) if self._done is None else self._done[0]
+        """As `TransformStamped.extrapolated_by`, of each: a read-only array of shape (n,) in ns."""
+        return locked(np.zeros(len(self), np.int64)) if self._done is None else self._done[0]
 
     @property
     def gap(self) -> Integers | None:
-        """As `TransformStamped.gap`, of each: an array of shape (n,) in ns, 2^63 - 1 at most; None without a policy."""
+        """As `TransformStamped.gap`, of each: a read-only array of shape (n,) in ns; None without a policy.
+
+        A gap of more than 2^63 - 1 ns is told as that.
+        """
         return None if self._done is None else self._done[1]
 
     def matrices(self) -> Floats:
@@ -133,10 +137,11 @@ class TransformArray:
         return moved
 
     def inverse(self) -> "TransformArray":
-        """The transforms that undo these."""
+        """The transforms that undo these; what a policy did is not carried over."""
         return from_columns(np.stack(invert((*self._columns,))))
 
     def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
+        """Each composed with one of `other`, or all with the same; what a policy did is not carried over."""
         columns = _columns_of(other, len(self))
         return NotImplemented if columns is None else from_columns(np.stack(compose((*self._columns,), columns)))
 
@@ -148,22 +153,28 @@ class TransformArray:
         return len(self._columns[0])
 
     @overload
-    def __getitem__(self, index: int) -> Transform: ...
+    def __getitem__(self, index: int | np.integer[Any]) -> Transform: ...
     @overload
-    def __getitem__(self, index: slice | npt.NDArray[Any]) -> "TransformArray": ...
+    def __getitem__(self, index: slice | list[int] | list[bool] | npt.NDArray[Any]) -> "TransformArray": ...
     def __getitem__(self, index: Any) -> "Transform | TransformArray":
-        """One transform, or those of a slice, a mask or an array of indices.
+        """One transform, or those of a slice, or of a mask or indices in a list or an array.
 
         Raises
         ------
         IndexError
-            If there is none at the index, or the index has more dimensions than one.
+            If there is none at the index, or it is anything else, such as a tuple.
         InvalidTransformError
             If the one that is asked for is NaN.
         """
-        columns = self._columns[:, index]
-        if columns.ndim > 2:
-            raise IndexError(f"index {index!r} does not leave transforms in a row")
+        try:
+            columns = None if isinstance(index, tuple) else self._columns[:, index]
+        except IndexError:
+            columns = None
+        if columns is None or columns.ndim > 2:
+            raise IndexError(
+                f"index {index!r} does not fit {len(self)} transforms: give an int, a slice, or a mask or indices in a "
+                "list or an array"
+            )
         if columns.ndim == 2:
             return from_columns(columns, None if self._done is None else self._done[:, index])
         x, y, z, qx, qy, qz, qw = columns.tolist()
@@ -183,9 +194,7 @@ class TransformArray:
 
 def from_rows(rows: list[Row]) -> TransformArray:
     """The transforms of rows that are known to be good."""
-    array = np.array(rows) if rows else np.empty((0, 7))
-    array.flags.writeable = False
-    return from_columns(array.T)
+    return from_columns(np.array(rows).T if rows else np.empty((7, 0)))
 
 
 def from_columns(columns: Floats, done: Integers | None = None) -> TransformArray:
@@ -194,11 +203,8 @@ def from_columns(columns: Floats, done: Integers | None = None) -> TransformArra
     The arrays belong to the transforms from now on.
     """
     transforms = TransformArray.__new__(TransformArray)
-    columns.flags.writeable = False
-    transforms._columns = columns
-    if done is not None:
-        done.flags.writeable = False
-    transforms._done = done
+    transforms._columns = locked(columns)
+    transforms._done = None if done is None else locked(done)
     return transforms
 
 

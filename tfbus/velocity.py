@@ -36,6 +36,7 @@ def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tupl
     The errors are those of `TransformTree.twist`. The caller holds the lock.
     """
     stamp = _common_stamp(forest, frame, reference, axes) if at is LATEST else at
+    # For its errors: of several edges without an answer, it names the one that decides.
     resolve(forest, reference, frame, stamp, None)
     turn = resolve(forest, axes, reference, stamp, None)[1][3:]
     linear, angular = _motion(forest.find_path(reference, frame, stamp), stamp)

@@ -227,8 +227,9 @@ class WaitingIndex:
 
     def pending(self) -> tuple[PendingLookup, ...]:
         """Who waits, and what blocks each."""
+        # Copied first, because another thread may ask while the loop parks and wakes.
         return tuple(
             PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
-            for waiter in self._waiters
+            for waiter in list(self._waiters)
             if waiter.blocked_by is not None
         )

@@ -1,4 +1,4 @@
-"""Arrays that stamped data hold: checked, and read-only."""
+"""Arrays that stamped data hold, checked."""
 
 from collections.abc import Callable
 from dataclasses import fields
@@ -7,15 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-
-def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """A read-only view of an array, or the array itself if nobody can write to it as it is."""
-    if not array.flags.writeable:
-        return array
-    view = array.view()
-    view.flags.writeable = False
-    return view
 
 
 def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:

@@ -22,6 +22,7 @@ def do_transform(data: Any, transform: TransformStamped) -> Any:  # noqa: ARG001
     Parameters
     ----------
     data : any type of `tfbus.data` but LaserScan, or a registered type
+        A subclass that is not registered itself comes back as its base class.
     transform : TransformStamped
         From the frame of `data` into the target.
 

@@ -1,7 +1,10 @@
 """What all stamped data have in common: a frame, a stamp, and the checks of both."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, Protocol
+
+import numpy as np
 
 from tfbus.geometry import Vector
 from tfbus.stamped import check_frame
@@ -43,16 +46,17 @@ def as_triple(value: Any, name: str) -> Vector:
     ValueError
         If there are not three. The message has the shape.
     TypeError
-        If they are not numbers.
+        If they are not numbers in a sequence or an array.
     """
-    if isinstance(value, (str, bytes)) or not hasattr(value, "__len__"):
+    if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
         raise TypeError(f"{name} must be three numbers, not {value!r}")
     shape = getattr(value, "shape", (len(value),))
     if shape != (3,):
         raise ValueError(f"{name} must be three numbers, got shape {shape}")
     try:
-        # `float` would read digits in a string.
-        any(map(math.isnan, value))
+        for part in value:
+            # `float` would read digits in a string.
+            math.isnan(part)
     except TypeError:
         raise TypeError(f"{name} must be three numbers, not {value!r}") from None
     x, y, z = value

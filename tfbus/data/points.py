@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy.typing as npt
 
-from tfbus.data.arrays import Rebuilt, as_points, read_only
+from tfbus.data.arrays import Rebuilt, as_points
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.data.header import as_triple, check_header
 from tfbus.geometry import Quaternion, Transform, Vector, as_rotation, rotate
+from tfbus.read_only import locked
 from tfbus.stamped import TransformStamped
 from tfbus.stamps import Latest
 
@@ -122,7 +123,7 @@ class Polygon(Rebuilt):
 
     def __post_init__(self) -> None:
         check_header(self)
-        object.__setattr__(self, "points", read_only(as_points(self.points).copy()))
+        object.__setattr__(self, "points", locked(as_points(self.points).copy()))
 
 
 @do_transform.register

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data.arrays import Rebuilt, as_floats, read_only
+from tfbus.data.arrays import Rebuilt, as_floats
 from tfbus.data.clouds import PointCloud
 from tfbus.data.header import check_header
+from tfbus.read_only import read_only
 from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
 
 
@@ -105,7 +106,10 @@ class LaserScan(Rebuilt):
             "intensities" what the scan has of them; both are named as in laser_geometry.
         """
         ranges = self.ranges
-        index = np.flatnonzero(np.isfinite(ranges) & (ranges >= self.range_min) & (ranges <= self.range_max))
+        # Rounded as the ranges were, so that one at a limit counts; a limit beyond all floats of that size is infinite.
+        with np.errstate(over="ignore"):
+            low, high = np.array((self.range_min, self.range_max)).astype(ranges.dtype)
+        index = np.flatnonzero(np.isfinite(ranges) & (ranges >= low) & (ranges <= high))
         angles = self.angle_min + index * self.angle_increment
         points = np.zeros((len(index), 3), ranges.dtype)
         points[:, 0] = ranges[index] * np.cos(angles)

@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data.arrays import Rebuilt, as_floats, read_only
+from tfbus.data.arrays import Rebuilt, as_floats
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.data.header import as_triple, check_header
 from tfbus.geometry import Transform, Vector, rotate
+from tfbus.read_only import locked
 from tfbus.stamped import TransformStamped
 from tfbus.stamps import Latest
 
@@ -49,7 +50,7 @@ class PoseWithCovarianceStamped(Rebuilt):
         covariance: npt.NDArray[Any] = as_floats(self.covariance, "covariance").astype(np.float64)
         if covariance.shape not in ((6, 6), (36,)):
             raise ValueError(f"covariance must have shape (6, 6) or (36,), got {covariance.shape}")
-        object.__setattr__(self, "covariance", read_only(covariance.reshape(6, 6)))
+        object.__setattr__(self, "covariance", locked(covariance.reshape(6, 6)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,8 @@ class TwistStamped:
     stamp : int or LATEST
         ns.
     linear : sequence of 3 floats
-        Velocity, in m/s along the axes of `frame`, of the body's point that is at the origin of `frame`.
+        Velocity, in m/s along the axes of `frame`, of the body's point that is at the origin of `frame`; see Notes for
+        the answers of `TransformTree.twist`.
     angular : sequence of 3 floats
         Angular velocity in rad/s about the axes of `frame`.
 
@@ -71,6 +73,9 @@ class TwistStamped:
     A transform tells the same motion at the origin of another frame, and assumes that this one is fixed to the same
     body: with R and t of target_from_source, angular' = R angular and linear' = R linear + t x angular'. This is the
     adjoint map of Lynch and Park, "Modern Robotics", 2017, section 3.3.2, who write the angular part first.
+
+    Of the answers of `TransformTree.twist`, only one with ``expressed_in=frame`` is such a twist. Any other, as by
+    default, has the velocity of the origin of `frame` along the axes of `reference` or a third frame: do not move it.
     """
 
     frame: str
