@@ -32,8 +32,8 @@ ABOVE_THE_ASYNC_LINE = [
     ("feed",),
 ]
 BELOW_THE_ASYNC_LINE = [
-    ("ticks", "stream", "threadsafe", "claim"),
-    ("clock",),
+    ("ticks", "threadsafe", "claim", "reading"),
+    ("clock", "stream"),
     ("event_stream",),
     ("bus", "waiting_room"),
     ("watch",),
