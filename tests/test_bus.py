@@ -673,3 +673,16 @@ def test_a_way_in_for_threads_that_is_never_entered_is_not_registered() -> None:
     with Bus() as bus:
         bus.threadsafe()
         assert bus.statistics().queues == ()
+
+
+async def test_a_buffer_that_closes_another_at_the_end_keeps_nobody_from_being_woken() -> None:
+    bus = Bus()
+    first, second, third = (Buffer(bus) for _ in range(3))
+    first.on_close(second.close)
+    first.on_close(lambda: 1 / 0)
+    async with anyio.create_task_group() as tasks:
+        asked: Asked[TransformStamped] = Asked(tasks, partial(third.lookup, "map", "a"))
+        await settle()
+        bus.close()
+    assert isinstance(asked.error, BusClosedError)
+    assert bus.closed

@@ -298,17 +298,45 @@ def test_only_its_bus_changes_the_tree_of_a_buffer() -> None:
     assert (feed.tree.latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)
 
 
-def test_whoever_asks_hears_of_each_end_or_at_once_of_one_that_was() -> None:
+def test_whoever_asks_hears_once_of_the_end_or_at_once_of_one_that_was() -> None:
     feed = Feed(10.0)
     heard: list[str] = []
-    early = feed.on_end(lambda: heard.append("early"))
-    gone = feed.on_end(lambda: heard.append("gone"))
-    gone.close()
-    assert heard == []
+    feed.on_end(lambda: heard.append("early"))
+    feed.on_end(lambda: heard.append("gone")).close()
+    assert feed.anyone_waits
     feed.end("the bus is closed")
+    assert heard == []
+    feed.tell_the_end()
+    feed.tell_the_end()
     assert heard == ["early"]
     feed.on_end(lambda: heard.append("late"))
     assert heard == ["early", "late"]
-    early.close()
-    feed.end("the buffer is closed")
-    assert heard == ["early", "late", "late"]
+    assert not feed.anyone_waits
+
+
+def test_what_raises_at_the_end_is_logged_and_does_not_keep_it_from_the_others(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    feed = Feed(10.0)
+    heard: list[str] = []
+    feed.on_end(lambda: 1 / 0)
+    feed.on_end(lambda: heard.append("told"))
+    feed.end("the bus is closed")
+    feed.tell_the_end()
+    assert heard == ["told"]
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_an_emptied_loop_that_is_dropped_wakes_who_asked_through_it() -> None:
+    feed = Feed(None)
+    woken: list[str] = []
+    feed.receive((moving("b", "c", 11), moving("a", "b", 10)))
+    feed.reset(11, 9)
+    with pytest.raises(TransformLookupError) as caught:
+        feed.tree.lookup("c", "b")
+    feed.waiting.park(Waiter(Question("c", "b", LATEST), 0, lambda: woken.append("b")), caught.value)
+    # Now c hangs on a, and b, which hung on a and carried c, is an edge of the past.
+    feed.receive((static("a", "c"),))
+    feed.receive((moving("a", "b", 10),))
+    assert feed.tree.can_transform("c", "b")
+    assert woken == ["b"]

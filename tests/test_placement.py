@@ -225,6 +225,24 @@ def test_latest_waits_until_it_is_out_of_the_gap_of_another_edge(tree: Transform
     assert tree.lookup("odom", "tool").stamp == seconds(4.0)
 
 
+@pytest.mark.parametrize(
+    ("policy", "stamp", "x", "extrapolated_by"),
+    [
+        ({}, 4.0, 4.0 + 40.0, 0.0),
+        ({"extrapolate": Hold(1.5)}, 5.5, 5.5 + 40.0, 1.5),
+        ({"tolerance": 0.5}, 4.0, 4.0 + 40.0, 0.0),
+        ({"extrapolate": Hold(9.0)}, 6.0, 6.0 + 40.0, 2.0),
+    ],
+)
+def test_latest_goes_as_far_as_the_lagging_edge_may_be_held_but_not_beyond_the_newest(
+    tree: TransformTree, policy: dict[str, Any], stamp: float, x: float, extrapolated_by: float
+) -> None:
+    found = tree.lookup("odom", "arm", **policy)
+    assert found.stamp == seconds(stamp)
+    assert found.transform.translation[0] == pytest.approx(x)
+    assert found.extrapolated_by == seconds(extrapolated_by)
+
+
 def test_time_travel_tells_the_worse_of_both_legs(tree: TransformTree) -> None:
     found = tree.lookup("base", "base", seconds(6.5), source_at=seconds(1.5), fixed="odom", extrapolate=Hold(1.0))
     assert found.transform.translation == pytest.approx((1.5 - 6.0, 0.0, 0.0))

@@ -352,3 +352,19 @@ async def test_all_that_only_reads_may_be_asked_by_threads_while_lookups_wait_an
                     tasks.start_soon(buffer.lookup, "map", "a", stamp)
                 await settle()
                 bus.publish([moving("map", frame, stamp, float(stamp)), moving("map", f"other{stamp % 7}", stamp)])
+
+
+@pytest.mark.parametrize("closes", ["buffer", "bus"])
+async def test_what_has_to_be_told_of_the_end_on_the_loop_keeps_other_threads_from_closing(closes: str) -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    told: list[str] = []
+    registration = buffer.on_close(lambda: told.append("the end"))
+    (error,) = in_thread(buffer.close if closes == "buffer" else bus.close)
+    assert isinstance(error, RuntimeError)
+    assert told == []
+    bus.publish(moving("map", "a", 1))
+    assert buffer.can_transform("map", "a", 1)
+    registration.close()
+    assert in_thread(buffer.close if closes == "buffer" else bus.close) == []
+    assert told == []

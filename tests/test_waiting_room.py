@@ -21,6 +21,7 @@ from tfbus import (
     SimulatedClock,
     TransformStamped,
     from_seconds,
+    to_seconds,
 )
 
 pytestmark = pytest.mark.anyio
@@ -100,6 +101,23 @@ async def test_latest_in_the_gap_of_another_edge_waits_for_either_end_of_it(end:
             await settle()
             assert asked.ended
     assert asked.answer.transform.translation[0] == pytest.approx(4.0 if asked.answer.stamp == 2 * SECOND else 3.0)
+
+
+async def test_a_held_edge_lets_the_others_make_the_latest_fresh_enough() -> None:
+    clock = SimulatedClock(from_seconds(100.0))
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish([driving("map", "odom", 99.0), driving("odom", "base", 99.2), driving("base", "arm", 99.4)])
+        lookup = partial(buffer.lookup, "map", "arm", max_age=0.1, extrapolate=Hold(5.0))
+        for last in ("odom", "base"):
+            async with anyio.create_task_group() as tasks:
+                asked: Asked[TransformStamped] = Asked(tasks, lookup)
+                await settle()
+                assert not asked.ended
+                bus.publish(driving({"odom": "map", "base": "odom"}[last], last, to_seconds(clock.now())))
+                await settle()
+                assert asked.ended
+            assert asked.answer.stamp == clock.now()
+            await clock.advance(1.0)
 
 
 async def test_a_timeout_says_how_near_a_sample_would_have_done() -> None:

@@ -376,13 +376,14 @@ class Buffer:
         return "\n".join(lines)
 
     def on_close(self, callback: Callable[[], object]) -> Registration:
-        """Call `callback` each time this buffer or its bus is closed, and now if one is. It must not raise."""
+        """Call `callback` once, on the event loop: when this buffer or its bus is closed, or now if one is."""
         return self._feed.on_end(callback)
 
     def close(self) -> None:
         """Leave the bus; lookups that wait end with `BusClosedError`. What is buffered can still be looked up."""
         self.bus.detach(self._feed)
         self._feed.end("the buffer is closed")
+        self._feed.tell_the_end()
 
     def _on_bus(self, question: Question) -> Question:
         """A question with the names that the bus has."""

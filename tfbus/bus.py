@@ -301,8 +301,12 @@ class Bus:
             publisher.discard()
         for reader in readers:
             reader.end()
-        for feed in self._feeds:
+        feeds = tuple(self._feeds)
+        for feed in feeds:
             feed.end("the bus is closed")
+        # Only now, when everybody has been woken, somebody else's code.
+        for feed in feeds:
+            feed.tell_the_end()
 
     def __enter__(self) -> "Bus":
         return self

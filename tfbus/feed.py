@@ -3,6 +3,7 @@
 Sans-IO like the tree and the indexes that it joins: waking is calling what each waiter brought along.
 """
 
+import logging
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 
@@ -101,21 +102,30 @@ class Feed:
         self.ended = self.ended or reason
         _wake(self.waiting.take_all())
         _wake(self.watching.end())
-        for callback in tuple(self._at_end.values()):
-            callback()
+
+    def tell_the_end(self) -> None:
+        """Call whoever asked to hear of the end, once; what one of them raises, nobody else notices."""
+        while self._at_end:
+            registration = next(iter(self._at_end))
+            callback = self._at_end.pop(registration)
+            try:
+                callback()
+            except Exception as error:
+                logging.getLogger("tfbus").warning("what was to be called at the end raised", exc_info=error)
 
     def on_end(self, callback: Callable[[], object]) -> Registration:
-        """Call `callback` when nothing more will come, or now if that is so, until the registration is closed."""
+        """Have `tell_the_end` call this, or call it now if the end was; closing the registration takes it back."""
         registration = Registration(lambda: self._at_end.pop(registration, None))
-        self._at_end[registration] = callback
         if self.ended:
             callback()
+        else:
+            self._at_end[registration] = callback
         return registration
 
     @property
     def anyone_waits(self) -> bool:
-        """Whether a task waits for something to come."""
-        return len(self.waiting) > 0 or self.watching.anyone_waits
+        """Whether somebody has to be told on the event loop of what comes, or of the end."""
+        return bool(self.waiting) or self.watching.anyone_waits or bool(self._at_end)
 
     def statistics(self, offered: int) -> BufferStatistics:
         """Counters; how many samples it was offered, the bus knows."""

@@ -175,4 +175,5 @@ class Forest:
         if above is history:
             for edge in walk:
                 if edge is not history and not len(edge):
+                    self.changed.add(edge.child)
                     self.remove(edge.child)

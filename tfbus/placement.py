@@ -38,7 +38,7 @@ def place(edge: FrameHistory, at: int, policy: Policy) -> Place:
     after = stamps[i] if i < len(stamps) else None
     if before is not None and after is not None and (policy.max_gap is None or after - before <= policy.max_gap):
         return Place(at, 0, after - before)
-    patience = max(policy.tolerance, policy.hold)
+    patience = policy.patience
     standing_in = []
     if before is not None and at - before <= patience:
         standing_in.append(Place(before, at - before, 0))
@@ -108,7 +108,7 @@ def place_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps
     if policy.max_gap is not None:
         between &= gap <= policy.max_gap
     alone = ~(exact | between)
-    by_before = alone & has_before & (late <= max(policy.tolerance, policy.hold))
+    by_before = alone & has_before & (late <= policy.patience)
     by_after = alone & has_after & (early <= policy.tolerance) & ~(by_before & (late <= early))
     if samples.parents is not None:
         parents = np.array(samples.parents, object)

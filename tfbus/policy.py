@@ -45,6 +45,11 @@ class Policy:
     max_gap: int | None = None
     hold: int = 0
 
+    @property
+    def patience(self) -> int:
+        """For how long a sample may stand in for the stamps after it, for whichever reason."""
+        return max(self.tolerance, self.hold)
+
 
 def policy_of(tolerance: float, max_gap: float | None, extrapolate: Hold | None) -> Policy | None:
     """The policy that three arguments in s make; None if they allow and refuse nothing.

@@ -53,7 +53,8 @@ class TreeReader:
         ----------
         target, source : str
         at : int or LATEST
-            ns. `LATEST` is the newest stamp that every moving edge on the path can answer.
+            ns. `LATEST` is the newest stamp that every moving edge on the path can answer; with `extrapolate`, the
+            newest stamp of any of them, as far as the lagging one may be held.
         source_at : int or LATEST, optional
             Take source at this stamp instead, and carry it to `at` through `fixed`.
         fixed : str, optional

@@ -11,6 +11,7 @@ from tfbus.errors import (
 )
 from tfbus.forest import Forest
 from tfbus.geometry import Row, compose
+from tfbus.history import FrameHistory
 from tfbus.path import Path, climb, find_path
 from tfbus.placement import Leniency
 from tfbus.stamps import LATEST, Latest, as_stamp
@@ -46,10 +47,12 @@ def resolve(
 
 
 def _resolve_latest(forest: Forest, path: Path, not_before: int | None, lenient: Leniency | None) -> Resolved:
-    """As `resolve`, at the newest stamp that every moving edge has reached."""
+    """As `resolve`, at the newest stamp that every moving edge has reached; under a policy, see `_missing`."""
     common, lagging = path.newest_common()
+    if lenient is not None:
+        common = min(common + lenient.policy.hold, max(edge.stamps[-1] for edge in path.moving))
     if not_before is not None and common < not_before:
-        raise lagging.missing(not_before)
+        raise _missing(path, lagging, not_before, lenient, 0)
     try:
         there = path
         if not path.lasting:
@@ -63,7 +66,23 @@ def _resolve_latest(forest: Forest, path: Path, not_before: int | None, lenient:
             needed = error.after
         elif path.lasting:
             needed = max(common if edge.oldest is None else edge.oldest for edge in path.moving)
-        raise lagging.missing(needed, 0 if lenient is None else lenient.policy.tolerance) from error
+        raise _missing(path, lagging, needed, lenient, 0 if lenient is None else lenient.policy.tolerance) from error
+
+
+def _missing(
+    path: Path, lagging: FrameHistory, needed: int, lenient: Leniency | None, slack: int
+) -> ExtrapolationError:
+    """The error that waits for the lagging edge.
+
+    Under a policy the latest is the newest stamp of any edge, as far as the lagging one may be held, and an edge that
+    lacks a sample may have another stand in: then a sample of any edge may help.
+    """
+    if lenient is None:
+        return lagging.missing(needed)
+    error = lagging.missing(needed, slack + lenient.policy.hold)
+    if isinstance(error, FutureExtrapolationError):
+        error.others = tuple(edge.child for edge in path.moving if edge is not lagging)
+    return error
 
 
 def resolve_travel(

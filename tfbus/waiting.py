@@ -84,7 +84,7 @@ def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
         If `error` is of a kind that waiting cannot help.
     """
     if isinstance(error, FutureExtrapolationError):
-        return (error.child,)
+        return (error.child, *error.others)
     if isinstance(error, UnknownFrameError):
         return (error.frame,)
     if isinstance(error, DisconnectedError):
