@@ -304,11 +304,21 @@ def test_the_first_authority_keeps_a_child_and_another_one_hears_of_it() -> None
     assert bus.statistics().authority_conflicts == 0
 
 
-@pytest.mark.parametrize("free", [lambda bus: bus.remove_frame("odom"), lambda bus: bus.clock.set(0)])
-def test_a_frame_that_is_forgotten_is_free_for_the_next_authority(free: Callable[[Bus], object]) -> None:
-    bus = Bus(SimulatedClock(start=5), on_conflict="reject")
+@pytest.mark.parametrize("resets", [0, 1, 2])
+def test_the_first_authority_keeps_a_child_across_clock_resets_until_it_is_removed(resets: int) -> None:
+    clock = SimulatedClock(start=5)
+    bus = Bus(clock, on_conflict="reject")
     bus.publish(moving("map", "odom", 5, authority="slam"))
-    free(bus)
+    for stamp in range(resets, 0, -1):
+        clock.set(stamp)
+        assert bus.statistics().frames == 0
+        with pytest.raises(InvalidTransformError, match="'slam', who was first"):
+            bus.publish(moving("map", "odom", stamp, authority="odometry"))
+    bus.publish(moving("map", "odom", 1, authority="slam"))
+    clock.set(0)
+    bus.remove_frame("odom")
+    with pytest.raises(UnknownFrameError):
+        bus.remove_frame("odom")
     bus.publish(moving("map", "odom", 1, authority="odometry"))
     with pytest.raises(InvalidTransformError, match="'odometry', who was first"):
         bus.publish(moving("map", "odom", 6, authority="slam"))

@@ -65,6 +65,12 @@ def test_an_exception_of_the_callback_is_counted_and_logged_once(caplog: pytest.
     assert str(record.exc_info[1]) == "spilt the coffee"
 
 
+@pytest.mark.parametrize("callback", ["print", 10])
+def test_a_callback_that_cannot_be_called_is_refused(callback: Any) -> None:
+    with pytest.raises(TypeError, match="on_drop must be callable"):
+        Drops(callback)
+
+
 def test_only_an_exception_of_the_callback_is_isolated() -> None:
     def impatient(_message: str, _reason: DropReason, _error: TransformError | None) -> None:
         raise KeyboardInterrupt

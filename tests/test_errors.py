@@ -172,6 +172,7 @@ def test_a_message_says_what_was_asked_what_there_is_and_the_gap(error: Transfor
     [
         (UnknownFrameError(frame="map"), "frame 'map' is not known"),
         (UnknownFrameError(frame="map", known=("lidar",)), "frame 'map' is not known"),
+        (UnknownFrameError(frame="/map"), "frame '/map' is not known, a frame name has no leading slash"),
         (
             DisconnectedError(target="map", source="tool0", roots=("map", "arm_base")),
             "no path from 'tool0' to 'map': they are in different trees, with roots 'map' and 'arm_base'",
@@ -269,6 +270,53 @@ def test_the_most_similar_name_comes_first() -> None:
     error = UnknownFrameError(frame="lidar_1", known=("map", "lidar", "lidar_11", "radar_1"))
     assert error.close_matches[0] == "lidar_11"
     assert "map" not in error.close_matches
+
+
+def test_a_leading_slash_is_what_is_wrong_with_a_name() -> None:
+    error = UnknownFrameError(frame="/map", known=("lidar", "map", "maps"))
+    assert (error.frame, error.close_matches[0]) == ("/map", "map")
+    assert str(error).startswith("frame '/map' is not known, a frame name has no leading slash, did you mean 'map'")
+    assert UnknownFrameError(frame="//a", known=("a", "b")).close_matches == ("a",)
+
+
+class CountedName(str):
+    """A frame name that counts how often it is compared in full."""
+
+    compared = 0
+    __slots__ = ()
+
+    def __iter__(self) -> Iterator[str]:
+        CountedName.compared += 1
+        return super().__iter__()
+
+
+def frames_of_many_robots() -> tuple[str, ...]:
+    return tuple(CountedName(f"robot{robot}/joint_{joint}_link") for robot in range(500) for joint in range(10))
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        "robot77/joint_4_lnik",
+        "robot77/joint_4_ink",
+        "robto77/joint_4_link",
+        "rboot77/joint_4_limk",
+        "robot77_joint_4_link",
+        "/robot77/joint_4_link",
+    ],
+)
+def test_of_thousands_of_names_only_the_likely_ones_are_compared_in_full(frame: str) -> None:
+    CountedName.compared = 0
+    assert UnknownFrameError(frame=frame, known=frames_of_many_robots()).close_matches[0] == "robot77/joint_4_link"
+    assert CountedName.compared <= errors.LOOKED_AT
+
+
+def test_many_errors_about_one_frame_look_for_similar_names_once() -> None:
+    known = frames_of_many_robots()
+    CountedName.compared = 0
+    texts = {str(UnknownFrameError(frame="robot5/joint_4_linkk", known=known)) for _ in range(1_000)}
+    assert len(texts) == 1
+    assert 0 < CountedName.compared <= errors.LOOKED_AT
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))

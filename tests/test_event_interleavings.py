@@ -135,6 +135,7 @@ class Reader:
     initial: int
     dropped: int = 0
     quarrels: dict[str, set[object]] = field(default_factory=dict)
+    refused: set[tuple[str | None, str | None, str]] = field(default_factory=set)
     stale: set[str] = field(default_factory=set)
     heard: list[str] = field(default_factory=list)
     read: list[Event] = field(default_factory=list)
@@ -149,34 +150,46 @@ class Reader:
             claim = (Reparented, happened.authority, happened.parent)
         elif isinstance(happened, KindChanged):
             claim = (KindChanged, happened.authority, happened.static)
-        elif isinstance(happened, FrameRemoved):
+        elif isinstance(happened, SampleRejected):
+            refusal = (happened.frame, happened.authority, happened.reason)
+            if refusal in self.refused:
+                return
+            self.refused.add(refusal)
+        elif isinstance(happened, (FrameAdded, FrameRemoved)):
             self.quarrels.pop(happened.frame, None)
+            self.refused = {refusal for refusal in self.refused if refusal[0] != happened.frame}
             self.stale.discard(happened.frame)
         elif isinstance(happened, ClockReset):
             self.quarrels.clear()
+            self.refused.clear()
             self.stale.clear()
         if claim is not None and frame in self.quarrels:
             told = self.quarrels[frame]
             if claim in told:
                 return
             told.add(claim)
-        self.pending.append(happened)
-        if len(self.pending) - self.initial > self.capacity:
-            del self.pending[self.initial]
+        if len(self.pending) - self.initial == self.capacity:
+            counting = self.pending[self.initial :]
+            moves = [other for other in counting if isinstance(other, (Reparented, KindChanged))]
+            own = [move for move in moves if isinstance(happened, (Reparented, KindChanged)) and move.frame == frame]
+            first = next((place for place, other in enumerate(counting) if own and other is own[0]), 0)
+            del self.pending[self.initial + first]
             self.dropped += 1
+        self.pending.append(happened)
 
     def look(self, edges: dict[str, Edge], now: int) -> None:
-        """Work out what is stale and what is live again."""
+        """Read what is pending, then all that is stale and live again, however much that is."""
+        self.flush()
         heard, self.heard = list(dict.fromkeys(self.heard)), []
         for frame in heard:
             edge = edges.get(frame)
             if frame in self.stale and edge is not None and (edge.static or edge.newest + self.limit >= now):
                 self.stale.remove(frame)
-                self.put(FrameLive(now, frame, None if edge.static else edge.newest, edge.authority))
+                self.read.append(FrameLive(now, frame, None if edge.static else edge.newest, edge.authority))
         for frame, edge in sorted(edges.items(), key=lambda known: (known[1].newest, known[0])):
             if not edge.static and frame not in self.stale and edge.newest + self.limit < now:
                 self.stale.add(frame)
-                self.put(FrameStale(now, frame, edge.newest, edge.authority))
+                self.read.append(FrameStale(now, frame, edge.newest, edge.authority))
 
     def flush(self) -> None:
         self.read += self.pending
@@ -213,6 +226,7 @@ class Model:
 
     first_keeps: bool
     edges: dict[str, Edge] = field(default_factory=dict)
+    kept: dict[str, str] = field(default_factory=dict)
     reserved: list[tuple[str, str]] = field(default_factory=list)
     readers: list[Reader] = field(default_factory=list)
     counted: Counter[str] = field(default_factory=Counter)
@@ -228,7 +242,7 @@ class Model:
         """Whether it is an error."""
         rejected: list[tuple[TransformStamped, str]] = []
         allowed: list[TransformStamped] = []
-        first = {child: edge.authority for child, edge in self.edges.items()}
+        first = self.kept | {child: edge.authority for child, edge in self.edges.items()}
         for sample in batch:
             owner = self.owner(sample.child)
             if owner is not None and owner != sample.authority:
@@ -323,6 +337,7 @@ class Game:
         elif isinstance(happening, Remove):
             with suppress(UnknownFrameError):
                 self.bus.remove_frame(happening.frame)
+            model.kept.pop(happening.frame, None)
             if model.edges.pop(happening.frame, None):
                 model.tell(FrameRemoved(now, happening.frame))
         elif isinstance(happening, Reserve):
@@ -354,6 +369,7 @@ class Game:
         self.clock.set(before + by)
         if by < 0:
             self.model.counted["resets"] += 1
+            self.model.kept |= {child: edge.authority for child, edge in self.model.edges.items() if not edge.static}
             self.model.edges = {child: edge for child, edge in self.model.edges.items() if edge.static}
             self.model.tell(ClockReset(before + by, before))
 
@@ -416,7 +432,6 @@ class Game:
             for place, reader in enumerate(self.model.readers):
                 if self.reading[place] is not None:
                     reader.look(self.model.edges, now)
-                    reader.flush()
         self.check()
 
     def check(self) -> None:

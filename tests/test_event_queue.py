@@ -6,6 +6,7 @@ from tfbus import (
     Event,
     FrameAdded,
     FrameRemoved,
+    FrameStale,
     KindChanged,
     QueueStatistics,
     Reparented,
@@ -91,13 +92,75 @@ def test_one_authority_that_hands_a_frame_to_and_fro_is_told_of_each_time() -> N
     assert emptied(queue)[1:] == [taken, put_down, taken, put_down, froze, froze]
 
 
-def test_rejections_are_told_each_time() -> None:
+def rejected(frame: str | None, authority: str | None, reason: str = "authority") -> SampleRejected:
+    return SampleRejected(1, reason, frame, "map", authority, ValueError())
+
+
+def test_a_rejection_is_told_once_a_frame_authority_and_reason_until_it_is_removed_added_or_the_clock_reset() -> None:
     queue = EventQueue(100)
-    queue.put(AuthorityConflict(0, "a", "x", "y"))
-    rejected = SampleRejected(1, "cycle", "a", "b", "x", ValueError())
-    for _ in range(3):
-        queue.put(rejected)
-    assert emptied(queue)[1:] == [rejected] * 3
+    different: list[Event] = [
+        rejected("a", "x"),
+        rejected("b", "x"),
+        rejected("a", "y"),
+        rejected("a", "x", "cycle"),
+        rejected(None, None, "not a sample"),
+    ]
+    for event in different * 3:
+        queue.put(event)
+    assert emptied(queue) == different
+    for end, again in (
+        (FrameRemoved(2, "a"), [rejected("a", "x")]),
+        (added("a"), [rejected("a", "x")]),
+        (ClockReset(2, 3), [rejected("a", "x"), rejected("b", "x")]),
+    ):
+        for event in (end, *[rejected("a", "x"), rejected("b", "x")] * 2):
+            queue.put(event)
+        assert emptied(queue) == [end, *again]
+
+
+def test_a_rejection_is_no_quarrel() -> None:
+    queue = EventQueue(100)
+    events: list[Event] = [rejected("cup", "x"), *[Reparented(1, "cup", "hand", "table", "y")] * 3]
+    for event in events:
+        queue.put(event)
+    assert emptied(queue) == events
+
+
+def test_rejections_of_ever_new_frames_and_authorities_fill_no_memory() -> None:
+    queue = EventQueue(1)
+    for number in range(3_000):
+        queue.put(rejected(f"frame {number}", "x"))
+        queue.put(rejected("frame 0", f"process {number}"))
+    dropped = queue.dropped
+    queue.put(rejected("frame 2999", "x"))
+    queue.put(rejected("frame 2500", "x"))
+    assert queue.dropped == dropped, "still remembered"
+    queue.put(rejected("frame 1", "x"))
+    assert queue.dropped == dropped + 1, "forgotten in favour of later ones"
+
+
+def test_a_frame_that_is_handed_to_and_fro_for_ever_pushes_nobody_else_out() -> None:
+    queue = EventQueue(5)
+    others: list[Event] = [added("a"), Reparented(0, "b", "map", "odom", "x"), FrameRemoved(0, "a")]
+    for event in others:
+        queue.put(event)
+    moves: list[Event] = []
+    for stamp in range(100):
+        moves += [Reparented(stamp, "cup", "hand", "table", ""), KindChanged(stamp, "cup", stamp % 2 == 0, "")]
+    for event in moves:
+        queue.put(event)
+    assert queue.dropped == len(moves) - 2
+    assert emptied(queue) == [*others, *moves[-2:]]
+
+
+def test_news_for_the_reader_come_next_and_are_never_dropped() -> None:
+    queue = EventQueue(1)
+    news = [FrameStale(5, f"frame {number}", 0, "") for number in range(10)]
+    queue.put_news(news)
+    queue.put(FrameRemoved(6, "frame 1"))
+    queue.put(FrameRemoved(7, "frame 2"))
+    assert queue.statistics() == QueueStatistics("events", "drop_oldest", capacity=1, pending=11, dropped=1)
+    assert emptied(queue) == [*news, FrameRemoved(7, "frame 2")]
 
 
 def test_who_quarrels_under_ever_new_names_fills_no_memory() -> None:

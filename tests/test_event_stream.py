@@ -174,6 +174,45 @@ async def test_a_frame_that_is_stale_before_anybody_reads_is_told_behind_what_is
         assert [type(await anext(events)) for _ in range(3)] == [FrameAdded, FrameAdded, FrameStale]
 
 
+async def test_however_many_frames_go_stale_together_a_reader_loses_none_of_them() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    names = [f"frame {number}" for number in range(100)]
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events(capacity=10) as events:
+            for name in names:
+                bus.publish(driving("map", name, 0.0))
+                assert isinstance(await anext(events), FrameAdded)
+            tasks.start_soon(read, events, got)
+            await clock.advance(2.0)
+            assert got == [FrameStale(SECOND + 1, name, 0, "") for name in sorted(names)]
+            got.clear()
+            bus.publish(driving("map", name, 2.0) for name in names)
+            await settle()
+            assert got == [FrameLive(2 * SECOND, name, 2 * SECOND, "") for name in names]
+            assert events.dropped == 0
+
+
+async def test_what_happens_while_news_are_read_comes_behind_them_and_pushes_none_out() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    bus.publish(driving("map", name, 0.0) for name in "abc")
+    with bus.events(capacity=1) as events:
+        for _ in "abc":
+            assert isinstance(await anext(events), FrameAdded)
+        await clock.advance(5.0)
+        assert await anext(events) == FrameStale(5 * SECOND, "a", 0, "")
+        bus.remove_frame("b")
+        bus.publish(driving("map", "c", 5.0))
+        assert [await anext(events) for _ in range(4)] == [
+            FrameStale(5 * SECOND, "b", 0, ""),
+            FrameStale(5 * SECOND, "c", 0, ""),
+            FrameRemoved(5 * SECOND, "b"),
+            FrameLive(5 * SECOND, "c", 5 * SECOND, ""),
+        ]
+
+
 async def test_a_jump_forward_makes_frames_stale_at_once() -> None:
     clock = SimulatedClock()
     bus = Bus(clock)

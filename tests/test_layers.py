@@ -26,13 +26,13 @@ ABOVE_THE_ASYNC_LINE = [
     ("topology", "subscribers", "event_queue"),
     ("forest", "data_question", "placement"),
     ("resolve",),
-    ("batch", "explanation", "velocity", "watching"),
+    ("batch", "explanation", "velocity", "watch_index"),
     ("reader", "prefix"),
     ("tree",),
     ("feed",),
 ]
 BELOW_THE_ASYNC_LINE = [
-    ("ticks", "threadsafe", "claim", "reading"),
+    ("ticks", "threadsafe", "bus_thread", "reading"),
     ("clock", "stream"),
     ("event_stream",),
     ("bus", "waiting_room"),

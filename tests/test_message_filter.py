@@ -452,6 +452,21 @@ async def test_messages_that_one_batch_makes_ready_come_out_as_they_came(
         assert stamps([await anext(pairs) for _ in order]) == order
 
 
+async def test_messages_that_corrected_samples_make_ready_come_out_in_that_order(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish([static("map", "base"), moving("odom", "one", 5), moving("odom", "two", 5)])
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        put(send, Scan(5, "one"), Scan(5, "two"))
+        await settle()
+        for frame in ("two", "one"):
+            bus.publish(moving("map", frame, 5))
+            await settle()
+        assert buffer.tree.inserted == 3
+        assert [(await anext(pairs))[0].frame for _ in range(2)] == ["two", "one"]
+
+
 @pytest.mark.parametrize("order", ["stamp", "arrival"])
 async def test_a_message_that_waits_holds_back_those_behind_it_until_it_is_dropped(
     order: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
@@ -1015,6 +1030,75 @@ async def test_what_closing_a_generator_raises_is_not_lost(buffer: Buffer) -> No
             await settle()
 
 
+class Alarm(BaseException):
+    """No `Exception`, like Ctrl-C, but no event loop knows it."""
+
+
+def ring(*_: object) -> str:
+    try:
+        raise KeyError("while this")
+    except KeyError:
+        raise Alarm from ValueError("because of that")
+
+
+async def ringing() -> AsyncIterator[Scan]:
+    yield Scan(5, "map")
+    ring()
+
+
+@pytest.mark.parametrize("where", ["source", "frame", "stamp", "on_drop", "on_drop of one that waits"])
+@pytest.mark.parametrize("reading", [True, False])
+async def test_what_is_no_exception_stops_the_body_and_comes_out_as_it_is(
+    where: str, reading: bool, clock: SimulatedClock, buffer: Buffer
+) -> None:
+    options: dict[str, dict[str, Any]] = {
+        "source": {},
+        "frame": {"frame": ring},
+        "stamp": {"stamp": ring},
+        "on_drop": {"on_drop": ring, "timeout": 0.0},
+        "on_drop of one that waits": {"on_drop": ring, "timeout": 1.0},
+    }
+    source = ringing() if where == "source" else Source(StopAsyncIteration(), Scan(5))
+    with anyio.fail_after(PATIENCE):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(clock.advance, 2.0)
+            with pytest.raises(Alarm) as caught:
+                async with MessageFilter(source, buffer, "map", **options[where]) as pairs:
+                    if reading:
+                        await anext(pairs)
+                    await anyio.sleep_forever()
+            await anyio.lowlevel.checkpoint()
+    assert repr(caught.value.__context__) == "KeyError('while this')"
+    assert repr(caught.value.__cause__) == "ValueError('because of that')"
+    assert (buffer.pending(), balanced(pairs)) == ((), True)
+
+
+async def test_a_group_that_the_source_raises_stays_one(buffer: Buffer) -> None:
+    alarm = Alarm()
+    with pytest.raises(BaseExceptionGroup, match="two or more") as caught:
+        async with MessageFilter(Source(BaseExceptionGroup("two or more", [alarm])), buffer, "map") as pairs:
+            await anext(pairs)
+    assert caught.value.exceptions == (alarm,)
+
+
+def test_an_interrupt_in_the_source_comes_out_of_the_loop_as_it_is(
+    run: Callable[[Callable[[], Any]], Any], buffer: Buffer
+) -> None:
+    seen: list[str] = []
+
+    async def main() -> None:
+        try:
+            async with MessageFilter(Source(KeyboardInterrupt()), buffer, "map") as pairs:
+                await anext(pairs)
+        except BaseException as error:
+            seen.append(type(error).__name__)
+            raise
+
+    with pytest.raises(KeyboardInterrupt):
+        run(main)
+    assert seen == ["KeyboardInterrupt"]
+
+
 # Cancellation
 
 
@@ -1093,6 +1177,9 @@ async def no_callback(_message: Scan, _reason: DropReason, _error: TransformErro
         ({"overflow": "conflate"}, ValueError),
         ({"order": "random"}, ValueError),
         ({"on_drop": no_callback}, TypeError),
+        ({"on_drop": "print"}, TypeError),
+        ({"frame": "laser"}, TypeError),
+        ({"stamp": 5}, TypeError),
         ({"messages": [Scan(1)]}, TypeError),
     ],
 )
@@ -1101,6 +1188,30 @@ def test_an_argument_that_makes_no_sense_is_refused(
 ) -> None:
     with pytest.raises(error):
         MessageFilter(**{"messages": Source(OSError()), "buffer": buffer, "target": "map", **arguments})
+
+
+def test_a_queue_size_behind_the_target_as_in_tf2_is_refused(buffer: Buffer) -> None:
+    make: Any = MessageFilter
+    with pytest.raises(TypeError, match="positional"):
+        make(Source(OSError()), buffer, "map", 10)
+
+
+async def test_a_leading_slash_is_named_with_the_frame_that_was_meant(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish(static("map", "laser"))
+    pairs = MessageFilter(receive, buffer, "map", on_drop=(drops := Drops()))
+    for target in ("/map", ["/map"]):
+        with pytest.raises(UnknownFrameError, match=r"no leading slash, did you mean 'map'\?"):
+            MessageFilter(receive, buffer, target)
+    with pytest.raises(UnknownFrameError, match="did you mean 'map'"):
+        pairs.set_target("/map")
+    async with pairs:
+        put(send, Scan(5, "/laser"))
+        await settle()
+    ((_, _, error),) = drops.all
+    assert "no leading slash, did you mean 'laser'?" in str(error)
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,28 @@ def test_of_a_new_child_the_first_in_the_batch_counts() -> None:
     assert [error.owner for error in refused] == ["one"]
 
 
+@pytest.mark.parametrize("first", ["", "odometry"])
+def test_what_is_remembered_is_kept_for_its_authority_until_it_is_forgotten(first: str) -> None:
+    ownership = Ownership("reject")
+    ownership.remember({"b": Known(first)})
+    mine, other = moving("a", "b", 1, authority=first), moving("a", "b", 2, authority="slam")
+    allowed, (error,) = ownership.split((other, mine), {})
+    assert (allowed, error.owner) == ((mine,), first)
+    assert ownership.split((other,), {"b": Known("slam")}) == ((other,), []), "what is known now counts more"
+    ownership.remember({"c": Known("gps")})
+    assert ownership.remembers("b")
+    ownership.forget("b")
+    assert not ownership.remembers("b")
+    assert ownership.split((other,), {}) == ((other,), [])
+
+
+def test_under_last_nothing_is_remembered() -> None:
+    ownership = Ownership("last")
+    ownership.remember({"b": Known("odometry")})
+    assert not ownership.remembers("b")
+    assert not ownership
+
+
 @pytest.mark.parametrize(("first", "second"), [("", "slam"), ("slam", "")])
 def test_no_authority_is_one_like_any_other(first: str, second: str) -> None:
     ownership = Ownership("reject")

@@ -147,6 +147,14 @@ def test_a_gap_is_refused_with_its_two_samples() -> None:
     )
 
 
+@pytest.mark.parametrize(("policy", "slack"), [((0, 0), 0), ((5, 0), 5), ((5, 8), 8), ((0, 8), 8), ((8, 5), 8)])
+def test_a_gap_that_nothing_stands_in_for_says_how_far_it_was_looked(policy: tuple[int, int], slack: int) -> None:
+    edge = history([0, 100])
+    with pytest.raises(GapError) as caught:
+        place(edge, 50, Policy(tolerance=policy[0], hold=policy[1], max_gap=20))
+    assert (caught.value.stamp, caught.value.slack) == (50, slack)
+
+
 # On whole paths: odom -> base moves 1 m/s with samples at 0, 1, 2 and 6 s; base -> arm is sampled at 0 and 4 s.
 
 

@@ -30,7 +30,7 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
-from tfbus.prefix import Prefix
+from tfbus.prefix import Prefix, as_prefix
 
 pytestmark = pytest.mark.anyio
 
@@ -118,6 +118,25 @@ def test_a_bad_prefix_is_refused(make: Callable[..., object], prefix: Any, share
     bus = Bus(SimulatedClock())
     with pytest.raises(error):
         make(bus, prefix=prefix, shared=shared)
+    assert bus.statistics().buffers == ()
+
+
+@pytest.mark.parametrize("shared", [{"map"}, "map", "", ["map", "earth"], iter(["map"]), 5])
+def test_shared_names_without_a_prefix_are_refused(shared: Any) -> None:
+    with pytest.raises(TypeError):
+        as_prefix(None, shared)
+
+
+@pytest.mark.parametrize("shared", [(), set(), iter([])])
+def test_no_prefix_and_nothing_shared_is_no_prefix(shared: Any) -> None:
+    assert as_prefix(None, shared) is None
+
+
+@pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
+def test_who_forgets_the_prefix_is_told(make: Callable[..., object]) -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(TypeError, match="prefix"):
+        make(bus, shared={"map"})
     assert bus.statistics().buffers == ()
 
 

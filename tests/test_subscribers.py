@@ -239,6 +239,52 @@ def test_an_async_subscriber_is_refused_because_nobody_would_await_it() -> None:
         bus.subscribe(callback)
 
 
+@pytest.mark.parametrize("together", [True, False])
+def test_a_frame_that_a_subscriber_removes_is_not_brought_back_by_those_behind_it(together: bool) -> None:
+    bus = Bus(SimulatedClock())
+    front: list[Batch] = []
+    behind: list[Batch] = []
+
+    def remove(batch: Batch) -> None:
+        front.append(batch)
+        if any(sample.child == "b" for sample in batch):
+            bus.remove_frame("b")
+
+    bus.subscribe(remove)
+    bus.subscribe(behind.append)
+    a, b, c = moving("map", "a", 1), static("map", "b"), moving("map", "c", 1)
+    bus.publish([a, b] if together else b)
+    bus.publish(c)
+    assert front == [(a, b) if together else (b,), (c,)]
+    assert behind == ([(a,)] if together else []) + [(c,)]
+
+
+def test_when_a_subscriber_turns_the_clock_back_those_behind_it_get_what_is_static() -> None:
+    clock = SimulatedClock(start=10)
+    bus = Bus(clock)
+    got: list[Batch] = []
+    bus.subscribe(lambda _: clock.set(clock.now() - 1))
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 10))
+    bus.publish([moving("map", "b", 9), static("map", "s")])
+    assert got == [(static("map", "s"),)]
+
+
+def test_what_a_subscriber_publishes_anew_after_a_removal_reaches_those_behind_it() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def replace(batch: Batch) -> None:
+        if batch[0].stamp == 1:
+            bus.remove_frame("a")
+            bus.publish(moving("map", "a", 2))
+
+    bus.subscribe(replace)
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    assert got == [(moving("map", "a", 2),)]
+
+
 def test_what_waits_for_subscribers_when_the_clock_jumps_back_is_dropped() -> None:
     clock = SimulatedClock(start=10)
     seen: list[str] = []

@@ -11,12 +11,12 @@ from samples import any_samples, moving, static
 from tfbus import InvalidTransformError, TransformStamped
 from tfbus.announcer import Announcer
 from tfbus.once import OnceLogger
-from tfbus.ownership import Ownership
+from tfbus.ownership import OnConflict, Ownership
 from tfbus.topology import Topology, admit
 
 
-def topology(*batches: Sequence[TransformStamped]) -> Topology:
-    made = Topology(OnceLogger(logging.getLogger("tfbus")), Ownership("last"), Announcer(lambda: 0))
+def topology(*batches: Sequence[TransformStamped], on_conflict: OnConflict = "last") -> Topology:
+    made = Topology(OnceLogger(logging.getLogger("tfbus")), Ownership(on_conflict), Announcer(lambda: 0))
     for batch in batches:
         made.take(tuple(batch), "raise")
     return made
@@ -236,6 +236,15 @@ def test_after_a_clock_reset_only_static_edges_are_known() -> None:
     assert len(known) == 1
     batch = (moving("c", "a", 1),)
     assert known.take(batch, "raise") == batch
+
+
+def test_under_reject_a_child_that_a_reset_forgot_can_still_be_removed() -> None:
+    known = topology([moving("a", "b", 100, authority="slam"), static("b", "c")], on_conflict="reject")
+    known.clear_moving()
+    assert "b" in known
+    assert (len(known), known.newest("b"), [event.frame for event in known.known()]) == (1, None, ["c"])
+    known.remove("b")
+    assert "b" not in known
 
 
 def test_a_long_chain_in_one_batch_is_judged_link_by_link_and_not_pair_by_pair() -> None:

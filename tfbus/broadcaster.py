@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from tfbus.bus import Bus
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.geometry import Transform
-from tfbus.prefix import Prefix
+from tfbus.prefix import as_prefix
 from tfbus.stamped import TransformStamped
 
 
@@ -29,7 +29,7 @@ class TransformBroadcaster:
     ValueError
         If the prefix, or a shared name, is empty or starts with a slash, or a shared name starts with the prefix.
     TypeError
-        If an argument is of another type.
+        If an argument is of another type, or there are shared names but no prefix.
     """
 
     def __init__(self, bus: Bus, authority: str = "", *, prefix: str | None = None, shared: Iterable[str] = ()) -> None:
@@ -37,7 +37,7 @@ class TransformBroadcaster:
             raise TypeError(f"authority must be a str, not {authority!r}")
         self.bus = bus
         self.authority = authority
-        self._prefix = None if prefix is None else Prefix(prefix, shared)
+        self._prefix = as_prefix(prefix, shared)
 
     def send(self, parent: str, child: str, transform: Transform, at: int | None = None) -> None:
         """Publish where `child` is, seen from `parent`.
@@ -94,7 +94,8 @@ class TransformBroadcaster:
     def owning(self, *frames: str) -> Iterator[None]:
         """Have frames for as long as a ``with`` lasts: nobody else may publish them, and at its end they are removed.
 
-        Nothing happens to a frame that was never published, and nothing at all once the bus is closed.
+        They are removed whoever published them: also what another authority, or this one, had sent before the ``with``
+        began. Nothing happens to a frame that was never published, and nothing at all once the bus is closed.
 
         Raises
         ------

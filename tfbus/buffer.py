@@ -12,7 +12,7 @@ from tfbus.explanation import Explanation
 from tfbus.feed import Feed
 from tfbus.picture import describe
 from tfbus.policy import Hold, policy_of
-from tfbus.prefix import Prefix
+from tfbus.prefix import as_prefix
 from tfbus.registration import Registration
 from tfbus.stamped import TransformStamped
 from tfbus.stamps import LATEST, Latest
@@ -41,7 +41,8 @@ class Buffer:
     prefill : Buffer or TransformTree, optional
         Start with a copy of its history, as far as `keep` reaches. If it is a buffer on the same bus, this one then
         answers as if it had been there all along. Otherwise, what is latched on this bus comes on top, and the stamps
-        of both have to be of one time: a sample older than the window that it falls into expires as always.
+        of both have to be of one time: a sample older than the window that it falls into expires as always. What was
+        removed after a buffer was closed, that buffer still has.
 
     Raises
     ------
@@ -51,7 +52,7 @@ class Buffer:
         If `keep` is negative; if the prefix, or a shared name, is empty or starts with a slash, or a shared name
         starts with the prefix.
     TypeError
-        If an argument is of another type.
+        If an argument is of another type, or there are shared names but no prefix.
 
     Notes
     -----
@@ -74,7 +75,7 @@ class Buffer:
     ) -> None:
         self.bus = bus
         self._clock = bus.clock
-        self._prefix = None if prefix is None else Prefix(prefix, shared)
+        self._prefix = as_prefix(prefix, shared)
         self._feed = Feed(keep)
         self._room = WaitingRoom(self._feed, bus.clock, bus.check_thread, self._prefix)
         answer = self._feed.tree.answer

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Literal
 
 from tfbus.announcer import Announcer
-from tfbus.claim import Claim
+from tfbus.bus_thread import BusThread
 from tfbus.clock import Clock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.event_stream import EventStream
@@ -39,7 +39,7 @@ class Bus:
         Where stamps, timeouts and timed tasks take their time from; by default a `SystemClock`.
     on_conflict : {"last", "reject"}
         What happens to samples of a child that another authority has published before: they are taken and reported,
-        or refused until the frame is removed. No authority, ``""``, is one like any other.
+        or refused until the frame is removed, across jumps of the clock. No authority, ``""``, is one like any other.
 
     Raises
     ------
@@ -55,7 +55,7 @@ class Bus:
 
     def __init__(self, clock: Clock | None = None, on_conflict: OnConflict = "last") -> None:
         self.clock: Clock = SystemClock() if clock is None else clock
-        self._claim = Claim()
+        self._owner = BusThread()
         self._closed = False
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._events: list[EventStream] = []
@@ -101,7 +101,7 @@ class Bus:
         RuntimeError
             If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
         """
-        if get_ident() != self._claim.thread:
+        if get_ident() != self._owner.thread:
             self.check_thread()
         if self._closed:
             raise BusClosedError
@@ -135,7 +135,7 @@ class Bus:
 
         The first event loop to use a bus that another thread has made takes it over.
         """
-        self._claim.check()
+        self._owner.check()
 
     def subscribe(self, callback: BatchCallback) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
@@ -176,14 +176,16 @@ class Bus:
     def events(self, capacity: int = 1_000, stale_after: float | None = 1.0) -> EventStream:
         """What happens besides samples: ``with bus.events() as events: async for event in events``.
 
-        It begins with a `FrameAdded` for each frame that has a parent by now. What is rejected, and each failure of a
-        subscriber, is one event; of two authorities that argue about a frame, each pair is told once, and each parent
-        and kind that one of them claims, until the frame is removed. The counters count every time.
+        It begins with a `FrameAdded` for each frame that has a parent by now. Each failure of a subscriber is an event;
+        what is rejected is told once for each frame, authority and reason. Of two authorities that argue about a frame,
+        each pair is told once, and each parent and kind that one of them claims. That lasts until the frame is removed,
+        or the clock jumps back; the counters count every time.
 
         Parameters
         ----------
         capacity : int
-            How many events may wait for the reader; then the oldest are dropped and counted.
+            How many events may wait for the reader; then the oldest are dropped and counted. What was there at the
+            beginning, and who is stale or live, is never dropped.
         stale_after : float or None
             A moving frame is stale when its newest stamp is more than this many s behind the clock, and live again when
             it is not; None for no such events. It is worked out while somebody reads, without a timer of its own.

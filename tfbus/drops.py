@@ -31,6 +31,8 @@ class Drops(Generic[MessageT]):
     """
 
     def __init__(self, on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None) -> None:
+        if on_drop is not None and not callable(on_drop):
+            raise TypeError(f"on_drop must be callable, not {on_drop!r}")
         if iscoroutinefunction(on_drop):
             raise TypeError(f"on_drop must not be async, as {on_drop!r} is")
         self._on_drop = on_drop

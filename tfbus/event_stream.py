@@ -19,7 +19,7 @@ class EventStream(Reading[Event]):
     """What `Bus.events` gives: ``async for event in events``, for one reader.
 
     The iteration ends when the bus or the stream is closed and what was pending has been read. Whether a frame is stale
-    is worked out while somebody reads, and told behind what is pending.
+    is worked out while somebody reads, once nothing is pending; what that gives is told in full, whatever the capacity.
     """
 
     def __init__(
@@ -62,10 +62,11 @@ class EventStream(Reading[Event]):
             self.wake()
 
     def _next(self) -> Event | None:
-        if self._staleness is not None and not self._ended:
-            for event in self._staleness.news(self._clock.now()):
-                self.queue.put(event)
-        return self.queue.get()
+        event = self.queue.get()
+        if event is None and self._staleness is not None and not self._ended:
+            self.queue.put_news(self._staleness.news(self._clock.now()))
+            event = self.queue.get()
+        return event
 
     async def _wait(self, woken: anyio.Event) -> None:
         due = None if self._staleness is None else self._staleness.due()

@@ -82,6 +82,9 @@ class AuthorityConflict:
 class SampleRejected:
     """The bus refused a sample, whether its sender was told or not.
 
+    A stream tells it once for each frame, authority and reason, until the frame is removed or added or the clock jumps
+    back; ``statistics().rejected`` counts every sample.
+
     Attributes
     ----------
     stamp : int
@@ -152,7 +155,10 @@ class FrameLive:
 
 @dataclass(frozen=True, slots=True)
 class ClockReset:
-    """The clock jumped back, from `before` to `stamp` (ns); every moving frame is forgotten."""
+    """The clock jumped back, from `before` to `stamp` (ns); every moving frame is forgotten.
+
+    With ``on_conflict="reject"`` its first authority keeps it all the same, until it is removed.
+    """
 
     stamp: int
     before: int

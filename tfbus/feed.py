@@ -14,7 +14,7 @@ from tfbus.stamped import Batch, TransformStamped
 from tfbus.statistics import BufferStatistics
 from tfbus.tree import TransformTree
 from tfbus.waiting import Waiter, WaitingIndex
-from tfbus.watching import Watched, WatchingIndex
+from tfbus.watch_index import Watched, WatchingIndex
 
 
 class Feed:

@@ -53,7 +53,8 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     frame, stamp : callable, optional
         Give the frame and the stamp (ns, or `LATEST`) of a message; by default its attributes `frame` and `stamp`.
     tolerance : float
-        A message is answered only when its stamp and the one this many s later both can be.
+        In s. Demands more, where that of a lookup allows more: a message is answered only when its stamp and the one
+        this much later both can be.
     timeout : float, optional
         How long a message may wait, in s on the bus's clock from its arrival; None for ever. One that is ready does
         not time out.
@@ -84,7 +85,8 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     ``async with`` was left).
 
     What the source raises, and what `frame` and `stamp` raise, comes out of the iteration as it is, after what is
-    ready; if nobody reads on, out of the end of the ``async with``, unless that is left by another exception.
+    ready; if nobody reads on, out of the end of the ``async with``, unless that is left by another exception. What is
+    no `Exception`, such as Ctrl-C, stops the body at once, and comes out of the ``async with`` as it is.
     """
 
     @overload
@@ -93,6 +95,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         messages: AsyncIterable[MessageT],
         buffer: Buffer,
         target: str,
+        *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
         tolerance: float = 0.0,
@@ -109,6 +112,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         messages: AsyncIterable[MessageT],
         buffer: Buffer,
         target: Sequence[str],
+        *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
         tolerance: float = 0.0,
@@ -124,6 +128,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         messages: AsyncIterable[MessageT],
         buffer: Buffer,
         target: str | Sequence[str],
+        *,
         frame: Callable[[MessageT], str] | None = None,
         stamp: Callable[[MessageT], int | Latest] | None = None,
         tolerance: float = 0.0,
@@ -137,6 +142,9 @@ class MessageFilter(Generic[MessageT, AnswerT]):
             raise TypeError(f"messages must be an async iterable, not {messages!r}")
         if overflow not in ("drop_oldest", "drop_newest", "block"):
             raise ValueError(f"overflow must be 'drop_oldest', 'drop_newest' or 'block', not {overflow!r}")
+        for name, function in (("frame", frame), ("stamp", stamp)):
+            if function is not None and not callable(function):
+                raise TypeError(f"{name} must be callable, not {function!r}")
         self.buffer = buffer
         self._messages = messages
         self._targets: Targets[AnswerT] = Targets(buffer, target, tolerance)
@@ -223,6 +231,10 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         try:
             # A task group would wrap what the body raises, so it is not told.
             await self._tasks.__aexit__(None, None, None)
+        except BaseExceptionGroup as group:
+            if len(group.exceptions) > 1:
+                raise
+            self._error, error = group.exceptions[0], None
         finally:
             for registration in self._registrations:
                 registration.close()
@@ -291,7 +303,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         named = is_frame(frame)
         self._arrived += 1
         if not named:
-            self._drops.add(message, "unknown frame", UnknownFrameError(frame=frame))
+            self._drops.add(message, "unknown frame", UnknownFrameError(frame=frame, known=self.buffer.tree.frames()))
             return
         answers: list[AnswerT] = []
         blocker: TransformLookupError | None = None
@@ -376,4 +388,10 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     def _raise_error(self) -> None:
         error, self._error = self._error, None
         if error is not None:
-            raise error
+            context = error.__context__
+            try:
+                raise error
+            finally:
+                # Raising has put what is handled here in the place of what it was raised from.
+                error.__context__ = context
+                del error

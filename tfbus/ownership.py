@@ -23,7 +23,7 @@ class Ownership:
     Parameters
     ----------
     on_conflict : {"last", "reject"}
-        Whether a second authority may publish a child, or only the first.
+        Whether a second authority may publish a child, or only the first, until it is forgotten by `forget`.
 
     Raises
     ------
@@ -36,9 +36,26 @@ class Ownership:
             raise ValueError(f"on_conflict must be 'last' or 'reject', not {on_conflict!r}")
         self._first_keeps = on_conflict == "reject"
         self._reserved: dict[str, tuple[str, int]] = {}
+        self._first: dict[str, str] = {}
 
     def __bool__(self) -> bool:
         return self._first_keeps or bool(self._reserved)
+
+    def remembers(self, frame: str) -> bool:
+        """Whether a frame is kept for its first authority although nothing else is known of it."""
+        return frame in self._first
+
+    def remember(self, known: Mapping[str, Published]) -> None:
+        """Keep children for those who published them, if that is the policy, while nothing else is known of them.
+
+        It is one name a child that was published and not removed, as many as are known if the clock is never reset.
+        """
+        if self._first_keeps:
+            self._first.update((child, published.authority) for child, published in known.items())
+
+    def forget(self, frame: str) -> None:
+        """Let a frame that was removed be anybody's; a reservation stays."""
+        self._first.pop(frame, None)
 
     def reserved_for(self, frame: str) -> str | None:
         """The authority that has reserved a frame, if any."""
@@ -80,7 +97,11 @@ class Ownership:
             owner = self.reserved_for(child)
             reason = "authority" if owner is None else "reserved"
             if owner is None and self._first_keeps:
-                owner = known[child].authority if child in known else new.setdefault(child, authority)
+                if child in known:
+                    owner = known[child].authority
+                else:
+                    owner = self._first.get(child)
+                    owner = new.setdefault(child, authority) if owner is None else owner
             if owner is None or owner == authority:
                 allowed.append(sample)
             else:

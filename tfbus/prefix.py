@@ -108,3 +108,18 @@ class Prefix:
             return renamed(found, target, source)
 
         return answer_locally
+
+
+def as_prefix(prefix: str | None, shared: Iterable[str]) -> Prefix | None:
+    """The arguments `prefix` and `shared` of a broadcaster or a buffer, checked; None without a prefix.
+
+    Raises
+    ------
+    ValueError, TypeError
+        As `Prefix`; and `TypeError` if there are shared names but no prefix that they could do without.
+    """
+    if prefix is not None:
+        return Prefix(prefix, shared)
+    if isinstance(shared, str) or tuple(shared):
+        raise TypeError(f"shared names need a prefix, got shared={shared!r} alone")
+    return None

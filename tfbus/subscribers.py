@@ -19,7 +19,8 @@ _QUEUED_BATCHES = 1_000
 class Subscribers:
     """Calls subscribers one batch after the other, and keeps them from harming each other or the publisher.
 
-    A batch that a subscriber publishes waits until everybody has had the current one, so all see the same order.
+    A batch that a subscriber publishes waits until everybody has had the current one, so all see the same order. If one
+    removes a frame or turns the clock back, those behind it get the current batch without what is gone.
 
     Attributes
     ----------
@@ -34,6 +35,7 @@ class Subscribers:
         self.callbacks: dict[int, BatchCallback] = {}
         self._keys = count()
         self._backlog: deque[Batch] = deque()
+        self._current: Batch = ()
         self._calling: BatchCallback | None = None
         self._queued = 0
         self.failures = 0
@@ -73,26 +75,29 @@ class Subscribers:
         self._deliver_backlog()
 
     def discard_moving(self) -> None:
-        """Take the moving samples out of what waits to be delivered: the clock has jumped back."""
+        """Deliver no moving sample of what was published so far to anybody any more: the clock has jumped back."""
         self._keep_only(lambda sample: sample.static)
 
     def forget(self, child: str) -> None:
-        """Take the samples of a removed frame out of what waits to be delivered."""
+        """Deliver no sample of a removed frame to anybody any more."""
         self._keep_only(lambda sample: sample.child != child)
 
     def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
+        self._current = tuple(filter(wanted, self._current))
         batches = (tuple(filter(wanted, batch)) for batch in self._backlog)
         self._backlog = deque(batch for batch in batches if batch)
 
     def _deliver_backlog(self) -> None:
         try:
             while self._backlog:
-                batch = self._backlog.popleft()
+                self._current = self._backlog.popleft()
                 for key in tuple(self.callbacks):
-                    if key in self.callbacks:
+                    # A callback may have ended another, or removed what the batch is about.
+                    if self._current and key in self.callbacks:
                         self._calling = self.callbacks[key]
-                        self._call(key, batch)
+                        self._call(key, self._current)
         finally:
+            self._current = ()
             self._calling = None
             self._queued = 0
 

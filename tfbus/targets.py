@@ -35,7 +35,7 @@ class Targets(Generic[AnswerT]):
     def __init__(self, buffer: Buffer, target: str | Sequence[str], tolerance: float) -> None:
         self._buffer = buffer
         self._one = isinstance(target, str)
-        self._names = _names_of(target)
+        self._names = self._names_of(target)
         self._tolerance = from_seconds(as_duration(tolerance, "tolerance"))
 
     def replace(self, target: str | Sequence[str]) -> None:
@@ -43,7 +43,7 @@ class Targets(Generic[AnswerT]):
         if isinstance(target, str) is not self._one:
             wanted = "one target" if self._one else "a sequence of targets"
             raise TypeError(f"the filter was made for {wanted}, and its pairs keep their shape: not {target!r}")
-        self._names = _names_of(target)
+        self._names = self._names_of(target)
 
     def questions(self, frame: str, stamp: int | Latest) -> Iterator[tuple[str, int | Latest]]:
         """The targets and stamps (ns) to look up; the last one of each target gives its transform."""
@@ -100,12 +100,11 @@ class Targets(Generic[AnswerT]):
                     raise LookupTimeoutError(target=target, source=frame, timeout=timeout, missing=blocker) from blocker
             raise
 
-
-def _names_of(target: str | Sequence[str]) -> tuple[str, ...]:
-    names = (target,) if isinstance(target, str) else tuple(target)
-    if not names:
-        raise ValueError("there must be at least one target")
-    for name in names:
-        if not is_frame(name):
-            raise UnknownFrameError(frame=name)
-    return names
+    def _names_of(self, target: str | Sequence[str]) -> tuple[str, ...]:
+        names = (target,) if isinstance(target, str) else tuple(target)
+        if not names:
+            raise ValueError("there must be at least one target")
+        for name in names:
+            if not is_frame(name):
+                raise UnknownFrameError(frame=name, known=self._buffer.tree.frames())
+        return names

@@ -178,7 +178,7 @@ class Topology:
         return len(self._newest)
 
     def __contains__(self, child: object) -> bool:
-        return child in self._newest
+        return child in self._newest or (isinstance(child, str) and self._ownership.remembers(child))
 
     def names(self) -> set[str]:
         """Every frame that an edge names."""
@@ -227,13 +227,15 @@ class Topology:
         return registration
 
     def remove(self, child: str) -> None:
-        """Forget a child."""
+        """Forget a child, and who was the first to publish it."""
         self.latched.pop(child, None)
+        self._ownership.forget(child)
         if self._newest.pop(child, None) is not None and self._announcer:
             self._announcer.tell(FrameRemoved(self._announcer.now(), child))
 
     def clear_moving(self) -> None:
-        """Forget every child that is not static."""
+        """Forget every child that is not static, but not for whom it is kept."""
+        self._ownership.remember({child: known for child, known in self._newest.items() if not known.static})
         self._newest = {child: known for child, known in self._newest.items() if known.static}
 
     def reject(self, reason: str, error: Exception) -> None:

@@ -14,7 +14,7 @@ from tfbus.stamped import TransformStamped, is_frame
 from tfbus.stamps import SECOND, STAMP_MAX, is_real, to_seconds
 from tfbus.waiting import MAY_COME, Question, Waiter, without_traceback
 from tfbus.waiting_room import REPORT_AFTER, WaitingRoom
-from tfbus.watching import Watched
+from tfbus.watch_index import Watched
 
 
 class Watch:

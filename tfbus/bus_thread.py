@@ -6,7 +6,7 @@ from threading import get_ident
 import anyio
 
 
-class Claim:
+class BusThread:
     """A thread's claim on a bus: first that of the thread that made it, then of the first event loop that uses it.
 
     Attributes

@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tfbus.claim import Claim
+from tfbus.bus_thread import BusThread
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 
@@ -15,7 +15,7 @@ def in_thread(call: Callable[[], object]) -> BaseException | None:
 
 
 def test_without_a_loop_it_is_the_thread_that_made_it() -> None:
-    claim = Claim()
+    claim = BusThread()
     claim.check()
     error = in_thread(claim.check)
     assert isinstance(error, RuntimeError)
@@ -24,7 +24,7 @@ def test_without_a_loop_it_is_the_thread_that_made_it() -> None:
 
 
 def test_the_first_loop_takes_it_over_and_keeps_it(run: Run) -> None:
-    claim = Claim()
+    claim = BusThread()
 
     async def use() -> None:
         claim.check()
@@ -35,10 +35,10 @@ def test_the_first_loop_takes_it_over_and_keeps_it(run: Run) -> None:
 
 
 def test_made_on_a_loop_it_is_that_loop_s(run: Run) -> None:
-    claims: list[Claim] = []
+    claims: list[BusThread] = []
 
     async def make() -> None:
-        claims.append(Claim())
+        claims.append(BusThread())
 
     assert in_thread(lambda: run(make)) is None
     with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):

@@ -6,7 +6,7 @@ from samples import any_samples, moving, static
 
 from tfbus import ClockResetError, InvalidTransformError, TransformLookupError, TransformStamped, TransformTree
 from tfbus.feed import Feed
-from tfbus.watching import Watched
+from tfbus.watch_index import Watched
 
 
 class Watcher:
