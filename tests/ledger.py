@@ -7,8 +7,8 @@ from tfbus.stamped import Batch
 class Ledger:
     """What a stream was offered while it was open, and where each moving sample of that has gone.
 
-    A conflating stream does not count as dropped what it replaces by something newer of the same child: that is
-    `superseded` here, and `pending` is what such a stream must hold.
+    What a conflating stream gives up for something newer of the same child is `superseded` here, and `pending` is what
+    such a stream must hold.
     """
 
     def __init__(self, stream: Stream) -> None:
@@ -48,10 +48,11 @@ class Ledger:
             self.pending.clear()
 
     def check(self) -> None:
-        left = self.offered - self.read - self.stream.dropped - self.superseded
+        left = self.offered - self.read - self.stream.dropped - self.stream.queue.conflated
         assert 0 <= left <= len(self.stream.queue)
         if self.conflates:
             assert (left, self.stream.dropped) == (len(self.pending), self.lost)
+        assert self.stream.queue.conflated == self.superseded
 
     async def check_to_the_end(self) -> None:
         """Read what the reader has left behind when it went."""

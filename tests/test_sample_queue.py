@@ -147,6 +147,17 @@ def test_statistics_say_what_the_queue_is_and_holds() -> None:
     assert queue.statistics("stream") == expected
 
 
+def test_moving_samples_that_give_way_to_another_of_their_child_are_counted_apart() -> None:
+    queue = SampleQueue(1, "conflate")
+    queue.put((moving("map", "a", 2), moving("map", "a", 3), moving("map", "a", 1)))
+    queue.put((static("map", "a"), static("map", "a")))
+    queue.put((moving("map", "a", 4), moving("map", "b", 4)))
+    assert emptied(queue) == [(moving("map", "b", 4),)]
+    # Offered 5: two gave way to newer ones, one to a static one, one was dropped for the capacity, one was read.
+    assert (queue.conflated, queue.dropped) == (3, 1)
+    assert queue.statistics("stream").conflated == 3
+
+
 @pytest.mark.parametrize(
     ("capacity", "overflow", "error"),
     [(0, "conflate", ValueError), (True, "conflate", TypeError), (1.5, "conflate", TypeError), (1, "grow", ValueError)],

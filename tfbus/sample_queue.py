@@ -36,6 +36,8 @@ class SampleQueue:
     ----------
     dropped : int
         Moving samples lost to the capacity, or discarded with their frame or their time.
+    conflated : int
+        Moving samples that gave way to another one of the same child; only with ``"conflate"``.
     """
 
     def __init__(self, capacity: int, overflow: Overflow) -> None:
@@ -45,6 +47,7 @@ class SampleQueue:
         self.capacity = capacity
         self.overflow: Overflow = overflow
         self.dropped = 0
+        self.conflated = 0
         self._newest: dict[str, TransformStamped] = {}
         self._batches: deque[Batch] = deque()
         self._moving = 0
@@ -95,11 +98,12 @@ class SampleQueue:
 
     def statistics(self, kind: str) -> QueueStatistics:
         """The queue's counters; `kind` says what it is for."""
-        return QueueStatistics(kind, self.overflow, self.capacity, len(self), self.dropped)
+        return QueueStatistics(kind, self.overflow, self.capacity, len(self), self.dropped, self.conflated)
 
     def _conflate(self, sample: TransformStamped) -> None:
         pending = self._newest.get(sample.child)
         if pending is not None:
+            self.conflated += not pending.static
             # The last kind wins; of moving samples, the newest stamp.
             if not (sample.static or pending.static) and sample.stamp < pending.stamp:
                 return

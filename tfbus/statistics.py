@@ -17,13 +17,18 @@ class BufferStatistics:
 
 @dataclass(frozen=True, slots=True)
 class QueueStatistics:
-    """One bounded queue: a stream, the samples of other threads, or events."""
+    """One bounded queue: a stream, the samples of other threads, or events.
+
+    Of moving samples, what was offered is what was read, is pending, was dropped, or gave way to another sample of the
+    same child (`conflated`, with that overflow only).
+    """
 
     kind: str
     overflow: str
     capacity: int
     pending: int
     dropped: int
+    conflated: int = 0
 
 
 @dataclass(frozen=True, slots=True)
