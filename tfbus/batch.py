@@ -194,18 +194,15 @@ def resolve_few(
     forest: Forest, target: str, source: str, stamps: Stamps, source_stamps: Stamps | None, fixed: str | None
 ) -> list[Row]:
     """The answers, one by one; errors as for the scalar lookup. The caller holds the lock."""
-    if source_stamps is not None:
-        for name in (target, source, fixed):
-            if name is not None:
-                forest.check_known(name)
-        both = zip(stamps.tolist(), source_stamps.tolist(), strict=True)
-        return [resolve_travel(forest, target, source, at, then, fixed, None)[1] for at, then in both]
     path = forest.paths.get((target, source))
-    if path is not None:
+    if path is not None and source_stamps is None:
         return path.rows(stamps.tolist())
-    forest.check_known(target)
-    forest.check_known(source)
-    return [resolve(forest, target, source, at, None)[1] for at in stamps.tolist()]
+    for name in (target, source) if fixed is None else (target, source, fixed):
+        forest.check_known(name)
+    if source_stamps is None:
+        return [resolve(forest, target, source, at, None)[1] for at in stamps.tolist()]
+    both = zip(stamps.tolist(), source_stamps.tolist(), strict=True)
+    return [resolve_travel(forest, target, source, at, then, fixed, None)[1] for at, then in both]
 
 
 def join(legs: list[Answers]) -> TransformArray:

@@ -3,7 +3,6 @@
 The caller of `explain` holds the lock; making text of an `Explanation` needs none.
 """
 
-from bisect import bisect_left
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -233,7 +232,7 @@ def _explained(
     before = after = fraction = None
     away = 0
     if instant is not None:
-        before, after = _round(edge, instant)
+        before, after = edge.around(instant)
         with suppress(ExtrapolationError):
             place = place_of(edge, instant, policy or Policy())
             away = place.extrapolated_by
@@ -241,16 +240,6 @@ def _explained(
     return ExplainedEdge(
         parent, edge.child, False, before, after, fraction, away, facts.newest, age, facts.rate, facts.authority, error
     )
-
-
-def _round(edge: FrameHistory, instant: int) -> tuple[int | None, int | None]:
-    """The stamps of the samples round an instant; twice the same if one has it."""
-    stamps, start = edge.stamps, edge.start
-    i = bisect_left(stamps, instant, start)
-    after = stamps[i] if i < len(stamps) else None
-    if after == instant:
-        return after, after
-    return stamps[i - 1] if i > start else None, after
 
 
 def _fraction(edge: FrameHistory, stamp: int, before: int | None, after: int | None) -> float:

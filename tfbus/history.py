@@ -246,6 +246,15 @@ class FrameHistory:
         stamps = self.stamps[self.start :]
         return [stamp for stamp, old, new in zip(stamps[1:], parents, parents[1:], strict=False) if new != old]
 
+    def around(self, stamp: int) -> tuple[int | None, int | None]:
+        """The stamps of the samples on either side of one, in ns; twice the same if a sample has it."""
+        stamps, start = self.stamps, self.start
+        i = bisect_left(stamps, stamp, start)
+        after = stamps[i] if i < len(stamps) else None
+        if after == stamp:
+            return after, after
+        return stamps[i - 1] if i > start else None, after
+
     def between(self, low: int, high: int) -> Samples:
         """Copies of the samples from stamp `low` to `high`, and of the nearest one on either side."""
         start = self.start

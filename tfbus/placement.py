@@ -1,6 +1,5 @@
 """Where a policy reads an edge: at the stamp itself, at a sample that stands in for it, or nowhere."""
 
-from bisect import bisect_left
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -30,19 +29,16 @@ def place(edge: FrameHistory, at: int, policy: Policy) -> Place:
     ExtrapolationError
         If the policy does not allow any sample to stand in.
     """
-    stamps, start = edge.stamps, edge.start
-    i = bisect_left(stamps, at, start)
-    if i < len(stamps) and stamps[i] == at:
+    before, after = edge.around(at)
+    if after == at:
         return Place(at, 0, 0)
-    before = stamps[i - 1] if i > start else None
-    after = stamps[i] if i < len(stamps) else None
     if before is not None and after is not None and (policy.max_gap is None or after - before <= policy.max_gap):
         return Place(at, 0, after - before)
     patience = policy.patience
     standing_in = []
     if before is not None and at - before <= patience:
         standing_in.append(Place(before, at - before, 0))
-    if after is not None and after - at <= policy.tolerance and _same_parent(edge, i):
+    if after is not None and after - at <= policy.tolerance and edge.parent_at(after) == edge.parent_at(at):
         standing_in.append(Place(after, after - at, 0))
     if standing_in:
         return min(standing_in, key=lambda found: found.extrapolated_by)
@@ -59,11 +55,6 @@ def place(edge: FrameHistory, at: int, policy: Policy) -> Place:
         after=after,
         max_gap=policy.max_gap,
     )
-
-
-def _same_parent(edge: FrameHistory, i: int) -> bool:
-    """Whether a sample hangs on the parent that holds just before it."""
-    return edge.parents is None or i == edge.start or edge.origins[i - 1][0] == edge.origins[i][0]
 
 
 def place_all(edges: tuple[FrameHistory, ...], at: int, policy: Policy) -> list[Place]:

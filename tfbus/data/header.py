@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tfbus.geometry import Vector
+from tfbus.geometry import Transform, Vector
 from tfbus.stamped import check_frame
 from tfbus.stamps import LATEST, Latest, as_stamp
 
@@ -36,6 +36,12 @@ def check_header(data: Stamped) -> None:
     check_frame(data.frame)
     if data.stamp is not LATEST:
         object.__setattr__(data, "stamp", as_stamp(data.stamp))
+
+
+def check_pose(pose: object) -> None:
+    """Raise `TypeError` unless `pose` is a `Transform`."""
+    if not isinstance(pose, Transform):
+        raise TypeError(f"pose must be a Transform, not {pose!r}")
 
 
 def as_triple(value: Any, name: str) -> Vector:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from tfbus.data.arrays import Rebuilt, as_points
 from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.data.header import as_triple, check_header
+from tfbus.data.header import as_triple, check_header, check_pose
 from tfbus.geometry import Quaternion, Transform, Vector, as_rotation, rotate
 from tfbus.read_only import locked
 from tfbus.stamped import TransformStamped
@@ -100,8 +100,7 @@ class PoseStamped:
 
     def __post_init__(self) -> None:
         check_header(self)
-        if not isinstance(self.pose, Transform):
-            raise TypeError(f"pose must be a Transform, not {self.pose!r}")
+        check_pose(self.pose)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from tfbus.data.arrays import Rebuilt, as_floats
 from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.data.header import as_triple, check_header
+from tfbus.data.header import as_triple, check_header, check_pose
 from tfbus.geometry import Transform, Vector, rotate
 from tfbus.read_only import locked
 from tfbus.stamped import TransformStamped
@@ -45,8 +45,7 @@ class PoseWithCovarianceStamped(Rebuilt):
 
     def __post_init__(self) -> None:
         check_header(self)
-        if not isinstance(self.pose, Transform):
-            raise TypeError(f"pose must be a Transform, not {self.pose!r}")
+        check_pose(self.pose)
         covariance: npt.NDArray[Any] = as_floats(self.covariance, "covariance").astype(np.float64)
         if covariance.shape not in ((6, 6), (36,)):
             raise ValueError(f"covariance must have shape (6, 6) or (36,), got {covariance.shape}")
