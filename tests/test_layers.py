@@ -32,7 +32,8 @@ ABOVE_THE_ASYNC_LINE = [
     ("feed",),
 ]
 BELOW_THE_ASYNC_LINE = [
-    ("ticks", "threadsafe", "bus_thread", "reading"),
+    ("ticks", "doorbell", "bus_thread", "reading"),
+    ("threadsafe",),
     ("clock", "stream"),
     ("event_stream",),
     ("bus", "waiting_room"),
@@ -42,6 +43,8 @@ BELOW_THE_ASYNC_LINE = [
     ("message_filter",),
     ("__init__",),
     ("tutorial", "testing"),
+    ("cli.options",),
+    ("cli.demo",),
     ("cli",),
 ]
 LAYERS = ABOVE_THE_ASYNC_LINE + BELOW_THE_ASYNC_LINE
@@ -51,8 +54,12 @@ EFFECTS = {"anyio", "asyncio", "sniffio", "socket", "threading", "time", "trio"}
 ALLOWED_EFFECTS = {"reader": {"threading"}}
 
 CORE = {"anyio", "numpy", "transforms3d"}
-EXTRAS = {"cyclopts", "hypothesis", "rich", "starlette", "uvicorn"}
-ALLOWED_EXTRAS = {"cli": {"cyclopts"}}
+EXTRAS = {"cyclopts", "hypothesis", "rich", "starlette", "uvicorn", "zenoh"}
+ALLOWED_EXTRAS = {
+    "cli": {"cyclopts"},
+    "cli.options": {"cyclopts"},
+    "cli.demo": {"cyclopts"},
+}
 
 
 def module_name(path: Path) -> str:

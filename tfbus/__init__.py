@@ -46,6 +46,9 @@ from tfbus.events import (
     FrameRemoved,
     FrameStale,
     KindChanged,
+    PeerJoined,
+    PeerLost,
+    PeerRejected,
     Reparented,
     SampleRejected,
     SubscriberFailed,
@@ -58,7 +61,7 @@ from tfbus.policy import Hold
 from tfbus.registration import Registration
 from tfbus.stamped import TransformStamped
 from tfbus.stamps import LATEST, SECOND, Latest, from_seconds, to_seconds
-from tfbus.statistics import BufferStatistics, BusStatistics, QueueStatistics
+from tfbus.statistics import BufferStatistics, BusStatistics, LinkStatistics, QueueStatistics
 from tfbus.stream import Stream
 from tfbus.threadsafe import ThreadPublisher
 from tfbus.ticks import Ticks
@@ -97,10 +100,14 @@ __all__ = [
     "KindChanged",
     "LaserScan",
     "Latest",
+    "LinkStatistics",
     "LookupTimeoutError",
     "MessageFilter",
     "Outcome",
     "PastExtrapolationError",
+    "PeerJoined",
+    "PeerLost",
+    "PeerRejected",
     "PendingLookup",
     "PointCloud",
     "PointStamped",

@@ -16,7 +16,7 @@ from tfbus.bus_thread import BusThread
 from tfbus.clock import Clock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.event_stream import EventStream
-from tfbus.events import ClockReset
+from tfbus.events import ClockReset, Event
 from tfbus.feed import Feed
 from tfbus.once import OnceLogger
 from tfbus.ownership import OnConflict, Ownership
@@ -25,7 +25,7 @@ from tfbus.sample_queue import Overflow
 from tfbus.stamped import Batch, TransformStamped, as_batch
 from tfbus.statistics import BusStatistics
 from tfbus.stream import Stream
-from tfbus.subscribers import BatchCallback, Subscribers
+from tfbus.subscribers import BatchCallback, FrameCallback, Subscribers
 from tfbus.threadsafe import ThreadPublisher
 from tfbus.topology import Topology
 
@@ -137,19 +137,21 @@ class Bus:
         """
         self._owner.check()
 
-    def subscribe(self, callback: BatchCallback) -> Registration:
+    def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
 
         It is called inside `publish`, so it should be quick; if it publishes, those batches are delivered behind the
         current one. If it raises an `Exception`, that is logged once and counted, and nobody else notices. What is
         latched, it is given at once.
 
+        `removed` is called with each frame that `remove_frame` takes away, between the batches before and after it.
+
         Raises
         ------
         BusClosedError
         """
         self._check_usable()
-        return self._subscribers.add(callback, tuple(self._topology.latched.values()))
+        return self._subscribers.add(callback, tuple(self._topology.latched.values()), removed)
 
     def stream(self, capacity: int = 1_000, overflow: Overflow = "conflate") -> Stream:
         """The batches as an async iterator: ``with bus.stream() as batches: async for batch in batches``.
@@ -200,6 +202,11 @@ class Bus:
         events = EventStream(capacity, stale_after, self._topology, self.clock, self.check_thread, self._detach_events)
         self._events.append(events)
         return events
+
+    def announce(self, event: Event) -> None:
+        """Tell whoever reads `events` of something that the bus cannot know: for links, recorders and players."""
+        self.check_thread()
+        self._announcer.tell(event)
 
     def reserve(self, frame: str, authority: str) -> Registration:
         """Let only `authority` publish a frame, whatever `on_conflict` says, until the registration is closed.
@@ -266,6 +273,7 @@ class Bus:
             stream.queue.forget(frame)
         for feed in self._feeds:
             feed.remove_frame(frame)
+        self._subscribers.tell_removed(frame)
 
     def statistics(self) -> BusStatistics:
         """All counters, as they are now."""

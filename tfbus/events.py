@@ -179,6 +179,77 @@ class SubscriberFailed:
         return _line(self.stamp, f"the subscriber {self.subscriber} raised {self.error!r}")
 
 
+@dataclass(frozen=True, slots=True)
+class PeerJoined:
+    """Another process was found over a link.
+
+    Attributes
+    ----------
+    stamp : int
+    link : str
+        Over which link.
+    peer : str
+        The other end's own name for itself, made anew whenever it starts.
+    """
+
+    stamp: int
+    link: str
+    peer: str
+
+    def __str__(self) -> str:
+        return _line(self.stamp, f"peer {self.peer} has joined {self.link}")
+
+
+@dataclass(frozen=True, slots=True)
+class PeerLost:
+    """Another process has gone, is frozen, or cannot be reached any more.
+
+    Attributes
+    ----------
+    stamp : int
+    link, peer : str
+        As in `PeerJoined`.
+    authorities : tuple of str
+        Whom it spoke for, sorted.
+    frames : tuple of str
+        What it was the last to publish, sorted; they leave the bus if the link drops what is lost.
+    """
+
+    stamp: int
+    link: str
+    peer: str
+    authorities: tuple[str, ...]
+    frames: tuple[str, ...]
+
+    def __str__(self) -> str:
+        spoke = f", who spoke for {', '.join(map(repr, self.authorities))}" if self.authorities else ""
+        return _line(self.stamp, f"peer {self.peer} is lost on {self.link}{spoke}: {len(self.frames)} frames")
+
+
+@dataclass(frozen=True, slots=True)
+class PeerRejected:
+    """Something that another process sent was refused; told once for each peer and reason.
+
+    Attributes
+    ----------
+    stamp : int
+    link, peer : str
+        As in `PeerJoined`.
+    reason : str
+        What the link's statistics count it by.
+    error : Exception
+    """
+
+    stamp: int
+    link: str
+    peer: str
+    reason: str
+    error: Exception = field(compare=False)
+
+    def __str__(self) -> str:
+        return _line(self.stamp, f"peer {self.peer} on {self.link} sent what was refused: {self.error}")
+
+
 Event = (
     FrameAdded
     | FrameRemoved
@@ -190,6 +261,9 @@ Event = (
     | FrameLive
     | ClockReset
     | SubscriberFailed
+    | PeerJoined
+    | PeerLost
+    | PeerRejected
 )
 """What `Bus.events` gives."""
 

@@ -67,3 +67,39 @@ class BusStatistics:
     frames: int
     buffers: tuple[BufferStatistics, ...]
     queues: tuple[QueueStatistics, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatistics:
+    """One link since it was entered.
+
+    Attributes
+    ----------
+    peers : int
+        Other ends that are there now.
+    sent_messages, sent_samples : int
+        What was handed to the network.
+    received_messages, received_samples : int
+        What was taken from it and published on the bus.
+    lost : int
+        Messages of peers that never came, by their numbers.
+    duplicates : int
+        Samples that had come before, or were overtaken by newer ones on another way.
+    not_sent : mapping of str to int
+        Samples of this bus that cannot be put into a message, by reason.
+    rejected : mapping of str to int
+        Messages and samples of peers that were refused, by reason.
+    queue : QueueStatistics
+        The messages that wait for the event loop.
+    """
+
+    peers: int
+    sent_messages: int
+    sent_samples: int
+    received_messages: int
+    received_samples: int
+    lost: int
+    duplicates: int
+    not_sent: Mapping[str, int]
+    rejected: Mapping[str, int]
+    queue: QueueStatistics

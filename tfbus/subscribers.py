@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from inspect import iscoroutinefunction
 from itertools import count
+from typing import TypeVar
 
 from tfbus.announcer import Announcer
 from tfbus.events import SubscriberFailed
@@ -12,6 +13,8 @@ from tfbus.registration import Registration
 from tfbus.stamped import Batch, TransformStamped
 
 BatchCallback = Callable[[Batch], object]
+FrameCallback = Callable[[str], object]
+GivenT = TypeVar("GivenT")
 
 _QUEUED_BATCHES = 1_000
 
@@ -33,6 +36,7 @@ class Subscribers:
         self._log = log
         self._announcer = news
         self.callbacks: dict[int, BatchCallback] = {}
+        self._removal_callbacks: dict[int, FrameCallback] = {}
         self._keys = count()
         self._backlog: deque[Batch] = deque()
         self._current: Batch = ()
@@ -40,23 +44,26 @@ class Subscribers:
         self._queued = 0
         self.failures = 0
 
-    def add(self, callback: BatchCallback, latched: Batch) -> Registration:
+    def add(self, callback: BatchCallback, latched: Batch, removed: FrameCallback | None = None) -> Registration:
         """Register a callback, and call it with what is latched if that is anything."""
-        if not callable(callback):
-            raise TypeError(f"a subscriber must be callable, not {callback!r}")
-        if iscoroutinefunction(callback):
-            raise TypeError(f"a subscriber must not be async, as {callback!r} is: read a bus.stream() instead")
+        for function in (callback, removed):
+            if function is not None and not callable(function):
+                raise TypeError(f"a subscriber must be callable, not {function!r}")
+            if iscoroutinefunction(function):
+                raise TypeError(f"a subscriber must not be async, as {function!r} is: read a bus.stream() instead")
         key = next(self._keys)
         self.callbacks[key] = callback
+        if removed is not None:
+            self._removal_callbacks[key] = removed
         if latched:
             outer, self._calling = self._calling, callback
             try:
-                self._call(key, latched)
+                self._call(key, callback, latched)
             finally:
                 self._calling = outer
             if outer is None:
                 self._deliver_backlog()
-        return Registration(lambda: self.callbacks.pop(key, None))
+        return Registration(lambda: self._remove(key))
 
     def check_backlog(self) -> None:
         """Raise `RuntimeError` if callbacks publish without end."""
@@ -82,6 +89,12 @@ class Subscribers:
         """Deliver no sample of a removed frame to anybody any more."""
         self._keep_only(lambda sample: sample.child != child)
 
+    def tell_removed(self, child: str) -> None:
+        """Tell those who want to know that a frame was removed."""
+        for key, removed in tuple(self._removal_callbacks.items()):
+            if key in self._removal_callbacks:
+                self._call(key, removed, child)
+
     def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
         self._current = tuple(filter(wanted, self._current))
         batches = (tuple(filter(wanted, batch)) for batch in self._backlog)
@@ -95,16 +108,19 @@ class Subscribers:
                     # A callback may have ended another, or removed what the batch is about.
                     if self._current and key in self.callbacks:
                         self._calling = self.callbacks[key]
-                        self._call(key, self._current)
+                        self._call(key, self._calling, self._current)
         finally:
             self._current = ()
             self._calling = None
             self._queued = 0
 
-    def _call(self, key: int, batch: Batch) -> None:
-        callback = self.callbacks[key]
+    def _remove(self, key: int) -> None:
+        self.callbacks.pop(key, None)
+        self._removal_callbacks.pop(key, None)
+
+    def _call(self, key: int, callback: Callable[[GivenT], object], given: GivenT) -> None:
         try:
-            callback(batch)
+            callback(given)
         except Exception as error:  # noqa: BLE001 - a subscriber is somebody else's code
             self.failures += 1
             self._log.warning(("subscriber", key), "the subscriber %s raised", _name(callback), exc_info=error)
@@ -112,5 +128,5 @@ class Subscribers:
                 self._announcer.tell(SubscriberFailed(self._announcer.now(), _name(callback), error))
 
 
-def _name(callback: BatchCallback | None) -> str:
+def _name(callback: Callable[..., object] | None) -> str:
     return getattr(callback, "__qualname__", None) or repr(callback)

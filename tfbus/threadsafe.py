@@ -3,10 +3,8 @@
 import threading
 from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import Any, cast
 
-import anyio.lowlevel
-
+from tfbus.doorbell import Doorbell
 from tfbus.errors import BusClosedError
 from tfbus.sample_queue import SampleQueue
 from tfbus.stamped import Batch, TransformStamped, as_batch
@@ -41,15 +39,16 @@ class ThreadPublisher:
         self._lock = threading.Lock()
         self._deliver = deliver
         self._detach = detach
-        self._soon: Callable[[Callable[[], object]], object] | None = None
-        self._armed = True
+        self._bell = Doorbell(self._drain)
         self._ended = False
 
     def __enter__(self) -> "ThreadPublisher":
-        # anyio has no public call for this; both loops' own one is the only thing that wakes them from a thread.
-        native = cast(Any, anyio.lowlevel.current_token().native_token)
-        self._attach(self)
-        self._soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
+        self._bell.connect()
+        try:
+            self._attach(self)
+        except BaseException:
+            self.end()
+            raise
         return self
 
     def __exit__(
@@ -76,19 +75,17 @@ class ThreadPublisher:
         What only the bus can judge, such as a loop of parents, is dropped and counted there.
         """
         batch = as_batch(samples)
-        if self._soon is None:
+        if not self._bell.connected:
             raise RuntimeError("enter the `with` of bus.threadsafe() on the event loop first")
         with self._lock:
             if self._ended:
                 raise BusClosedError("the bus takes no more samples from this thread: its `with` has ended")
             self.queue.put(batch)
-            wake, self._armed = self._armed, False
-        if wake:
-            try:
-                self._soon(self._drain)
-            except RuntimeError as error:
-                self.end()
-                raise BusClosedError("the event loop of the bus has ended") from error
+        try:
+            self._bell.ring()
+        except RuntimeError as error:
+            self.end()
+            raise BusClosedError("the event loop of the bus has ended") from error
 
     def end(self) -> None:
         """Take no more samples."""
@@ -107,8 +104,6 @@ class ThreadPublisher:
 
     def _drain(self) -> None:
         with self._lock:
-            # Re-armed before the queue is emptied: a sample that comes right behind it wakes the loop again.
-            self._armed = True
             pending = len(self.queue)
         # One by one: what is delivered may make the clock jump, and that discards the rest.
         for _ in range(pending):
