@@ -142,7 +142,7 @@ class Reader:
 
     def put(self, happened: Event) -> None:
         claim: object = None
-        frame = None if isinstance(happened, (ClockReset, SubscriberFailed)) else happened.frame
+        frame = getattr(happened, "frame", None)
         if isinstance(happened, AuthorityConflict):
             claim = frozenset((happened.authority, happened.other))
             self.quarrels.setdefault(happened.frame, set())

@@ -15,6 +15,11 @@ from tfbus import (
     FrameStale,
     InvalidTransformError,
     KindChanged,
+    PeerJoined,
+    PeerLost,
+    PeerRejected,
+    RecordingDropped,
+    RecordingFailed,
     Reparented,
     SampleRejected,
     SubscriberFailed,
@@ -47,6 +52,18 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     (FrameLive(AT, "base", AT, "odometry"), "frame 'base' is live again, from 'odometry'"),
     (ClockReset(AT, 90 * SECOND), "the clock jumped back from 90.000 s"),
     (SubscriberFailed(AT, "print", OSError("full")), "the subscriber print raised OSError('full')"),
+    (PeerJoined(AT, "tf", "5eed"), "peer 5eed has joined tf"),
+    (
+        PeerLost(AT, "tf", "5eed", ("arm", "slam"), ("odom", "tool")),
+        "peer 5eed is lost on tf, who spoke for 'arm', 'slam': 2 frames",
+    ),
+    (PeerLost(AT, "tf", "5eed", (), ()), "peer 5eed is lost on tf: 0 frames"),
+    (
+        PeerRejected(AT, "tf", "5eed", "truncated", ValueError("ends\nearly")),
+        "peer 5eed on tf sent what was refused: ends early",
+    ),
+    (RecordingDropped(AT, "run.mcap", 7), "the recording run.mcap is behind and loses samples, 7 so far"),
+    (RecordingFailed(AT, "run.mcap", OSError("disk\nfull")), "the recording run.mcap has ended early: disk full"),
 ]
 
 

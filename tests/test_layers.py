@@ -18,7 +18,7 @@ ABOVE_THE_ASYNC_LINE = [
     ("errors", "policy", "events"),
     ("geometry", "drops", "pending_messages"),
     ("stamped", "history", "transform_array"),
-    ("data.header", "data.arrays"),
+    ("data.header", "data.arrays", "tf_message"),
     ("data.dispatch",),
     ("data.points", "data.spatial", "data.clouds"),
     ("data.scans",),
@@ -43,7 +43,15 @@ BELOW_THE_ASYNC_LINE = [
     ("message_filter",),
     ("__init__",),
     ("tutorial", "testing"),
+    ("links", "links.arrivals", "links.attachment", "links.peers", "links.zenoh_settings"),
+    ("links.received",),
+    ("links.relay",),
+    ("links.inbox", "links.outbox"),
+    ("links.zenoh_statics",),
+    ("links.zenoh_session",),
+    ("links.zenoh",),
     ("cli.options",),
+    ("cli.link",),
     ("cli.demo",),
     ("cli",),
 ]
@@ -55,9 +63,12 @@ ALLOWED_EFFECTS = {"reader": {"threading"}}
 
 CORE = {"anyio", "numpy", "transforms3d"}
 EXTRAS = {"cyclopts", "hypothesis", "rich", "starlette", "uvicorn", "zenoh"}
+LINKS_OVER_ZENOH = ("links.zenoh", "links.zenoh_session", "links.zenoh_settings", "links.zenoh_statics")
 ALLOWED_EXTRAS = {
+    **{module: {"zenoh"} for module in LINKS_OVER_ZENOH},
     "cli": {"cyclopts"},
     "cli.options": {"cyclopts"},
+    "cli.link": {"cyclopts"},
     "cli.demo": {"cyclopts"},
 }
 

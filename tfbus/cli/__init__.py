@@ -9,6 +9,7 @@ except ImportError:
     raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
 
 from tfbus.cli.demo import demo
+from tfbus.cli.link import UnusableError
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -28,6 +29,10 @@ def main() -> None:
         app(exit_on_error=False, print_error=False, result_action="return_value")
     except* CycloptsError as wrong:
         for error in wrong.exceptions:
+            print(f"tfbus: {error}", file=sys.stderr)
+        status = USAGE_ERROR
+    except* UnusableError as unusable:
+        for error in unusable.exceptions:
             print(f"tfbus: {error}", file=sys.stderr)
         status = USAGE_ERROR
     except* KeyboardInterrupt:

@@ -1,0 +1,159 @@
+"""What goes beside a TFMessage: whose samples they are, in which batches, and what was removed between them.
+
+ROS has no words for origin, authority, sequence and tombstone. A message holds the samples of several batches behind
+each other; its attachment says how many belong to which, in the order in which all of it happened. Little endian::
+
+    version u8, origins u8, authorities u16, entries u32, number u64
+    origins      16 bytes each
+    authorities  length u16, UTF-8
+    entries      kind u8, origin u8, runs u16, sequence u64, and then
+        batch    runs times: authority u16, static u16, samples u32
+        removal  the length of the name in place of runs, UTF-8
+"""
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, repeat
+
+from tfbus.tf_message import MalformedMessageError
+
+VERSION = 1
+ORIGIN_BYTES = 16
+
+_HEADER = struct.Struct("<BBHIQ")
+_ENTRY = struct.Struct("<BBHQ")
+_RUN = struct.Struct("<HHI")
+_LENGTH = struct.Struct("<H")
+_BATCH, _REMOVAL = 0, 1
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedBatch:
+    """A batch: `runs` says of how many samples each, in the message's order, is which authority and whether static."""
+
+    origin: bytes
+    sequence: int
+    runs: tuple[tuple[str, bool, int], ...]
+
+    @property
+    def count(self) -> int:
+        """How many samples it has."""
+        return sum(count for _, _, count in self.runs)
+
+
+@dataclass(frozen=True, slots=True)
+class RemovedFrame:
+    """A tombstone."""
+
+    origin: bytes
+    sequence: int
+    frame: str
+
+
+Entry = PublishedBatch | RemovedFrame
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """What goes beside a message; the sender numbers its live messages 1, 2, 3, and all others 0."""
+
+    number: int
+    entries: tuple[Entry, ...]
+
+    def tags(self) -> Iterator[tuple[str, bool]]:
+        """Authority and kind of each sample of the message."""
+        batches = (entry for entry in self.entries if isinstance(entry, PublishedBatch))
+        runs = chain.from_iterable(batch.runs for batch in batches)
+        return chain.from_iterable(repeat((authority, static), count) for authority, static, count in runs)
+
+
+def pack(number: int, entries: Sequence[Entry]) -> bytes:
+    """The bytes of an attachment.
+
+    Raises
+    ------
+    ValueError
+        If it has more than 255 origins, or more than 65,535 authorities or bytes in one name.
+    """
+    origins: dict[bytes, int] = {}
+    authorities: dict[str, int] = {}
+    body = bytearray()
+    for entry in entries:
+        origin = origins.setdefault(entry.origin, len(origins))
+        if isinstance(entry, RemovedFrame):
+            name = entry.frame.encode()
+            body += _pack(_ENTRY, _REMOVAL, origin, len(name), entry.sequence) + name
+        else:
+            body += _pack(_ENTRY, _BATCH, origin, len(entry.runs), entry.sequence)
+            for authority, static, count in entry.runs:
+                body += _pack(_RUN, authorities.setdefault(authority, len(authorities)), static, count)
+    head = bytearray(_pack(_HEADER, VERSION, len(origins), len(authorities), len(entries), number))
+    for known in origins:
+        head += known
+    for authority in authorities:
+        text = authority.encode()
+        head += _pack(_LENGTH, len(text)) + text
+    return bytes(head + body)
+
+
+def unpack(data: bytes) -> Attachment:
+    """The attachment that bytes hold.
+
+    Raises
+    ------
+    MalformedMessageError
+        If they hold none of this version.
+    """
+    if not data or data[0] != VERSION:
+        found = f"version {data[0]}" if data else "nothing"
+        raise MalformedMessageError("version", f"the attachment has {found}, expected version {VERSION}")
+    try:
+        return _unpack(data)
+    except (struct.error, IndexError):
+        detail = f"the attachment of {len(data)} bytes is cut off or inconsistent"
+        raise MalformedMessageError("attachment", detail) from None
+    except UnicodeDecodeError:
+        raise MalformedMessageError("attachment", "a name in the attachment is no UTF-8") from None
+
+
+def _unpack(data: bytes) -> Attachment:
+    _, origin_count, authority_count, entry_count, number = _HEADER.unpack_from(data)
+    at = _HEADER.size + ORIGIN_BYTES * origin_count
+    origins = [data[at - ORIGIN_BYTES * (k + 1) : at - ORIGIN_BYTES * k] for k in reversed(range(origin_count))]
+    authorities = []
+    for _ in range(authority_count):
+        (length,) = _LENGTH.unpack_from(data, at)
+        authorities.append(_text(data, at + _LENGTH.size, length))
+        at += _LENGTH.size + length
+    entries: list[Entry] = []
+    # Each entry takes some bytes, so a count that is a lie ends the loop with an error before the list is long.
+    for _ in range(entry_count):
+        kind, origin, size, sequence = _ENTRY.unpack_from(data, at)
+        at += _ENTRY.size
+        if kind == _REMOVAL:
+            entries.append(RemovedFrame(origins[origin], sequence, _text(data, at, size)))
+            at += size
+        elif kind == _BATCH:
+            runs = _RUN.iter_unpack(data[at : at + _RUN.size * size])
+            at += _RUN.size * size
+            named = tuple((authorities[authority], bool(static), count) for authority, static, count in runs)
+            entries.append(PublishedBatch(origins[origin], sequence, named))
+        else:
+            raise IndexError
+    if at != len(data):
+        raise IndexError
+    return Attachment(number, tuple(entries))
+
+
+def _pack(layout: struct.Struct, *values: object) -> bytes:
+    try:
+        return layout.pack(*values)
+    except struct.error as error:
+        raise ValueError(f"too much for one attachment: {error}") from None
+
+
+def _text(data: bytes, start: int, length: int) -> str:
+    if start + length > len(data):
+        raise IndexError
+    return data[start : start + length].decode()

@@ -1,0 +1,41 @@
+"""Samples that came from another bus know where from, so that no link sends them back there."""
+
+from typing import Any
+
+from tfbus.links.peers import Peer
+from tfbus.stamped import TransformStamped
+
+
+class Source:
+    """Where a batch came from.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which it was published first, 16 bytes.
+    sequence : int
+        Its number there; what comes later has a higher one.
+    link : object
+        The link that brought it.
+    peer : Peer
+        The other end, which sent it.
+    """
+
+    __slots__ = ("link", "origin", "peer", "sequence")
+
+    def __init__(self, origin: bytes, sequence: int, link: object, peer: Peer) -> None:
+        self.origin = origin
+        self.sequence = sequence
+        self.link = link
+        self.peer = peer
+
+
+class ReceivedTransform(TransformStamped):
+    """A sample that came from another bus; equal to one that did not."""
+
+    __slots__ = ("_source",)
+    _source: Source
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Elsewhere it has not come over this link.
+        return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)

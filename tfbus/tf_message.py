@@ -1,0 +1,314 @@
+"""Transforms as the bytes of a ROS 2 ``tf2_msgs/msg/TFMessage``, and back.
+
+The message is ``geometry_msgs/msg/TransformStamped[] transforms``. One of them, with the place of each part where both
+names are empty::
+
+    0  header.stamp       int32 sec, uint32 nanosec
+    8  header.frame_id    string: uint32 length, UTF-8, NUL
+   16  child_frame_id     string
+   24  transform          float64 translation x, y, z, rotation x, y, z, w
+
+The encoding is plain CDR, version 1: a header of four bytes, of which the second tells the byte order and the last two
+are options (OMG DDSI-RTPS 2.5, section 10); then each number at a multiple of its own size, counted from the end of the
+header, and each string with a length that counts its NUL (OMG DDS-XTYPES 1.3, section 7.4.1). Because float64 comes
+last, every transform ends at a multiple of 8.
+
+The same few names come again in each message, so what two of them are in bytes, with lengths and padding, is remembered
+as one piece: nothing is left to check in a piece that is known. Whatever is not plainly good goes through `Transform`
+and `TransformStamped`, so that it is refused just as they do it.
+"""
+
+import math
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice, repeat
+from typing import Any, Final, Generic, NamedTuple, TypeVar, cast, overload
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry import NORM_TOLERANCE, ROUNDING, Row, Transform
+from tfbus.stamped import Fields, TransformStamped
+from tfbus.stamps import SECOND, format_stamp
+
+MAX_NAME: Final = 1_024
+"""The longest frame name that is sent or taken, in bytes of UTF-8."""
+LEAST_SIZE: Final = 80
+"""The fewest bytes of a transform: a stamp of 8, two empty names of 4 + 1 with 3 of padding, and 7 numbers of 8."""
+
+SampleT = TypeVar("SampleT", bound=TransformStamped)
+Tag = tuple[str, bool]
+
+
+class MalformedMessageError(ValueError):
+    """A payload that is no message of transforms; nothing of it was taken.
+
+    Attributes
+    ----------
+    reason : str
+        One word to count by: ``"truncated"``, ``"oversized"``, ``"encoding"``, ``"text"`` (a string without its NUL) or
+        ``"tags"``.
+    detail : str
+        What was found.
+    """
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(reason, detail)
+        self.reason = reason
+        self.detail = detail
+
+    def __str__(self) -> str:
+        return f"no message of transforms ({self.reason}): {self.detail}"
+
+
+class Decoded(NamedTuple, Generic[SampleT]):
+    """What a message holds."""
+
+    samples: list[SampleT | None]
+    """One for each transform, in order; None if it was refused."""
+    errors: list[InvalidTransformError]
+    """Why, one for each that was refused, in order; with its authority, and its frames as far as they can be read."""
+
+
+class _Layout:
+    """The numbers of a message in one byte order."""
+
+    def __init__(self, order: str) -> None:
+        self.size = struct.Struct(f"{order}I")
+        self.head = struct.Struct(f"{order}iII")
+        self.numbers = struct.Struct(f"{order}7d")
+
+
+_LITTLE_ENDIAN = _Layout("<")
+_LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _LITTLE_ENDIAN}
+_HEADER = b"\x00\x01\x00\x00"
+_STAMP = struct.Struct("<iI")
+
+_SHOWN = 40
+_REMEMBERED = 2_048
+_REMEMBERED_SIZE = 256
+_pieces: dict[tuple[str, str, bool], bytes] = {}
+_names: dict[bytes, tuple[str, str]] = {}
+_bared_names: dict[bytes, tuple[str, str]] = {}
+
+
+def _remember(memory: dict[Any, Any], key: object, value: object, size: int) -> None:
+    # Strangers choose the names: long ones are not kept, and a full memory starts anew.
+    if size <= _REMEMBERED_SIZE:
+        if len(memory) >= _REMEMBERED:
+            memory.clear()
+        memory[key] = value
+
+
+def encode(samples: Sequence[TransformStamped]) -> bytes:
+    """A message of some samples, in little endian CDR with its header; it has no authorities and no static flags.
+
+    Raises
+    ------
+    InvalidTransformError
+        If `refusal` has something against a sample; the first one counts.
+    """
+    pack_stamp, pack_numbers, piece_of = _STAMP.pack, _LITTLE_ENDIAN.numbers.pack, _pieces.get
+    parts = [_HEADER, _LITTLE_ENDIAN.size.pack(len(samples))]
+    add = parts.append
+    first = True
+    try:
+        for sample in samples:
+            parent, child, stamp, row, _, _ = sample._fields
+            add(pack_stamp(stamp // SECOND, stamp % SECOND))
+            add(piece_of((parent, child, first)) or _piece(parent, child, first))
+            add(pack_numbers(*row))
+            first = False
+    except (struct.error, ValueError):
+        for refused in filter(None, map(refusal, samples)):
+            raise refused from None
+        raise
+    return b"".join(parts)
+
+
+def _piece(parent: str, child: str, first: bool) -> bytes:
+    piece = b""
+    for name in (parent, child):
+        text = name.encode()
+        if len(text) > MAX_NAME:
+            raise ValueError
+        piece += bytes(-len(piece) % 4) + _LITTLE_ENDIAN.size.pack(len(text) + 1) + text + b"\0"
+    # Only in front of the first transform there is the count.
+    piece += bytes(-(len(piece) + 4 * first) % 8)
+    _remember(_pieces, (parent, child, first), piece, len(piece))
+    return piece
+
+
+def refusal(sample: TransformStamped) -> InvalidTransformError | None:
+    """Why a sample cannot be in a message, or None if it can.
+
+    The reason is ``"stamp"`` before December 1901 and after January 2038, because ROS has 32 bits for the seconds, and
+    ``"frame name"`` for a name that is longer than `MAX_NAME` or has no UTF-8, as half of a surrogate pair.
+    """
+    parent, child, stamp, _, authority, _ = sample._fields
+    reason, why = "frame name", ""
+    for name in (parent, child):
+        try:
+            size = len(name.encode())
+        except UnicodeEncodeError:
+            why = f"frame name {name!r} cannot be written in UTF-8"
+        else:
+            if size > MAX_NAME:
+                why = f"a frame name in a message has at most {MAX_NAME} bytes, got {size}"
+    if not why and not -(2**31) <= stamp // SECOND < 2**31:
+        reason, why = "stamp", f"a message cannot be stamped {format_stamp(stamp)}: its seconds have 32 bits"
+    if not why:
+        return None
+    return InvalidTransformError(why, reason=reason, parent=parent, child=child, authority=authority)
+
+
+@overload
+def decode(
+    payload: bytes | memoryview, tags: Iterable[Tag] | None = None, *, bare_names: bool = False
+) -> Decoded[TransformStamped]: ...
+@overload
+def decode(
+    payload: bytes | memoryview,
+    tags: Iterable[Tag] | None = None,
+    kind: type[SampleT] = ...,
+    bare_names: bool = False,
+) -> Decoded[SampleT]: ...
+def decode(
+    payload: bytes | memoryview,
+    tags: Iterable[Tag] | None = None,
+    kind: type[Any] = TransformStamped,
+    bare_names: bool = False,
+) -> Decoded[Any]:
+    """The samples of a message, in either byte order.
+
+    Parameters
+    ----------
+    payload : bytes or memoryview
+        With its header. Zeros behind it, up to three, are padding.
+    tags : iterable of (str, bool), optional
+        What the message does not hold: authority and static of each transform; ``("", False)`` if left out.
+    kind : type, optional
+        What to make: `TransformStamped`, or a subclass whose further slots the caller fills.
+    bare_names : bool, optional
+        Take leading slashes off the names, as for recordings of ROS 1.
+
+    Raises
+    ------
+    MalformedMessageError
+        If the payload is no such message, or there is not one tag for each transform. Bytes raise nothing else, and
+        what is allocated is in proportion to their number, whatever they claim.
+
+    Notes
+    -----
+    A transform is refused, and the others are not, for what `Transform` and `TransformStamped` refuse, for a name that
+    is longer than `MAX_NAME` or not UTF-8 (``"frame name"``), and for a stamp with a second or more of nanoseconds
+    (``"stamp"``).
+    """
+    body = bytes(payload)
+    layout = _LAYOUTS.get(body[:2])
+    if len(body) < 8:
+        raise MalformedMessageError("truncated", f"{len(body)} bytes")
+    if layout is None:
+        raise MalformedMessageError("encoding", f"it is not plain CDR, its header is {body[:4].hex(' ')}")
+    body = body[4:]
+    (count,) = layout.size.unpack_from(body)
+    if count and 8 + count * LEAST_SIZE > len(body):
+        raise MalformedMessageError("truncated", f"{len(body)} bytes cannot hold {count} transforms")
+    try:
+        decoded, end = _transforms(body, layout, _as_tags(tags, count), kind, bare_names)
+    except struct.error:
+        raise MalformedMessageError("truncated", f"{len(body)} bytes end inside of a transform") from None
+    if body[end:] not in (b"", b"\0", b"\0\0", b"\0\0\0"):
+        raise MalformedMessageError("oversized", f"{len(body) - end} bytes behind the last transform")
+    return decoded
+
+
+def _as_tags(tags: Iterable[Tag] | None, count: int) -> Iterable[Tag]:
+    if tags is None:
+        return repeat(("", False), count)
+    known = tuple(islice(tags, count + 1))
+    if len(known) != count:
+        raise MalformedMessageError("tags", f"there is not one tag for each of the {count} transforms")
+    return known
+
+
+def _transforms(
+    body: bytes, layout: _Layout, tags: Iterable[Tag], kind: type[Any], bare_names: bool
+) -> tuple[Decoded[Any], int]:
+    """What a message holds, and where it ends; `struct.error` if it would go on behind the end of the body."""
+    head, size, numbers = layout.head.unpack_from, layout.size.unpack_from, layout.numbers.unpack_from
+    memory = _bared_names if bare_names else _names
+    names_of, make = memory.get, cast(Any, kind.__new__)
+    samples: list[Any] = []
+    errors: list[InvalidTransformError] = []
+    at = 4
+    for tag in tags:
+        seconds, nanoseconds, length = head(body, at)
+        middle = at + 12 + length + 3 & -4
+        (length,) = size(body, middle)
+        end = middle + 4 + length + 7 & -8
+        # Read before anything is cut out of the body: it fails where a length is wrong.
+        row = x, y, z, i, j, k, w = numbers(body, end)
+        piece = body[at + 8 : end]
+        at = end + 56
+        names = names_of(piece)
+        unit: Row | None = row
+        if not -ROUNDING <= i * i + j * j + k * k + w * w - 1.0 <= ROUNDING:
+            unit = _normalised(row)
+        # A number that is not finite makes NaN of zero.
+        if names is not None and nanoseconds < SECOND and unit is not None and (x + y + z) * 0.0 == 0.0:
+            fields = *names, seconds * SECOND + nanoseconds, unit, *tag
+        else:
+            parent, child = (_name(text, bare_names) for text in _texts(piece, layout))
+            try:
+                fields = _checked(parent, child, seconds, nanoseconds, row, tag)
+            except InvalidTransformError as error:
+                error.parent, error.child, error.authority = parent, child, tag[0]
+                errors.append(error.with_traceback(None))
+                samples.append(None)
+                continue
+            _remember(memory, piece, fields[:2], len(piece))
+        sample = make(kind)
+        sample._fields = fields
+        samples.append(sample)
+    return Decoded(samples, errors), at
+
+
+def _normalised(row: Row) -> Row | None:
+    """The row with a unit quaternion, in the arithmetic of `as_rotation`; None if its norm is off by too much."""
+    x, y, z, i, j, k, w = row
+    norm = math.sqrt(i * i + j * j + k * k + w * w)
+    if not abs(norm - 1.0) <= NORM_TOLERANCE:
+        return None
+    return x, y, z, i / norm, j / norm, k / norm, w / norm
+
+
+def _texts(piece: bytes, layout: _Layout) -> Iterator[bytes]:
+    """The two strings of a piece, without their NUL."""
+    at = 0
+    for _ in range(2):
+        (length,) = layout.size.unpack_from(piece, at)
+        text = piece[at + 4 : at + 4 + length]
+        if not text.endswith(b"\0"):
+            raise MalformedMessageError("text", f"the string {text[:_SHOWN]!r} does not end with NUL")
+        yield text[:-1]
+        at += 4 + length + 3 & -4
+
+
+def _name(text: bytes, bare: bool) -> str | None:
+    """The name that a text is; None for what cannot be one."""
+    if len(text) > MAX_NAME:
+        return None
+    try:
+        name = text.decode()
+    except UnicodeDecodeError:
+        return None
+    return name.lstrip("/") if bare else name
+
+
+def _checked(parent: str | None, child: str | None, seconds: int, nanoseconds: int, row: Row, tag: Tag) -> Fields:
+    """The fields of a sample, or what is wrong with them."""
+    if parent is None or child is None:
+        raise InvalidTransformError(f"a frame name must be UTF-8 of at most {MAX_NAME} bytes", reason="frame name")
+    if nanoseconds >= SECOND:
+        raise InvalidTransformError(f"a stamp has less than 1e9 nanosec, got {nanoseconds}", reason="stamp")
+    stamp = seconds * SECOND + nanoseconds
+    return TransformStamped(parent, child, stamp, Transform(row[:3], row[3:]), *tag)._fields
