@@ -27,12 +27,8 @@ def main() -> None:
     status = 0
     try:
         app(exit_on_error=False, print_error=False, result_action="return_value")
-    except* CycloptsError as wrong:
+    except* (CycloptsError, UnusableError) as wrong:
         for error in wrong.exceptions:
-            print(f"tfbus: {error}", file=sys.stderr)
-        status = USAGE_ERROR
-    except* UnusableError as unusable:
-        for error in unusable.exceptions:
             print(f"tfbus: {error}", file=sys.stderr)
         status = USAGE_ERROR
     except* KeyboardInterrupt:
