@@ -1,0 +1,517 @@
+import copy
+import itertools
+import math
+import pickle
+import random
+import struct
+import tracemalloc
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import pytest
+import strategies as some
+from hypothesis import example, given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from samples import moving
+
+from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped
+from tfbus.geometry import IDENTITY, Row
+from tfbus.tf_message import LEAST_SIZE, MAX_NAME, MalformedMessageError, decode, encode, refusal
+
+MESSAGE = "tf2_msgs/msg/TFMessage"
+ROS = get_typestore(Stores.ROS2_JAZZY)
+
+FIRST_STAMP = -(2**31) * SECOND
+LAST_STAMP = 2**31 * SECOND - 1
+NOT_FINITE = (math.nan, math.inf, -math.inf)
+
+sendable = st.lists(some.samples(at=some.stamps(FIRST_STAMP, LAST_STAMP)), max_size=5)
+byte_orders = pytest.mark.parametrize("little_endian", [True, False], ids=["little endian", "big endian"])
+
+
+class Part(NamedTuple):
+    """One transform of a message, good or bad."""
+
+    parent: bytes = b"map"
+    child: bytes = b"base"
+    sec: int = 12
+    nanosec: int = 5
+    numbers: Row = IDENTITY
+
+
+def message_of(*parts: Part, order: str = "<") -> bytes:
+    """A message, written number by number with the alignment that CDR wants."""
+    body = bytearray()
+
+    def add(kind: str, value: float) -> None:
+        body.extend(bytes(-len(body) % struct.calcsize(kind)))
+        body.extend(struct.pack(order + kind, value))
+
+    add("I", len(parts))
+    for part in parts:
+        add("i", part.sec)
+        add("I", part.nanosec)
+        for name in (part.parent, part.child):
+            add("I", len(name) + 1)
+            body.extend(name + b"\0")
+        for number in part.numbers:
+            add("d", number)
+    return {"<": b"\0\1\0\0", ">": b"\0\0\0\0"}[order] + bytes(body)
+
+
+def by_ros(samples: Iterable[TransformStamped], little_endian: bool = True) -> bytes:
+    """The message as rosbags writes it."""
+    kinds = ROS.types
+
+    def transform_of(sample: TransformStamped) -> Any:
+        sec, nanosec = divmod(sample.stamp, SECOND)
+        stamp = kinds["builtin_interfaces/msg/Time"](sec, nanosec)
+        translation = kinds["geometry_msgs/msg/Vector3"](*sample.transform.translation)
+        rotation = kinds["geometry_msgs/msg/Quaternion"](*sample.transform.rotation)
+        return kinds["geometry_msgs/msg/TransformStamped"](
+            kinds["std_msgs/msg/Header"](stamp, sample.parent),
+            sample.child,
+            kinds["geometry_msgs/msg/Transform"](translation, rotation),
+        )
+
+    message = kinds[MESSAGE]([transform_of(sample) for sample in samples])
+    return bytes(ROS.serialize_cdr(message, MESSAGE, little_endian=little_endian))
+
+
+def tags_of(samples: Iterable[TransformStamped]) -> list[tuple[str, bool]]:
+    return [(sample.authority, sample.static) for sample in samples]
+
+
+def bits(sample: TransformStamped | None) -> tuple[object, ...]:
+    """Everything in a sample, with numbers that only a bit tells apart kept apart."""
+    assert sample is not None
+    parent, child, stamp, row, authority, static = sample._fields
+    return parent, child, stamp, struct.pack("<7d", *row), authority, static
+
+
+def reason_of(payload: bytes | memoryview, tags: Iterable[tuple[str, bool]] | None = None) -> str:
+    with pytest.raises(MalformedMessageError) as caught:
+        decode(payload, tags)
+    return caught.value.reason
+
+
+def peak_of(call: Callable[[], object]) -> int:
+    """The bytes that a call had allocated at most."""
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+# Encoding.
+
+
+@given(samples=sendable)
+def test_a_message_has_the_very_bytes_that_rosbags_writes(samples: list[TransformStamped]) -> None:
+    assert encode(samples) == by_ros(samples)
+
+
+def test_a_message_is_laid_out_as_the_definitions_say() -> None:
+    sample = TransformStamped("map", "base", 12 * SECOND + 5, Transform((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0)))
+    names = b"\x04\0\0\0map\0" + b"\x05\0\0\0base\0"
+    numbers = struct.pack("<7d", 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    later = b"\x0c\0\0\0" + b"\x05\0\0\0" + names + bytes(7) + numbers
+    first = b"\x0c\0\0\0" + b"\x05\0\0\0" + names + bytes(3) + numbers
+    assert encode([sample, sample]) == b"\0\1\0\0" + b"\x02\0\0\0" + first + later
+
+
+def test_a_message_of_nothing_is_a_header_and_a_count() -> None:
+    assert encode([]) == b"\0\1\0\0\0\0\0\0"
+    assert decode(encode([])) == ([], [])
+
+
+@pytest.mark.parametrize("stamp", [FIRST_STAMP, -1, 0, SECOND - 1, LAST_STAMP])
+def test_every_stamp_from_1901_to_2038_can_be_sent(stamp: int) -> None:
+    assert refusal(moving("map", "base", stamp)) is None
+    (sample,) = decode(encode([moving("map", "base", stamp)])).samples
+    assert sample is not None
+    assert sample.stamp == stamp
+
+
+@pytest.mark.parametrize(
+    ("parent", "child", "stamp", "reason"),
+    [
+        ("map", "base", FIRST_STAMP - 1, "stamp"),
+        ("map", "base", LAST_STAMP + 1, "stamp"),
+        ("map", "base", 2**63 - 1, "stamp"),
+        ("map", "\ud800", 0, "frame name"),
+        ("a\udfffb", "base", 0, "frame name"),
+        ("map", "a" * (MAX_NAME + 1), 0, "frame name"),
+        ("ü" * (MAX_NAME // 2) + "a", "base", 0, "frame name"),
+    ],
+)
+def test_what_a_message_cannot_hold_is_refused_with_its_facts(parent: str, child: str, stamp: int, reason: str) -> None:
+    bad = moving(parent, child, stamp, authority="odometry")
+    good = moving("map", "base", 0)
+    with pytest.raises(InvalidTransformError) as caught:
+        encode([good, bad, good])
+    error = caught.value
+    assert (error.reason, error.parent, error.child, error.authority) == (reason, parent, child, "odometry")
+    told = refusal(bad)
+    assert told is not None
+    assert (str(told), vars(told)) == (str(error), vars(error))
+    assert refusal(good) is None
+
+
+def test_the_first_sample_that_is_refused_is_the_one_told_of() -> None:
+    late = moving("map", "late", LAST_STAMP + 1)
+    unnamed = moving("map", "\ud800", 0)
+    for samples, child in (([late, unnamed], "late"), ([unnamed, late], "\ud800")):
+        with pytest.raises(InvalidTransformError) as caught:
+            encode(samples)
+        assert caught.value.child == child
+
+
+@pytest.mark.parametrize("name", ["a" * MAX_NAME, "ü" * (MAX_NAME // 2), "a\0b"])
+def test_a_name_of_the_greatest_length_or_with_a_nul_inside_arrives(name: str) -> None:
+    samples = [moving("map", name, 0), moving(name, "base", 0)]
+    assert [refusal(sample) for sample in samples] == [None, None]
+    assert encode(samples) == by_ros(samples)
+    assert decode(encode(samples)).samples == samples
+
+
+# Decoding what is good.
+
+
+@given(samples=sendable)
+def test_what_was_encoded_comes_back_bit_for_bit(samples: list[TransformStamped]) -> None:
+    decoded = decode(encode(samples), tags_of(samples))
+    assert [bits(sample) for sample in decoded.samples] == [bits(sample) for sample in samples]
+    assert decoded.errors == []
+
+
+@byte_orders
+@given(samples=sendable)
+def test_both_byte_orders_are_read(little_endian: bool, samples: list[TransformStamped]) -> None:
+    payload = by_ros(samples, little_endian)
+    assert payload[1] == little_endian
+    assert decode(payload, tags_of(samples)).samples == samples
+
+
+def test_without_tags_nobody_says_so_and_everything_moves() -> None:
+    samples = [moving("map", "base", 0), moving("base", "arm", 0)]
+    assert [(s.authority, s.static) for s in decode(encode(samples)).samples if s] == [("", False)] * 2
+
+
+def test_the_options_of_the_header_do_not_matter() -> None:
+    payload = encode([moving("map", "base", 7)])
+    assert decode(payload[:2] + b"\xff\x03" + payload[4:]).samples == [moving("map", "base", 7)]
+
+
+@pytest.mark.parametrize("zeros", range(4))
+def test_up_to_three_zeros_behind_a_message_are_padding(zeros: int) -> None:
+    for samples in ([], [moving("map", "base", 7)]):
+        assert decode(encode(samples) + bytes(zeros)).samples == samples
+
+
+def test_a_payload_may_be_a_piece_of_a_larger_buffer() -> None:
+    samples = [moving("map", "base", 7)]
+    buffer = memoryview(b"xyz" + encode(samples) + b"xyz")
+    assert decode(buffer[3:-3]).samples == samples
+
+
+def test_padding_may_be_anything() -> None:
+    payload = bytearray(message_of(Part()))
+    at = payload.index(b"base\0") + 5
+    payload[at : at + 3] = b"\xff\xfe\xfd"
+    assert decode(bytes(payload)).samples == [moving("map", "base", 12 * SECOND + 5)]
+
+
+class Marked(TransformStamped):
+    __slots__ = ("mark",)
+    mark: str
+
+
+def test_samples_are_of_the_kind_that_is_asked_for() -> None:
+    samples = [moving("map", "base", 7, authority="odometry")]
+    for _ in range(2):
+        (marked,) = decode(encode(samples), tags_of(samples), kind=Marked).samples
+        assert type(marked) is Marked
+        assert bits(marked) == bits(samples[0])
+        marked.mark = "mine"
+
+
+def test_a_name_is_taken_bare_only_where_that_is_asked_for() -> None:
+    payload = message_of(Part(b"/map", b"//base"), Part(b"odom", b"arm"))
+    for _ in range(2):
+        bare = decode(payload, bare_names=True)
+        assert [(s.parent, s.child) for s in bare.samples if s] == [("map", "base"), ("odom", "arm")]
+        kept = decode(payload)
+        assert [sample is None for sample in kept.samples] == [True, False]
+        assert [error.reason for error in kept.errors] == ["frame name"]
+
+
+# Decoding what is bad, one transform at a time.
+
+
+def expected(part: Part, tag: tuple[str, bool], bare_names: bool) -> TransformStamped | InvalidTransformError:
+    """What the classes themselves make of the parts of a transform."""
+    try:
+        if part.nanosec >= SECOND:
+            raise InvalidTransformError("", reason="stamp")
+        parent, child = part.parent.decode(), part.child.decode()
+        if bare_names:
+            parent, child = parent.lstrip("/"), child.lstrip("/")
+        transform = Transform(part.numbers[:3], part.numbers[3:])
+        return TransformStamped(parent, child, part.sec * SECOND + part.nanosec, transform, *tag)
+    except InvalidTransformError as error:
+        return error
+
+
+def faults() -> st.SearchStrategy[set[str]]:
+    """What is wrong with a transform: mostly nothing, or one thing."""
+    fault = st.sampled_from(("name", "nanosec", "norm", "slightly", "number", "rotation", "zero", "huge"))
+    return st.just(set()) | st.sets(fault, min_size=1, max_size=1) | st.sets(fault, max_size=3)
+
+
+@st.composite
+def parts(draw: st.DrawFn) -> Part:
+    """Transforms of which some are bad."""
+    wrong = draw(faults())
+    parent, child = draw(st.permutations((b"a", b"b", b"c", "ü".encode())))[:2]
+    if "name" in wrong:
+        child = draw(st.sampled_from((b"", b"/", b"/c", b"//d", parent, b"/" + parent)))
+    elif draw(st.booleans()):
+        child = draw(some.frame_names()).encode()
+    sec = draw(st.integers(-(2**31), 2**31 - 1))
+    nanosec = draw(st.integers(SECOND, 2**32 - 1) if "nanosec" in wrong else st.integers(0, SECOND - 1))
+    numbers = list(draw(some.transforms())._row)
+    if "huge" in wrong:
+        numbers[:3] = [1.7e308, 1.7e308, -1e308]
+    if "norm" in wrong:
+        factor = draw(st.floats(0.985, 1.015) | st.sampled_from((0.99, 1.01, 1e-200, 1e200)))
+        numbers[3:] = [number * factor for number in numbers[3:]]
+    if "slightly" in wrong:
+        factor = 1.0 + draw(st.sampled_from((1e-16, 3e-16, 5e-16, 1e-15, 1e-14, 1e-8))) * draw(st.sampled_from((-1, 1)))
+        numbers[3:] = [number * factor for number in numbers[3:]]
+    if "zero" in wrong:
+        numbers[3:] = [0.0, -0.0, 0.0, 0.0]
+    if "number" in wrong:
+        numbers[draw(st.integers(0, 2))] = draw(st.sampled_from(NOT_FINITE) | st.floats())
+    if "rotation" in wrong:
+        numbers[draw(st.integers(3, 6))] = draw(st.sampled_from(NOT_FINITE) | st.floats())
+    x, y, z, i, j, k, w = numbers
+    return Part(parent, child, sec, nanosec, (x, y, z, i, j, k, w))
+
+
+@byte_orders
+@given(wanted=st.lists(parts(), max_size=6), bare_names=st.booleans(), known=st.booleans())
+def test_each_transform_is_taken_normalised_or_refused_as_the_classes_do_it(
+    little_endian: bool, wanted: list[Part], bare_names: bool, known: bool
+) -> None:
+    order = "<" if little_endian else ">"
+    if known:
+        decode(message_of(*(Part(part.parent, part.child) for part in wanted), order=order), bare_names=bare_names)
+    tags = [(f"sender {place}", place % 2 == 1) for place in range(len(wanted))]
+    found = decode(message_of(*wanted, order=order), tags, bare_names=bare_names)
+    errors = iter(found.errors)
+    for part, tag, sample in zip(wanted, tags, found.samples, strict=True):
+        answer = expected(part, tag, bare_names)
+        if isinstance(answer, TransformStamped):
+            assert bits(sample) == bits(answer)
+            continue
+        error = next(errors)
+        assert sample is None
+        assert error.reason == answer.reason
+        assert error.authority == tag[0]
+        if error.reason != "stamp":
+            assert str(error) == str(answer)
+    assert list(errors) == []
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason", "parent", "child"),
+    [
+        (Part(nanosec=SECOND), "stamp", "map", "base"),
+        (Part(nanosec=2**32 - 1), "stamp", "map", "base"),
+        (Part(child=b"\xff"), "frame name", "map", None),
+        (Part(parent=b"caf\xe9"), "frame name", None, "base"),
+        (Part(child=b"\xed\xa0\x80"), "frame name", "map", None),
+        (Part(child=b"a" * (MAX_NAME + 1)), "frame name", "map", None),
+        (Part(parent=b"/map"), "frame name", "/map", "base"),
+        (Part(child=b""), "frame name", "map", ""),
+        (Part(child=b"map"), "self transform", "map", "map"),
+        (Part(numbers=(0.0, 0.0, math.nan, 0.0, 0.0, 0.0, 1.0)), "not finite", "map", "base"),
+        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, -math.inf, 1.0)), "not finite", "map", "base"),
+        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)), "zero quaternion", "map", "base"),
+        (Part(numbers=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.011)), "not a unit quaternion", "map", "base"),
+    ],
+)
+def test_a_bad_transform_is_refused_with_its_facts_and_its_neighbours_are_not(
+    bad: Part, reason: str, parent: str | None, child: str | None
+) -> None:
+    tags = [("first", False), ("bad", True), ("last", True)]
+    payload = message_of(Part(child=b"first"), bad, Part(child=b"last"))
+    for _ in range(2):
+        samples, (error,) = decode(payload, tags)
+        assert [sample and (sample.child, sample.authority) for sample in samples] == [
+            ("first", "first"),
+            None,
+            ("last", "last"),
+        ]
+        assert (error.reason, error.parent, error.child, error.authority) == (reason, parent, child, "bad")
+
+
+def test_a_refused_transform_keeps_nothing_of_the_message_alive() -> None:
+    (error,) = decode(message_of(Part(child=b"\xff" * 100_000))).errors
+    assert error.__traceback__ is None
+    assert error.__context__ is None
+    assert len(str(error)) < 200
+
+
+# Payloads that are no message.
+
+
+@pytest.mark.parametrize("samples", [[], [moving("map", "base", 0), moving("base", "arm", 1)]], ids=len)
+def test_a_message_that_is_cut_anywhere_is_truncated(samples: list[TransformStamped]) -> None:
+    payload = encode(samples)
+    for length in range(len(payload)):
+        assert reason_of(payload[:length]) == "truncated"
+
+
+@pytest.mark.parametrize("header", ["0002", "0003", "0006", "0007", "0008", "0009", "000a", "000b", "0100", "0101"])
+def test_parameter_lists_and_the_second_version_are_not_read(header: str) -> None:
+    payload = encode([moving("map", "base", 0)])
+    assert reason_of(bytes.fromhex(header) + payload[2:]) == "encoding"
+
+
+@pytest.mark.parametrize("behind", [b"\1", b"\0\0\1", bytes(4), bytes(100_000), b"\0\0\0\0x"], ids=len)
+def test_what_lies_behind_the_message_is_too_much(behind: bytes) -> None:
+    for samples in ([], [moving("map", "base", 0)]):
+        assert reason_of(encode(samples) + behind) == "oversized"
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_a_string_ends_with_the_nul_that_its_length_counts(order: str) -> None:
+    payload = message_of(Part(), order=order)
+    assert decode(payload).errors == []
+    for name in (b"map", b"base"):
+        end = payload.index(name) + len(name)
+        assert reason_of(payload[:end] + b"x" + payload[end + 1 :]) == "text"
+    at = payload.index(b"base")
+    for length in range(len(b"base")):
+        assert reason_of(payload[: at - 4] + struct.pack(f"{order}I", length) + payload[at:]) == "text"
+
+
+def test_the_least_message_of_many_transforms_is_long_enough() -> None:
+    """Nothing that is counted can be smaller, so a count that does not fit is a lie."""
+    for count in range(1, 5):
+        payload = message_of(*[Part(b"", b"")] * count)
+        assert len(payload) == 4 + 8 + count * LEAST_SIZE
+        assert [error.reason for error in decode(payload).errors] == ["frame name"] * count
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("count", [2, 1_000, 2**31, 2**32 - 1])
+def test_a_count_that_does_not_fit_allocates_nothing(count: int, order: str) -> None:
+    payload = message_of(Part(), order=order)
+    payload = payload[:4] + struct.pack(f"{order}I", count) + payload[8:]
+    assert reason_of(payload) == "truncated"
+    tags = itertools.repeat(("", False))
+    assert peak_of(lambda: reason_of(payload, tags)) < 100_000
+    assert reason_of(payload[:60]) == "truncated"
+
+
+@pytest.mark.parametrize("length", [100, 2**31 - 1, 2**31, 2**32 - 2, 2**32 - 1])
+@pytest.mark.parametrize("name", [b"map", b"base"])
+def test_a_length_that_does_not_fit_allocates_nothing(name: bytes, length: int) -> None:
+    payload = message_of(Part())
+    at = payload.index(name)
+    payload = payload[: at - 4] + struct.pack("<I", length) + payload[at:]
+    assert reason_of(payload) == "truncated"
+    assert peak_of(lambda: reason_of(payload)) < 100_000
+
+
+@pytest.mark.parametrize("tags", [0, 1, 3])
+def test_there_is_one_tag_for_each_transform(tags: int) -> None:
+    payload = encode([moving("map", "base", 0), moving("base", "arm", 0)])
+    assert reason_of(payload, [("odometry", False)] * tags) == "tags"
+    assert reason_of(encode([]), [("odometry", False)]) == "tags"
+
+
+def test_tags_without_an_end_are_not_read_to_it() -> None:
+    payload = encode([moving("map", "base", 0)])
+    assert reason_of(payload, itertools.repeat(("odometry", False))) == "tags"
+
+
+def check(payload: bytes) -> None:
+    """Nothing but the one error comes out, and what comes out of it is good."""
+    try:
+        samples, errors = decode(payload)
+    except MalformedMessageError as error:
+        assert error.reason in {"truncated", "oversized", "encoding", "text"}
+        return
+    assert samples.count(None) == len(errors)
+    assert len(samples) * LEAST_SIZE <= len(payload)
+    for sample in samples:
+        if sample is not None:
+            assert refusal(sample) is None
+            assert sample.replace() == sample
+
+
+@given(payload=st.binary(max_size=400))
+@example(payload=b"")
+def test_random_bytes_do_no_harm(payload: bytes) -> None:
+    check(payload)
+
+
+@given(
+    order=st.sampled_from((b"\0\0\0\0", b"\0\1\0\0")),
+    count=st.integers(0, 3),
+    rest=st.binary(max_size=400),
+    pad=st.integers(0, 300),
+)
+def test_random_bytes_behind_a_good_header_do_no_harm(order: bytes, count: int, rest: bytes, pad: int) -> None:
+    check(order + count.to_bytes(4, "little" if order[1] else "big") + rest + bytes(pad))
+
+
+@byte_orders
+@given(wanted=st.lists(parts(), min_size=1, max_size=4), data=st.data())
+def test_a_damaged_message_does_no_harm(little_endian: bool, wanted: list[Part], data: st.DataObject) -> None:
+    damaged = bytearray(message_of(*wanted, order="<" if little_endian else ">"))
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(damaged) - 1))
+        damaged[at] = data.draw(st.integers(0, 255) | st.just(damaged[at] ^ 1) | st.sampled_from((0, 255)))
+    end = data.draw(st.integers(0, len(damaged)) | st.just(len(damaged)))
+    check(bytes(damaged[:end]))
+
+
+# Memory, and what is remembered.
+
+
+def test_names_by_the_thousand_are_not_remembered_for_ever() -> None:
+    for name in ("frame {}", "a" * 100 + "{}", "🦾" * 200 + "{}"):
+        tracemalloc.start()
+        try:
+            for _ in range(10):
+                samples = [moving("map", name.format(random.random()), 0) for _ in range(1_000)]
+                assert decode(encode(samples)).samples == samples
+            samples.clear()
+            kept, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert kept < 3_000_000
+
+
+@pytest.mark.parametrize("share", [copy.copy, copy.deepcopy, lambda error: pickle.loads(pickle.dumps(error))])
+def test_the_error_copies_and_pickles(share: Callable[[MalformedMessageError], MalformedMessageError]) -> None:
+    with pytest.raises(MalformedMessageError) as caught:
+        decode(b"\0\1\0\0\1\0\0\0")
+    twin = share(caught.value)
+    assert type(twin) is MalformedMessageError
+    assert (twin.reason, str(twin)) == ("truncated", str(caught.value))
+
+
+def test_the_error_says_what_was_found() -> None:
+    with pytest.raises(MalformedMessageError, match=r"\(truncated\): 80 bytes cannot hold 4294967295 transforms"):
+        decode(b"\0\1\0\0" + b"\xff" * 4 + bytes(76))
+    with pytest.raises(MalformedMessageError, match=r"\(encoding\): .* 00 07 00 00"):
+        decode(b"\0\7\0\0" + bytes(76))
