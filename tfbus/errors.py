@@ -12,6 +12,8 @@
                 GapError                   .before .after .max_gap            waiting cannot help: raised at once
             LookupTimeoutError (TimeoutError)  __cause__ says what was still missing
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
+        InvalidRobotError (ValueError)         .element
+        RecordingError (ValueError)            .path .reason
         ClockResetError                        .before .after
         BusClosedError
 
@@ -307,6 +309,38 @@ class InvalidTransformError(TransformError, ValueError):
         self.authority = authority
         self.loop = loop
         self.owner = owner
+
+
+class InvalidRobotError(TransformError, ValueError):
+    """A robot's description cannot be used.
+
+    Attributes
+    ----------
+    element : str
+        The part of it that is wrong, such as ``<joint name="elbow">``; empty where it is the whole.
+    """
+
+    def __init__(self, problem: str, *, element: str = "") -> None:
+        super().__init__(f"in {element}: {problem}" if element else problem)
+        self.element = element
+
+
+class RecordingError(TransformError, ValueError):
+    """A file cannot be read as a recording.
+
+    Attributes
+    ----------
+    path : str
+    reason : str
+        ``"missing"``, ``"empty"``, ``"truncated"`` (before its first message), ``"foreign"``, ``"damaged"``,
+        ``"unreadable"`` or ``"missing extra"``.
+    """
+
+    def __init__(self, problem: str, *, path: str, reason: str) -> None:
+        # What other packages say of a file may have several lines.
+        super().__init__(f"recording {path!r}: {' '.join(problem.split()).rstrip('.')}")
+        self.path = path
+        self.reason = reason
 
 
 class ClockResetError(TransformError):

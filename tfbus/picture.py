@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from tfbus.history import Edge
 from tfbus.stamps import format_duration, format_stamp
@@ -23,19 +24,22 @@ def describe(edges: Sequence[Edge], now: int | None = None) -> str:
         return "(no frames)"
     if now is None:
         now = max((edge.newest for edge in edges if edge.newest is not None), default=0)
-    lines = list(_branches(edges))
+    lines = [(f"{branch.guides}{branch.frame}", branch.edge) for branch in branches(edges)]
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(
-        label if edge is None else f"{label:<{width}}{_facts(edge, now)}".rstrip() for label, edge in lines
+        label if edge is None else f"{label:<{width}}{'  '.join(facts(edge, now).values())}" for label, edge in lines
     )
 
 
-def _facts(edge: Edge, now: int) -> str:
-    sender = f"  from {edge.authority!r}" if edge.authority else ""
-    if edge.oldest is None or edge.newest is None:
-        return f"{_rate(edge)}{sender}"
-    span = format_duration(edge.newest - edge.oldest)
-    return f"{_rate(edge)}  age {format_duration(now - edge.newest)}  span {span}{sender}"
+def facts(edge: Edge, now: int) -> dict[str, str]:
+    """What is known of an edge, for people: rate, age, span and authority, as far as it has them."""
+    known = {"rate": _rate(edge)}
+    if edge.oldest is not None and edge.newest is not None:
+        known["age"] = f"age {format_duration(now - edge.newest)}"
+        known["span"] = f"span {format_duration(edge.newest - edge.oldest)}"
+    if edge.authority:
+        known["authority"] = f"from {edge.authority!r}"
+    return known
 
 
 def _rate(edge: Edge) -> str:
@@ -53,8 +57,16 @@ def format_rate(static: bool, newest: int | None, rate: float | None) -> str:
     return f"{rate:.1f} Hz" if rate >= 1.0 else f"{rate:.2g} Hz"
 
 
-def _branches(edges: Sequence[Edge]) -> Iterator[tuple[str, Edge | None]]:
-    """Each frame's label and its edge, roots first; a loop is opened at one of its frames."""
+class Branch(NamedTuple):
+    """One line of a picture: the frame, what is drawn before it, and its edge unless it is a root."""
+
+    guides: str
+    frame: str
+    edge: Edge | None
+
+
+def branches(edges: Sequence[Edge]) -> Iterator[Branch]:
+    """All frames as they are drawn, roots first; a loop is opened at one of its frames."""
     below: dict[str, list[Edge]] = {}
     for edge in edges:
         below.setdefault(edge.parent, []).append(edge)
@@ -70,14 +82,14 @@ def _branches(edges: Sequence[Edge]) -> Iterator[tuple[str, Edge | None]]:
             climbed.add(root)
             root = above[root]
         drawn.add(root)
-        yield (f"{root} (in a loop)" if root in above else root), None
+        yield Branch("", f"{root} (in a loop)" if root in above else root, None)
         stack = _stacked(below.get(root, []), "")
         while stack:
-            edge, branch, indent = stack.pop()
+            edge, guides, indent = stack.pop()
             if edge.child in drawn:
                 continue
             drawn.add(edge.child)
-            yield branch + edge.child, edge
+            yield Branch(guides, edge.child, edge)
             stack.extend(_stacked(below.get(edge.child, []), indent))
 
 

@@ -103,3 +103,48 @@ class LinkStatistics:
     not_sent: Mapping[str, int]
     rejected: Mapping[str, int]
     queue: QueueStatistics
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatistics:
+    """One recorder since it was entered.
+
+    What it was offered is ``samples + sum(refused.values()) + queue.pending + queue.dropped + queue.conflated``.
+
+    Attributes
+    ----------
+    samples, messages : int
+        What is in the file by now, and survives if the process is killed.
+    unattributed : int
+        Of the samples, those whose authority is not in the file, because there were too many.
+    refused : mapping of str to int
+        Samples that a message of ROS cannot hold, by reason.
+    queue : QueueStatistics
+        What waits for the disk. Dropped is what it was too slow for, or failed to take; conflated are static samples
+        that gave way to a newer one of the same child when there was too much.
+    """
+
+    samples: int
+    messages: int
+    unattributed: int
+    refused: Mapping[str, int]
+    queue: QueueStatistics
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStatistics:
+    """One publisher of a robot since it was made.
+
+    Attributes
+    ----------
+    messages : int
+        Sets of positions that were published.
+    unknown_joints : int
+        Positions in them for joints that the robot does not have.
+    violations : mapping of str to int
+        Positions in them beyond the limits of a joint, by its name.
+    """
+
+    messages: int
+    unknown_joints: int
+    violations: Mapping[str, int]
