@@ -250,6 +250,48 @@ class PeerRejected:
         return _line(self.stamp, f"peer {self.peer} on {self.link} sent what was refused: {self.error}")
 
 
+@dataclass(frozen=True, slots=True)
+class RecordingDropped:
+    """The disk is too slow for a recorder, which begins to lose samples; told again once it has caught up meanwhile.
+
+    Attributes
+    ----------
+    stamp : int
+    path : str
+        The recording.
+    dropped : int
+        How many samples it has lost so far.
+    """
+
+    stamp: int
+    path: str
+    dropped: int
+
+    def __str__(self) -> str:
+        return _line(self.stamp, f"the recording {self.path} is behind and loses samples, {self.dropped} so far")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingFailed:
+    """A recording could not be written any further; what is in the file can be read, and the program goes on.
+
+    Attributes
+    ----------
+    stamp : int
+    path : str
+        The recording.
+    error : Exception
+        What the disk said.
+    """
+
+    stamp: int
+    path: str
+    error: Exception = field(compare=False)
+
+    def __str__(self) -> str:
+        return _line(self.stamp, f"the recording {self.path} has ended early: {self.error}")
+
+
 Event = (
     FrameAdded
     | FrameRemoved
@@ -264,6 +306,8 @@ Event = (
     | PeerJoined
     | PeerLost
     | PeerRejected
+    | RecordingDropped
+    | RecordingFailed
 )
 """What `Bus.events` gives."""
 
