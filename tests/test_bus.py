@@ -6,6 +6,7 @@ from dataclasses import asdict
 from functools import partial
 
 import anyio
+import anyio.to_thread
 import pytest
 from asking import Asked, driving, settle
 from samples import moving, static
@@ -16,6 +17,8 @@ from tfbus import (
     BusClosedError,
     FutureExtrapolationError,
     InvalidTransformError,
+    PeerJoined,
+    PeerLost,
     SimulatedClock,
     SystemClock,
     TransformBroadcaster,
@@ -390,6 +393,44 @@ def test_a_quarrel_fills_neither_the_log_nor_the_events(caplog: pytest.LogCaptur
 def test_a_misspelt_policy_for_conflicts_is_refused() -> None:
     with pytest.raises(ValueError, match="on_conflict must be 'last' or 'reject', not 'first'"):
         Bus(on_conflict="first")  # type: ignore[arg-type]
+
+
+# Events of others
+
+
+async def test_what_is_announced_reaches_everybody_who_reads_events() -> None:
+    bus = Bus(SimulatedClock(start=5))
+    joined, lost = PeerJoined(5, "tf", "other"), PeerLost(6, "tf", "other", ("slam",), ("odom",))
+    bus.announce(joined)
+    with bus.events() as first, bus.events() as second:
+        for event in (joined, lost):
+            bus.announce(event)
+        for events in (first, second):
+            assert [await anext(events), await anext(events)] == [joined, lost]
+    bus.announce(joined)
+    bus.close()
+    bus.announce(joined)
+
+
+async def test_who_waits_for_events_is_woken_by_what_is_announced() -> None:
+    bus = Bus(SimulatedClock())
+    joined = PeerJoined(0, "tf", "other")
+    with bus.events() as events:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, events.__anext__)
+            await settle()
+            bus.announce(joined)
+            await settle()
+            assert asked.answer == joined
+
+
+async def test_nothing_is_announced_from_another_thread() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.events() as events:
+        bus.check_thread()
+        with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+            await anyio.to_thread.run_sync(bus.announce, PeerJoined(0, "tf", "other"))
+        assert len(events.queue) == 0
 
 
 # Latched statics

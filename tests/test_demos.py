@@ -14,6 +14,7 @@ from typing import Any
 import anyio
 import httpx
 import pytest
+from programs import Program, new_domain
 
 from tfbus import SimulatedClock, tutorial
 from tfbus.testing import simulate
@@ -147,6 +148,86 @@ def test_the_demo_of_a_message_filter_runs_as_a_script() -> None:
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.splitlines()[-1].startswith("7 detections")
+
+
+@pytest.mark.anyio
+async def test_what_the_camera_of_the_arm_sees_is_where_the_closed_form_puts_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = SimulatedClock()
+    demo = load("robot_arm.py")
+    await simulate(clock, lambda: demo["main"](clock))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5
+    for detection, line in enumerate(lines):
+        # Each is seen half way between two messages of the joints, 195 ms after the one before was placed.
+        place = arm_sees(0.195 + 0.2 * detection)
+        found = re.fullmatch(r"\((.+)\) in the base, after 5 ms; by the closed form \((.+)\)", line)
+        assert found
+        # Between two messages the joints are taken to move evenly: a tenth of a mm, and another half is rounded off.
+        for numbers in found.groups():
+            assert [float(number) for number in numbers.split(", ")] == pytest.approx(place, abs=7e-4)
+
+
+def arm_sees(seconds: float) -> tuple[float, float, float]:
+    """Where a thing 0.6 m ahead of the camera is, seen from the foot of the arm."""
+    swing = math.sin(2.0 * seconds)
+    pan, angles = 1.2 * swing, (0.4 * swing, (0.4 - 0.9) * swing, (0.4 - 0.9 + 0.8) * swing)
+    parts = (0.4, 0.35, 0.1 + 0.05 + 0.6)
+    reach = sum(part * math.cos(angle) for part, angle in zip(parts, angles, strict=True))
+    height = 0.5 - sum(part * math.sin(angle) for part, angle in zip(parts, angles, strict=True))
+    return reach * math.cos(pan), reach * math.sin(pan), height
+
+
+def test_the_demo_of_the_arm_runs_as_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "robot_arm.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(done.stdout.splitlines()) == 5
+
+
+def test_the_tutorials_two_programs_find_each_other_in_either_order_and_one_goes_on_without_the_other() -> None:
+    domain = new_domain()
+    info = (
+        r"^\[ INFO\] \d+\.\d{9}: base_laser: \(1\.00, 0\.20\. 0\.00\) -----> "
+        r"base_link: \(1\.10, 0\.20, 0\.20\) at time \d+\.\d\d$"
+    )
+    with Program(sys.executable, DEMOS / "tf_listener.py", domain) as listener:
+        listener.output.expect(r"^\[ERROR\] .*: frame 'base_link' is not known$")
+        with Program(sys.executable, DEMOS / "tf_broadcaster.py", domain) as broadcaster:
+            listener.output.expect(info)
+            assert broadcaster.end() == 130
+        listener.output.expect(r"^\[ERROR\] .*: frame 'base_laser': asked for .*, from 'robot_tf_publisher'$")
+        with Program(sys.executable, DEMOS / "tf_broadcaster.py", domain):
+            listener.output.expect(info)
+        assert listener.end() == 130
+    assert (listener.errors.text, broadcaster.errors.text, broadcaster.output.text) == ("", "", "")
+
+
+def test_the_demo_of_a_recording_finds_the_camera_where_it_was_and_keeps_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "kept.mcap"
+    expected = []
+    for second in (1, 2, 4):
+        # The map's plane as complex numbers: 2 m from its origin, and 0.3 m on along the circle.
+        camera = (2 + 0.3j) * cmath.exp(2j * math.pi * second / 8)
+        expected.append(f"({camera.real:.3f}, {camera.imag:.3f}, 0.500) at {second}.00 s")
+    for arguments in ([], [str(path)]):
+        done = subprocess.run(
+            [sys.executable, DEMOS / "record_and_replay.py", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.splitlines() == [
+            # 50 a second for 8 s with both ends, and the camera's place.
+            "recorded: 402 samples",
+            *(f"the camera was at {place}" for place in expected),
+            f"and once more at {expected[-1]}",
+        ]
+    assert path.stat().st_size > 0
 
 
 @pytest.fixture(scope="module")

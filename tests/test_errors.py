@@ -17,9 +17,11 @@ from tfbus import (
     ExtrapolationError,
     FutureExtrapolationError,
     GapError,
+    InvalidRobotError,
     InvalidTransformError,
     LookupTimeoutError,
     PastExtrapolationError,
+    RecordingError,
     TransformError,
     TransformLookupError,
     UnknownFrameError,
@@ -96,6 +98,11 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         ),
         "frame 'a' cannot be its own parent",
     ),
+    (
+        InvalidRobotError("parent link 'arm' is not there", element='<joint name="elbow">'),
+        "in <joint name=\"elbow\">: parent link 'arm' is not there",
+    ),
+    (RecordingError("the file is empty", path="run.mcap", reason="empty"), "recording 'run.mcap': the file is empty"),
     (
         ClockResetError(before=from_seconds(90), after=from_seconds(3.5)),
         "the clock jumped back from 90.000 s to 3.500 s",

@@ -3,7 +3,8 @@ import logging
 import pytest
 from samples import moving, static
 
-from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
+from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, SubscriberFailed, TransformStamped, UnknownFrameError
+from tfbus.registration import Registration
 
 Batch = tuple[TransformStamped, ...]
 
@@ -300,3 +301,197 @@ def test_what_waits_for_subscribers_when_the_clock_jumps_back_is_dropped() -> No
         bus.subscribe(callback)
         bus.publish(moving("map", "a", 10))
     assert seen == ["a", "c"]
+
+
+# Removals
+
+
+def noting(bus: Bus, log: list[object]) -> Registration:
+    """Note the children of each batch, and each frame that is removed."""
+    return bus.subscribe(lambda batch: log.append([sample.child for sample in batch]), log.append)
+
+
+def test_a_subscriber_is_told_of_removals_in_order_with_the_batches_until_it_is_closed() -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+    with noting(bus, log):
+        bus.publish([moving("map", "a", 1), static("map", "b")])
+        bus.remove_frame("a")
+        bus.publish(moving("map", "a", 1))
+        bus.remove_frame("b")
+        bus.remove_frame("a")
+        bus.publish(moving("map", "c", 1))
+    bus.remove_frame("c")
+    bus.publish(moving("map", "d", 1))
+    assert log == [["a", "b"], "a", ["a"], "b", "a", ["c"]]
+
+
+def test_only_what_is_removed_while_one_is_there_is_told() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish([static("map", "a"), static("map", "b")])
+    bus.remove_frame("a")
+    log: list[object] = []
+    noting(bus, log)
+    with pytest.raises(UnknownFrameError):
+        bus.remove_frame("a")
+    bus.remove_frame("b")
+    assert log == [["b"], "b"]
+
+
+def test_a_frame_that_only_a_buffer_still_lists_is_told_of_when_it_goes() -> None:
+    clock = SimulatedClock(start=10)
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    log: list[object] = []
+    noting(bus, log)
+    bus.publish(moving("map", "a", 10))
+    clock.set(0)
+    bus.remove_frame("a")
+    assert log == [["a"], "a"]
+    assert buffer.tree.frames() == []
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["in front", "behind"])
+def test_a_removal_inside_a_callback_is_told_between_what_was_and_what_is_published_anew(first: bool) -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+    stamps: list[int] = []
+
+    def replace(batch: Batch) -> None:
+        if batch[0].stamp == 1:
+            bus.publish(moving("map", "b", 2))
+            bus.publish(moving("map", "a", 3))
+            bus.remove_frame("a")
+            bus.publish(moving("map", "a", 4))
+
+    registrations = [noting(bus, log)] if first else []
+    bus.subscribe(replace)
+    bus.subscribe(lambda batch: stamps.extend(sample.stamp for sample in batch))
+    registrations += [] if first else [noting(bus, log)]
+    bus.publish([moving("map", "a", 1), moving("map", "c", 1)])
+    before: list[object] = [["a", "c"], "a"] if first else ["a", ["c"]]
+    assert log == [*before, ["b"], ["a"]]
+    assert stamps == [1, 2, 4]
+
+
+def test_what_is_published_on_hearing_of_a_removal_comes_behind_it_for_everybody() -> None:
+    bus = Bus(SimulatedClock())
+    logs: list[list[object]] = [[], []]
+    noting(bus, logs[0])
+
+    def keep(frame: str) -> None:
+        if frame == "a":
+            bus.publish(moving("map", "a", 2))
+            bus.publish(moving("map", "b", 2))
+
+    bus.subscribe(lambda _: None, keep)
+    noting(bus, logs[1])
+    bus.publish(moving("map", "a", 1))
+    bus.remove_frame("a")
+    assert logs[0] == logs[1] == [["a"], "a", ["a"], ["b"]]
+
+
+def test_what_is_removed_on_hearing_of_a_removal_is_told_to_everybody() -> None:
+    bus = Bus(SimulatedClock())
+    logs: list[list[object]] = [[], []]
+    noting(bus, logs[0])
+    bus.subscribe(lambda _: None, lambda frame: bus.remove_frame("tool") if frame == "arm" else None)
+    noting(bus, logs[1])
+    bus.publish([static("map", "arm"), static("arm", "tool")])
+    bus.remove_frame("arm")
+    assert logs[0] == [["arm", "tool"], "arm", "tool"]
+    assert sorted(map(str, logs[1][1:])) == ["arm", "tool"]
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_one_that_raises_on_a_removal_disturbs_nobody_and_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+
+    def clumsy(frame: str) -> None:
+        raise ValueError(frame)
+
+    bus.subscribe(lambda _: None, clumsy)
+    noting(bus, log)
+    with bus.events() as events:
+        for stamp in range(3):
+            bus.publish(moving("map", "a", stamp))
+            bus.remove_frame("a")
+        pending = [event for event in iter(events.queue.get, None) if isinstance(event, SubscriberFailed)]
+    assert log == [["a"], "a"] * 3
+    assert bus.statistics().callbacks_failed == 3
+    assert [str(event.error) for event in pending] == ["a", "a", "a"]
+    assert all("clumsy" in event.subscriber for event in pending)
+    (record,) = caplog.records
+    assert "clumsy" in record.getMessage()
+
+
+def test_what_is_no_exception_is_not_swallowed_on_a_removal_either() -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+
+    def interrupted(frame: str) -> None:
+        bus.publish(moving("map", "b", 1))
+        raise KeyboardInterrupt(frame)
+
+    noting(bus, log)
+    registration = bus.subscribe(lambda _: None, interrupted)
+    bus.publish(moving("map", "a", 1))
+    with pytest.raises(KeyboardInterrupt):
+        bus.remove_frame("a")
+    registration.close()
+    bus.publish(moving("map", "c", 1))
+    assert log == [["a"], "a", ["b"], ["c"]]
+
+
+def test_a_registration_that_ends_on_a_removal_ends_both() -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+    other: list[object] = []
+
+    def once(frame: str) -> None:
+        log.append(frame)
+        registration.close()
+        victim.close()
+
+    registration = bus.subscribe(log.append, once)
+    victim = noting(bus, other)
+    bus.publish([static("map", "a"), static("map", "b")])
+    bus.remove_frame("a")
+    bus.remove_frame("b")
+    bus.publish(moving("map", "c", 1))
+    assert log == [(static("map", "a"), static("map", "b")), "a"]
+    assert other == [["a", "b"]]
+
+
+def test_one_that_publishes_without_end_on_removals_is_stopped_by_an_error_that_names_it() -> None:
+    bus = Bus(SimulatedClock())
+    errors: list[RuntimeError] = []
+
+    def chatterbox(_frame: str) -> None:
+        try:
+            for stamp in range(5_000):
+                bus.publish(moving("map", "a", stamp))
+        except RuntimeError as error:
+            errors.append(error)
+
+    got: list[Batch] = []
+    bus.subscribe(got.append, chatterbox)
+    bus.publish(moving("map", "a", 0))
+    bus.remove_frame("a")
+    assert "chatterbox" in str(errors[0])
+    assert len(got) == 1_001
+    bus.publish(moving("map", "a", 0))
+    assert len(got) == 1_002
+
+
+def test_what_hears_of_removals_must_be_callable_and_not_async() -> None:
+    async def callback(frame: str) -> None: ...
+
+    with Bus() as bus:
+        with pytest.raises(TypeError, match="callable"):
+            bus.subscribe(print, "print")  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="must not be async"):
+            bus.subscribe(print, callback)
+        bus.publish(moving("map", "a", 1))
+        assert bus.statistics().callbacks_failed == 0

@@ -29,9 +29,11 @@ from tfbus.errors import (
     ExtrapolationError,
     FutureExtrapolationError,
     GapError,
+    InvalidRobotError,
     InvalidTransformError,
     LookupTimeoutError,
     PastExtrapolationError,
+    RecordingError,
     TransformError,
     TransformLookupError,
     UnknownFrameError,
@@ -49,6 +51,8 @@ from tfbus.events import (
     PeerJoined,
     PeerLost,
     PeerRejected,
+    RecordingDropped,
+    RecordingFailed,
     Reparented,
     SampleRejected,
     SubscriberFailed,
@@ -56,12 +60,22 @@ from tfbus.events import (
 from tfbus.explanation import ExplainedEdge, Explanation
 from tfbus.geometry import Transform
 from tfbus.history import Edge, Outcome
+from tfbus.joint import Joint, Mimic
 from tfbus.message_filter import MessageFilter
 from tfbus.policy import Hold
 from tfbus.registration import Registration
+from tfbus.robot import LimitViolation, RobotModel
+from tfbus.robot_state import RobotStatePublisher
 from tfbus.stamped import TransformStamped
 from tfbus.stamps import LATEST, SECOND, Latest, from_seconds, to_seconds
-from tfbus.statistics import BufferStatistics, BusStatistics, LinkStatistics, QueueStatistics
+from tfbus.statistics import (
+    BufferStatistics,
+    BusStatistics,
+    LinkStatistics,
+    QueueStatistics,
+    RecorderStatistics,
+    RobotStatistics,
+)
 from tfbus.stream import Stream
 from tfbus.threadsafe import ThreadPublisher
 from tfbus.ticks import Ticks
@@ -96,13 +110,17 @@ __all__ = [
     "FutureExtrapolationError",
     "GapError",
     "Hold",
+    "InvalidRobotError",
     "InvalidTransformError",
+    "Joint",
     "KindChanged",
     "LaserScan",
     "Latest",
+    "LimitViolation",
     "LinkStatistics",
     "LookupTimeoutError",
     "MessageFilter",
+    "Mimic",
     "Outcome",
     "PastExtrapolationError",
     "PeerJoined",
@@ -117,8 +135,15 @@ __all__ = [
     "QuaternionStamped",
     "Question",
     "QueueStatistics",
+    "RecorderStatistics",
+    "RecordingDropped",
+    "RecordingError",
+    "RecordingFailed",
     "Registration",
     "Reparented",
+    "RobotModel",
+    "RobotStatePublisher",
+    "RobotStatistics",
     "SampleRejected",
     "SimulatedClock",
     "Stamped",

@@ -23,6 +23,7 @@ class Doorbell:
     def __init__(self, answer: Callable[[], object]) -> None:
         self._answer = answer
         self._soon: Callable[[Callable[[], object]], object] | None = None
+        self._has_ended: Callable[[], bool] = bool
         self._armed = True
 
     @property
@@ -35,6 +36,10 @@ class Doorbell:
         # anyio has no public call for this; both loops' own one is the only thing that wakes them from a thread.
         native = cast(Any, anyio.lowlevel.current_token().native_token)
         self._soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
+        # trio answers each ring that it has taken; asyncio's loops may end with some.
+        self._has_ended = getattr(native, "is_closed", bool)
+        # An earlier loop may have ended with a ring that it never answered.
+        self._armed = True
 
     def ring(self) -> None:
         """Have it answered; for any thread.
@@ -48,7 +53,13 @@ class Doorbell:
             raise RuntimeError("connect the doorbell on the event loop first")
         if self._armed:
             self._armed = False
-            self._soon(self._open)
+            try:
+                self._soon(self._open)
+            except BaseException:
+                self._armed = True
+                raise
+        elif self._has_ended():
+            raise RuntimeError("the event loop has ended before it answered an earlier ring")
 
     def _open(self) -> None:
         self._armed = True

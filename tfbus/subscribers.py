@@ -40,7 +40,7 @@ class Subscribers:
         self._keys = count()
         self._backlog: deque[Batch] = deque()
         self._current: Batch = ()
-        self._calling: BatchCallback | None = None
+        self._calling: Callable[..., object] | None = None
         self._queued = 0
         self.failures = 0
 
@@ -90,10 +90,17 @@ class Subscribers:
         self._keep_only(lambda sample: sample.child != child)
 
     def tell_removed(self, child: str) -> None:
-        """Tell those who want to know that a frame was removed."""
-        for key, removed in tuple(self._removal_callbacks.items()):
-            if key in self._removal_callbacks:
-                self._call(key, removed, child)
+        """Tell those who want to know that a frame was removed; what one of them publishes comes behind that."""
+        outer = self._calling
+        try:
+            for key, removed in tuple(self._removal_callbacks.items()):
+                if key in self._removal_callbacks:
+                    self._calling = removed
+                    self._call(key, removed, child)
+        finally:
+            self._calling = outer
+        if outer is None:
+            self._deliver_backlog()
 
     def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
         self._current = tuple(filter(wanted, self._current))

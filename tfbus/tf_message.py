@@ -245,7 +245,7 @@ def _transforms(
         middle = at + 12 + length + 3 & -4
         (length,) = size(body, middle)
         end = middle + 4 + length + 7 & -8
-        # Read before anything is cut out of the body: it fails where a length is wrong.
+        # Before the names are cut out, because it fails where a length is wrong.
         row = x, y, z, i, j, k, w = numbers(body, end)
         piece = body[at + 8 : end]
         at = end + 56

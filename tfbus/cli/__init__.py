@@ -2,15 +2,28 @@
 
 import os
 import sys
+from io import TextIOWrapper
 
 try:
     from cyclopts import App, CycloptsError
 except ImportError:
     raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
 
+from tfbus.cli.broadcast import broadcast
 from tfbus.cli.demo import demo
+from tfbus.cli.echo import echo
+from tfbus.cli.info import info
 from tfbus.cli.link import UnusableError
+from tfbus.cli.listen import listen
+from tfbus.cli.play import play
+from tfbus.cli.query import query
+from tfbus.cli.record import record
+from tfbus.cli.robot import robot
+from tfbus.cli.static import static
+from tfbus.cli.tree import tree
+from tfbus.errors import RecordingError, TransformLookupError
 
+UNANSWERED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
 
@@ -20,17 +33,34 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 app.command(demo)
+app.command(broadcast)
+app.command(listen)
+app.command(static)
+app.command(robot)
+app.command(echo)
+app.command(tree)
+app.command(record)
+app.command(play)
+app.command(info)
+app.command(query)
 
 
 def main() -> None:
-    """Run the command and exit: 0 when done, 2 for a wrong call, 130 for Ctrl-C."""
+    """Run the command and exit: 0 when done, 1 for a question without an answer, 2 for a wrong call, 130 for Ctrl-C."""
     status = 0
+    if isinstance(sys.stdout, TextIOWrapper):
+        # It may not have the letters of a frame's name.
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        app(exit_on_error=False, print_error=False, result_action="return_value")
-    except* (CycloptsError, UnusableError) as wrong:
+        app(sys.argv[1:], exit_on_error=False, print_error=False, result_action="return_value")
+    except* (CycloptsError, UnusableError, RecordingError) as wrong:
         for error in wrong.exceptions:
             print(f"tfbus: {error}", file=sys.stderr)
         status = USAGE_ERROR
+    except* TransformLookupError as missing:
+        for reason in missing.exceptions:
+            print(f"tfbus: {reason}", file=sys.stderr)
+        status = UNANSWERED
     except* KeyboardInterrupt:
         status = INTERRUPTED
     except* BrokenPipeError:

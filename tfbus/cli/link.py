@@ -1,13 +1,19 @@
 """The options of every command that joins a domain."""
 
-from contextlib import AbstractAsyncContextManager
+import os
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
+import anyio
 from cyclopts import Parameter
 
 from tfbus.bus import Bus
 from tfbus.cli.options import Backend
+
+_SOON = 1.0
 
 
 class UnusableError(Exception):
@@ -33,17 +39,54 @@ class LinkOptions:
     """
 
     domain: str = "tf"
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
+    listen: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     backend: Backend = "asyncio"
 
-    def open(self, bus: Bus, **options: Any) -> AbstractAsyncContextManager[object]:
-        """The link, to be entered."""
+    @asynccontextmanager
+    async def open(self, bus: Bus, **options: Any) -> AsyncIterator[object]:
+        """The link, to be entered; whatever keeps it from being there is an `UnusableError`."""
         try:
             from tfbus.links.zenoh import ZenohLink
-        except ImportError as error:
-            raise UnusableError(str(error)) from None
-        try:
-            return ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None, **options)
-        except ValueError as error:
-            raise UnusableError(str(error)) from None
+        except ImportError:
+            raise UnusableError('joining a domain needs a package more: pip install "tfbus[cli,zenoh]"') from None
+        async with AsyncExitStack() as stack:
+            try:
+                link = ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None, **options)
+                await stack.enter_async_context(link)
+            except ValueError as error:
+                raise UnusableError(str(error)) from None
+            except OSError as error:
+                where = " or ".join(self.listen) or "the loopback"
+                why = os.strerror(error.errno) if error.errno else error
+                raise UnusableError(f"cannot listen at {where}: {why}") from None
+            yield link
+
+    def run(self, program: Callable[[Bus], Awaitable[object]], **options: Any) -> None:
+        """Run a program on a bus that has joined the domain, on the event loop that was chosen."""
+
+        async def join_and_run() -> None:
+            with Bus() as bus:
+                async with self.open(bus, **options):
+                    await program(bus)
+
+        anyio.run(join_and_run, backend=self.backend)
+
+    async def first_transform(self, bus: Bus) -> None:
+        """Return when something has been published on the bus; say so if that takes more than a moment."""
+        arrived = anyio.Event()
+        with bus.subscribe(lambda _: arrived.set()):
+            with bus.clock.move_on_after(_SOON):
+                await arrived.wait()
+                return
+            say(f"waiting for transforms on domain {self.domain!r} …")
+            await arrived.wait()
+
+
+LOCAL = LinkOptions()
+"""What holds where nothing is said."""
+
+
+def say(line: str) -> None:
+    """Print a line for people, which is not what was asked."""
+    print(line, file=sys.stderr, flush=True)

@@ -8,6 +8,7 @@ from typing import Any
 from tfbus.statistics import QueueStatistics
 
 MAX_BYTES = 64 * 2**20
+_OWN_SIZE = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +22,7 @@ class Arrival:
     content : Any
         A message; or a bool, whether the peer is there now.
     size : int
-        Bytes that it keeps in memory.
+        Bytes that its content keeps in memory.
     moving : bool
         Whether it may be dropped when there is too much: newer data will come.
     """
@@ -58,7 +59,7 @@ class Arrivals:
         """Add one, from any thread."""
         with self._lock:
             self._pending.append(arrival)
-            self._bytes += arrival.size
+            self._bytes += _size(arrival)
             self._moving += arrival.moving
             while self._moving > self._capacity or self._bytes > MAX_BYTES:
                 self._drop_one()
@@ -69,7 +70,7 @@ class Arrivals:
             for queue in (self._kept, self._pending):
                 if queue:
                     arrival = queue.popleft()
-                    self._bytes -= arrival.size
+                    self._bytes -= _size(arrival)
                     self._moving -= arrival.moving
                     return arrival
         return None
@@ -80,7 +81,7 @@ class Arrivals:
             kept = [arrival for arrival in (*self._kept, *self._pending) if not arrival.moving]
             self._dropped += self._moving
             self._kept, self._pending = deque(kept), deque()
-            self._bytes = sum(arrival.size for arrival in kept)
+            self._bytes = sum(map(_size, kept))
             self._moving = 0
 
     def statistics(self) -> QueueStatistics:
@@ -92,6 +93,11 @@ class Arrivals:
         while self._pending and not self._pending[0].moving:
             self._kept.append(self._pending.popleft())
         arrival = (self._pending or self._kept).popleft()
-        self._bytes -= arrival.size
+        self._bytes -= _size(arrival)
         self._moving -= arrival.moving
         self._dropped += 1
+
+
+def _size(arrival: Arrival) -> int:
+    # What has no content, as that a peer is there, takes memory too.
+    return arrival.size + _OWN_SIZE

@@ -9,6 +9,9 @@ each other; its attachment says how many belong to which, in the order in which 
     entries      kind u8, origin u8, runs u16, sequence u64, and then
         batch    runs times: authority u16, static u16, samples u32
         removal  the length of the name in place of runs, UTF-8
+        loss     as a removal
+
+What it costs to read one is in proportion to its bytes, and to take in an entry may cost more; both have a limit.
 """
 
 import struct
@@ -16,16 +19,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 
-from tfbus.tf_message import MalformedMessageError
+from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 VERSION = 1
 ORIGIN_BYTES = 16
+MAX_BYTES = 2**20
+MAX_ENTRIES = 10_000
 
 _HEADER = struct.Struct("<BBHIQ")
 _ENTRY = struct.Struct("<BBHQ")
 _RUN = struct.Struct("<HHI")
 _LENGTH = struct.Struct("<H")
-_BATCH, _REMOVAL = 0, 1
+_BATCH, _REMOVAL, _LOSS = 0, 1, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +49,12 @@ class PublishedBatch:
 
 @dataclass(frozen=True, slots=True)
 class RemovedFrame:
-    """A tombstone."""
+    """A tombstone; with `lost`, it is only about what the sender has brought itself, and lost where that came from."""
 
     origin: bytes
     sequence: int
     frame: str
+    lost: bool = False
 
 
 Entry = PublishedBatch | RemovedFrame
@@ -74,8 +80,11 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
     Raises
     ------
     ValueError
-        If it has more than 255 origins, or more than 65,535 authorities or bytes in one name.
+        If it has more than 255 origins, `MAX_ENTRIES`, `MAX_BYTES`, or 65,535 authorities or bytes of one; or if the
+        name of a removed frame has more than `MAX_NAME` bytes. Also for a name that has no UTF-8.
     """
+    if len(entries) > MAX_ENTRIES:
+        raise ValueError(f"too much for one attachment: {len(entries)} entries, more than {MAX_ENTRIES}")
     origins: dict[bytes, int] = {}
     authorities: dict[str, int] = {}
     body = bytearray()
@@ -83,7 +92,10 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
         origin = origins.setdefault(entry.origin, len(origins))
         if isinstance(entry, RemovedFrame):
             name = entry.frame.encode()
-            body += _pack(_ENTRY, _REMOVAL, origin, len(name), entry.sequence) + name
+            if len(name) > MAX_NAME:
+                raise ValueError(f"too much for one attachment: a frame name of {len(name)} bytes")
+            kind = _LOSS if entry.lost else _REMOVAL
+            body += _pack(_ENTRY, kind, origin, len(name), entry.sequence) + name
         else:
             body += _pack(_ENTRY, _BATCH, origin, len(entry.runs), entry.sequence)
             for authority, static, count in entry.runs:
@@ -94,6 +106,8 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
     for authority in authorities:
         text = authority.encode()
         head += _pack(_LENGTH, len(text)) + text
+    if len(head) + len(body) > MAX_BYTES:
+        raise ValueError(f"too much for one attachment: {len(head) + len(body)} bytes, more than {MAX_BYTES}")
     return bytes(head + body)
 
 
@@ -108,6 +122,8 @@ def unpack(data: bytes) -> Attachment:
     if not data or data[0] != VERSION:
         found = f"version {data[0]}" if data else "nothing"
         raise MalformedMessageError("version", f"the attachment has {found}, expected version {VERSION}")
+    if len(data) > MAX_BYTES:
+        raise MalformedMessageError("oversized", f"the attachment has {len(data)} bytes, more than {MAX_BYTES}")
     try:
         return _unpack(data)
     except (struct.error, IndexError):
@@ -119,20 +135,24 @@ def unpack(data: bytes) -> Attachment:
 
 def _unpack(data: bytes) -> Attachment:
     _, origin_count, authority_count, entry_count, number = _HEADER.unpack_from(data)
+    if entry_count > MAX_ENTRIES:
+        raise MalformedMessageError("oversized", f"the attachment has {entry_count} entries, more than {MAX_ENTRIES}")
     at = _HEADER.size + ORIGIN_BYTES * origin_count
     origins = [data[at - ORIGIN_BYTES * (k + 1) : at - ORIGIN_BYTES * k] for k in reversed(range(origin_count))]
     authorities = []
     for _ in range(authority_count):
         (length,) = _LENGTH.unpack_from(data, at)
-        authorities.append(_text(data, at + _LENGTH.size, length))
-        at += _LENGTH.size + length
+        at += _LENGTH.size
+        authorities.append(data[at : at + length].decode())
+        at += length
     entries: list[Entry] = []
-    # Each entry takes some bytes, so a count that is a lie ends the loop with an error before the list is long.
+    # Each takes some bytes, so a count that is a lie ends the loop with an error before the list is long.
     for _ in range(entry_count):
         kind, origin, size, sequence = _ENTRY.unpack_from(data, at)
         at += _ENTRY.size
-        if kind == _REMOVAL:
-            entries.append(RemovedFrame(origins[origin], sequence, _text(data, at, size)))
+        if kind in (_REMOVAL, _LOSS) and size <= MAX_NAME:
+            frame = data[at : at + size].decode()
+            entries.append(RemovedFrame(origins[origin], sequence, frame, kind == _LOSS))
             at += size
         elif kind == _BATCH:
             runs = _RUN.iter_unpack(data[at : at + _RUN.size * size])
@@ -141,6 +161,7 @@ def _unpack(data: bytes) -> Attachment:
             entries.append(PublishedBatch(origins[origin], sequence, named))
         else:
             raise IndexError
+    # Slices end with the data, counts may not.
     if at != len(data):
         raise IndexError
     return Attachment(number, tuple(entries))
@@ -151,9 +172,3 @@ def _pack(layout: struct.Struct, *values: object) -> bytes:
         return layout.pack(*values)
     except struct.error as error:
         raise ValueError(f"too much for one attachment: {error}") from None
-
-
-def _text(data: bytes, start: int, length: int) -> str:
-    if start + length > len(data):
-        raise IndexError
-    return data[start : start + length].decode()

@@ -9,6 +9,8 @@ from tfbus.links.received import ReceivedTransform, Source
 from tfbus.links.relay import Relay
 from tfbus.tf_message import MalformedMessageError, decode
 
+_MOST_LOST = 2**32
+
 
 class Inbox:
     """The receiving half of a link; nothing that a peer can send makes it raise.
@@ -68,14 +70,20 @@ class Inbox:
 
     def _take(self, peer: Peer, entries: Attachment, samples: list[ReceivedTransform | None]) -> None:
         start = 0
+        live = entries.number > 0
         for entry in entries.entries:
-            source = Source(entry.origin, entry.sequence, self._link, peer)
+            if self._bus.closed:
+                # By a subscriber, in the middle of this.
+                return
             if isinstance(entry, PublishedBatch):
+                source = Source(entry.origin, entry.sequence, self._link, peer, live)
                 end = start + entry.count
-                if self._knows_authorities(peer, entry):
-                    self._publish(source, [sample for sample in samples[start:end] if sample is not None])
+                batch = [sample for sample in samples[start:end] if sample is not None]
+                if self._knows_authorities(peer, entry, len(batch)):
+                    self._publish(source, batch)
                 start = end
             elif self._frames is None or entry.frame in self._frames:
+                source = Source(entry.origin, entry.sequence, self._link, peer, live, entry.lost)
                 self._relay.remove(source, entry.frame)
 
     def _publish(self, source: Source, samples: list[ReceivedTransform]) -> None:
@@ -89,8 +97,8 @@ class Inbox:
             error = ValueError(f"the peer has announced more than {self._max_frames} frames")
             self._peers.reject(peer.id, "too many frames", error, refused)
 
-    def _knows_authorities(self, peer: Peer, batch: PublishedBatch) -> bool:
-        for authority, _, count in batch.runs:
+    def _knows_authorities(self, peer: Peer, batch: PublishedBatch, count: int) -> bool:
+        for authority, _, _ in batch.runs:
             if authority not in peer.authorities:
                 if len(peer.authorities) >= MAX_AUTHORITIES:
                     error = ValueError(f"the peer has spoken for more than {MAX_AUTHORITIES} authorities")
@@ -101,6 +109,8 @@ class Inbox:
 
     def _count(self, peer: Peer, number: int) -> None:
         if number > peer.number:
-            if peer.number:
-                self.lost += number - peer.number - 1
+            missing = number - peer.number - 1
+            # More than that never were: the number is a lie.
+            if peer.number and missing <= _MOST_LOST:
+                self.lost += missing
             peer.number = number

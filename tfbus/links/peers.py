@@ -2,12 +2,16 @@
 
 from collections import Counter
 from collections.abc import Callable
+from itertools import count
 
 from tfbus.once import Once
 
 MAX_PEERS = 1_000
 MAX_AUTHORITIES = 1_000
 _REASONS = 100
+
+ages = count()
+"""What comes later, a peer or a loss, takes a higher one."""
 
 
 class Peer:
@@ -16,6 +20,8 @@ class Peer:
     Attributes
     ----------
     id : str
+    age : int
+        Higher for one that was met later, also for one that has come back.
     present : bool
         Whether it has said that it is there.
     number : int
@@ -26,10 +32,11 @@ class Peer:
         Origin and child of all that it has brought: what its limit counts.
     """
 
-    __slots__ = ("authorities", "frames", "id", "number", "present", "told")
+    __slots__ = ("age", "authorities", "frames", "id", "number", "present", "told")
 
     def __init__(self, id: str) -> None:  # noqa: A002 - it is called so on the wire
         self.id = id
+        self.age = next(ages)
         self.present = False
         self.number = 0
         self.authorities: set[str] = set()

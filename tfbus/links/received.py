@@ -19,15 +19,23 @@ class Source:
         The link that brought it.
     peer : Peer
         The other end, which sent it.
+    live : bool
+        Whether it came in order with all else from there, and not out of what is kept for late joiners.
+    lost : bool
+        Of a removal, whether it is only that the frame's way here has broken.
     """
 
-    __slots__ = ("link", "origin", "peer", "sequence")
+    __slots__ = ("link", "live", "lost", "origin", "peer", "sequence")
 
-    def __init__(self, origin: bytes, sequence: int, link: object, peer: Peer) -> None:
+    def __init__(
+        self, origin: bytes, sequence: int, link: object, peer: Peer, live: bool = True, lost: bool = False
+    ) -> None:
         self.origin = origin
         self.sequence = sequence
         self.link = link
         self.peer = peer
+        self.live = live
+        self.lost = lost
 
 
 class ReceivedTransform(TransformStamped):

@@ -3,20 +3,25 @@
 Every batch is numbered by the bus on which it was published first, its *origin*. The same batch may come back on
 another way, for a bus with two links passes on by each what came by the other; so a sample is taken only if its number
 is higher than that of the newest one of its origin and child. A ring, of any number of buses, thus has no echo.
+
+What was removed is remembered, with the number up to which a copy on a slower way is not to bring it back. Of so many
+removals that they cannot all be remembered, the highest number of each origin is: new names below it are old ones too.
 """
 
-from collections.abc import Iterable, Sequence
-from itertools import groupby
-from typing import Protocol
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import count, groupby
+from typing import NamedTuple, Protocol
 from uuid import uuid4
+from weakref import WeakKeyDictionary
 
 from tfbus.bus import Bus
 from tfbus.errors import UnknownFrameError
-from tfbus.links.peers import Peer
+from tfbus.links.peers import Peer, ages
 from tfbus.links.received import ReceivedTransform, Source
 from tfbus.stamped import Batch, TransformStamped
 
 _REMEMBERED_REMOVALS = 10_000
+_REMEMBERED_ORIGINS = 1_000
 
 
 class Piece:
@@ -30,11 +35,22 @@ class Piece:
         self.samples = samples
 
 
-class Outlet(Protocol):
-    """The sending half of a link."""
+class _Removal(NamedTuple):
+    """What is remembered of a frame of one origin that has gone."""
 
-    def take(self, piece: Piece) -> object: ...
-    def remove(self, origin: bytes, sequence: int, frame: str) -> object: ...
+    sequence: int
+    """What has no higher number is older."""
+    since: int | None = None
+    """If it was not removed but lost: the age from which on peers may say the same again."""
+    peer: str = ""
+    """And who has told of it, and may do so too. All others had the same before, so it may only be late."""
+
+
+class Outlet(Protocol):
+    """The sending half of a link; what came by this very link, it is told with `send` false."""
+
+    def take(self, piece: Piece, send: bool) -> object: ...
+    def remove(self, origin: bytes, sequence: int, frame: str, lost: bool, send: bool) -> object: ...
 
 
 class Relay:
@@ -47,15 +63,15 @@ class Relay:
     """
 
     def __init__(self, bus: Bus) -> None:
-        self.origin = uuid4().bytes
+        self.origin, self._numbers = _identities.setdefault(bus, (uuid4().bytes, count(1)))
         self._bus = bus
-        self._sequence = 0
         self._outlets: list[Outlet] = []
         self._newest: dict[bytes, dict[str, int]] = {}
         self._brought_by: dict[tuple[bytes, str], Peer] = {}
-        self._removals: dict[tuple[bytes, str], int] = {}
-        self._last_from: dict[str, Peer] = {}
-        self._removing: Source | None = None
+        self._removals: dict[tuple[bytes, str], _Removal] = {}
+        self._forgotten: dict[bytes, int] = {}
+        self._last_from: dict[str, Peer | None] = {}
+        self._removing: tuple[str, Source] | None = None
         self._registration = bus.subscribe(self._published, self._removed)
 
     def add(self, outlet: Outlet) -> None:
@@ -91,16 +107,19 @@ class Relay:
         newest = self._newest.setdefault(source.origin, {})
         fresh = []
         for sample in samples:
-            known = newest.get(sample._fields[1])
-            if known is None:
-                if self._is_known(source, sample.child):
+            child = sample._fields[1]
+            known = newest.get(child)
+            if known is not None:
+                if known >= source.sequence:
+                    continue
+            # Else it is the second one of a child that is new in this batch.
+            elif (source.origin, child) not in source.peer.frames:
+                if self._is_known(source, child):
                     continue
                 if len(source.peer.frames) >= max_frames:
                     refused += 1
                     continue
-                self._charge(source, sample.child)
-            elif known >= source.sequence:
-                continue
+                self._charge(source, child)
             sample._source = source
             fresh.append(sample)
         # Only now: a batch may have several samples of one child.
@@ -113,66 +132,82 @@ class Relay:
         return len(fresh), refused
 
     def remove(self, source: Source, frame: str) -> None:
-        """Remove a frame from the bus, unless newer samples of it have come from the same origin."""
-        known = self._newest.get(source.origin, {}).get(frame, -1)
-        if source.origin == self.origin or known >= source.sequence or self._is_known(source, frame):
+        """Remove a frame from the bus, unless newer samples of it have come from the same origin.
+
+        One that was lost goes if that peer was the last to bring it.
+        """
+        if source.origin == self.origin:
             return
-        self._take_off(frame, source)
+        if source.lost:
+            # It may be there all the same, on another way.
+            news = self._last_from.get(frame) is source.peer
+        else:
+            known = self._newest.get(source.origin, {}).get(frame, -1)
+            news = known < source.sequence and not self._is_known(source, frame)
+        if news:
+            self._take_off(frame, source)
 
     def lose(self, peer: Peer, link: object, drop: bool) -> tuple[str, ...]:
         """Forget a peer; the frames that it was the last to publish, which leave the bus with `drop`."""
         frames = tuple(sorted(frame for frame, last in self._last_from.items() if last is peer))
+        since = next(ages)
         for origin, child in tuple(peer.frames):
-            # When it comes back it may say the same again.
+            self._remember_removal(origin, child, _Removal(self._newest[origin][child], since))
             self._discharge(origin, child)
         for frame in frames:
-            del self._last_from[frame]
-            if drop:
-                # Whoever is behind this link has noticed by himself; others have to be told.
-                self._take_off(frame, Source(self.origin, self._next(), link, peer))
+            # Whoever hears of a removal may have removed or published others of them.
+            if self._last_from.get(frame) is peer:
+                if drop and not self._bus.closed:
+                    # Whoever is behind this link has noticed by himself; others have to be told.
+                    self._take_off(frame, Source(self.origin, next(self._numbers), link, peer, lost=True))
+                else:
+                    self._last_from[frame] = None
         return frames
 
     def _take_off(self, frame: str, source: Source) -> None:
-        self._removing = source
+        if frame not in self._last_from:
+            # Nothing of it was passed on, so there is nobody to tell.
+            self._forget(frame, source)
+            return
+        self._removing = frame, source
         try:
             self._bus.remove_frame(frame)
         except UnknownFrameError:
-            self._remember_removal(source.origin, frame, source.sequence)
+            # The bus has forgotten it when its clock jumped back; the others have not.
+            self._removed(frame)
         finally:
             self._removing = None
 
     def _published(self, batch: Batch) -> None:
         for sample in batch:
-            if type(sample) is ReceivedTransform:
-                self._last_from[sample.child] = sample._source.peer
-            elif self._last_from:
-                self._last_from.pop(sample.child, None)
+            self._last_from[sample._fields[1]] = sample._source.peer if type(sample) is ReceivedTransform else None
         self._send(batch, self._outlets)
 
     def _send(self, batch: Batch, outlets: Sequence[Outlet]) -> None:
         for source, samples in groupby(batch, _source_of):
             if source is None:
-                piece, link = Piece(self.origin, self._next(), tuple(samples)), None
+                piece, link = Piece(self.origin, next(self._numbers), tuple(samples)), None
             else:
                 piece, link = Piece(source.origin, source.sequence, tuple(samples)), source.link
             for outlet in outlets:
-                if outlet is not link:
-                    outlet.take(piece)
+                outlet.take(piece, outlet is not link)
 
     def _removed(self, frame: str) -> None:
+        if self._removing is not None and self._removing[0] == frame:
+            source = self._removing[1]
+        else:
+            source = Source(self.origin, next(self._numbers), None, _NOBODY)
         self._last_from.pop(frame, None)
-        for origin in [origin for origin, newest in self._newest.items() if frame in newest]:
-            self._remember_removal(origin, frame, self._newest[origin][frame])
-            self._discharge(origin, frame)
-        source = self._removing or Source(self.origin, self._next(), None, _NOBODY)
-        self._remember_removal(source.origin, frame, source.sequence)
+        self._forget(frame, source)
         for outlet in self._outlets:
-            if outlet is not source.link:
-                outlet.remove(source.origin, source.sequence, frame)
+            outlet.remove(source.origin, source.sequence, frame, source.lost, outlet is not source.link)
 
-    def _next(self) -> int:
-        self._sequence += 1
-        return self._sequence
+    def _forget(self, frame: str, source: Source) -> None:
+        since, by = (next(ages), source.peer.id) if source.lost else (None, "")
+        for origin in [origin for origin, newest in self._newest.items() if frame in newest]:
+            self._remember_removal(origin, frame, _Removal(self._newest[origin][frame], since, by))
+            self._discharge(origin, frame)
+        self._remember_removal(source.origin, frame, _Removal(source.sequence, since, by))
 
     def _charge(self, source: Source, child: str) -> None:
         source.peer.frames.add((source.origin, child))
@@ -186,12 +221,30 @@ class Relay:
             del self._newest[origin]
 
     def _is_known(self, source: Source, child: str) -> bool:
-        return self._removals.get((source.origin, child), -1) >= source.sequence
+        """Whether something of an origin's child that is not there is no news."""
+        known = self._removals.get((source.origin, child))
+        if known is None:
+            # What is kept for late joiners is there now, however old it is.
+            return source.live and source.sequence <= self._forgotten.get(source.origin, -1)
+        if known.sequence == source.sequence and known.since is not None:
+            return source.peer.age < known.since and source.peer.id != known.peer
+        return known.sequence >= source.sequence
 
-    def _remember_removal(self, origin: bytes, frame: str, sequence: int) -> None:
-        self._removals[origin, frame] = max(sequence, self._removals.pop((origin, frame), -1))
+    def _remember_removal(self, origin: bytes, frame: str, removal: _Removal) -> None:
+        if origin == self.origin:
+            return
+        known = self._removals.pop((origin, frame), None)
+        if known is not None and known.sequence > removal.sequence:
+            removal = known
+        self._removals[origin, frame] = removal
         if len(self._removals) > _REMEMBERED_REMOVALS:
-            del self._removals[next(iter(self._removals))]
+            oldest = next(iter(self._removals))
+            self._forget_removal(oldest[0], self._removals.pop(oldest).sequence)
+
+    def _forget_removal(self, origin: bytes, sequence: int) -> None:
+        self._forgotten[origin] = max(sequence, self._forgotten.pop(origin, -1))
+        if len(self._forgotten) > _REMEMBERED_ORIGINS:
+            del self._forgotten[next(iter(self._forgotten))]
 
 
 _NOBODY = Peer("")
@@ -202,6 +255,8 @@ def _source_of(sample: TransformStamped) -> Source | None:
 
 
 _relays: dict[Bus, Relay] = {}
+# For as long as a bus lives: its own samples are also to be known when its links have ended and others begin.
+_identities: WeakKeyDictionary[Bus, tuple[bytes, Iterator[int]]] = WeakKeyDictionary()
 
 
 def join(bus: Bus, outlet: Outlet) -> Relay:

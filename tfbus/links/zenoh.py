@@ -45,7 +45,10 @@ from tfbus.statistics import LinkStatistics
 from tfbus.tf_message import MalformedMessageError
 
 _AT_A_TIME = 100
+_BYTES_AT_A_TIME = 2**16
 _LINGER = 5.0
+_CLOSING = 1.0
+_LONGEST_DOMAIN = 200
 
 
 class ZenohLink:
@@ -161,7 +164,8 @@ class ZenohLink:
             bell.connect()
         self._session = ZenohSession(self._config, f"tfbus/{self.domain}", self.id, self._receive)
         try:
-            await anyio.to_thread.run_sync(self._session.open)
+            # The session closes itself if nobody waits for it any more.
+            await anyio.to_thread.run_sync(self._session.open, abandon_on_cancel=True)
             self._relay = join(self.bus, self._outbox)
         except BaseException:
             await self._close(self._session)
@@ -200,8 +204,10 @@ class ZenohLink:
 
     @staticmethod
     async def _close(session: ZenohSession) -> None:
-        with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(session.close)
+        # Begun at once: asyncio's own cancel knows no shield, and an open session would not let the program end.
+        closing = session.close()
+        with anyio.move_on_after(_CLOSING, shield=True):
+            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
 
     def _gathered(self) -> None:
         if self._outbox.pending >= MAX_SAMPLES:
@@ -249,10 +255,12 @@ class ZenohLink:
     def _take_in(self) -> None:
         if self._inbox is None:
             return
-        for _ in range(_AT_A_TIME):
+        taken = 0
+        while taken < _BYTES_AT_A_TIME:
             arrival = self._arrivals.get()
             if arrival is None:
                 return
+            taken += arrival.size + _BYTES_AT_A_TIME // _AT_A_TIME
             try:
                 self._handle(self._inbox, arrival)
             except Exception as error:  # noqa: BLE001 - no peer, and no subscriber, may end the event loop
@@ -267,8 +275,8 @@ class ZenohLink:
         elif isinstance(content, MalformedMessageError):
             self._peers.reject(sender, content.reason, content)
         else:
-            attachment = b"" if content.attachment is None else content.attachment.to_bytes()
-            inbox.receive(sender, content.payload.to_bytes(), attachment)
+            payload, attachment = content
+            inbox.receive(sender, payload, attachment)
 
     def _note_presence(self, sender: str, present: bool) -> None:
         assert self._relay is not None
@@ -297,8 +305,11 @@ class ZenohLink:
 
 
 def _checked(domain: str) -> str:
-    if not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", domain, re.ASCII):
+    if domain.endswith("/static"):
+        raise ValueError(f"the domain {domain!r} would hear the static frames of {domain.removesuffix('/static')!r}")
+    if len(domain) > _LONGEST_DOMAIN or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", domain, re.ASCII):
         raise ValueError(
-            f"a domain is made of letters, digits, '-', '_' and '.', with '/' between them, not {domain!r}"
+            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
+            f"{_LONGEST_DOMAIN} at most, not {domain!r}"
         )
     return domain

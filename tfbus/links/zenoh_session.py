@@ -1,21 +1,25 @@
 """One zenoh session of a link: its keys, and what zenoh's threads bring."""
 
+import re
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
 
 import zenoh
 
 from tfbus.links.arrivals import Arrival
-from tfbus.links.outbox import Message
+from tfbus.links.outbox import MAX_BYTES, Message
+from tfbus.links.zenoh_settings import without_source
 from tfbus.links.zenoh_statics import StaticKeys, hear_statics
 from tfbus.tf_message import MalformedMessageError
 
-MAX_BYTES = 2**24
-"""The largest message that is taken."""
+_ID = re.compile("[0-9a-f]{32}")
+_SHOWN = 200
 
 
 class ZenohSession:
-    """What blocks, for worker threads (`open` and `close`), and what does not, for the event loop (`put`).
+    """What blocks, for worker threads (`open`), and what does not, for the event loop (`put` and `close`).
 
     Parameters
     ----------
@@ -25,7 +29,8 @@ class ZenohSession:
     id : str
         The link's own name, the last part of its keys.
     receive : callable
-        Called in zenoh's threads with each `Arrival`; the content of one is a `zenoh.Sample`, a bool or an `Exception`.
+        Called in zenoh's threads with each `Arrival`; the content of one is a payload and an attachment, a bool, or a
+        `MalformedMessageError`.
 
     Attributes
     ----------
@@ -49,13 +54,38 @@ class ZenohSession:
         self._declared: tuple[object, ...] = ()
 
     def open(self) -> None:
-        """Open the session and tell the others."""
-        session = zenoh.open(self._config)
+        """Open the session and tell the others.
+
+        Raises
+        ------
+        OSError
+            If it cannot listen where it should; with its `errno`, if the system has given one.
+        """
+        opened: Future[None] = Future()
+
+        def complete() -> None:
+            try:
+                self._open()
+            except BaseException as error:  # noqa: BLE001 - whoever waits gets it
+                opened.set_exception(error)
+            else:
+                opened.set_result(None)
+
+        # The threads that call back are daemons if the one that declares is, as a worker of trio is. The interpreter
+        # ends without waiting for daemons, and what zenoh runs in one at that moment aborts the process.
+        threading.Thread(target=complete, daemon=False).start()
+        opened.result()
+
+    def _open(self) -> None:
+        try:
+            session = zenoh.open(self._config)
+        except zenoh.ZError as error:
+            raise _as_os_error(error) from error
         with self._lock:
             self._session = session
             abandoned = self._closed
         if abandoned:
-            session.close()
+            _close(session)
             return
         self.statics = StaticKeys(session, f"{self._prefix}/static/{self._id}")
         self._live = session.declare_publisher(
@@ -74,31 +104,66 @@ class ZenohSession:
         """Send a live message, or drop it while the network is congested."""
         self._live.put(message.payload, attachment=message.attachment)
 
-    def close(self) -> None:
-        """Close the session, also one that is only about to be opened."""
+    def close(self) -> threading.Thread:
+        """Begin to close the session, also one that is only about to be opened.
+
+        Returns
+        -------
+        threading.Thread
+            It ends when that is done: within milliseconds, or after 10 s if a peer is frozen.
+        """
         with self._lock:
             self._closed = True
             session = self._session
-        if session is not None:
-            session.close()
+        closing = threading.Thread(target=_close, args=(session,), daemon=False)
+        closing.start()
+        return closing
 
     def _live_came(self, sample: zenoh.Sample) -> None:
-        self._came(str(sample.key_expr).rsplit("/", 1)[1], sample, moving=True)
+        self._came(sample, "live", moving=True)
 
     def _static_came(self, sample: zenoh.Sample) -> None:
-        self._came(str(sample.key_expr).rsplit("/", 2)[1], sample, moving=False)
+        self._came(sample, "static", moving=False)
 
-    def _came(self, sender: str, sample: zenoh.Sample, moving: bool) -> None:
-        if sender == self._id or sample.kind != zenoh.SampleKind.PUT:
+    def _came(self, sample: zenoh.Sample, kind: str, moving: bool) -> None:
+        sender = self._sender(sample, kind)
+        if sender is None or sample.kind != zenoh.SampleKind.PUT:
             return
         size = len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment))
         if size > MAX_BYTES:
-            error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_BYTES}")
-            self._receive(Arrival(sender, error))
+            self._refuse(sender, "oversized", f"{size} bytes, more than {MAX_BYTES}")
         else:
-            self._receive(Arrival(sender, sample, size, moving))
+            # A sample would keep all of the buffer that it came in.
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            message = sample.payload.to_bytes(), attachment
+            self._receive(Arrival(sender, message, size, moving))
 
     def _presence_changed(self, sample: zenoh.Sample) -> None:
-        peer = str(sample.key_expr).rsplit("/", 1)[1]
-        if peer != self._id:
-            self._receive(Arrival(peer, sample.kind == zenoh.SampleKind.PUT))
+        sender = self._sender(sample, "@alive")
+        if sender is not None:
+            self._receive(Arrival(sender, sample.kind == zenoh.SampleKind.PUT))
+
+    def _sender(self, sample: zenoh.Sample, kind: str) -> str | None:
+        """Which peer a sample is from; None if it is from here, or if its key has none, for anybody can use any key."""
+        key = str(sample.key_expr)
+        sender = key.removeprefix(f"{self._prefix}/{kind}/").partition("/")[0]
+        if not _ID.fullmatch(sender):
+            self._refuse("", "key", f"there is no link's id in its key {key[:_SHOWN]!r}")
+            return None
+        return None if sender == self._id else sender
+
+    def _refuse(self, sender: str, reason: str, detail: str) -> None:
+        self._receive(Arrival(sender, MalformedMessageError(reason, detail)))
+
+
+def _close(session: zenoh.Session | None) -> None:
+    if session is not None:
+        # It may give up waiting for a peer, who will notice by himself.
+        with suppress(zenoh.ZError):
+            session.close()
+
+
+def _as_os_error(error: zenoh.ZError) -> OSError:
+    text = f"zenoh cannot open a session: {without_source(error)}"
+    number = re.search(r"\(os error (\d+)\)", text)
+    return OSError(int(number[1]), text) if number else OSError(text)

@@ -1,0 +1,173 @@
+"""Processes that run `peer_process.py`, told what to do and asked how it went."""
+
+import json
+import os
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import anyio
+
+PATIENCE = 20.0
+"""s; far more than anything takes."""
+
+_PROGRAM = Path(__file__).parent / "peer_process.py"
+_numbers = count()
+
+
+def free_ports(how_many: int) -> list[int]:
+    """Ports of the loopback at which nobody listens."""
+    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(how_many)]
+    ports = [taken.getsockname()[1] for taken in sockets]
+    for taken in sockets:
+        taken.close()
+    return ports
+
+
+def new_domain() -> str:
+    """A domain that nobody else uses."""
+    return f"test-{uuid4().hex}"
+
+
+class PeerProcess:
+    """One of them; what it says is kept until somebody asks for it."""
+
+    def __init__(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> None:
+        command = [*prefix, sys.executable, str(_PROGRAM), json.dumps({"backend": backend, "links": links})]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self._said: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        self._kept: list[dict[str, Any]] = []
+        self.errors = ""
+        self._readers = [threading.Thread(target=read) for read in (self._read_output, self._read_errors)]
+        for reader in self._readers:
+            reader.start()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def start(self, do: str, **arguments: Any) -> int:
+        """Have it begin something; the number is for `finish`."""
+        number = next(_numbers)
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({"id": number, "do": do, **arguments}) + "\n")
+        self._process.stdin.flush()
+        return number
+
+    def finish(self, number: int) -> dict[str, Any]:
+        """Wait until it has done that."""
+        return self.wait(id=number)
+
+    def ask(self, do: str, **arguments: Any) -> dict[str, Any]:
+        """Have it do something, and wait for its answer."""
+        return self.finish(self.start(do, **arguments))
+
+    def wait(self, **facts: Any) -> dict[str, Any]:
+        """The first thing it says, or has said and nobody waited for, of which all of `facts` is true."""
+        for said in self._kept:
+            if facts.items() <= said.items():
+                self._kept.remove(said)
+                return said
+        while True:
+            try:
+                news = self._said.get(timeout=PATIENCE)
+            except queue.Empty:
+                raise TimeoutError(f"{facts} was not said, but {self._kept}; {self.errors}") from None
+            if news is None:
+                raise EOFError(f"the process ended before it said {facts}, after {self._kept}; {self.errors}")
+            if facts.items() <= news.items():
+                return news
+            self._kept.append(news)
+
+    def said(self, **facts: Any) -> list[dict[str, Any]]:
+        """What it has said by now, and nobody waited for."""
+        self.ask("facts")
+        return [said for said in self._kept if facts.items() <= said.items()]
+
+    def signal(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
+
+    def kill(self) -> None:
+        """End it without a word."""
+        self._process.kill()
+        self._process.wait(PATIENCE)
+
+    def end(self) -> int:
+        """Let it end by itself; its exit status."""
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            self._process.stdin.close()
+        try:
+            return self._process.wait(PATIENCE)
+        finally:
+            self.clean_up()
+
+    def clean_up(self) -> None:
+        if self._process.poll() is None:
+            os.kill(self.pid, signal.SIGCONT)
+            self.kill()
+        for reader in self._readers:
+            reader.join(PATIENCE)
+        for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
+            if stream is not None and not stream.closed:
+                try:
+                    stream.close()
+                except BrokenPipeError:
+                    continue
+
+    def _read_output(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._said.put(json.loads(line))
+        self._said.put(None)
+
+    def _read_errors(self) -> None:
+        assert self._process.stderr is not None
+        for line in self._process.stderr:
+            self.errors += line
+
+
+class Crowd:
+    """Processes that are all gone when the test is over."""
+
+    def __init__(self) -> None:
+        self.members: list[PeerProcess] = []
+
+    def add(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> PeerProcess:
+        """Begin one, and wait until its links are there."""
+        process = self.begin(*links, backend=backend, prefix=prefix)
+        process.wait(event="ready")
+        return process
+
+    def begin(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> PeerProcess:
+        """Begin one."""
+        process = PeerProcess(*links, backend=backend, prefix=prefix)
+        self.members.append(process)
+        return process
+
+
+@contextmanager
+def crowd() -> Iterator[Crowd]:
+    together = Crowd()
+    try:
+        yield together
+    finally:
+        for member in together.members:
+            member.clean_up()
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Wait for what happens in this process."""
+    with anyio.fail_after(PATIENCE):
+        while not holds():  # noqa: ASYNC110 - what zenoh's threads bring rings no bell here
+            await anyio.sleep(0.002)
