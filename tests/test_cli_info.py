@@ -1,6 +1,7 @@
 """The command as a user types it; once in a process of its own."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -94,6 +95,22 @@ def test_names_are_shown_as_they_are_and_in_full_where_a_program_reads_them(tmp_
     assert rows[long][0] == ":robot:"
 
 
+def test_names_do_not_control_the_terminal(tmp_path: Path, info: Command) -> None:
+    samples = [moving("\x1b[2Jroot", "red\x1b[31m\nhot", 1), moving("red\x1b[31m\nhot", "leaf", 1)]
+    metadata = {"tfbus.authorities": json.dumps([["\x1b]0;title\x07", 1]])}
+    done = info(write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)], metadata=metadata))
+    assert "\x1b" not in done.stdout
+    assert r"frames    2, below \x1b[2Jroot" in done.stdout
+    rows = rows_of(done.stdout)
+    assert rows[r"red\x1b[31m\nhot"][0] == r"\x1b[2Jroot"
+    assert rows["leaf"][0] == r"red\x1b[31m\nhot"
+    assert rows["leaf"][-1] == r"\x1b]0;title\x07"
+
+
+def test_no_line_ends_with_blanks(info: Command) -> None:
+    assert all(line == line.rstrip() for line in info(SMALL).stdout.splitlines())
+
+
 def test_a_frame_of_both_kinds_shows_both(tmp_path: Path, info: Command) -> None:
     lines = [(1, "/tf_static", [static("a", "b")]), (2, "/tf", [moving("a", "b", 1)])]
     assert rows_of(info(write_mcap(tmp_path / "run.mcap", lines)).stdout)["b"][:3] == ["a", "static, moving", "2"]
@@ -157,16 +174,21 @@ def test_help_has_an_example(info: Command) -> None:
 
 
 def test_a_reader_that_has_had_enough_is_no_traceback(tmp_path: Path) -> None:
-    samples = [moving("a", f"frame_{number}", 1) for number in range(1_500)]
+    samples = [moving("a", f"frame_{number}", 1) for number in range(5_000)]
     path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)])
-    with subprocess.Popen([TFBUS, "info", str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+    # Unbuffered, Python says nothing of what a pipe takes only a part of.
+    environment = {**os.environ, "PYTHONUNBUFFERED": ""}
+    command = [TFBUS, "info", str(path)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, env=environment) as process:
         assert process.stdout is not None
         assert process.stderr is not None
-        process.stdout.readline()
+        # In the middle of the table, which is more than fits into a pipe.
+        assert any(line.startswith(b"frame_") for line in process.stdout)
         process.stdout.close()
         errors = process.stderr.read()
-        process.wait(timeout=30)
-    assert errors == b""
+        status = process.wait(timeout=30)
+    assert (status, errors) == (0, b"")
 
 
 def test_without_its_extra_the_command_names_it() -> None:

@@ -110,6 +110,12 @@ def test_people_get_columns_with_units(recording: Path, query: Command) -> None:
     ]
 
 
+def test_people_get_no_negative_zeros(tmp_path: Path, query: Command) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("map", "base", NEXT, -1e-9)])])
+    _, line = query(path, "map", "base").stdout.splitlines()
+    assert line.split()[1:] == ["0.000000"] * 6 + ["1.000000"]
+
+
 def test_what_is_static_has_one_answer(recording: Path, query: Command) -> None:
     done = query(recording, "base", "laser", "--every", "0.1", "--csv")
     assert [line.split(",")[1] for line in done.stdout.splitlines()] == ["x", "100.0"]

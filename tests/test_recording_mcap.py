@@ -94,6 +94,17 @@ def test_a_message_at_log_time_zero_counts(write: Write) -> None:
         assert [message.received for message in messages_in(path)] == [0]
 
 
+@pytest.mark.parametrize("finish", [True, False])
+def test_a_message_whose_log_time_is_no_stamp_is_told_and_the_others_are_read(write: Write, finish: bool) -> None:
+    late = [(2**63 + 5, "/tf", [moving("a", "b", 6)]), (2**64 - 1, "/tf", [moving("a", "b", 7)])]
+    path = write([(5, "/tf", [moving("a", "b", 5)]), *late], finish=finish)
+    found = [
+        (message.received, len(message.batch), [str(each) for each in message.errors]) for message in messages_in(path)
+    ]
+    reasons = [f"no message of transforms (damaged): a message has the log time {time} ns" for time, _, _ in late]
+    assert found == [(5, 1, []), *((5, 0, [reason]) for reason in reasons)]
+
+
 def test_a_finished_file_without_messages_is_an_empty_recording(write: Write) -> None:
     with open_recording(write([])) as recording:
         assert facts(recording) == (None, None, 0, True)

@@ -1,7 +1,9 @@
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Iterable
-from contextlib import closing
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -60,6 +62,24 @@ def drive(seconds: Iterable[float], authority: str = "odometry") -> list[Entry]:
 
 def x_at(buffer: Buffer, seconds: float) -> float:
     return buffer.lookup_nowait("map", "base", START + round(seconds * SECOND)).transform.translation[0]
+
+
+@contextmanager
+def reads_of(path: Path) -> Iterator[set[int]]:
+    """The threads that open a file."""
+    readers: set[int] = set()
+    listening = [True]
+
+    def hear(event: str, arguments: tuple[object, ...]) -> None:
+        if listening and event == "open" and arguments[0] in (path, str(path)):
+            readers.add(threading.get_ident())
+
+    # It cannot be taken away again.
+    sys.addaudithook(hear)
+    try:
+        yield readers
+    finally:
+        listening.clear()
 
 
 class Heard:
@@ -339,6 +359,28 @@ async def test_a_seek_before_it_plays_is_where_it_begins_once(tmp_path: Path) ->
     assert heard.entries == [*entries[3:], *entries]
 
 
+async def test_a_seek_behind_the_end_does_not_end_a_loop(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive(range(5)))
+    with Bus(SimulatedClock()) as bus:
+        heard = Heard(bus)
+        player = Player(bus, path, rate=AS_FAST, loop=True)
+        player.seek(START + 3_600 * SECOND)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(player.play)
+            await heard.until(10)
+            tasks.cancel_scope.cancel()
+    assert player.passes >= 2
+
+
+async def test_a_loop_ends_where_there_is_nothing_to_play(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive(range(5)))
+    with Bus(SimulatedClock()) as bus, anyio.fail_after(PATIENCE):
+        player = Player(bus, path, rate=AS_FAST, loop=True, since=START + 3_600 * SECOND)
+        player.seek(START + 7_200 * SECOND)
+        await player.play()
+    assert (player.played, player.passes) == (0, 2)
+
+
 async def test_as_fast_as_can_be_waits_for_nothing(tmp_path: Path) -> None:
     path = written(tmp_path / "run.mcap", *drive(3_600.0 * k for k in range(1_000)))
     with Bus() as bus, anyio.fail_after(PATIENCE):
@@ -370,6 +412,40 @@ def test_each_message_comes_at_its_time(tmp_path: Path, rate: float, simulated: 
     heard: list[float] = []
     in_virtual_time(play)
     assert [time - heard[0] for time in heard] == pytest.approx([time / rate for time in times], abs=1e-6)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+async def test_the_highest_rates_are_as_fast_as_can_be(tmp_path: Path, simulated: bool) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
+    for rate in (1e12, 1e300):
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            player = Player(bus, path, rate=rate)
+            with anyio.fail_after(PATIENCE):
+                await player.play()
+            assert player.played == 3
+
+
+def test_at_the_lowest_rates_a_simulated_clock_still_goes_on(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 3e-9)))
+    heard: list[float] = []
+
+    async def play() -> None:
+        with Bus(SimulatedClock()) as bus:
+            bus.subscribe(lambda _: heard.append(anyio.current_time()))
+            await Player(bus, path, rate=1e-9).play()
+
+    in_virtual_time(play)
+    assert heard[1] - heard[0] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("finish", [True, False])
+async def test_the_event_loop_does_not_read_the_file(tmp_path: Path, finish: bool) -> None:
+    lines = [(received, "/tf", batch) for received, batch in drive((0.0, 0.5))]
+    path = write_mcap(tmp_path / "run.mcap", lines, finish=finish)
+    with Bus(SimulatedClock()) as bus, reads_of(path) as readers:
+        await Player(bus, path, rate=AS_FAST).play()
+    assert readers
+    assert threading.get_ident() not in readers
 
 
 def test_at_a_rate_a_simulated_clock_does_not_stand_still_between_messages(tmp_path: Path) -> None:

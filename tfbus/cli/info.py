@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from tfbus.cli.instants import seconds
+from tfbus.cli.printable import printable
 from tfbus.cli.progress import watched
 from tfbus.recording.files import open_recording
 from tfbus.recording.summary import FrameSummary, RecordingSummary, summarise
@@ -83,16 +84,21 @@ def _print_table(summary: RecordingSummary) -> None:
         table.add_row(*_row(frame))
     # Names are shown as they are; and nobody wants lines that are broken where a program reads them.
     width = None if sys.stdout.isatty() else 10_000
-    Console(markup=False, emoji=False, highlight=False, width=width).print(table)
+    console = Console(markup=False, emoji=False, highlight=False, width=width)
+    # Rich would end the process itself if nobody reads the lines any more.
+    with console.capture() as text:
+        console.print(table)
+    for line in text.get().splitlines():
+        print(line.rstrip())
 
 
 def _head(summary: RecordingSummary) -> list[str]:
-    lines = [f"{summary.path}" + ("" if summary.finished else ", not finished by its writer")]
+    lines = [printable(f"{summary.path}") + ("" if summary.finished else ", not finished by its writer")]
     if summary.start is not None and summary.end is not None:
         lines.append(f"start     {seconds(summary.start)} s{_date(summary.start)}")
         lines.append(f"end       {seconds(summary.end)} s{_date(summary.end)}")
         lines.append(f"duration  {seconds(summary.end - summary.start)} s")
-    below = f", below {', '.join(summary.roots)}" if summary.roots else ""
+    below = f", below {_names(summary.roots)}" if summary.roots else ""
     lines.append(f"contents  {summary.transforms:,} transforms in {summary.messages:,} messages")
     lines.append(f"frames    {len(summary.frames):,}{below}")
     if summary.problems:
@@ -109,12 +115,16 @@ def _date(stamp: int) -> str:
 
 def _row(frame: FrameSummary) -> tuple[str, ...]:
     return (
-        frame.frame,
-        ", ".join(frame.parents),
+        printable(frame.frame),
+        _names(frame.parents),
         "static, moving" if frame.kind == "both" else frame.kind,
         f"{frame.static + frame.moving:,}",
         "" if frame.rate is None else f"{frame.rate:.1f} Hz",
         "" if frame.span is None else format_duration(from_seconds(frame.span)),
         "" if frame.longest_gap is None else format_duration(from_seconds(frame.longest_gap)),
-        ", ".join(frame.authorities),
+        _names(frame.authorities),
     )
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(map(printable, names))

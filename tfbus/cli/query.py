@@ -150,4 +150,4 @@ def _print_text(rows: Iterator[Row]) -> None:
     for place, row in enumerate(rows):
         if place == 0:
             print(f"{'stamp [s]':>20}" + "".join(f"{name:>12}" for name in ("x [m]", "y [m]", "z [m]", *_FIELDS[4:])))
-        print(f"{seconds(row.stamp):>20}" + "".join(f"{number:12.6f}" for number in (*row.translation, *row.rotation)))
+        print(f"{seconds(row.stamp):>20}" + "".join(f"{number:z12.6f}" for number in (*row.translation, *row.rotation)))

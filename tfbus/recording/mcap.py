@@ -28,6 +28,7 @@ from zstandard import ZstdError
 
 from tfbus.errors import RecordingError
 from tfbus.recording.storage import Channel, Stored, channel_of, lost
+from tfbus.stamps import STAMP_MAX
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
@@ -97,9 +98,13 @@ class McapStorage:
     def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[Stored]:
         """As `Storage` has it; without an index, in the order of the file."""
         low = 0 if since is None else since
-        high = 2**64 if until is None else until
+        high = STAMP_MAX if until is None else until
+        now = low
         for stored in self._by_index(low, high, only_static) if self._chunks else self._in_sequence(low):
             received, channel, _ = stored
+            if received > STAMP_MAX:
+                received, channel, _ = stored = lost(now, f"a message has the log time {received} ns")
+            now = max(now, received)
             if low <= received <= high and (not only_static or (isinstance(channel, Channel) and channel.static)):
                 yield stored
 

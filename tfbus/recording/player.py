@@ -14,10 +14,12 @@ from tfbus.clock import SimulatedClock
 from tfbus.errors import UnknownFrameError
 from tfbus.recording.files import RecordedMessage, Recording, open_recording
 from tfbus.recording.read_ahead import ReadAhead
-from tfbus.stamps import STAMP_MAX, as_stamp, from_seconds, is_real, to_seconds
+from tfbus.stamps import as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCKS_AHEAD = 2
 _STEP = 0.02
+_LEAST_STEP = 1e-9
+_MOST_STEP = 1e9
 
 
 class Player:
@@ -123,10 +125,7 @@ class Player:
             raise RuntimeError("the recording is being played already")
         self._playing = True
         try:
-            recording = await anyio.to_thread.run_sync(open_recording, self.path)
-            with recording:
-                self.start = recording.start if self._since is None else self._since
-                self.end = recording.end if self._until is None else self._until
+            with await anyio.to_thread.run_sync(self._open) as recording:
                 await self._play(recording)
         finally:
             self._playing = False
@@ -137,9 +136,21 @@ class Player:
         if self._pause is not None:
             self._pause.cancel()
 
+    def _open(self) -> Recording:
+        recording = open_recording(self.path)
+        try:
+            # Where there is no index, only reading all of the file tells these.
+            self.start = recording.start if self._since is None else self._since
+            self.end = recording.end if self._until is None else self._until
+        except BaseException:
+            recording.close()
+            raise
+        return recording
+
     async def _play(self, recording: Recording) -> None:
         while True:
-            since, self._sought = self._since if self._sought is None else self._sought, None
+            sought, self._sought = self._sought, None
+            since = self._since if sought is None else sought
             before = self.played
             # Time stands still for a thread only if nothing else goes on meanwhile.
             ahead = _BLOCKS_AHEAD if self._simulated is None else 0
@@ -151,7 +162,8 @@ class Player:
             if self._sought is not None:
                 continue
             self.passes += 1
-            if not self.loop or self.played == before:
+            # What is empty from its beginning would be played over and over without ever waiting.
+            if not self.loop or (sought is None and self.played == before):
                 return
 
     async def _play_once(self, blocks: ReadAhead, since: int | None) -> None:
@@ -185,7 +197,7 @@ class Player:
             await self._sleep_until_due(stamp)
             return
         # In steps, or a clock that is watched would stand still between two messages.
-        longest = STAMP_MAX if self.rate == math.inf else from_seconds(_STEP * self.rate)
+        longest = from_seconds(min(max(_STEP * self.rate, _LEAST_STEP), _MOST_STEP))
         while True:
             step = max(0, min(stamp - clock.now(), longest))
             if self.rate != math.inf:
