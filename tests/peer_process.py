@@ -6,6 +6,7 @@ comes by itself, as ``{"event": "PeerLost", ..}``. It ends at the end of its inp
 """
 
 import json
+import os
 import sys
 import time
 from collections import defaultdict
@@ -72,7 +73,7 @@ class Program:
         self.tallies: defaultdict[str, Tally] = defaultdict(Tally)
         self.static: set[str] = set()
         self.moving: set[str] = set()
-        self.seen: set[str] = set()
+        self.x: dict[str, float] = {}
         self.longest_pause = 0.0
         self._changed = anyio.Event()
         bus.subscribe(self._arrived, self._removed)
@@ -83,11 +84,13 @@ class Program:
             new, old = (self.static, self.moving) if sample.static else (self.moving, self.static)
             new.add(sample.child)
             old.discard(sample.child)
+            self.x[sample.child] = sample.transform.translation[0]
         self._changed.set()
 
     def _removed(self, frame: str) -> None:
         self.static.discard(frame)
         self.moving.discard(frame)
+        self.x.pop(frame, None)
         self._changed.set()
 
     async def tell_events(self) -> None:
@@ -163,9 +166,14 @@ class Program:
         static: list[str] | None = None,
         peers: int | None = None,
         last: dict[str, int] | None = None,
+        x: dict[str, float] | None = None,
         link: int = 0,
     ) -> dict[str, Any]:
-        """Wait until all of this holds: frames that are there, static or not at all; peers; numbers of last batches."""
+        """Wait until all of this holds.
+
+        Frames that are there, that are not, and that are static; how many peers; numbers of last batches; and where some
+        frames are.
+        """
 
         def holds() -> bool:
             return (
@@ -174,6 +182,7 @@ class Program:
                 and not set(lacks or ()) & (self.static | self.moving)
                 and (peers is None or len(self.links[link].peers) == peers)
                 and all(self.tallies[authority].last >= number for authority, number in (last or {}).items())
+                and all(self.x.get(frame) == place for frame, place in (x or {}).items())
             )
 
         began = time.monotonic()
@@ -188,6 +197,12 @@ class Program:
     async def do_block(self, seconds: float) -> None:
         """Keep the event loop busy."""
         time.sleep(seconds)  # noqa: ASYNC251 - that is what is asked for
+
+    async def do_hang(self, until: str) -> None:
+        """Keep the event loop busy until there is a file."""
+        tell(event="hanging")
+        while not os.path.exists(until):  # noqa: ASYNC110, ASYNC240, PTH110
+            time.sleep(0.01)  # noqa: ASYNC251 - that is what is asked for
 
     async def do_facts(self) -> dict[str, Any]:
         """All counters."""

@@ -5,7 +5,6 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 
 import anyio
@@ -153,21 +152,6 @@ print("done")
     with Program(sys.executable, "-c", script % new_domain()) as program:
         assert program.wait() == 0
     assert (program.output.text, program.errors.text) == ("done\n", "")
-
-
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_the_interpreter_waits_for_all_threads_of_a_link_when_it_ends(backend: str) -> None:
-    # One that runs on is killed then, and inside zenoh that aborts the process.
-    before = set(threading.enumerate())
-    lasting: list[str] = []
-
-    async def join() -> None:
-        with Bus() as bus:
-            async with LinkOptions(new_domain(), listen=("tcp/127.0.0.1:0",)).open(bus):
-                lasting.extend(thread.name for thread in set(threading.enumerate()) - before if not thread.daemon)
-
-    anyio.run(join, backend=backend)
-    assert sum("pyo3" in name for name in lasting) == 3
 
 
 @pytest.mark.parametrize("command", COMMANDS)

@@ -1,3 +1,4 @@
+import asyncio
 import sys
 import threading
 from collections.abc import Awaitable, Callable
@@ -158,6 +159,31 @@ def test_a_bell_may_be_connected_again_to_a_loop_that_comes_later(run: Run, ring
     run(leave_with_unanswered_rings)
     for _ in range(2):
         run(answer)
+
+
+def test_a_ring_that_an_ended_loop_has_never_answered_is_told_of_at_the_next_and_forgotten_on_another_loop() -> None:
+    door = Door()
+
+    async def connect() -> None:
+        door.bell.connect()
+
+    for _ in range(2):
+        loop = asyncio.new_event_loop()
+        loop.run_until_complete(connect())
+        door.bell.ring()
+        loop.close()
+        for _ in range(2):
+            with pytest.raises(RuntimeError):
+                door.bell.ring()
+        assert door.answers == 0
+
+    async def answer() -> None:
+        door.bell.connect()
+        door.bell.ring()
+        await asyncio.wait_for(door.opened.wait(), PATIENCE)
+
+    asyncio.run(answer())
+    assert door.answers == 1
 
 
 def test_a_thread_that_rings_while_the_loop_ends_is_told_of_it(run: Run) -> None:

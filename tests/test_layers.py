@@ -53,7 +53,7 @@ BELOW_THE_ASYNC_LINE = [
     ("links.zenoh_statics",),
     ("links.zenoh_session",),
     ("links.zenoh",),
-    ("cli.instants", "cli.options", "cli.printable", "cli.progress"),
+    ("cli.instants", "cli.options", "cli.printable", "cli.progress", "cli.running"),
     ("cli.link",),
     ("cli.tree_display",),
     ("cli.broadcast", "cli.demo", "cli.echo", "cli.listen", "cli.robot", "cli.static", "cli.tree"),

@@ -234,6 +234,16 @@ def test_runs_of_billions_cost_what_their_bytes_do() -> None:
     assert peak_of(lambda: unpack(data)) < 32 * len(data)
 
 
+def test_more_than_the_most_entries_are_not_even_looked_at() -> None:
+    removal = entry(1, size=1) + b"a"
+    for count in (MAX_ENTRIES, MAX_ENTRIES + 1):
+        data = header(1, 0, count) + ONE + removal * count
+        if count > MAX_ENTRIES:
+            assert reason_of(data) == "oversized"
+        else:
+            assert len(unpack(data).entries) == count
+
+
 def test_more_than_the_most_bytes_are_not_even_looked_at() -> None:
     data = header(authorities=65_535) + bytes(MAX_BYTES)
     peak = peak_of(lambda: reason_of(data))

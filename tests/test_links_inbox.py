@@ -12,8 +12,9 @@ import strategies as some
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import moving, static
+from wires import size_of
 
-from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
+from tfbus import Buffer, Bus, BusClosedError, FrameAdded, SimulatedClock, TransformStamped
 from tfbus.links.attachment import MAX_ENTRIES, Entry, PublishedBatch, RemovedFrame, pack
 from tfbus.links.inbox import Inbox
 from tfbus.links.outbox import Outbox
@@ -53,8 +54,16 @@ class Receiver:
         """One batch in a message of its own."""
         self.inbox.receive(sender, encode(samples), pack(number, [batch(samples, origin, sequence)]))
 
-    def remove(self, frame: str, origin: bytes = ORIGIN, sequence: int = 1, sender: str = "peer") -> None:
-        self.inbox.receive(sender, encode(()), pack(1, [RemovedFrame(origin, sequence, frame)]))
+    def remove(
+        self, frame: str, origin: bytes = ORIGIN, sequence: int = 1, sender: str = "peer", lost: bool = False
+    ) -> None:
+        self.inbox.receive(sender, encode(()), pack(1, [RemovedFrame(origin, sequence, frame, lost)]))
+
+    @property
+    def frames(self) -> list[str]:
+        """The children that the bus knows."""
+        with self.bus.events() as events:
+            return [event.frame for event in iter(events.queue.get, None) if isinstance(event, FrameAdded)]
 
     @property
     def counts(self) -> tuple[int, int, int, int]:
@@ -195,6 +204,136 @@ def test_other_origins_are_other_sources() -> None:
         assert here.counts == (2, 2, 0, 0)
 
 
+# What was removed.
+
+
+def test_an_older_removal_does_not_take_what_is_newer() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 5), sequence=5)
+        here.remove("a", sequence=4)
+        assert here.bus.statistics().frames == 1
+        here.remove("a", sequence=6)
+        assert here.bus.statistics().frames == 0
+
+
+def test_what_was_removed_comes_back_only_with_a_higher_number() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1)
+        here.remove("a", sequence=3)
+        here.receive(moving("map", "a", 2), sequence=2)
+        here.receive(moving("map", "a", 3), sequence=3)
+        assert here.bus.statistics().frames == 0
+        here.receive(moving("map", "a", 4), sequence=4)
+        assert here.bus.statistics().frames == 1
+        assert here.counts[1:3] == (2, 2)
+
+
+def test_a_removal_that_overtakes_what_it_removes_is_remembered() -> None:
+    with receiver() as here:
+        here.remove("a", sequence=2)
+        here.receive(moving("map", "a", 1), moving("map", "b", 1), sequence=1)
+        assert [[sample.child for sample in heard] for heard in here.heard] == [["b"]]
+
+
+def test_a_removal_that_comes_twice_does_not_take_what_somebody_else_has_published_since() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1)
+        here.remove("a", sequence=2)
+        here.receive(moving("map", "a", 1), origin=OTHER)
+        here.remove("a", sequence=2)
+        assert here.bus.statistics().frames == 1
+        here.bus.remove_frame("a")
+        here.bus.publish(static("map", "a"))
+        here.remove("a", sequence=2)
+        assert here.bus.statistics().frames == 1
+
+
+def test_who_removes_what_others_publish_removes_their_samples_up_to_now() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 5), sequence=5)
+        here.remove("a", origin=OTHER, sequence=1)
+        here.receive(moving("map", "a", 4), sequence=4)
+        here.receive(moving("map", "a", 5), sequence=5)
+        assert here.bus.statistics().frames == 0
+        here.receive(moving("map", "a", 6), sequence=6)
+        here.bus.remove_frame("a")
+        here.receive(moving("map", "a", 6), sequence=6)
+        assert here.bus.statistics().frames == 0
+
+
+def test_of_very_many_removals_the_highest_number_is_remembered_for_live_messages() -> None:
+    with receiver() as here:
+        for start in (10, 6_010):
+            entries: list[Entry] = [RemovedFrame(ORIGIN, start + n, f"{start + n}") for n in range(6_000)]
+            here.inbox.receive("peer", encode(()), pack(start, entries))
+        here.receive(moving("map", "10", 1), sequence=9, number=20_000)
+        here.receive(moving("map", "new", 1), sequence=8, number=20_001)
+        assert here.heard == []
+        here.receive(moving("map", "new", 1), origin=OTHER, sequence=8, number=20_002)
+        here.receive(static("map", "old"), sequence=1, number=0)
+        here.receive(moving("map", "10", 1), sequence=20_000, number=20_003)
+        assert [[sample.child for sample in heard] for heard in here.heard] == [["new"], ["old"], ["10"]]
+
+
+def test_removals_of_very_many_origins_are_not_remembered_without_end() -> None:
+    with receiver() as here:
+        for number in range(15_000):
+            here.remove("a", origin=number.to_bytes(16))
+        assert 10_000 <= size_of(here.relay) < 11_100
+
+
+def test_the_loss_of_a_frame_is_about_what_that_peer_has_brought() -> None:
+    with receiver() as here:
+        for name in "abcd":
+            here.receive(moving("map", name, 1), sequence=1, sender="bridge")
+        here.receive(moving("map", "b", 1), sequence=2, sender="other")
+        here.bus.publish(static("map", "c"))
+        for name in "abcde":
+            here.remove(name, origin=OTHER, sequence=9, sender="bridge", lost=True)
+        assert set(here.frames) == {"b", "c"}
+        here.receive(moving("map", "d", 0), sequence=0, sender="bridge")
+        here.receive(moving("map", "d", 1), sequence=1, sender="other")
+        assert set(here.frames) == {"b", "c"}, "what is still on its way does not bring it back"
+        here.receive(moving("map", "d", 1), sequence=1, sender="bridge")
+        assert set(here.frames) == {"b", "c", "d"}, "but who had lost it has it again"
+        here.remove("d", origin=OTHER, sequence=9, sender="bridge", lost=True)
+        here.receive(moving("map", "d", 1), sequence=1, sender="new")
+        assert set(here.frames) == {"b", "c", "d"}, "and so has who has come since then"
+
+
+def test_after_a_loss_a_removal_counts_as_ever() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=18)
+        here.remove("a", origin=OTHER, sequence=20)
+        here.receive(moving("map", "a", 1), sequence=19)
+        here.remove("a", origin=OTHER, sequence=15, lost=True)
+        assert here.frames == []
+        here.receive(moving("map", "a", 1), origin=OTHER, sequence=18)
+        assert here.frames == []
+        here.receive(moving("map", "a", 1), sequence=19)
+        assert here.frames == ["a"]
+        here.remove("a", sequence=30)
+        here.receive(moving("map", "a", 1), sequence=19)
+        assert here.frames == []
+
+
+@pytest.mark.parametrize("drop", [True, False])
+def test_when_a_peer_is_lost_only_who_comes_later_may_say_the_same_again(drop: bool) -> None:
+    with receiver() as here:
+        here.receive(moving("map", "b", 1), sequence=1, sender="old")
+        here.receive(moving("map", "a", 5), sequence=5)
+        lost = here.peers.forget("peer")
+        assert lost is not None
+        assert here.relay.lose(lost, here.outbox, drop) == ("a",)
+        here.receive(moving("map", "a", 5), sequence=5, sender="old")
+        here.receive(moving("map", "a", 4), sequence=4, sender="new")
+        assert here.counts[1:3] == (2, 2)
+        here.receive(moving("map", "a", 5), sequence=5)
+        assert here.counts[1:3] == (3, 2)
+        here.receive(moving("map", "a", 5), sequence=5, sender="new")
+        assert here.counts[1:3] == (3, 3)
+
+
 def test_the_highest_of_all_sequences_does_no_harm() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=2**64 - 1)
@@ -318,6 +457,7 @@ def test_many_origins_do_not_get_around_the_limit() -> None:
             here.receive(moving("map", f"{number}", 1), origin=number.to_bytes(16), sequence=number)
         assert here.bus.statistics().frames <= 10
         assert here.inbox.samples == 10
+        assert size_of(here.relay) < 100
         assert here.peers.rejected == {"too many frames": 1_990}
 
 

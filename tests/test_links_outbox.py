@@ -346,7 +346,7 @@ def test_what_is_kept_follows_what_comes_in_by_the_same_link_and_is_not_sent_bac
 
 
 def test_nobody_is_woken_for_what_comes_in_and_is_not_kept_here() -> None:
-    sender = Sender({"s"})
+    sender = Sender()
     sender.take(static("map", "s"))
     sender.kept()
     sender.notified = 0

@@ -1,6 +1,6 @@
 import gc
 import weakref
-from collections.abc import Callable, Sized
+from collections.abc import Callable
 from functools import partial
 from itertools import combinations
 
@@ -8,7 +8,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from samples import moving, static
-from wires import CHAIN, CIRCLE, MESH, PAIR, RING, RING_WITH_A_TAIL, TWO_BRIDGES, Domain, Graph, Network, latched
+from wires import (
+    CHAIN,
+    CIRCLE,
+    MESH,
+    PAIR,
+    RING,
+    RING_WITH_A_TAIL,
+    TWO_BRIDGES,
+    Domain,
+    Graph,
+    Network,
+    latched,
+    size_of,
+)
 
 from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
 from tfbus.links import relay as relay_module
@@ -26,11 +39,6 @@ def frames_of(bus: Bus) -> set[str]:
     """The children that a bus knows now, through what it would tell a new reader of events."""
     with bus.events() as events:
         return {event.frame for event in iter(events.queue.get, None) if hasattr(event, "frame")}
-
-
-def size_of(*things: object) -> int:
-    """How many entries all containers in some objects have."""
-    return sum(len(value) for thing in things for value in vars(thing).values() if isinstance(value, Sized))
 
 
 # What is published.
@@ -501,6 +509,36 @@ def test_a_bus_without_links_has_no_relay_and_can_go() -> None:
     assert gone() is None
 
 
+def test_a_relay_hears_nothing_any_more_when_the_last_link_has_left() -> None:
+    bus = Bus(SimulatedClock())
+    domain = Domain()
+    ends = [domain.join(bus), Domain().join(bus)]
+    relay = weakref.ref(ends[0].relay)
+    for end in ends:
+        end.leave()
+    del end
+    ends.clear()
+    domain.ends.clear()
+    gc.collect()
+    assert relay() is None
+
+
+def test_a_bus_whose_links_end_and_begin_again_is_told_nothing_of_its_own() -> None:
+    with Network(PAIR) as net:
+        net.buses[0].publish(static("map", "s"))
+        net.settle()
+        for end in list(net.ends):
+            end.leave()
+            net.domains[0].kill(end)
+        for bus in net.buses:
+            net.domains[0].join(bus)
+        net.settle()
+        assert net.heard[0] == [(static("map", "s"),)]
+        net.buses[0].remove_frame("s")
+        net.settle()
+        assert [latched(bus) for bus in net.buses] == [{}, {}]
+
+
 def test_a_bus_whose_links_end_and_begin_again_knows_its_own_samples() -> None:
     with Network(RING) as net:
         a = net.buses[0]
@@ -727,3 +765,31 @@ def test_when_peers_are_lost_and_found_all_agree_in_the_end_whether_their_frames
 @settings(suppress_health_check=[HealthCheck.too_slow])
 def test_when_messages_are_lost_besides_all_agree_in_the_end(graph: Graph, steps: list[Step]) -> None:
     lose_and_find(graph, steps, drop_lost=False)
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, CIRCLE, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of(),
+    more=steps_of(),
+    which=st.integers(0, 3),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_whatever_is_on_its_way_when_a_bus_dies_its_frames_leave_everywhere(
+    graph: Graph, steps: list[Step], more: list[Step], which: int
+) -> None:
+    with Network(graph, drop_lost=True) as net:
+        model = Model(net)
+        for step in steps:
+            model.do(*step)
+        dead = net.buses[which % len(net.buses)]
+        for domain in net.domains:
+            for end in [end for end in domain.ends if end.bus is dead]:
+                domain.kill(end)
+        for step in more:
+            model.do(*step)
+        net.settle()
+        model.check_nothing_went_wrong()
+        model.check_nothing_older_came()
+        alive = [bus for bus in net.buses if bus is not dead]
+        for bus in alive:
+            assert not any(frame.startswith(f"{net.buses.index(dead)}.") for frame in frames_of(bus))

@@ -32,6 +32,9 @@ from tfbus.links.zenoh import ZenohLink
 
 pytestmark = pytest.mark.anyio
 
+ON_ONE_LOOP = pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
+"""For what takes long and depends on zenoh only."""
+
 Batch = tuple[TransformStamped, ...]
 
 
@@ -584,6 +587,7 @@ async def test_ten_thousand_static_frames_arrive(place: Place) -> None:
             assert link.statistics().rejected == {}
 
 
+@ON_ONE_LOOP
 async def test_a_thousand_static_frames_arrive_at_a_late_joiner(place: Place) -> None:
     names = {f"landmark {i}" for i in range(1_000)}
     with Bus() as here, Bus() as late:
@@ -610,6 +614,7 @@ async def test_a_static_frame_that_comes_and_goes_a_thousand_times_is_there_at_l
                     )
 
 
+@ON_ONE_LOOP
 async def test_fifty_links_one_after_another_leave_no_thread_and_no_file_behind(place: Place) -> None:
     async def open_one() -> None:
         with Bus() as bus:
@@ -654,6 +659,7 @@ def run_program(program: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
 
 
+@ON_ONE_LOOP
 async def test_without_the_extra_the_error_names_it() -> None:
     done = run_program("import sys; sys.modules['zenoh'] = None; import tfbus.links.zenoh")
     assert done.returncode == 1

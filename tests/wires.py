@@ -1,7 +1,7 @@
 """Links with no network between them: buses joined by wires, on which a test itself lets things come, late or never."""
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence, Sized
 from types import TracebackType
 
 from tfbus import Bus, SimulatedClock, TransformStamped
@@ -214,6 +214,11 @@ class Network:
             for batch in self.heard[member]
             if isinstance(batch[0], ReceivedTransform) and batch[0]._source.origin == ends[0].relay.origin
         ]
+
+
+def size_of(*things: object) -> int:
+    """How many entries all containers in some objects have."""
+    return sum(len(value) for thing in things for value in vars(thing).values() if isinstance(value, Sized))
 
 
 def latched(bus: Bus) -> dict[str, TransformStamped]:

@@ -12,6 +12,7 @@ from cyclopts import Parameter
 
 from tfbus.bus import Bus
 from tfbus.cli.options import Backend
+from tfbus.cli.running import run
 
 _SOON = 1.0
 
@@ -63,14 +64,14 @@ class LinkOptions:
             yield link
 
     def run(self, program: Callable[[Bus], Awaitable[object]], **options: Any) -> None:
-        """Run a program on a bus that has joined the domain, on the event loop that was chosen."""
+        """Run a program on a bus that has joined the domain, on the event loop that was chosen. See `running.run`."""
 
         async def join_and_run() -> None:
             with Bus() as bus:
                 async with self.open(bus, **options):
                     await program(bus)
 
-        anyio.run(join_and_run, backend=self.backend)
+        run(join_and_run, self.backend)
 
     async def first_transform(self, bus: Bus) -> None:
         """Return when something has been published on the bus; say so if that takes more than a moment."""

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
+from typing import Any
 
 import zenoh
 
@@ -94,9 +95,9 @@ class ZenohSession:
         remote, alive = zenoh.Locality.REMOTE, session.liveliness()
         # zenoh takes back what nobody refers to.
         self._declared = (
-            session.declare_subscriber(f"{self._prefix}/live/*", self._live_came, allowed_origin=remote),
-            hear_statics(session, f"{self._prefix}/static/*/*", self._static_came),
-            alive.declare_subscriber(f"{self._prefix}/@alive/*", self._presence_changed, history=True),
+            session.declare_subscriber(f"{self._prefix}/live/*", _directly(self._live_came), allowed_origin=remote),
+            hear_statics(session, f"{self._prefix}/static/*/*", _directly(self._static_came)),
+            alive.declare_subscriber(f"{self._prefix}/@alive/*", _directly(self._presence_changed), history=True),
             alive.declare_token(f"{self._prefix}/@alive/{self._id}"),
         )
 
@@ -161,6 +162,11 @@ def _close(session: zenoh.Session | None) -> None:
         # It may give up waiting for a peer, who will notice by himself.
         with suppress(zenoh.ZError):
             session.close()
+
+
+def _directly(callback: Callable[[zenoh.Sample], object]) -> Any:
+    # Else each has a thread of its own, and what comes by one overtakes what came by another.
+    return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def _as_os_error(error: zenoh.ZError) -> OSError:

@@ -58,7 +58,7 @@ def settings(
         "connect/exit_on_failure": False,
         "connect/timeout_ms": {"peer": -1, "router": -1, "client": 0},
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
-        "scouting/delay": 200,
+        "scouting/delay": 100,
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
         # What is cached for late joiners is told apart by time.
         "timestamping/enabled": True,

@@ -1,6 +1,7 @@
 """Static frames on zenoh: one key each, with the last message kept for those who join late."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Any
 from urllib.parse import quote
 
 import zenoh
@@ -85,7 +86,7 @@ class StaticKeys:
             publisher.undeclare()
 
 
-def hear_statics(session: zenoh.Session, keys: str, receive: Callable[[zenoh.Sample], object]) -> object:
+def hear_statics(session: zenoh.Session, keys: str, receive: Any) -> object:
     """Hear all static frames of a domain: those that are there, those that come, and those that were lost."""
     return ext.declare_advanced_subscriber(
         session,
