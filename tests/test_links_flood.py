@@ -61,3 +61,44 @@ class Flood(threading.Thread):
         put(f"live/{'f' * 32}", payload, pack(0, [PublishedBatch(b"f" * 16, number, (("flood", False, 5_000),))]))
         if number % 50 == 0:
             put(f"live/{me}", bytes(MAX_BYTES + 1), b"")
+
+
+def test_a_flood_of_everything_is_counted_and_told_and_harms_nobody(processes: Crowd) -> None:
+    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    # Fewer frames than the victim's reader of events has room for.
+    victim = processes.add({"domain": domain, "listen": address, "max_frames": 500})
+    good = processes.add({"domain": domain, "connect": address})
+    for process in (victim, good):
+        process.ask("until", peers=1)
+    good.ask("stream", authority="wheels", batches=10, rate=100.0)
+    victim.ask("until", last={"wheels": 9})
+    before = victim.ask("facts")
+    flood = Flood(domain, address, good.ask("facts")["ids"][0])
+    streaming = good.start("stream", authority="wheels", batches=200, rate=100.0, start=10)
+    flood.start()
+    try:
+        while flood.is_alive():
+            # It still answers.
+            victim.ask("facts")
+            flood.join(0.1)
+    finally:
+        flood.join(PATIENCE)
+    assert flood.rounds == 200
+    good.finish(streaming)
+    good.ask("statics", names=STATICS, authority="urdf")
+    good.ask("stream", authority="wheels", batches=10, rate=100.0, start=210)
+    victim.ask("until", last={"wheels": 219}, static=STATICS)
+    after = victim.ask("facts")
+    tally, link = after["tallies"]["wheels"], after["links"][0]
+    assert tally["batches"] + tally["missing"] == 220
+    # Two that are published in one turn are one message.
+    assert tally["missing"] <= 2 * link["lost"]
+    assert (tally["not_in_order"], tally["not_whole"]) == (0, 0)
+    assert after["tallies"]["flood"]["samples"] == 500
+    told = {said["reason"] for said in victim.said(event="PeerRejected")}
+    assert told >= {"key", "version", "attachment", "oversized", "too many frames"}
+    assert link["rejected"].keys() == told
+    # Each of the messages is counted somewhere.
+    assert link["rejected"]["too many frames"] + link["queue"]["dropped"] * 5_000 + 500 >= 1_000_000
+    assert sum(link["rejected"].values()) - link["rejected"]["too many frames"] + link["queue"]["dropped"] >= 200 * 62
+    assert after["megabytes"] - before["megabytes"] < 150
