@@ -6,7 +6,6 @@ comes by itself, as ``{"event": "PeerLost", ..}``. It ends at the end of its inp
 """
 
 import json
-import os
 import sys
 import time
 from collections import defaultdict
@@ -198,11 +197,26 @@ class Program:
         """Keep the event loop busy."""
         time.sleep(seconds)  # noqa: ASYNC251 - that is what is asked for
 
-    async def do_hang(self, until: str) -> None:
-        """Keep the event loop busy until there is a file."""
-        tell(event="hanging")
-        while not os.path.exists(until):  # noqa: ASYNC110, ASYNC240, PTH110
-            time.sleep(0.01)  # noqa: ASYNC251 - that is what is asked for
+    async def do_stamp(self, authority: str, messages: int, rate: float) -> None:
+        """Publish single samples, each with the time of the machine's steady clock as its stamp."""
+        began = time.monotonic()
+        for number in range(messages):
+            self.bus.publish([as_sample("map", authority, time.monotonic_ns(), authority=authority)])
+            await anyio.sleep(max(0.0, began + (number + 1) / rate - time.monotonic()))
+
+    async def do_delays(self, authority: str, messages: int) -> dict[str, Any]:
+        """How many ns after their stamps these come, behind the buffer."""
+        delays: list[int] = []
+
+        def note(batch: Batch) -> None:
+            now = time.monotonic_ns()
+            delays.extend(now - sample.stamp for sample in batch if sample.authority == authority)
+            self._changed.set()
+
+        with self.bus.subscribe(note):
+            tell(event="noting")
+            await self._until(lambda: len(delays) >= messages)
+        return {"delays": delays}
 
     async def do_facts(self) -> dict[str, Any]:
         """All counters."""
@@ -234,6 +248,7 @@ async def main(links: list[dict[str, Any]]) -> None:
             tasks = await stack.enter_async_context(anyio.create_task_group())
             tasks.start_soon(program.tell_events)
             tasks.start_soon(program.watch_pauses)
+            tell(event="joining")
             for link in program.links:
                 await stack.enter_async_context(link)
             tell(event="ready", ids=[link.id for link in program.links])

@@ -164,11 +164,11 @@ def test_a_killed_broadcaster_is_lost_and_refreshes_its_static_frames_when_it_is
 def test_a_frozen_process_is_lost_and_comes_back_with_its_static_frames(processes: Crowd, place: Place) -> None:
     listener = processes.add(place.first(lease=1.0, drop_lost=True))
     frozen = processes.add(place.other(lease=1.0))
-    other = processes.add(place.other(lease=1.0, drop_lost=True), backend="trio")
-    meet(listener, frozen, other)
     frozen.ask("statics", names=["lidar"], authority="urdf")
+    # Whoever comes later has it from the cache.
+    other = processes.add(place.other(lease=1.0, drop_lost=True), backend="trio")
     for process in (listener, other):
-        process.ask("until", static=["lidar"])
+        process.ask("until", static=["lidar"], peers=2)
     frozen.signal(signal.SIGSTOP)
     for process in (listener, other):
         lost = process.wait(event="PeerLost")

@@ -1,3 +1,4 @@
+import asyncio
 import gc
 import socket
 import subprocess
@@ -71,6 +72,15 @@ async def joined(place: Place, *buses: Bus, **options: Any) -> AsyncIterator[lis
         links = [await stack.enter_async_context(place.link(bus, **options)) for bus in buses]
         await meet(*links)
         yield links
+
+
+def is_free(place: Place) -> bool:
+    """Whether nobody listens there."""
+    try:
+        socket.create_server(("127.0.0.1", int(place.address.rpartition(":")[2]))).close()
+    except OSError:
+        return False
+    return True
 
 
 def hear(bus: Bus) -> list[Batch]:
@@ -450,8 +460,6 @@ async def test_a_link_that_is_cancelled_while_it_begins_leaves_nothing_open() ->
     for checkpoints in range(6):
         place = Place()
         with Bus() as bus, anyio.CancelScope() as scope:
-            # Nobody is there, so that it takes a while to begin.
-            link = ZenohLink(bus, place.domain, listen=place.address, connect=f"tcp/127.0.0.1:{free_ports(1)[0]}")
             async with anyio.create_task_group() as tasks:
 
                 async def cancel(scope: anyio.CancelScope = scope, checkpoints: int = checkpoints) -> None:
@@ -460,18 +468,105 @@ async def test_a_link_that_is_cancelled_while_it_begins_leaves_nothing_open() ->
                     scope.cancel()
 
                 tasks.start_soon(cancel)
-                await link.__aenter__()
+                await enter_slowly(place, bus)
         assert scope.cancelled_caught
         await until(lambda place=place: is_free(place))  # type: ignore[misc]
 
 
-def is_free(place: Place) -> bool:
-    """Whether nobody listens there."""
-    try:
-        socket.create_server(("127.0.0.1", int(place.address.rpartition(":")[2]))).close()
-    except OSError:
-        return False
-    return True
+async def enter_slowly(place: Place, bus: Bus) -> None:
+    """A link that takes a while to begin, because nobody is where it connects to."""
+    async with ZenohLink(bus, place.domain, listen=place.address, connect=f"tcp/127.0.0.1:{free_ports(1)[0]}"):
+        pass
+
+
+def test_asyncios_own_cancel_while_a_link_begins_leaves_nothing_open() -> None:
+    async def main(turns: int) -> None:
+        place = Place()
+        with Bus() as bus:
+            task = asyncio.create_task(enter_slowly(place, bus))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+        await until(lambda: is_free(place))
+
+    for turns in range(6):
+        asyncio.run(main(turns))
+
+
+def test_asyncios_own_timeout_while_a_link_begins_leaves_nothing_open() -> None:
+    async def main() -> None:
+        place = Place()
+        with Bus() as bus:
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(enter_slowly(place, bus), 0.01)
+            await until(lambda: is_free(place))
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.01):
+                    await enter_slowly(place, bus)
+            await until(lambda: is_free(place))
+
+    asyncio.run(main())
+
+
+def test_asyncios_own_ways_to_end_a_body_end_the_link(place: Place) -> None:
+    entered = asyncio.Event()
+
+    async def stay(bus: Bus, link: ZenohLink) -> None:
+        async with place.link(bus) as own:
+            await meet(own, link)
+            entered.set()
+            await asyncio.sleep(3600)
+
+    async def main() -> None:
+        with Bus() as here, Bus() as there:
+            async with place.link(there) as link:
+                for way in ("cancel", "group", "timeout"):
+                    entered.clear()
+                    if way == "cancel":
+                        task = asyncio.create_task(stay(here, link))
+                        await entered.wait()
+                        task.cancel()
+                        with pytest.raises(asyncio.CancelledError):
+                            await task
+                    elif way == "group":
+                        with pytest.raises(ExceptionGroup) as caught:
+                            async with asyncio.TaskGroup() as group:
+                                group.create_task(stay(here, link))
+                                await entered.wait()
+                                raise MineError
+                        assert [type(error) for error in caught.value.exceptions] == [MineError]
+                    else:
+                        with pytest.raises(TimeoutError):
+                            async with asyncio.timeout(None) as timeout:
+                                async with place.link(here) as own:
+                                    await meet(own, link)
+                                    timeout.reschedule(0)
+                                    await asyncio.sleep(3600)
+                    await until(lambda: link.peers == ())
+                    task_now = asyncio.current_task()
+                    assert task_now is not None
+                    assert task_now.cancelling() == 0
+
+    asyncio.run(main())
+
+
+async def test_clients_talk_through_the_one_that_they_connect_to(place: Place) -> None:
+    # Neither listens, so they could not reach each other.
+    client: dict[str, Any] = {"config": {"mode": "client"}}
+    with Bus() as middle, Bus() as left, Bus() as right:
+        async with place.link(middle) as link, place.link(left, **client) as one, place.link(right, **client) as two:
+            await meet(link, one, two)
+            heard, back = hear(right), hear(left)
+            left.publish(static("map", "lidar"))
+            await until(lambda: len(heard) == 1)
+            right.publish(moving("map", "base", 1))
+            await until(lambda: len(back) == 2)
+            assert len(heard) == 2
+        async with place.link(middle):
+            with pytest.raises(OSError, match="Unable to connect"):
+                await ZenohLink(left, connect=f"tcp/127.0.0.1:{free_ports(1)[0]}", **client).__aenter__()
 
 
 async def test_an_address_that_cannot_be_had_is_an_os_error_and_the_bus_is_as_before(place: Place) -> None:

@@ -13,6 +13,7 @@ import logging
 import math
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from copy import copy
 from types import TracebackType
 from typing import Any
@@ -34,11 +35,11 @@ from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links.arrivals import Arrival, Arrivals
 from tfbus.links.inbox import Inbox
 from tfbus.links.outbox import MAX_SAMPLES, Outbox
-from tfbus.links.peers import Peers
+from tfbus.links.peers import MAX_PEERS, Peers
 from tfbus.links.relay import Relay, join, leave
 from tfbus.links.zenoh_session import ZenohSession
 from tfbus.links.zenoh_settings import Addresses, settings
-from tfbus.once import OnceLogger
+from tfbus.once import Once, OnceLogger
 from tfbus.registration import Registration
 from tfbus.sample_queue import check_capacity
 from tfbus.statistics import LinkStatistics
@@ -130,6 +131,8 @@ class ZenohLink:
         self._tasks: anyio.abc.TaskGroup | None = None
         self._jumps: Registration | None = None
         self._statics_changed = anyio.Event()
+        self._met = Once(MAX_PEERS)
+        self._hear_again = False
         self._sent_messages = 0
         self._sent_samples = 0
 
@@ -232,6 +235,10 @@ class ZenohLink:
     async def _keep_statics(self, session: ZenohSession) -> None:
         while True:
             self._statics_changed = anyio.Event()
+            if self._hear_again:
+                self._hear_again = False
+                with suppress(zenoh.ZError):
+                    await anyio.to_thread.run_sync(session.hear_again)
             if changes := self._outbox.take_statics(_AT_A_TIME):
                 for error in await anyio.to_thread.run_sync(session.statics.apply, changes):
                     self._cannot_send(error)
@@ -284,6 +291,10 @@ class ZenohLink:
             peer = self._peers.find(sender)
             if peer is not None and not peer.present:
                 peer.present = True
+                if not self._met.first(sender):
+                    # It was lost, and zenoh does not bring again what it has brought before.
+                    self._hear_again = True
+                    self._statics_changed.set()
                 self.bus.announce(PeerJoined(self.bus.clock.now(), self.domain, sender))
             return
         peer = self._peers.forget(sender)

@@ -53,6 +53,7 @@ class ZenohSession:
         self._closed = False
         self._session: zenoh.Session | None = None
         self._declared: tuple[object, ...] = ()
+        self._static_subscriber: Any = None
 
     def open(self) -> None:
         """Open the session and tell the others.
@@ -92,14 +93,28 @@ class ZenohSession:
         self._live = session.declare_publisher(
             f"{self._prefix}/live/{self._id}", congestion_control=zenoh.CongestionControl.DROP
         )
+        self.hear_again()
         remote, alive = zenoh.Locality.REMOTE, session.liveliness()
         # zenoh takes back what nobody refers to.
         self._declared = (
             session.declare_subscriber(f"{self._prefix}/live/*", _directly(self._live_came), allowed_origin=remote),
-            hear_statics(session, f"{self._prefix}/static/*/*", _directly(self._static_came)),
             alive.declare_subscriber(f"{self._prefix}/@alive/*", _directly(self._presence_changed), history=True),
             alive.declare_token(f"{self._prefix}/@alive/{self._id}"),
         )
+
+    def hear_again(self) -> None:
+        """Have all static frames come that there are, also those that came before; for a worker thread.
+
+        Raises
+        ------
+        zenoh.ZError
+            If the session is closed.
+        """
+        assert self._session is not None
+        before, came = self._static_subscriber, _directly(self._static_came)
+        self._static_subscriber = hear_statics(self._session, f"{self._prefix}/static/*/*", came)
+        if before is not None:
+            before.undeclare()
 
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested."""
