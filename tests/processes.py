@@ -17,7 +17,7 @@ from uuid import uuid4
 
 import anyio
 
-PATIENCE = 20.0
+PATIENCE = 60.0
 """s; far more than anything takes."""
 
 _PROGRAM = Path(__file__).parent / "peer_process.py"

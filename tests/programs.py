@@ -2,7 +2,6 @@
 
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -10,22 +9,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import IO
-from uuid import uuid4
+
+from processes import free_ports
 
 TFBUS = str(Path(sys.executable).with_name("tfbus"))
 PATIENCE = 30.0
 """How long a test waits, in s, for what should come at once."""
 
 
-def new_domain() -> str:
-    """A domain that nobody else is in."""
-    return f"test-{uuid4().hex}"
-
-
 def free_address() -> str:
     """An address on the loopback where nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_ports(1)[0]}"
 
 
 class Lines:

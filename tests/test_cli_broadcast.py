@@ -4,7 +4,8 @@ import json
 import signal
 
 import pytest
-from programs import free_address, new_domain, tfbus
+from processes import new_domain
+from programs import free_address, tfbus
 
 
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])

@@ -4,7 +4,8 @@ import subprocess
 from collections.abc import Sequence
 
 import pytest
-from programs import PATIENCE, TFBUS, free_address, new_domain, tfbus
+from processes import new_domain
+from programs import PATIENCE, TFBUS, free_address, tfbus
 
 from tfbus import SECOND, Transform, TransformStamped, from_seconds
 from tfbus.cli import main

@@ -9,7 +9,8 @@ from collections.abc import Callable
 
 import anyio
 import pytest
-from programs import Program, new_domain
+from processes import new_domain
+from programs import Program
 
 from tfbus import Bus
 from tfbus.cli import main

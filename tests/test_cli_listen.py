@@ -3,7 +3,8 @@
 import signal
 
 import pytest
-from programs import free_address, new_domain, tfbus
+from processes import new_domain
+from programs import free_address, tfbus
 
 POINT = r"base_laser: \(1\.00, 0\.20\. 0\.00\) -----> base_link: \(1\.10, 0\.20, 0\.20\) at time \d+\.\d\d$"
 INFO = rf"^\[ INFO\] \d+\.\d{{9}}: {POINT}"

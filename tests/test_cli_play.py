@@ -4,7 +4,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from programs import PATIENCE, TFBUS, free_address, new_domain, tfbus
+from processes import new_domain
+from programs import PATIENCE, TFBUS, free_address, tfbus
 from recorded import SMALL, messages_in, write_mcap
 from samples import moving, static
 from test_cli_progress import on_a_terminal

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from programs import PATIENCE, TFBUS, Program, free_address, new_domain, tfbus
+from processes import new_domain
+from programs import PATIENCE, TFBUS, Program, free_address, tfbus
 from recorded import messages_in
 from rosbags.highlevel import AnyReader
 

@@ -3,7 +3,8 @@ import math
 from collections.abc import Sequence
 
 import pytest
-from programs import free_address, new_domain, tfbus
+from processes import new_domain
+from programs import free_address, tfbus
 
 from tfbus import Transform
 from tfbus.cli import main

@@ -10,7 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from programs import PATIENCE, TFBUS, Program, free_address, new_domain, tfbus
+from processes import new_domain
+from programs import PATIENCE, TFBUS, Program, free_address, tfbus
 
 from tfbus import SECOND, Edge
 from tfbus.cli.link import UnusableError

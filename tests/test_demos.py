@@ -14,7 +14,8 @@ from typing import Any
 import anyio
 import httpx
 import pytest
-from programs import Program, new_domain
+from processes import new_domain
+from programs import Program
 
 from tfbus import SimulatedClock, tutorial
 from tfbus.testing import simulate

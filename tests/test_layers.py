@@ -34,9 +34,9 @@ ABOVE_THE_ASYNC_LINE = [
     ("recording.summary",),
 ]
 BELOW_THE_ASYNC_LINE = [
-    ("ticks", "doorbell", "bus_thread", "reading", "recording.mcap_output", "recording.read_ahead"),
+    ("ticks", "doorbell", "bus_thread", "own_tasks", "reading", "recording.mcap_output"),
     ("threadsafe",),
-    ("clock", "stream"),
+    ("clock", "stream", "recording.read_ahead"),
     ("event_stream",),
     ("bus", "waiting_room"),
     ("watch", "recording.player", "recording.recorder"),

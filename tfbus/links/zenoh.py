@@ -40,6 +40,7 @@ from tfbus.links.relay import Relay, join, leave
 from tfbus.links.zenoh_session import ZenohSession
 from tfbus.links.zenoh_settings import Addresses, settings
 from tfbus.once import Once, OnceLogger
+from tfbus.own_tasks import end_tasks
 from tfbus.registration import Registration
 from tfbus.sample_queue import check_capacity
 from tfbus.statistics import LinkStatistics
@@ -196,12 +197,7 @@ class ZenohLink:
             self._relay.lose(peer, self._outbox, drop=False)
         self._tasks.cancel_scope.cancel()
         try:
-            # A task group would wrap what the body raises, so it is not told.
-            await self._tasks.__aexit__(None, None, None)
-        except BaseExceptionGroup as group:
-            if len(group.exceptions) > 1:
-                raise
-            raise group.exceptions[0] from None
+            await end_tasks(self._tasks)
         finally:
             await self._close(self._session)
 

@@ -10,6 +10,7 @@ import anyio.abc
 import anyio.streams.memory
 import anyio.to_thread
 
+from tfbus.own_tasks import end_tasks
 from tfbus.recording.files import RecordedMessage
 
 _BLOCK = 256
@@ -53,12 +54,7 @@ class ReadAhead:
     ) -> None:
         self._tasks.cancel_scope.cancel()
         try:
-            # A task group would wrap what the body raises, so it is not told.
-            await self._tasks.__aexit__(None, None, None)
-        except BaseExceptionGroup as group:
-            if len(group.exceptions) > 1:
-                raise
-            raise group.exceptions[0] from None
+            await end_tasks(self._tasks)
         finally:
             self._receive.close()
 

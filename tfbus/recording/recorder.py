@@ -20,6 +20,7 @@ import anyio.to_thread
 
 from tfbus.bus import Bus
 from tfbus.events import RecordingDropped, RecordingFailed
+from tfbus.own_tasks import end_tasks
 from tfbus.recording.backlog import Backlog
 from tfbus.recording.mcap_output import McapOutput
 from tfbus.registration import Registration
@@ -151,13 +152,7 @@ class Recorder:
         self._ended = True
         self._arrived.set()
         self._hurry.set()
-        try:
-            # A task group would wrap what the body raises, so it is not told.
-            await self._tasks.__aexit__(None, None, None)
-        except BaseExceptionGroup as group:
-            if len(group.exceptions) > 1:
-                raise
-            raise group.exceptions[0] from None
+        await end_tasks(self._tasks)
 
     def _check_entered(self) -> None:
         if self._registration is None:
