@@ -170,8 +170,8 @@ class Program:
     ) -> dict[str, Any]:
         """Wait until all of this holds.
 
-        Frames that are there, that are not, and that are static; how many peers; numbers of last batches; and where some
-        frames are.
+        Frames that are there, that are not, and that are static; how many peers; numbers of last batches; and where
+        some frames are.
         """
 
         def holds() -> bool:

@@ -175,7 +175,7 @@ def test_too_many_frame_names_are_refused_and_the_first_ones_go_with_their_peer(
     assert len(lost["frames"]) == 10_000
 
 
-def test_forged_senders_are_as_many_as_a_link_takes_and_no_more(scene: Scene) -> None:
+def test_forged_senders_are_as_many_as_a_link_takes_and_keep_nobody_out(scene: Scene) -> None:
     stranger = scene.stranger
     for _ in range(2 * MAX_PEERS):
         stranger.say(moving("map", "base", 1), key=f"{stranger.prefix}/live/{uuid4().hex}")
@@ -187,6 +187,12 @@ def test_forged_senders_are_as_many_as_a_link_takes_and_no_more(scene: Scene) ->
     (link,) = scene.victim.ask("facts")["links"]
     assert link["rejected"]["too many peers"] >= MAX_PEERS
     assert scene.told() == ["too many peers"]
+    # Whoever says that he is there gets in all the same.
+    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/@alive/{stranger.id}")
+    scene.victim.wait(event="PeerJoined", peer=stranger.id)
+    stranger.say(moving("map", "newcomer", 1))
+    scene.victim.ask("until", has=["newcomer"])
+    token.undeclare()
 
 
 def test_keys_that_no_link_has_are_refused(scene: Scene) -> None:

@@ -69,6 +69,27 @@ def test_there_is_room_for_so_many_peers_and_for_others_when_some_have_gone() ->
     assert peers.find("0") is None
 
 
+def test_who_says_that_he_is_there_takes_the_place_of_the_first_who_has_not() -> None:
+    peers, _ = peers_and_reports()
+    for number in range(MAX_PEERS):
+        assert peers.make_room(f"{number}") is None
+        known(peers, f"{number}").present = number == 0
+    assert peers.make_room("0") is None
+    assert peers.make_room("2") is None
+    gone = peers.make_room("new")
+    assert gone is not None
+    assert gone.id == "1"
+    assert known(peers, "new").id == "new"
+
+
+def test_there_is_no_room_where_everybody_has_said_that_he_is_there() -> None:
+    peers, _ = peers_and_reports()
+    for number in range(MAX_PEERS):
+        known(peers, f"{number}").present = True
+    assert peers.make_room("new") is None
+    assert peers.find("new") is None
+
+
 def test_what_is_refused_is_counted_each_time_and_told_once_for_each_peer_and_reason() -> None:
     peers, reports = peers_and_reports()
     known(peers, "a")

@@ -79,6 +79,13 @@ class Peers:
             peer = self._peers[id] = Peer(id)
         return peer
 
+    def make_room(self, id: str) -> Peer | None:  # noqa: A002
+        """Take out the first one that has not said that it is there, if there is no room for somebody new who has."""
+        if id in self._peers or len(self._peers) < MAX_PEERS:
+            return None
+        stranger = next((peer for peer in self._peers.values() if not peer.present), None)
+        return None if stranger is None else self._peers.pop(stranger.id)
+
     def forget(self, id: str) -> Peer | None:  # noqa: A002
         """Take out a peer that has gone, if it was known."""
         return self._peers.pop(id, None)

@@ -284,6 +284,9 @@ class ZenohLink:
     def _note_presence(self, sender: str, present: bool) -> None:
         assert self._relay is not None
         if present:
+            stranger = self._peers.make_room(sender)
+            if stranger is not None:
+                self._relay.lose(stranger, self._outbox, drop=False)
             peer = self._peers.find(sender)
             if peer is not None and not peer.present:
                 peer.present = True
