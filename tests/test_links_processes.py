@@ -422,6 +422,27 @@ def test_hosts_find_each_other_through_one_whose_address_they_know(hosts: Hosts,
     members[2].ask("until", static=["camera"])
 
 
+def test_a_host_that_is_cut_off_is_lost_and_comes_back(hosts: Hosts, processes: Crowd) -> None:
+    (address, first), (_, second), _ = hosts
+    place = {"domain": new_domain(), "lease": 1.0, "drop_lost": True}
+    stays = processes.add({**place, "listen": f"tcp/{address}:17447"}, prefix=first)
+    apart = processes.add({**place, "connect": f"tcp/{address}:17447"}, prefix=second, backend="trio")
+    meet(stays, apart)
+    stays.ask("statics", names=["map lidar"])
+    apart.ask("statics", names=["lidar"], authority="urdf")
+    stays.ask("until", static=["lidar"])
+    apart.ask("until", static=["map lidar"])
+    subprocess.run([*second, "ip", "link", "set", "eth0", "down"], check=True, timeout=PATIENCE)
+    assert stays.wait(event="PeerLost")["authorities"] == ["urdf"]
+    apart.wait(event="PeerLost")
+    stays.ask("until", lacks=["lidar"])
+    apart.ask("until", lacks=["map lidar"])
+    apart.ask("statics", names=["meanwhile"])
+    subprocess.run([*second, "ip", "link", "set", "eth0", "up"], check=True, timeout=PATIENCE)
+    stays.ask("until", static=["lidar", "meanwhile"])
+    apart.ask("until", static=["map lidar"])
+
+
 def test_hosts_that_are_told_no_address_stay_by_themselves(hosts: Hosts, processes: Crowd) -> None:
     domain = {"domain": new_domain()}
     (_, first), (_, second), _ = hosts

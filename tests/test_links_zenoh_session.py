@@ -114,6 +114,33 @@ def test_a_static_message_comes_to_those_who_are_there_and_to_those_who_come_lat
     assert second.up_to(A, (b"new", b"2"))[-1] == Arrival(A, (b"new", b"2"), 4, moving=False)
 
 
+def test_what_was_heard_is_heard_again_if_that_is_wanted(join: Join) -> None:
+    first, second = join(A), join(B)
+    meet(first, second)
+    assert first.session.statics.apply({"lidar": Message(b"there", b"", 1)}) == []
+    assert second.next() == Arrival(A, (b"there", b""), 5, moving=False)
+    second.session.hear_again()
+    assert second.next() == Arrival(A, (b"there", b""), 5, moving=False)
+    # And from now on once again.
+    assert first.session.statics.apply({"lidar": Message(b"new", b"", 1)}) == []
+    assert second.next() == Arrival(A, (b"new", b""), 3, moving=False)
+    first.session.put(Message(b"last", b"", 0))
+    assert second.next() == Arrival(A, (b"last", b""), 4, moving=True)
+
+
+def test_what_comes_on_different_keys_comes_in_order(join: Join) -> None:
+    first, second = join(A), join(B)
+    meet(first, second)
+    for number in range(200):
+        message = Message(b"%d" % number, b"", 1)
+        first.session.put(message)
+        assert first.session.statics.apply({f"frame {number}": message}) == []
+    first.session.close()
+    came = second.up_to(A, False)
+    expected = [(b"%d" % (number // 2), number % 2 == 0) for number in range(400)]
+    assert [(arrival.content[0], arrival.moving) for arrival in came[:-1]] == expected
+
+
 def test_a_message_without_an_attachment_comes_with_an_empty_one(join: Join, address: str, prefix: str) -> None:
     first = join(A)
     with stranger(address, prefix) as session:

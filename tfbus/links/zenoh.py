@@ -67,7 +67,9 @@ class ZenohLink:
         between them.
     listen, connect : str or iterable of str, optional
         zenoh's endpoints, such as ``tcp/192.168.1.5:7447``: where to listen, and where other links or a router listen.
-        Links find those whom they can reach through the ones that they are connected to.
+        Links find each other through the ones that they are connected to, and then talk directly; so of any two, one
+        has to listen where the other can reach it, or be a client, ``config={"mode": "client"}``, for whom the one
+        that it is connected to passes everything on.
     config : mapping of str to any, optional
         Settings of zenoh by their path, laid over those of the link: TLS, access control, routers.
     frames : iterable of str, optional

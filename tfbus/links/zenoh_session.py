@@ -73,8 +73,8 @@ class ZenohSession:
             else:
                 opened.set_result(None)
 
-        # The threads that call back are daemons if the one that declares is, as a worker of trio is. The interpreter
-        # ends without waiting for daemons, and what zenoh runs in one at that moment aborts the process.
+        # A worker of trio is a daemon. The interpreter ends without waiting for those, and what zenoh does in one at
+        # that moment aborts the process.
         threading.Thread(target=complete, daemon=False).start()
         opened.result()
 
