@@ -356,9 +356,10 @@ async def test_arguments_that_make_no_sense_are_refused_at_once() -> None:
     bus = Bus()
     with pytest.raises(TypeError, match="'base'"):
         ZenohLink(bus, frames="base")
-    for options in ({"capacity": 0}, {"max_frames": 0}, {"lease": 0}, {"listen": "garbage"}, {"config": {"no": 1}}):
-        with pytest.raises(ValueError, match=r"capacity|lease|garbage|'no'"):
-            ZenohLink(bus, **options)
+    for name, value in {"capacity": 0, "max_frames": 0, "lease": 0, "listen": "garbage", "config": {"no": 1}}.items():
+        said = {"listen": "garbage", "config": "'no'"}.get(name, name)
+        with pytest.raises(ValueError, match=said):
+            ZenohLink(bus, **{name: value})
 
 
 async def test_a_link_is_entered_once(place: Place) -> None:

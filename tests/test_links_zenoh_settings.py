@@ -53,6 +53,13 @@ def test_whoever_is_given_an_address_does_not_go_to_the_meeting_point() -> None:
     assert read(CONNECT, config={"connect": {"endpoints": ["tcp/127.0.0.1:7000"]}}) == ["tcp/127.0.0.1:7000"]
 
 
+@pytest.mark.parametrize("address", ["tls/192.168.1.5:7447", "quic/192.168.1.5:7447"])
+def test_whoever_connects_with_a_certificate_opens_no_port_without_one(address: str) -> None:
+    assert read(LISTEN, connect=address) == []
+    assert read(LISTEN, connect=[address, "tcp/127.0.0.1:7000"]) == [LOOPBACK]
+    assert read(LISTEN, connect=address, listen="tcp/127.0.0.1:7000") == ["tcp/127.0.0.1:7000"]
+
+
 def test_how_to_connect_is_no_address() -> None:
     config = {"connect/retry": {"period_max_ms": 5_000}, "listen/timeout_ms": 100}
     assert read(LISTEN, config=config) == [MEETING_POINT, LOOPBACK]
@@ -204,7 +211,7 @@ async def test_two_links_talk_over_tls(certificates: Path) -> None:
         robot.publish(static("map", "base", 1.0))
         async with (
             ZenohLink(robot, domain, listen=address, config=tls(certificates, "robot")),
-            ZenohLink(guest, domain, listen=[], connect=address, config=tls(certificates, "guest")),
+            ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")),
         ):
             with anyio.fail_after(30):
                 assert (await buffer.lookup("map", "base")).transform.translation[0] == 1.0
@@ -220,7 +227,7 @@ async def test_nobody_joins_over_tls_without_a_certificate(certificates: Path) -
             ZenohLink(robot, domain, listen=address, config=tls(certificates, "robot")) as link,
             ZenohLink(other, domain, listen=[], connect=address, config=stranger) as refused,
             # It comes behind the other and gets in.
-            ZenohLink(guest, domain, listen=[], connect=address, config=tls(certificates, "guest")) as welcome,
+            ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")) as welcome,
         ):
             await until(lambda: welcome.peers == (link.id,))
             assert refused.peers == ()
@@ -251,7 +258,7 @@ async def test_access_control_lets_a_guest_listen_and_not_publish(certificates: 
     with Bus() as robot, Bus() as guest, Buffer(robot) as own, Buffer(guest) as buffer:
         guest.publish(static("map", "too early"))
         async with ZenohLink(robot, domain, listen=address, config=tls(certificates, "robot") | read_only) as link:
-            async with ZenohLink(guest, domain, listen=[], connect=address, config=tls(certificates, "guest")) as other:
+            async with ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")) as other:
                 await until(lambda: link.peers == (other.id,) and other.peers == (link.id,))
                 guest.publish([static("map", "a fake"), moving("map", "another", 1)])
                 robot.publish([static("map", "base", 1.0), moving("base", "arm", 1)])

@@ -181,13 +181,13 @@ class SubscriberFailed:
 
 @dataclass(frozen=True, slots=True)
 class PeerJoined:
-    """Another process was found over a link.
+    """Another bus was found over a link.
 
     Attributes
     ----------
     stamp : int
     link : str
-        Over which link.
+        The domain of the link.
     peer : str
         The other end's own name for itself, made anew whenever it starts.
     """
@@ -202,7 +202,7 @@ class PeerJoined:
 
 @dataclass(frozen=True, slots=True)
 class PeerLost:
-    """Another process has gone, is frozen, or cannot be reached any more.
+    """Another bus has gone with its process or its link, is frozen, or cannot be reached any more.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ class PeerLost:
 
 @dataclass(frozen=True, slots=True)
 class PeerRejected:
-    """Something that another process sent was refused; told once for each peer and reason.
+    """Something that another bus sent was refused; told once for each peer and reason.
 
     Attributes
     ----------

@@ -10,12 +10,12 @@ from tfbus.statistics import QueueStatistics
 Overflow = Literal["conflate", "drop_oldest"]
 
 
-def check_capacity(capacity: object) -> None:
-    """Raise `TypeError` or `ValueError` unless a queue can hold that many."""
+def check_capacity(capacity: object, name: str = "capacity") -> None:
+    """Raise `TypeError` or `ValueError` unless something can hold that many; `name` is for the error."""
     if isinstance(capacity, bool) or not isinstance(capacity, int):
-        raise TypeError(f"capacity must be an int, not {capacity!r}")
+        raise TypeError(f"{name} must be an int, not {capacity!r}")
     if capacity < 1:
-        raise ValueError(f"capacity must be at least 1, got {capacity}")
+        raise ValueError(f"{name} must be at least 1, got {capacity}")
 
 
 class SampleQueue:

@@ -78,7 +78,7 @@ class LinkStatistics:
     peers : int
         Other ends that are there now.
     sent_messages, sent_samples : int
-        What was handed to the network.
+        What was handed to the network live. Static frames go out once more by themselves, for those who join late.
     received_messages, received_samples : int
         What was taken from it and published on the bus.
     lost : int
@@ -86,7 +86,7 @@ class LinkStatistics:
     duplicates : int
         Samples that had come before, or were overtaken by newer ones on another way.
     not_sent : mapping of str to int
-        Samples of this bus that cannot be put into a message, by reason.
+        Samples and removals of this bus that cannot be put into a message, by reason.
     rejected : mapping of str to int
         Messages and samples of peers that were refused, by reason.
     queue : QueueStatistics

@@ -45,7 +45,7 @@ class MalformedMessageError(ValueError):
     ----------
     reason : str
         One word to count by: ``"truncated"``, ``"oversized"``, ``"encoding"``, ``"text"`` (a string without its NUL) or
-        ``"tags"``.
+        ``"tags"``; a link has some more for what goes beside a message.
     detail : str
         What was found.
     """

@@ -93,7 +93,7 @@ def to_json(found: TransformStamped, now: int) -> str:
 
 
 def describe(found: TransformStamped, now: int) -> str:
-    """An answer as ``tf2_echo`` prints it, with the two frames and the age."""
+    """An answer much as ``tf2_echo`` prints it, with the two frames and the age."""
     when = "any time" if found.static else f"{_exact(found.stamp)} s, age {format_duration(now - found.stamp)}"
     angles = found.transform.as_rpy()
     return "\n".join(

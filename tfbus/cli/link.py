@@ -5,7 +5,7 @@ import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import anyio
 from cyclopts import Parameter
@@ -34,7 +34,7 @@ class LinkOptions:
         Where to listen, as tcp/192.168.1.5:7447; may be given several times. Without any address, programs on this
         machine find each other by themselves.
     connect
-        Where others listen; may be given several times.
+        Where others listen; may be given several times. Programs without an address are at tcp/127.0.0.1:17447.
     backend
         The event loop to run on.
     """
@@ -45,7 +45,7 @@ class LinkOptions:
     backend: Backend = "asyncio"
 
     @asynccontextmanager
-    async def open(self, bus: Bus, **options: Any) -> AsyncIterator[object]:
+    async def open(self, bus: Bus) -> AsyncIterator[None]:
         """The link, to be entered; whatever keeps it from being there is an `UnusableError`."""
         try:
             from tfbus.links.zenoh import ZenohLink
@@ -53,7 +53,7 @@ class LinkOptions:
             raise UnusableError('joining a domain needs a package more: pip install "tfbus[cli,zenoh]"') from None
         async with AsyncExitStack() as stack:
             try:
-                link = ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None, **options)
+                link = ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None)
                 await stack.enter_async_context(link)
             except ValueError as error:
                 raise UnusableError(str(error)) from None
@@ -61,14 +61,14 @@ class LinkOptions:
                 where = " or ".join(self.listen) or "the loopback"
                 why = os.strerror(error.errno) if error.errno else error
                 raise UnusableError(f"cannot listen at {where}: {why}") from None
-            yield link
+            yield
 
-    def run(self, program: Callable[[Bus], Awaitable[object]], **options: Any) -> None:
+    def run(self, program: Callable[[Bus], Awaitable[object]]) -> None:
         """Run a program on a bus that has joined the domain, on the event loop that was chosen. See `running.run`."""
 
         async def join_and_run() -> None:
             with Bus() as bus:
-                async with self.open(bus, **options):
+                async with self.open(bus):
                     await program(bus)
 
         run(join_and_run, self.backend)

@@ -18,9 +18,9 @@ class Arrival:
     Attributes
     ----------
     sender : str
-        The id of the peer.
+        The id of the peer; empty if its key names none.
     content : Any
-        A message; or a bool, whether the peer is there now.
+        A message; a bool, whether the peer is there now; or the error for which a message was refused.
     size : int
         Bytes that its content keeps in memory.
     moving : bool

@@ -80,8 +80,8 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
     Raises
     ------
     ValueError
-        If it has more than 255 origins, `MAX_ENTRIES`, `MAX_BYTES`, or 65,535 authorities or bytes of one; or if the
-        name of a removed frame has more than `MAX_NAME` bytes. Also for a name that has no UTF-8.
+        If it has more than 255 origins, `MAX_ENTRIES`, `MAX_BYTES`, 65,535 authorities, bytes of one or runs of one
+        batch; or if the name of a removed frame has more than `MAX_NAME` bytes. Also for a name that has no UTF-8.
     """
     if len(entries) > MAX_ENTRIES:
         raise ValueError(f"too much for one attachment: {len(entries)} entries, more than {MAX_ENTRIES}")

@@ -12,6 +12,7 @@ from tfbus.stamped import TransformStamped
 from tfbus.tf_message import encode, refusal
 
 MAX_SAMPLES = 5_000
+"""With so many, a message is full; the batch that fills it is still whole."""
 MAX_BYTES = 2**24
 """The largest message that is sent, or taken by the other end."""
 _LONGEST_AUTHORITY = 65_535
@@ -41,11 +42,12 @@ class Outbox:
     Attributes
     ----------
     pending : int
-        How many samples wait.
+        How many samples and removals wait.
     statics : dict of str to Piece, RemovedFrame or None
-        What has changed of the static frames: the newest sample of each, or None when it is not to be kept any more.
+        What has changed of the static frames: the newest sample of each, its tombstone, or None when it is not to be
+        kept any more.
     not_sent : Counter
-        Samples that cannot be put into a message, by reason.
+        Samples and removals that cannot be put into a message, by reason.
     """
 
     def __init__(

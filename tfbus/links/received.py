@@ -16,7 +16,7 @@ class Source:
     sequence : int
         Its number there; what comes later has a higher one.
     link : object
-        The link that brought it.
+        The sending half of the link that brought it.
     peer : Peer
         The other end, which sent it.
     live : bool

@@ -69,7 +69,8 @@ class ZenohLink:
         zenoh's endpoints, such as ``tcp/192.168.1.5:7447``: where to listen, and where other links or a router listen.
         Links find each other through the ones that they are connected to, and then talk directly; so of any two, one
         has to listen where the other can reach it, or be a client, ``config={"mode": "client"}``, for whom the one
-        that it is connected to passes everything on.
+        that it is connected to passes everything on. Links without any address meet at ``tcp/127.0.0.1:17447``; one
+        that has an address meets them only if it connects there as well.
     config : mapping of str to any, optional
         Settings of zenoh by their path, laid over those of the link: TLS, access control, routers.
     frames : iterable of str, optional
@@ -77,18 +78,32 @@ class ZenohLink:
     drop_lost : bool
         Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
     lease : float
-        A peer that is frozen or cut off is lost after this many s; one that dies, at once.
+        Others take this link for lost when it is frozen or cut off for so many s, and this one them by theirs; who
+        dies is lost at once.
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
-        How many messages may wait for the event loop; then the oldest are dropped and counted.
+        How many live messages may wait for the event loop; then the oldest are dropped and counted.
+
+    Attributes
+    ----------
+    bus : Bus
+    domain : str
+    id : str
+        Its own name for itself, as others are told of it.
 
     Raises
     ------
     ValueError
         If `domain` cannot be part of a key, a number is out of range, or zenoh does not take an address or a setting.
+    TypeError
+        If `frames` is one name, or a number or an address is of another type.
+    OSError
+        On entering, if it cannot listen where it should, or as a client reaches nobody.
+    BusClosedError, RuntimeError
+        On entering, if the bus is closed; if it belongs to another thread, or the link was entered before.
     ImportError
-        Without the extra: ``pip install "tfbus[zenoh]"``.
+        On import, without the extra: ``pip install "tfbus[zenoh]"``.
 
     Notes
     -----
@@ -114,7 +129,7 @@ class ZenohLink:
         if isinstance(frames, str):
             raise TypeError(f"frames must be several names, not {frames!r}")
         check_capacity(capacity)
-        check_capacity(max_frames)
+        check_capacity(max_frames, "max_frames")
         self.bus = bus
         self.domain = _checked(domain)
         self.id = uuid4().hex

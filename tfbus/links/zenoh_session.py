@@ -20,7 +20,7 @@ _SHOWN = 200
 
 
 class ZenohSession:
-    """What blocks, for worker threads (`open`), and what does not, for the event loop (`put` and `close`).
+    """What blocks, for worker threads (`open`, `hear_again`, `statics`), and what does not (`put`, `close`).
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class ZenohSession:
     prefix : str
         What all keys of the domain begin with.
     id : str
-        The link's own name, the last part of its keys.
+        The link's own name, a part of all its keys.
     receive : callable
         Called in zenoh's threads with each `Arrival`; the content of one is a payload and an attachment, a bool, or a
         `MalformedMessageError`.
@@ -36,6 +36,7 @@ class ZenohSession:
     Attributes
     ----------
     statics : StaticKeys
+        Once it is open.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class ZenohSession:
         Raises
         ------
         OSError
-            If it cannot listen where it should; with its `errno`, if the system has given one.
+            If it cannot listen where it should, or as a client reaches nobody; with its `errno`, if there is one.
         """
         opened: Future[None] = Future()
 

@@ -16,6 +16,7 @@ MEETING_POINT = "tcp/127.0.0.1:17447"
 Addresses = str | Iterable[str]
 
 _ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
+_ENCRYPTED = ("tls/", "quic/")
 _ON_MACHINE = re.compile(r"(unixsock-stream|unixpipe|serial|vsock)/.+")
 
 
@@ -28,12 +29,13 @@ def settings(
     ----------
     listen, connect : str or iterable of str, or None
         zenoh's endpoints, such as ``tcp/192.168.1.5:7447``. With neither, and none in `config`, the link meets others
-        at `MEETING_POINT`. With one of them, nothing is done by itself but to listen at a port of the loopback.
+        at `MEETING_POINT`. With one of them, nothing is done by itself but, where nobody says where to listen, to do
+        so at a port of the loopback; and not even that if it only connects over TLS or QUIC.
     config : mapping of str to any, or None
         zenoh's own settings by their path, such as ``transport/link/tls/root_ca_certificate``; they come last, so
         they win.
     lease : float
-        After how many s of silence a peer is lost.
+        After how many s of silence others take this end for lost; each announces its own.
 
     Raises
     ------
@@ -48,7 +50,11 @@ def settings(
     silence = as_duration(lease, "lease")
     if not 0 < silence < math.inf:
         raise ValueError(f"lease must be a time that passes, got {lease}")
+    connects = [] if connect is None else _endpoints(connect)
     loopback = ["tcp/127.0.0.1:0"] if addressed else [MEETING_POINT, "tcp/127.0.0.1:0"]
+    if connects and all(address.startswith(_ENCRYPTED) for address in connects):
+        # Who goes to others with a certificate leaves no door open without one.
+        loopback = []
     values: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
@@ -71,7 +77,7 @@ def settings(
         # Somebody else holds the meeting point, as a rule.
         values |= {"listen/exit_on_failure": False, "listen/timeout_ms": 0}
     if connect is not None:
-        values["connect/endpoints"] = _endpoints(connect)
+        values["connect/endpoints"] = connects
     result = zenoh.Config()
     for path, value in (values | own).items():
         try:
