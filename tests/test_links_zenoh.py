@@ -356,7 +356,8 @@ async def test_arguments_that_make_no_sense_are_refused_at_once() -> None:
     bus = Bus()
     with pytest.raises(TypeError, match="'base'"):
         ZenohLink(bus, frames="base")
-    for name, value in {"capacity": 0, "max_frames": 0, "lease": 0, "listen": "garbage", "config": {"no": 1}}.items():
+    wrong: dict[str, Any] = {"capacity": 0, "max_frames": 0, "lease": 0, "listen": "garbage", "config": {"no": 1}}
+    for name, value in wrong.items():
         said = {"listen": "garbage", "config": "'no'"}.get(name, name)
         with pytest.raises(ValueError, match=said):
             ZenohLink(bus, **{name: value})

@@ -128,7 +128,7 @@ def test_what_was_heard_is_heard_again_if_that_is_wanted(join: Join) -> None:
     assert second.next() == Arrival(A, (b"last", b""), 4, moving=True)
 
 
-def test_what_comes_on_different_keys_comes_in_order(join: Join) -> None:
+def test_a_static_message_never_overtakes_the_live_one_before_it_nor_the_end_a_live_one(join: Join) -> None:
     first, second = join(A), join(B)
     meet(first, second)
     for number in range(200):
@@ -136,9 +136,10 @@ def test_what_comes_on_different_keys_comes_in_order(join: Join) -> None:
         first.session.put(message)
         assert first.session.statics.apply({f"frame {number}": message}) == []
     first.session.close()
-    came = second.up_to(A, False)
-    expected = [(b"%d" % (number // 2), number % 2 == 0) for number in range(400)]
-    assert [(arrival.content[0], arrival.moving) for arrival in came[:-1]] == expected
+    came = [(int(arrival.content[0]), arrival.moving) for arrival in second.up_to(A, False)[:-1]]
+    assert [number for number, moving in came if moving] == list(range(200))
+    # It may come later, when zenoh asks for what there is on a key that is new.
+    assert all((number, True) in came[:place] for place, (number, moving) in enumerate(came) if not moving)
 
 
 def test_a_message_without_an_attachment_comes_with_an_empty_one(join: Join, address: str, prefix: str) -> None:

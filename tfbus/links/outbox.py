@@ -13,8 +13,8 @@ from tfbus.tf_message import encode, refusal
 
 MAX_SAMPLES = 5_000
 """With so many, a message is full; the batch that fills it is still whole."""
-MAX_BYTES = 2**24
-"""The largest message that is sent, or taken by the other end."""
+MAX_BYTES = 2**22
+"""The largest message that is sent, or taken by the other end: some 30,000 samples, which keep its loop for a while."""
 _LONGEST_AUTHORITY = 65_535
 
 

@@ -71,7 +71,7 @@ def settings(
         # It would leave a file open for each link that there was.
         "transport/shared_memory/enabled": False,
         # What is larger is not even put together.
-        "transport/link/rx/max_message_size": 2**25,
+        "transport/link/rx/max_message_size": 2**23,
     }
     if not listens:
         # Somebody else holds the meeting point, as a rule.
