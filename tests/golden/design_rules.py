@@ -1,4 +1,4 @@
-"""What DESIGN.md says of errors and stamps, in the most obvious way: for questions that nobody wrote by hand.
+"""What tfbus promises of errors and stamps, in the most obvious way: for questions that nobody wrote by hand.
 
 Where tf2's recorded answer is another one, the step gets the deviation that explains it. No transform is predicted.
 """
