@@ -32,3 +32,12 @@ def command(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
         return Done(ended.value.code, *capsys.readouterr())
 
     return run
+
+
+def check_wrong_call(done: Done, why: str) -> None:
+    """A command that was called wrongly says so in one line, with `why` in it, and does nothing."""
+    assert done.returncode == 2
+    assert done.stdout == ""
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("tfbus: ")
+    assert why in line

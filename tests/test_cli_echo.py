@@ -4,11 +4,11 @@ import subprocess
 from collections.abc import Sequence
 
 import pytest
+from commands import check_wrong_call, command
 from processes import new_domain
 from programs import PATIENCE, TFBUS, free_address, tfbus
 
 from tfbus import SECOND, Transform, TransformStamped, from_seconds
-from tfbus.cli import main
 from tfbus.cli.echo import describe, to_json
 
 MOVING = TransformStamped(
@@ -124,12 +124,4 @@ def test_a_reader_that_has_had_enough_is_no_traceback() -> None:
 def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
     arguments: Sequence[str], why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["tfbus", "echo", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    (line,) = printed.err.splitlines()
-    assert line.startswith("tfbus: ")
-    assert why in line
+    check_wrong_call(command("echo", monkeypatch, capsys)(*arguments), why)

@@ -3,11 +3,11 @@ import math
 from collections.abc import Sequence
 
 import pytest
+from commands import check_wrong_call, command
 from processes import new_domain
 from programs import free_address, tfbus
 
 from tfbus import Transform
-from tfbus.cli import main
 from tfbus.cli.static import describe
 
 HALF = math.sqrt(0.5)
@@ -75,12 +75,4 @@ def test_the_transform_is_told_in_metres_and_radians() -> None:
 def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
     arguments: Sequence[str], why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("sys.argv", ["tfbus", "static", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 2
-    printed = capsys.readouterr()
-    assert printed.out == ""
-    (line,) = printed.err.splitlines()
-    assert line.startswith("tfbus: ")
-    assert why in line
+    check_wrong_call(command("static", monkeypatch, capsys)(*arguments), why)

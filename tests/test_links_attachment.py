@@ -1,10 +1,9 @@
 import random
 import struct
-import tracemalloc
-from collections.abc import Callable
 from itertools import islice
 
 import pytest
+from allocations import peak_of
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -50,16 +49,6 @@ def reason_of(data: bytes) -> str:
     with pytest.raises(MalformedMessageError) as caught:
         unpack(data)
     return caught.value.reason
-
-
-def peak_of(call: Callable[[], object]) -> int:
-    """The bytes that a call had allocated at most."""
-    tracemalloc.start()
-    try:
-        call()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
 
 
 # Both ways.

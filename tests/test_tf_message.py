@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import strategies as some
+from allocations import peak_of
 from hypothesis import example, given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
@@ -94,16 +95,6 @@ def reason_of(payload: bytes | memoryview, tags: Iterable[tuple[str, bool]] | No
     with pytest.raises(MalformedMessageError) as caught:
         decode(payload, tags)
     return caught.value.reason
-
-
-def peak_of(call: Callable[[], object]) -> int:
-    """The bytes that a call had allocated at most."""
-    tracemalloc.start()
-    try:
-        call()
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
 
 
 # Encoding.

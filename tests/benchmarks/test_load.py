@@ -3,11 +3,11 @@
 import math
 import random
 from collections.abc import Awaitable, Callable
-from time import perf_counter
 from typing import Any
 
 import anyio
 from beside import Table
+from lag import probe
 
 from tfbus import SECOND, Buffer, Bus, Transform, TransformBroadcaster
 
@@ -24,7 +24,6 @@ AHEAD = SECOND
 WATCHERS = 50
 WARM_UP = 1.0
 SECONDS = 8.0
-PROBE = 0.001
 
 
 async def broadcast(bus: Bus, number: int, count: list[int]) -> None:
@@ -51,14 +50,6 @@ async def watch(buffer: Buffer, number: int, count: list[int]) -> None:
     with buffer.watch("base", f"f{number * 2}", max_rate=10.0) as changes:
         async for _ in changes:
             count[0] += 1
-
-
-async def probe(lags: list[float]) -> None:
-    """How much later than it asked for a task that sleeps is woken."""
-    while True:
-        due = perf_counter() + PROBE
-        await anyio.sleep(PROBE)
-        lags.append(perf_counter() - due)
 
 
 def test_lag_under_load(table: Table, run: Run, anyio_backend: tuple[str, dict[str, Any]]) -> None:

@@ -3,11 +3,11 @@
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from statistics import median
-from time import perf_counter
 from typing import Any
 
 import anyio
 from beside import Table
+from lag import probe
 
 from tfbus import Bus, RecorderStatistics, Transform, TransformBroadcaster
 from tfbus.recording import Recorder
@@ -21,7 +21,6 @@ FRAMES = 10
 RATE = 100.0
 TURNS = 11
 SECONDS = 1.5
-PROBE = 0.001
 
 
 async def broadcast(bus: Bus, number: int, count: list[int]) -> None:
@@ -32,14 +31,6 @@ async def broadcast(bus: Bus, number: int, count: list[int]) -> None:
         for frame in range(FRAMES):
             broadcaster.send("base", f"f{number}_{frame}", Transform((tick / 7, frame / 7, number / 7)))
         count[0] += FRAMES
-
-
-async def probe(lags: list[float]) -> None:
-    """How much later than it asked for a task that sleeps is woken."""
-    while True:
-        due = perf_counter() + PROBE
-        await anyio.sleep(PROBE)
-        lags.append(perf_counter() - due)
 
 
 def percentile(lags: list[float], part: float) -> float:

@@ -9,11 +9,12 @@ from cyclopts import Parameter
 
 from tfbus.buffer import Buffer
 from tfbus.bus import Bus
+from tfbus.cli.instants import seconds
 from tfbus.cli.link import LOCAL, LinkOptions, UnusableError, say
 from tfbus.cli.options import Duration, Rate
 from tfbus.errors import InvalidTransformError, TransformLookupError
 from tfbus.stamped import TransformStamped, check_frame
-from tfbus.stamps import SECOND, format_duration, to_seconds
+from tfbus.stamps import format_duration, to_seconds
 from tfbus.waiting import MAY_COME, blocking_frames
 
 _SOON = 1.0
@@ -94,7 +95,7 @@ def to_json(found: TransformStamped, now: int) -> str:
 
 def describe(found: TransformStamped, now: int) -> str:
     """An answer much as ``tf2_echo`` prints it, with the two frames and the age."""
-    when = "any time" if found.static else f"{_exact(found.stamp)} s, age {format_duration(now - found.stamp)}"
+    when = "any time" if found.static else f"{seconds(found.stamp)} s, age {format_duration(now - found.stamp)}"
     angles = found.transform.as_rpy()
     return "\n".join(
         (
@@ -105,12 +106,6 @@ def describe(found: TransformStamped, now: int) -> str:
             f"            in rpy (deg)          [{_join(map(math.degrees, angles))}]",
         )
     )
-
-
-def _exact(stamp: int) -> str:
-    """Seconds with nine decimals, so that all lines are aligned."""
-    seconds, nanoseconds = divmod(abs(stamp), SECOND)
-    return f"{'-' if stamp < 0 else ''}{seconds}.{nanoseconds:09d}"
 
 
 def _join(numbers: Iterable[float]) -> str:

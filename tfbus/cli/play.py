@@ -53,26 +53,23 @@ def play(
     """
     start, end = _range(file, since, until)
 
-    async def play_to_domain() -> None:
-        with Bus() as bus, bus.events(stale_after=None) as events:
-            player = Player(bus, file, rate=rate, loop=loop, since=start, until=end)
-            async with link.open(bus):
-                # Who is there needs a moment to be found, and would else miss the beginning.
-                with anyio.move_on_after(_MEETING):
-                    async for event in events:
-                        if isinstance(event, PeerJoined):
-                            break
-                events.close()
-                say(f"playing {file} on domain {link.domain!r}")
-                async with anyio.create_task_group() as tasks:
-                    tasks.start_soon(_show, player)
-                    await player.play()
-                    tasks.cancel_scope.cancel()
-            say(f"{player.played:,} samples played")
-            if wrong := player.bad + Counter(bus.statistics().rejected):
-                say(f"tfbus: left out: {left_out(wrong)}")
+    async def play_to_domain(bus: Bus) -> None:
+        player = Player(bus, file, rate=rate, loop=loop, since=start, until=end)
+        # Who is there needs a moment to be found, and would else miss the beginning.
+        with bus.events(stale_after=None) as events, anyio.move_on_after(_MEETING):
+            async for event in events:
+                if isinstance(event, PeerJoined):
+                    break
+        say(f"playing {file} on domain {link.domain!r}")
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(_show, player)
+            await player.play()
+            tasks.cancel_scope.cancel()
+        say(f"{player.played:,} samples played")
+        if wrong := player.bad + Counter(bus.statistics().rejected):
+            say(f"tfbus: left out: {left_out(wrong)}")
 
-    anyio.run(play_to_domain, backend=link.backend)
+    link.run(play_to_domain)
 
 
 def _range(file: Path, since: int | None, until: int | None) -> tuple[int | None, int | None]:
