@@ -6,9 +6,9 @@ from itertools import count
 
 import anyio
 import pytest
-from asking import Asked, driving, settle
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.asking import Asked, driving, settle
 
 from tfbus import SECOND, Buffer, Bus, Clock, ClockResetError, SimulatedClock, SystemClock, from_seconds, to_seconds
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import TODAY, stamps
+from support.strategies import TODAY, stamps
 
 from tfbus import LATEST, SECOND, from_seconds, to_seconds
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, as_stamp, as_stamps, format_duration, format_stamp

@@ -9,15 +9,15 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import pytest
-import strategies as some
-from allocations import peak_of
 from hypothesis import example, given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
-from samples import moving
+from support import strategies as some
+from support.allocations import peak_of
+from support.samples import moving
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped
-from tfbus.geometry import IDENTITY, Row
+from tfbus.geometry.rows import IDENTITY, Row
 from tfbus.tf_message import LEAST_SIZE, MAX_NAME, MalformedMessageError, decode, encode, refusal
 
 MESSAGE = "tf2_msgs/msg/TFMessage"

@@ -4,10 +4,14 @@ A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of 
 seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
 """
 
-from tfbus.broadcaster import TransformBroadcaster
-from tfbus.buffer import Buffer
-from tfbus.bus import Bus
-from tfbus.clock import Clock, SimulatedClock, SystemClock
+from tfbus.buffer.buffer import Buffer
+from tfbus.buffer.watch import Watch
+from tfbus.bus.broadcaster import TransformBroadcaster
+from tfbus.bus.bus import Bus
+from tfbus.bus.event_stream import EventStream
+from tfbus.bus.stream import Stream
+from tfbus.bus.thread_publisher import ThreadPublisher
+from tfbus.clock import Clock, SimulatedClock, SystemClock, Ticks
 from tfbus.data import (
     LaserScan,
     PointCloud,
@@ -38,7 +42,6 @@ from tfbus.errors import (
     TransformLookupError,
     UnknownFrameError,
 )
-from tfbus.event_stream import EventStream
 from tfbus.events import (
     AuthorityConflict,
     ClockReset,
@@ -57,16 +60,14 @@ from tfbus.events import (
     SampleRejected,
     SubscriberFailed,
 )
-from tfbus.explanation import ExplainedEdge, Explanation
-from tfbus.geometry import Transform
-from tfbus.history import Edge, Outcome
-from tfbus.joint import Joint, Mimic
-from tfbus.message_filter import MessageFilter
-from tfbus.policy import Hold
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform_array import TransformArray
+from tfbus.message_filter.message_filter import MessageFilter
 from tfbus.registration import Registration
-from tfbus.robot import LimitViolation, RobotModel
-from tfbus.robot_state import RobotStatePublisher
-from tfbus.stamped import TransformStamped
+from tfbus.robot.joint import Joint, Mimic
+from tfbus.robot.model import LimitViolation, RobotModel
+from tfbus.robot.state_publisher import RobotStatePublisher
 from tfbus.stamps import LATEST, SECOND, Latest, from_seconds, to_seconds
 from tfbus.statistics import (
     BufferStatistics,
@@ -76,13 +77,12 @@ from tfbus.statistics import (
     RecorderStatistics,
     RobotStatistics,
 )
-from tfbus.stream import Stream
-from tfbus.threadsafe import ThreadPublisher
-from tfbus.ticks import Ticks
-from tfbus.transform_array import TransformArray
-from tfbus.tree import TransformTree
-from tfbus.waiting import PendingLookup, Question
-from tfbus.watch import Watch
+from tfbus.tree.explanation import ExplainedEdge, Explanation
+from tfbus.tree.history import Edge, Outcome
+from tfbus.tree.policy import Hold
+from tfbus.tree.question import Question
+from tfbus.tree.tree import TransformTree
+from tfbus.waiting.waiting_index import PendingLookup
 
 __all__ = [
     "LATEST",

@@ -363,3 +363,7 @@ class BusClosedError(TransformError):
 
     def __init__(self, message: str = "the bus is closed") -> None:
         super().__init__(message)
+
+
+MAY_COME = (UnknownFrameError, DisconnectedError, FutureExtrapolationError)
+"""The errors that waiting may help against."""

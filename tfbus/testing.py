@@ -6,8 +6,8 @@ from typing import TypeVar
 import anyio
 
 from tfbus.clock import SimulatedClock
-from tfbus.geometry import Transform
-from tfbus.stamped import TransformStamped
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
 
 T = TypeVar("T")
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from beside import Table
-from processes import Crowd, PeerProcess, crowd, free_ports, new_domain
+from support.processes import Crowd, PeerProcess, crowd, free_ports, new_domain
 
 pytest_plugins = ["side_by_side"]
 

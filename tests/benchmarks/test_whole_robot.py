@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from time import perf_counter
 
-import pr2
 import pytest
 from beside import Table, show
+from support import pr2
 
 from tfbus import Buffer, Bus, RobotModel, RobotStatePublisher, SimulatedClock
 

@@ -9,18 +9,18 @@ try:
 except ImportError:
     raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
 
-from tfbus.cli.broadcast import broadcast
-from tfbus.cli.demo import demo
-from tfbus.cli.echo import echo
-from tfbus.cli.info import info
-from tfbus.cli.link import UnusableError
-from tfbus.cli.listen import listen
-from tfbus.cli.play import play
-from tfbus.cli.query import query
-from tfbus.cli.record import record
-from tfbus.cli.robot import robot
-from tfbus.cli.static import static
-from tfbus.cli.tree import tree
+from tfbus.cli.commands.broadcast import broadcast
+from tfbus.cli.commands.demo import demo
+from tfbus.cli.commands.echo import echo
+from tfbus.cli.commands.info import info
+from tfbus.cli.commands.listen import listen
+from tfbus.cli.commands.play import play
+from tfbus.cli.commands.query import query
+from tfbus.cli.commands.record import record
+from tfbus.cli.commands.robot import robot
+from tfbus.cli.commands.static import static
+from tfbus.cli.commands.tree import tree
+from tfbus.cli.domain import UnusableError
 from tfbus.errors import RecordingError, TransformLookupError
 
 UNANSWERED = 1

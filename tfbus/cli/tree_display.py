@@ -9,9 +9,9 @@ from rich.live import Live
 from rich.text import Text
 
 from tfbus.cli.printable import printable
-from tfbus.history import Edge
-from tfbus.picture import branches, facts
 from tfbus.stamps import SECOND
+from tfbus.tree.history import Edge
+from tfbus.tree.rendering import branches, facts
 
 _ASCII = str.maketrans("├└─│", "|`-|")
 _STYLES = {"rate": "cyan", "age": "green", "span": "dim", "authority": "magenta"}

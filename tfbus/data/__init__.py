@@ -4,9 +4,9 @@
 `functools.singledispatch` function: register your own types with ``@do_transform.register``.
 """
 
+from tfbus.data._header import Stamped
 from tfbus.data.clouds import PointCloud
 from tfbus.data.dispatch import check_registered, do_transform
-from tfbus.data.header import Stamped
 from tfbus.data.points import PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
 from tfbus.data.scans import LaserScan
 from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchStamped

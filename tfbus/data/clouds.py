@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data.arrays import Rebuilt, as_points
+from tfbus.data._arrays import Rebuilt, as_points
+from tfbus.data._header import check_header
 from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.data.header import check_header
-from tfbus.read_only import read_only
-from tfbus.stamped import TransformStamped
+from tfbus.geometry.read_only import read_only
+from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import Latest, as_stamps
 
 

@@ -3,8 +3,8 @@
 from functools import singledispatch
 from typing import Any
 
-from tfbus.data.header import Stamped
-from tfbus.stamped import TransformStamped
+from tfbus.data._header import Stamped
+from tfbus.geometry.stamped import TransformStamped
 
 
 def check_registered(data: object) -> None:

@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy.typing as npt
 
-from tfbus.data.arrays import Rebuilt, as_points
+from tfbus.data._arrays import Rebuilt, as_points
+from tfbus.data._header import as_triple, check_header, check_pose
 from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.data.header import as_triple, check_header, check_pose
-from tfbus.geometry import Quaternion, Transform, Vector, as_rotation, rotate
-from tfbus.read_only import locked
-from tfbus.stamped import TransformStamped
+from tfbus.geometry.read_only import locked
+from tfbus.geometry.rows import Quaternion, Vector, as_rotation, rotate
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
 from tfbus.stamps import Latest
 
 

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data.arrays import Rebuilt, as_floats
+from tfbus.data._arrays import Rebuilt, as_floats
+from tfbus.data._header import check_header
 from tfbus.data.clouds import PointCloud
-from tfbus.data.header import check_header
-from tfbus.read_only import read_only
+from tfbus.geometry.read_only import read_only
 from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
 
 

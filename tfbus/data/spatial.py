@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data.arrays import Rebuilt, as_floats
+from tfbus.data._arrays import Rebuilt, as_floats
+from tfbus.data._header import as_triple, check_header, check_pose
 from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.data.header import as_triple, check_header, check_pose
-from tfbus.geometry import Transform, Vector, rotate
-from tfbus.read_only import locked
-from tfbus.stamped import TransformStamped
+from tfbus.geometry.read_only import locked
+from tfbus.geometry.rows import Vector, rotate
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
 from tfbus.stamps import Latest
 
 

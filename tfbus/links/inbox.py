@@ -2,10 +2,10 @@
 
 from collections.abc import Collection
 
-from tfbus.bus import Bus
+from tfbus.bus.bus import Bus
 from tfbus.links.attachment import Attachment, PublishedBatch, unpack
 from tfbus.links.peers import MAX_AUTHORITIES, Peer, Peers
-from tfbus.links.received import ReceivedTransform, Source
+from tfbus.links.provenance import ReceivedTransform, Source
 from tfbus.links.relay import Relay
 from tfbus.tf_message import MalformedMessageError, decode
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from tfbus.errors import InvalidTransformError
+from tfbus.geometry.stamped import TransformStamped
 from tfbus.links.attachment import PublishedBatch, RemovedFrame, pack
 from tfbus.links.relay import Piece
-from tfbus.stamped import TransformStamped
 from tfbus.tf_message import encode, refusal
 
 MAX_SAMPLES = 5_000

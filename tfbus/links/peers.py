@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count
 
-from tfbus.once import Once
+from tfbus._log import SeenKeys
 
 MAX_PEERS = 1_000
 MAX_AUTHORITIES = 1_000
@@ -41,7 +41,7 @@ class Peer:
         self.number = 0
         self.authorities: set[str] = set()
         self.frames: set[tuple[bytes, str]] = set()
-        self.told = Once(_REASONS)
+        self.told = SeenKeys(_REASONS)
 
 
 class Peers:
@@ -61,7 +61,7 @@ class Peers:
     def __init__(self, report: Callable[[str, str, Exception], object]) -> None:
         self._report = report
         self._peers: dict[str, Peer] = {}
-        self._strangers = Once(_REASONS)
+        self._strangers = SeenKeys(_REASONS)
         self.rejected: Counter[str] = Counter()
 
     @property

@@ -14,11 +14,11 @@ from typing import NamedTuple, Protocol
 from uuid import uuid4
 from weakref import WeakKeyDictionary
 
-from tfbus.bus import Bus
+from tfbus.bus.bus import Bus
 from tfbus.errors import UnknownFrameError
+from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.links.peers import Peer, ages
-from tfbus.links.received import ReceivedTransform, Source
-from tfbus.stamped import Batch, TransformStamped
+from tfbus.links.provenance import ReceivedTransform, Source
 
 _REMEMBERED_REMOVALS = 10_000
 _REMEMBERED_ORIGINS = 1_000

@@ -9,11 +9,11 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 
-from tfbus.bus import Bus
+from tfbus.bus.bus import Bus
 from tfbus.clock import SimulatedClock
 from tfbus.errors import UnknownFrameError
-from tfbus.recording.files import RecordedMessage, Recording, open_recording
-from tfbus.recording.read_ahead import ReadAhead
+from tfbus.recording._read_ahead import ReadAhead
+from tfbus.recording.recording import RecordedMessage, Recording, open_recording
 from tfbus.stamps import as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCKS_AHEAD = 2

@@ -18,13 +18,13 @@ import anyio.abc
 import anyio.lowlevel
 import anyio.to_thread
 
-from tfbus.bus import Bus
+from tfbus._aio.task_groups import close_task_group
+from tfbus.bus.bus import Bus
 from tfbus.events import RecordingDropped, RecordingFailed
-from tfbus.own_tasks import end_tasks
-from tfbus.recording.backlog import Backlog
-from tfbus.recording.mcap_output import McapOutput
+from tfbus.geometry.stamped import Batch
+from tfbus.recording._write_queue import Backlog
+from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.registration import Registration
-from tfbus.stamped import Batch
 from tfbus.statistics import RecorderStatistics
 
 ResultT = TypeVar("ResultT")
@@ -152,7 +152,7 @@ class Recorder:
         self._ended = True
         self._arrived.set()
         self._hurry.set()
-        await end_tasks(self._tasks)
+        await close_task_group(self._tasks)
 
     def _check_entered(self) -> None:
         if self._registration is None:

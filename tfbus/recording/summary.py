@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tfbus.recording.files import RecordedMessage, Recording
-from tfbus.recording.loading import sift
-from tfbus.stamped import TransformStamped
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.recording.load import sift
+from tfbus.recording.recording import RecordedMessage, Recording
 from tfbus.stamps import SECOND
 
 
@@ -133,7 +133,7 @@ def summarise(recording: Recording, messages: Iterable[RecordedMessage] | None =
 
 
 class _Frame:
-    """What is gathered of one frame; its newest edge, as `tfbus.topology` wants to know it."""
+    """What is gathered of one frame; its newest edge, as `tfbus.bus._topology` wants to know it."""
 
     def __init__(self, frame: str) -> None:
         self.frame = frame

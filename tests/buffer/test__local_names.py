@@ -1,0 +1,366 @@
+"""Local names, by themselves and where two robots with the same frames share a bus."""
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import anyio
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from support.asking import Asked, driving, settle
+from support.samples import moving, static, x_of
+
+from tfbus import (
+    LATEST,
+    SECOND,
+    Buffer,
+    Bus,
+    DisconnectedError,
+    FutureExtrapolationError,
+    Hold,
+    InvalidTransformError,
+    LookupTimeoutError,
+    PointStamped,
+    Question,
+    SimulatedClock,
+    Transform,
+    TransformBroadcaster,
+    TransformStamped,
+    UnknownFrameError,
+)
+from tfbus.frames import Prefix, as_prefix
+
+pytestmark = pytest.mark.anyio
+
+names = st.text("ab/_", min_size=1, max_size=6).filter(lambda name: not name.startswith("/"))
+
+
+def at_x(x: float) -> Transform:
+    return Transform((x, 0.0, 0.0))
+
+
+def two_robots(start: int = 0) -> tuple[SimulatedClock, Bus, list[TransformBroadcaster], list[Buffer]]:
+    """Robot 1 at x = 1 m in the map and robot 2 at 20 m, each with an arm 0.5 m further."""
+    clock = SimulatedClock(start)
+    bus = Bus(clock)
+    broadcasters = [TransformBroadcaster(bus, f"r{i}", prefix=f"robot{i}/", shared={"map"}) for i in (1, 2)]
+    buffers = [Buffer(bus, prefix=f"robot{i}/", shared={"map"}) for i in (1, 2)]
+    for broadcaster, x in zip(broadcasters, (1.0, 20.0), strict=True):
+        broadcaster.send("map", "base", at_x(x), at=SECOND)
+        broadcaster.send_static("base", "arm", at_x(0.5))
+    return clock, bus, broadcasters, buffers
+
+
+# Names
+
+
+def test_a_name_gets_the_prefix_as_it_is_unless_it_is_shared() -> None:
+    prefix = Prefix("robot1/", {"map", "earth"})
+    assert [prefix.on_bus(name) for name in ("base", "map", "earth", "robot2/base")] == [
+        "robot1/base",
+        "map",
+        "earth",
+        "robot1/robot2/base",
+    ]
+    assert Prefix("r1_").on_bus("base") == "r1_base"
+
+
+@given(names, st.sets(names, max_size=3), names)
+def test_a_local_name_comes_back_from_the_bus(text: str, shared: set[str], name: str) -> None:
+    assume(not any(other.startswith(text) for other in shared))
+    prefix = Prefix(text, shared)
+    assert prefix.local(prefix.on_bus(name)) == name
+
+
+def test_somebody_elses_frame_is_not_taken_for_a_shared_one() -> None:
+    prefix = Prefix("robot1/", {"map"})
+    assert [prefix.local(name) for name in ("map", "robot1/map", "robot1/", "robot1//a", "robot2/a")] == [
+        "map",
+        "/robot1/map",
+        "/robot1/",
+        "/robot1//a",
+        "/robot2/a",
+    ]
+
+
+@given(names, st.sets(names, max_size=3), names)
+def test_what_has_no_local_name_is_told_with_a_slash_so_that_it_cannot_be_taken_for_one(
+    text: str, shared: set[str], name: str
+) -> None:
+    assume(not any(other.startswith(text) for other in shared))
+    prefix = Prefix(text, shared)
+    local = prefix.local(name)
+    assert local == f"/{name}" if local.startswith("/") else prefix.on_bus(local) == name
+
+
+@pytest.mark.parametrize("name", ["", "/base", "//"])
+def test_what_cannot_name_a_frame_is_left_for_others_to_refuse(name: str) -> None:
+    assert Prefix("robot1/").on_bus(name) == name
+
+
+@pytest.mark.parametrize(
+    ("prefix", "shared", "error"),
+    [
+        pytest.param("", set(), ValueError, id="empty"),
+        pytest.param("/robot1/", set(), ValueError, id="leading slash"),
+        pytest.param(5, set(), TypeError, id="number"),
+        pytest.param("robot1/", "map", TypeError, id="one shared name"),
+        pytest.param("robot1/", {""}, ValueError, id="empty shared name"),
+        pytest.param("robot1/", {"/map"}, ValueError, id="shared name with a slash"),
+        pytest.param("robot1/", {5}, TypeError, id="shared number"),
+        pytest.param("robot1/", {"robot1/map"}, ValueError, id="shared name with the prefix"),
+    ],
+)
+@pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
+def test_a_bad_prefix_is_refused(make: Callable[..., object], prefix: Any, shared: Any, error: type[Exception]) -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(error):
+        make(bus, prefix=prefix, shared=shared)
+    assert bus.statistics().buffers == ()
+
+
+@pytest.mark.parametrize("shared", [{"map"}, "map", "", ["map", "earth"], iter(["map"]), 5])
+def test_shared_names_without_a_prefix_are_refused(shared: Any) -> None:
+    with pytest.raises(TypeError):
+        as_prefix(None, shared)
+
+
+@pytest.mark.parametrize("shared", [(), set(), iter([])])
+def test_no_prefix_and_nothing_shared_is_no_prefix(shared: Any) -> None:
+    assert as_prefix(None, shared) is None
+
+
+@pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
+def test_who_forgets_the_prefix_is_told(make: Callable[..., object]) -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(TypeError, match="prefix"):
+        make(bus, shared={"map"})
+    assert bus.statistics().buffers == ()
+
+
+# Two robots
+
+
+def test_two_robots_with_the_same_frames_do_not_meet() -> None:
+    _, bus, _, (first, second) = two_robots()
+    assert first.lookup_nowait("map", "arm").transform == at_x(1.5)
+    assert second.lookup_nowait("map", "arm").transform == at_x(20.5)
+    assert first.tree.frames() == ["map", "robot1/arm", "robot1/base", "robot2/arm", "robot2/base"]
+    assert bus.statistics().reparented == bus.statistics().authority_conflicts == 0
+
+
+def test_a_buffer_without_a_prefix_sees_one_robot_from_the_other_through_the_map() -> None:
+    _, bus, (first, second), _ = two_robots()
+    everything = Buffer(bus)
+    first.send("map", "base", at_x(1.0), at=2 * SECOND)
+    assert not everything.can_transform("robot1/arm", "robot2/arm")
+    second.send("map", "base", at_x(30.0), at=2 * SECOND)
+    found = everything.lookup_nowait("robot1/arm", "robot2/base")
+    assert (found.parent, found.child, found.transform) == ("robot1/arm", "robot2/base", at_x(28.5))
+    assert x_of(everything.tree, "robot2/arm", "robot1/base") == -29.5
+
+
+async def test_answers_have_the_names_that_were_asked() -> None:
+    _, _, _, (robot, _) = two_robots()
+    for answer in (
+        robot.lookup_nowait("map", "arm"),
+        robot.lookup_nowait("map", "arm", SECOND, source_at=SECOND, fixed="base"),
+        await robot.lookup("map", "arm"),
+        await robot.lookup("map", "arm", SECOND, source_at=SECOND, fixed="base"),
+        await robot.lookup("map", "arm", SECOND, tolerance=1.0),
+    ):
+        assert (answer.parent, answer.child, answer.stamp, answer.transform) == ("map", "arm", SECOND, at_x(1.5))
+
+
+def test_an_answer_still_says_what_a_policy_did() -> None:
+    _, _, _, (robot, _) = two_robots()
+    found = robot.lookup_nowait("map", "arm", 3 * SECOND, extrapolate=Hold(5.0))
+    assert (found.parent, found.child, found.extrapolated_by, found.gap) == ("map", "arm", 2 * SECOND, 0)
+
+
+async def test_data_are_in_local_frames_before_and_after() -> None:
+    _, _, _, (_, robot) = two_robots()
+    point = PointStamped("arm", LATEST, (0.0, 0.0, 1.0))
+    expected = PointStamped("map", SECOND, (20.5, 0.0, 1.0))
+    assert robot.transform_nowait(point, "map") == expected
+    assert await robot.transform(point, "map") == expected
+    assert robot.transform_nowait(expected, "arm", at=SECOND, fixed="base").point == (0.0, 0.0, 1.0)
+
+
+def test_all_ways_of_sending_take_local_names() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[TransformStamped] = []
+    bus.subscribe(got.extend)
+    robot = TransformBroadcaster(bus, "me", prefix="r/", shared=["map"])
+    robot.send("map", "a", at_x(1.0))
+    robot.send_static("a", "b", at_x(2.0))
+    robot.send_all([("b", "c", at_x(3.0)), moving("map", "d", 7, 4.0)])
+    assert [(sample.parent, sample.child, sample.authority) for sample in got] == [
+        ("map", "r/a", "me"),
+        ("r/a", "r/b", "me"),
+        ("r/b", "r/c", "me"),
+        ("map", "r/d", "me"),
+    ]
+    assert [sample.transform.translation[0] for sample in got] == [1.0, 2.0, 3.0, 4.0]
+
+
+def test_a_robot_owns_its_own_frames_and_no_other_robots() -> None:
+    _, bus, (first, second), (robot, other) = two_robots()
+    with first.owning("tool"), second.owning("tool"):
+        first.send_static("arm", "tool", at_x(0.25))
+        second.send_static("arm", "tool", at_x(0.5))
+        assert x_of(robot.tree, "map", "robot1/tool") == 1.75
+        with pytest.raises(InvalidTransformError):
+            TransformBroadcaster(bus, "stranger").send_static("robot1/arm", "robot1/tool", at_x(0.0))
+    assert not robot.can_transform("arm", "tool")
+    assert not other.can_transform("arm", "tool")
+    assert robot.can_transform("map", "arm")
+
+
+@pytest.mark.parametrize("bad", ["", "/a"])
+def test_a_prefix_does_not_make_a_bad_name_good(bad: str) -> None:
+    _, bus, (robot, _), (buffer, _) = two_robots()
+    before = bus.statistics().samples
+    with pytest.raises(InvalidTransformError):
+        robot.send("map", bad, at_x(0.0))
+    with pytest.raises(InvalidTransformError):
+        robot.send(bad, "a", at_x(0.0))
+    with pytest.raises(InvalidTransformError):
+        robot.send_static("map", bad, at_x(0.0))
+    with pytest.raises(InvalidTransformError):
+        robot.send_all([("map", bad, at_x(0.0))])
+    assert bus.statistics().samples == before
+    assert not buffer.can_transform("map", bad)
+
+
+@pytest.mark.parametrize("bad", ["", "/arm"])
+async def test_a_name_that_no_frame_can_have_fails_at_once(bad: str) -> None:
+    _, _, _, (robot, _) = two_robots()
+    with pytest.raises(UnknownFrameError) as caught:
+        await robot.lookup("map", bad)
+    assert caught.value.frame == bad
+    with pytest.raises(UnknownFrameError), robot.watch("map", bad):
+        pass
+
+
+def test_another_robots_frame_has_no_name_in_a_buffer_with_a_prefix() -> None:
+    _, _, _, (robot, _) = two_robots()
+    for name in ("robot2/arm", "robot1/arm", "/robot2/arm"):
+        assert not robot.can_transform("map", name)
+
+
+def test_errors_have_the_names_of_the_bus() -> None:
+    _, _, _, (robot, _) = two_robots()
+    with pytest.raises(UnknownFrameError) as unknown:
+        robot.lookup_nowait("map", "aarm")
+    assert (unknown.value.frame, unknown.value.close_matches[0]) == ("robot1/aarm", "robot1/arm")
+    with pytest.raises(FutureExtrapolationError) as future:
+        robot.lookup_nowait("map", "arm", 2 * SECOND)
+    assert future.value.child == "robot1/base"
+
+
+async def test_a_lookup_waits_under_the_names_of_the_bus_and_is_listed_under_its_own() -> None:
+    clock, _, (first, second), (robot, _) = two_robots()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, lambda: robot.lookup("map", "arm", 2 * SECOND))
+        late = Asked(tasks, lambda: robot.lookup("map", "arm", 3 * SECOND, timeout=4.0))
+        travels = Asked(tasks, lambda: robot.lookup("map", "tool", 2 * SECOND, source_at=SECOND, fixed="base"))
+        await settle()
+        assert {pending.question for pending in robot.pending()} == {
+            Question("map", "arm", 2 * SECOND),
+            Question("map", "arm", 3 * SECOND),
+            Question("map", "tool", 2 * SECOND, SECOND, "base"),
+        }
+        assert "waiting: 'arm' in 'map': frame 'robot1/base': asked for 2.000 s" in robot.describe()
+        second.send("map", "base", at_x(21.0), at=2 * SECOND)
+        await settle()
+        assert not asked.ended
+        first.send("map", "base", at_x(3.0), at=2 * SECOND)
+        await settle()
+        assert (asked.answer.parent, asked.answer.child, asked.answer.transform) == ("map", "arm", at_x(3.5))
+        first.send_static("base", "tool", at_x(0.25))
+        await settle()
+        assert (travels.answer.child, travels.answer.transform) == ("tool", at_x(3.25))
+        await clock.advance(5.0)
+        assert isinstance(late.error, LookupTimeoutError)
+        assert (late.error.target, late.error.source) == ("map", "robot1/arm")
+
+
+async def test_who_waits_below_a_frame_looks_again_when_it_gets_another_parent() -> None:
+    _, bus, (first, _), (robot, _) = two_robots()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, lambda: robot.lookup("map", "arm", 0))
+        await settle()
+        assert asked.ended
+        asked = Asked(tasks, lambda: robot.lookup("map", "arm", 9 * SECOND))
+        await settle()
+        first.send_static("map", "base", at_x(7.0))
+        await settle()
+        assert asked.answer.transform == at_x(7.5)
+    assert bus.statistics().kind_changes == 1
+
+
+async def test_what_waits_long_is_logged_with_the_names_of_the_bus(caplog: pytest.LogCaptureFixture) -> None:
+    clock, _, _, (robot, _) = two_robots()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, lambda: robot.lookup("map", "aarm"))
+        await settle()
+        with caplog.at_level(logging.WARNING, "tfbus"):
+            await clock.advance(6.0)
+        asked.cancel()
+    assert "'robot1/aarm' in 'map'" in caplog.text
+
+
+async def test_a_watch_gives_local_names() -> None:
+    _, _, (first, second), (robot, _) = two_robots()
+    with robot.watch("map", "arm") as changes:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, lambda: anext(changes))
+            await settle()
+            assert (asked.answer.parent, asked.answer.child, asked.answer.transform) == ("map", "arm", at_x(1.5))
+            asked = Asked(tasks, lambda: anext(changes))
+            await settle()
+            second.send("map", "base", at_x(21.0), at=2 * SECOND)
+            await settle()
+            assert not asked.ended
+            first.send("map", "base", at_x(2.0), at=2 * SECOND)
+            await settle()
+            assert (asked.answer.parent, asked.answer.child, asked.answer.transform) == ("map", "arm", at_x(2.5))
+        assert changes.skipped == 0
+
+
+# Pictures
+
+
+def test_a_picture_has_local_names_and_marks_what_is_somebody_elses() -> None:
+    _, bus, _, (robot, _) = two_robots(SECOND)
+    bus.publish([static("earth", "map"), driving("map", "base", 1.0)])
+    assert robot.describe().splitlines() == [
+        "/earth",
+        "└── map                  static",
+        "    ├── /base            one sample  age 0 ns  span 0 ns",
+        "    ├── /robot2/base     one sample  age 0 ns  span 0 ns  from 'r2'",
+        "    │   └── /robot2/arm  static  from 'r2'",
+        "    └── base             one sample  age 0 ns  span 0 ns  from 'r1'",
+        "        └── arm          static  from 'r1'",
+    ]
+    assert "robot1/base" in robot.tree.describe()
+
+
+def test_an_explanation_has_local_names_and_errors_have_those_of_the_bus() -> None:
+    _, bus, _, (robot, _) = two_robots()
+    found = robot.explain("map", "arm", 2 * SECOND)
+    assert (found.target, found.source, found.chain) == ("map", "arm", ("map", "base", "arm"))
+    assert [(edge.parent, edge.child) for edge in found.edges] == [("map", "base"), ("base", "arm")]
+    (error,) = found.errors
+    assert isinstance(error, FutureExtrapolationError)
+    assert error.child == "robot1/base"
+    assert str(found).splitlines()[1].startswith("! map <- base ")
+    bus.publish(static("raft", "robot1/boat"))
+    apart = robot.explain("boat", "arm")
+    assert apart.half_chains == (("boat", "/raft"), ("arm", "base", "map"))
+    assert isinstance(apart.errors[0], DisconnectedError)
+    misspelt = robot.explain("map", "/arm")
+    assert (misspelt.source, misspelt.answerable) == ("/arm", False)

@@ -1,0 +1,185 @@
+"""Lookups that wait under a policy end at the first moment at which it allows an answer."""
+
+import gc
+from functools import partial
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import pytest
+from support.asking import Asked, driving, settle
+
+from tfbus import (
+    SECOND,
+    Buffer,
+    Bus,
+    FutureExtrapolationError,
+    GapError,
+    Hold,
+    LookupTimeoutError,
+    PointStamped,
+    SimulatedClock,
+    TransformStamped,
+    from_seconds,
+    to_seconds,
+)
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.mark.parametrize(
+    ("policy", "too_early", "enough", "x", "extrapolated_by"),
+    [
+        ({"tolerance": 0.2}, 9.7, 9.8, 9.8, 0.2),
+        ({"extrapolate": Hold(0.5)}, 9.4, 9.6, 9.6, 0.4),
+        ({"tolerance": 0.2, "extrapolate": Hold(0.5)}, 9.4, 9.5, 9.5, 0.5),
+        ({"max_gap": 1.0}, 9.9, 10.5, 10.0, 0.0),
+    ],
+)
+async def test_a_wait_ends_at_the_first_answerable_moment(
+    policy: dict[str, Any], too_early: float, enough: float, x: float, extrapolated_by: float
+) -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        bus.publish(driving("map", "base", 9.0))
+        async with anyio.create_task_group() as tasks:
+            asked: Asked[TransformStamped] = Asked(
+                tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), **policy)
+            )
+            await settle()
+            bus.publish(driving("map", "base", too_early))
+            await settle()
+            assert not asked.ended
+            bus.publish(driving("map", "base", enough))
+            await settle()
+    assert asked.answer.transform.translation[0] == pytest.approx(x)
+    assert asked.answer.stamp == from_seconds(10.0)
+    assert asked.answer.extrapolated_by == from_seconds(extrapolated_by)
+
+
+async def test_a_sample_that_is_too_early_does_not_even_wake_the_lookup() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        bus.publish(driving("map", "base", 9.0))
+        async with anyio.create_task_group() as tasks:
+            Asked(tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), tolerance=0.2))
+            await settle()
+            (before,) = buffer.pending()
+            bus.publish(driving("map", "base", 9.7))
+            await settle()
+            (after,) = buffer.pending()
+            # It would have parked again with a new error.
+            assert after.blocked_by is before.blocked_by
+            bus.publish(driving("map", "base", 9.8))
+
+
+async def test_a_gap_that_has_closed_behind_a_wait_ends_it() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        bus.publish(driving("map", "base", 9.0))
+        async with anyio.create_task_group() as tasks:
+            asked: Asked[TransformStamped] = Asked(
+                tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), max_gap=1.0)
+            )
+            await settle()
+            bus.publish(driving("map", "base", 11.0))
+            await settle()
+        assert isinstance(asked.error, GapError)
+        assert not buffer.pending()
+
+
+@pytest.mark.parametrize("end", ["the lagging edge comes out of the gap", "a late sample fills the gap"])
+async def test_latest_in_the_gap_of_another_edge_waits_for_either_end_of_it(end: str) -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        # map -> base lags at 1.5 s, where base -> arm has a gap from 1 s to 2 s.
+        bus.publish([driving("map", "base", 1.5), driving("base", "arm", 1.0), driving("base", "arm", 2.0)])
+        async with anyio.create_task_group() as tasks:
+            asked: Asked[TransformStamped] = Asked(tasks, partial(buffer.lookup, "map", "arm", max_gap=0.6))
+            await settle()
+            assert not asked.ended
+            if end == "the lagging edge comes out of the gap":
+                bus.publish(driving("map", "base", 2.0))
+            else:
+                bus.publish(driving("base", "arm", 1.4))
+            await settle()
+            assert asked.ended
+    assert asked.answer.transform.translation[0] == pytest.approx(4.0 if asked.answer.stamp == 2 * SECOND else 3.0)
+
+
+async def test_a_held_edge_lets_the_others_make_the_latest_fresh_enough() -> None:
+    clock = SimulatedClock(from_seconds(100.0))
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish([driving("map", "odom", 99.0), driving("odom", "base", 99.2), driving("base", "arm", 99.4)])
+        lookup = partial(buffer.lookup, "map", "arm", max_age=0.1, extrapolate=Hold(5.0))
+        for last in ("odom", "base"):
+            async with anyio.create_task_group() as tasks:
+                asked: Asked[TransformStamped] = Asked(tasks, lookup)
+                await settle()
+                assert not asked.ended
+                bus.publish(driving({"odom": "map", "base": "odom"}[last], last, to_seconds(clock.now())))
+                await settle()
+                assert asked.ended
+            assert asked.answer.stamp == clock.now()
+            await clock.advance(1.0)
+
+
+async def test_a_timeout_says_how_near_a_sample_would_have_done() -> None:
+    clock = SimulatedClock()
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish(driving("map", "base", 9.0))
+        async with anyio.create_task_group() as tasks:
+            asked: Asked[TransformStamped] = Asked(
+                tasks, partial(buffer.lookup, "map", "base", from_seconds(10.0), tolerance=0.2, timeout=1.0)
+            )
+            await clock.advance(1.0)
+        assert isinstance(asked.error, LookupTimeoutError)
+        assert isinstance(asked.error.__cause__, FutureExtrapolationError)
+        assert "asked for 10.000 s within 200 ms, newest sample is 9.000 s (1 s short)" in str(asked.error)
+
+
+async def test_data_are_moved_under_a_policy_too() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        bus.publish(driving("map", "base", 9.0))
+        point = PointStamped("base", from_seconds(9.25), (1.0, 0.0, 0.0))
+        expected = PointStamped("map", from_seconds(9.25), (10.0, 0.0, 0.0))
+        assert await buffer.transform(point, "map", extrapolate=Hold(0.25)) == expected
+        assert buffer.transform_nowait(point, "map", tolerance=0.25) == expected
+        with pytest.raises(FutureExtrapolationError):
+            buffer.transform_nowait(point, "map", max_gap=0.25)
+
+
+async def test_a_policy_that_makes_no_sense_is_refused_before_anything_waits() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        with pytest.raises(TypeError, match="extrapolate must be a Hold"):
+            await buffer.lookup("map", "base", extrapolate=0.5)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="max_gap"):
+            buffer.lookup_nowait("map", "base", max_gap=-1.0)
+
+
+@pytest.mark.parametrize("source", ["base", "arm"])
+async def test_a_lookup_that_has_waited_leaves_nothing_to_the_garbage_collector(source: str) -> None:
+    with Bus() as bus, Buffer(bus, keep=None) as buffer:
+        bus.publish([driving("map", "base", 0.0), driving("base", "arm", 0.0), driving("base", "arm", 90.0)])
+
+        async def wait(seconds: float) -> None:
+            async with anyio.create_task_group() as tasks:
+                asked: Asked[TransformStamped] = Asked(
+                    tasks, partial(buffer.lookup, "map", source, from_seconds(seconds), timeout=5.0)
+                )
+                while not buffer.pending():
+                    await anyio.lowlevel.checkpoint()
+                bus.publish(driving("map", "base", seconds))
+            assert asked.answer.stamp == from_seconds(seconds)
+
+        await wait(1.0)
+        gc.collect()
+        gc.disable()
+        try:
+            for seconds in range(2, 12):
+                await wait(float(seconds))
+            gc.set_debug(gc.DEBUG_SAVEALL)
+            gc.collect()
+            # The task groups and scopes of the test, and the loop's own, may leave some; the lookups must not.
+            left = [thing for thing in gc.garbage if type(thing).__module__.startswith("tfbus")]
+        finally:
+            gc.set_debug(0)
+            gc.garbage.clear()
+            gc.enable()
+        assert left == []

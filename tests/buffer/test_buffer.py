@@ -1,0 +1,910 @@
+import logging
+import math
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import numpy as np
+import pytest
+from support.asking import Asked, HandClock, driving, settle
+from support.samples import moving, static
+
+from tfbus import (
+    LATEST,
+    SECOND,
+    Buffer,
+    Bus,
+    BusClosedError,
+    ClockResetError,
+    DisconnectedError,
+    FutureExtrapolationError,
+    LaserScan,
+    LookupTimeoutError,
+    PastExtrapolationError,
+    PointStamped,
+    Question,
+    SimulatedClock,
+    TransformBroadcaster,
+    TransformStamped,
+    UnknownFrameError,
+    Vector3Stamped,
+    do_transform,
+)
+
+pytestmark = pytest.mark.anyio
+
+
+def make(start: int = 0, keep: float | None = 10.0) -> tuple[SimulatedClock, Bus, Buffer]:
+    clock = SimulatedClock(start)
+    bus = Bus(clock)
+    return clock, bus, Buffer(bus, keep)
+
+
+# Answers at once
+
+
+async def test_what_can_be_answered_is_answered_after_one_checkpoint() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])
+    turns = 0
+
+    async def count() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await anyio.lowlevel.checkpoint()
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(count)
+        await anyio.lowlevel.checkpoint()
+        before = turns
+        found = await buffer.lookup("map", "a", 1_500_000_000)
+        # In one turn of the loop the other task runs once; a shuffled turn may put it on either side of this one.
+        assert turns - before <= 2
+        tasks.cancel_scope.cancel()
+    assert found.transform.translation == (1.5, 0.0, 0.0)
+    assert (found.parent, found.child, found.stamp) == ("map", "a", 1_500_000_000)
+
+
+async def test_even_what_can_be_answered_passes_a_checkpoint() -> None:
+    _, bus, buffer = make()
+    bus.publish(static("map", "a"))
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        await buffer.lookup("map", "a")
+    assert scope.cancelled_caught
+
+
+async def test_a_lookup_with_no_time_at_all_still_answers_what_it_can() -> None:
+    _, bus, buffer = make()
+    bus.publish(driving("map", "a", 1.0))
+    assert (await buffer.lookup("map", "a", timeout=0)).stamp == SECOND
+    with pytest.raises(LookupTimeoutError):
+        await buffer.lookup("map", "a", 2 * SECOND, timeout=0)
+
+
+async def test_the_past_fails_at_once_because_waiting_cannot_help() -> None:
+    _, bus, buffer = make(keep=2.0)
+    bus.publish([driving("map", "a", 5.0), driving("map", "a", 9.0), static("a", "b")])
+    with pytest.raises(PastExtrapolationError) as caught:
+        await buffer.lookup("map", "b", 6 * SECOND)
+    assert (caught.value.child, caught.value.oldest) == ("a", 9 * SECOND)
+
+
+@pytest.mark.parametrize("bad", ["", "/a"])
+@pytest.mark.parametrize("ask", [lambda bad: (bad, "a"), lambda bad: ("nowhere", bad)], ids=["target", "source"])
+async def test_a_name_that_no_frame_can_have_fails_at_once(bad: str, ask: Callable[[str], tuple[str, str]]) -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    with pytest.raises(UnknownFrameError) as caught:
+        await buffer.lookup(*ask(bad))
+    assert caught.value.frame == bad
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        pytest.param({"at": 1.5}, TypeError, id="float stamp"),
+        pytest.param({"at": None}, TypeError, id="no stamp"),
+        pytest.param({"at": 2**63}, ValueError, id="stamp beyond int64"),
+        pytest.param({"source": 5}, TypeError, id="number for a name"),
+        pytest.param({"source_at": 1}, TypeError, id="source_at without fixed"),
+        pytest.param({"fixed": "map"}, TypeError, id="fixed without source_at"),
+        pytest.param({"source_at": 1.5, "fixed": "map"}, TypeError, id="float source_at"),
+        pytest.param({"at": 1, "max_age": 1.0}, TypeError, id="max_age without LATEST"),
+        pytest.param({"max_age": -1.0}, ValueError, id="negative max_age"),
+        pytest.param({"max_age": math.nan}, ValueError, id="NaN max_age"),
+        pytest.param({"timeout": -1.0}, ValueError, id="negative timeout"),
+        pytest.param({"timeout": math.nan}, ValueError, id="NaN timeout"),
+        pytest.param({"timeout": "1"}, TypeError, id="text for a timeout"),
+    ],
+)
+@pytest.mark.parametrize("target", ["map", "nowhere"])
+async def test_a_wrong_question_raises_at_once_whatever_is_known(
+    target: str, arguments: dict[str, Any], error: type[Exception]
+) -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    with pytest.raises(error):
+        await buffer.lookup(target, **{"source": "a", **arguments})
+    assert buffer.pending() == ()
+
+
+# Waiting, as tf2's tests have it
+
+
+async def test_a_lookup_wakes_when_the_stamp_becomes_covered() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 10 * SECOND))
+        for second in range(1, 10):
+            bus.publish(driving("map", "a", second))
+            await settle()
+            assert not asked.ended
+        bus.publish(driving("map", "a", 10))
+    assert asked.answer.stamp == 10 * SECOND
+
+
+async def test_an_old_stamp_fails_when_the_first_sample_is_newer_although_older_ones_might_follow() -> None:
+    """tf2 goes on waiting here (``waitForOldTransform``); out-of-order data that fill the past are no way to run."""
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 1 * SECOND))
+        await settle()
+        bus.publish(driving("map", "a", 10))
+        await settle()
+        assert isinstance(asked.error, PastExtrapolationError)
+
+
+async def test_out_of_order_samples_in_one_batch_are_one_arrival() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 1 * SECOND))
+        await settle()
+        bus.publish([driving("map", "a", second) for second in range(10, 0, -1)])
+    assert asked.answer.transform.translation == (1.0, 0.0, 0.0)
+
+
+async def test_what_arrived_between_asking_and_the_timeout_is_not_lost() -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 2 * SECOND, timeout=1.0))
+        await settle()
+        bus.publish([driving("map", "a", 1), driving("map", "a", 3)])
+        await clock.advance(1.0)
+    assert asked.answer.stamp == 2 * SECOND
+
+
+async def test_irrelevant_data_do_not_end_a_wait_and_the_timeout_does() -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5 * SECOND, timeout=2.0))
+        for _ in range(3):
+            await clock.advance(0.5)
+            bus.publish([driving("map", "a", 1), driving("map", "b", 5), driving("a", "c", 5)])
+        await clock.advance(0.5)
+        assert clock.now() == 2 * SECOND
+        error = asked.error
+        assert isinstance(error, LookupTimeoutError)
+        assert (error.target, error.source, error.timeout) == ("map", "a", 2.0)
+        cause = error.__cause__
+        assert isinstance(cause, FutureExtrapolationError)
+        assert (cause.child, cause.stamp, cause.newest) == ("a", 5 * SECOND, 1 * SECOND)
+
+
+@pytest.mark.parametrize("timeout", [0.25, 4.999, 5.0, 5.001, 10.0, 3600.0])
+async def test_a_timeout_runs_out_at_its_own_time_on_the_bus_s_clock(timeout: float) -> None:
+    clock, _, buffer = make()
+
+    async def ask() -> int:
+        with pytest.raises(TimeoutError):
+            await buffer.lookup("map", "a", timeout=timeout)
+        return clock.now()
+
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, ask)
+        await clock.advance(timeout + 1.0)
+        assert asked.answer == round(timeout * SECOND)
+
+
+async def test_each_return_to_waiting_keeps_the_same_deadline() -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "c", 9 * SECOND, timeout=8.0))
+        for second, (parent, child) in enumerate([("map", "a"), ("a", "b"), ("b", "c")]):
+            await clock.advance(2.0)
+            bus.publish(driving(parent, child, second))
+            await settle()
+            assert len(buffer.pending()) == 1
+        await clock.advance(1.999)
+        assert not asked.ended
+        await clock.advance(0.001)
+        assert isinstance(asked.error, LookupTimeoutError)
+
+
+async def test_a_timeout_is_a_duration_that_survives_jumps() -> None:
+    clock, _, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=3.0))
+        await clock.advance(1.0)
+        clock.set(1000 * SECOND)
+        await clock.advance(1.999)
+        assert not asked.ended
+        await clock.advance(0.001)
+        assert isinstance(asked.error, LookupTimeoutError)
+
+
+async def test_an_infinite_timeout_is_none() -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=math.inf))
+        await clock.advance(1e6)
+        assert not asked.ended
+        bus.publish(moving("map", "a", 7))
+        await settle()
+        assert asked.answer.stamp == 7
+
+
+@pytest.mark.parametrize("phase", ["before the report", "after the report"])
+@pytest.mark.parametrize("data_first", [True, False])
+@pytest.mark.parametrize("timeout", [None, 2.0, 7.0])
+async def test_data_that_come_in_the_turn_in_which_time_runs_out_still_answer(
+    timeout: float | None, data_first: bool, phase: str
+) -> None:
+    clock = HandClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5, timeout=timeout))
+        await settle()
+        if phase == "after the report" and timeout != 2.0:
+            clock.scopes[-1].cancel()
+            await settle()
+            assert len(buffer.pending()) == 1
+        steps: list[Callable[[], object]] = [clock.scopes[-1].cancel, lambda: bus.publish(moving("map", "a", 9))]
+        for step in reversed(steps) if data_first else steps:
+            step()
+        await settle()
+        assert asked.ended
+        assert asked.answer.stamp == 5
+    assert buffer.pending() == ()
+
+
+async def test_fail_after_works_around_a_lookup_and_leaves_nothing_behind() -> None:
+    buffer = Buffer(Bus())
+    with pytest.raises(TimeoutError) as caught, anyio.fail_after(0.001):
+        await buffer.lookup("map", "a", timeout=3600.0)
+    assert not isinstance(caught.value, LookupTimeoutError)
+    assert buffer.pending() == ()
+
+
+async def test_time_travel_waits_for_both_of_its_stamps() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("world", "car", second) for second in (1, 2)])
+    ask = partial(buffer.lookup, "car", "car", fixed="world")
+    async with anyio.create_task_group() as tasks:
+        known = await ask(2 * SECOND, source_at=1 * SECOND)
+        later_target = Asked(tasks, partial(ask, 4 * SECOND, source_at=1 * SECOND))
+        later_source = Asked(tasks, partial(ask, 1 * SECOND, source_at=5 * SECOND))
+        await settle()
+        bus.publish(driving("world", "car", 4))
+        await settle()
+        assert not later_source.ended
+        bus.publish(driving("world", "car", 5))
+    assert known.transform.translation == (-1.0, 0.0, 0.0)
+    assert later_target.answer.transform.translation == (-3.0, 0.0, 0.0)
+    assert later_source.answer.transform.translation == (4.0, 0.0, 0.0)
+
+
+async def test_a_lookup_waits_until_two_trees_are_joined() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "a", 1), driving("world", "b", 1)])
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "a", "b", 1 * SECOND))
+        await settle()
+        (pending,) = buffer.pending()
+        assert isinstance(pending.blocked_by, DisconnectedError)
+        bus.publish(static("map", "world", x=10.0))
+    assert asked.answer.transform.translation == (10.0, 0.0, 0.0)
+
+
+async def test_lookups_wait_for_statics_too() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "base", "laser", 123))
+        await settle()
+        bus.publish(static("base", "laser", x=0.5))
+    assert (asked.answer.stamp, asked.answer.static) == (123, True)
+
+
+async def test_a_woken_lookup_reads_what_holds_when_its_turn_comes() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        await settle()
+        bus.publish(moving("map", "a", 5))
+        assert not asked.ended
+        bus.remove_frame("a")
+        await settle()
+        assert not asked.ended
+        bus.publish(moving("map", "a", 5, 1.0))
+        bus.publish(moving("map", "a", 5, 2.0))
+    assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
+
+
+async def test_a_thousand_waiters_of_one_publish_are_all_answered() -> None:
+    _, bus, buffer = make()
+    bus.publish(driving("map", "a", 0))
+    async with anyio.create_task_group() as tasks:
+        asked = [Asked(tasks, partial(buffer.lookup, "map", "a", stamp)) for stamp in range(1, 1001)]
+        await settle()
+        bus.publish(driving("map", "a", 10))
+    assert [each.answer.stamp for each in asked] == list(range(1, 1001))
+
+
+# LATEST and max_age
+
+
+async def test_latest_waits_until_every_edge_has_a_common_stamp() -> None:
+    _, bus, buffer = make(keep=2.0)
+    bus.publish([driving("map", "slow", 1), driving("slow", "fast", 20), driving("slow", "fast", 22)])
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "fast"))
+        await settle()
+        (pending,) = buffer.pending()
+        assert isinstance(pending.blocked_by, FutureExtrapolationError)
+        assert (pending.blocked_by.child, pending.blocked_by.stamp) == ("slow", 20 * SECOND)
+        bus.publish(driving("map", "slow", 19))
+        await settle()
+        assert not asked.ended
+        bus.publish(driving("map", "slow", 21))
+    assert asked.answer.stamp == 21 * SECOND
+
+
+async def test_a_dead_broadcaster_answers_for_ever_without_max_age_and_not_with_it() -> None:
+    clock, bus, buffer = make()
+    bus.publish(driving("map", "a", 0))
+    await clock.advance(1.0)
+    assert (await buffer.lookup("map", "a", max_age=1.0)).stamp == 0
+    await clock.advance(0.001)
+    assert (await buffer.lookup("map", "a")).stamp == 0
+    assert buffer.can_transform("map", "a")
+    assert not buffer.can_transform("map", "a", max_age=1.0)
+    with pytest.raises(FutureExtrapolationError) as caught:
+        buffer.lookup_nowait("map", "a", max_age=1.0)
+    assert (caught.value.child, caught.value.stamp, caught.value.newest) == ("a", 1_000_000, 0)
+
+
+async def test_max_age_waits_for_a_sample_that_is_fresh_when_it_comes() -> None:
+    clock, bus, buffer = make()
+    bus.publish([driving("map", "a", 0), static("a", "b")])
+    async with anyio.create_task_group() as tasks:
+        await clock.advance(5.0)
+        asked = Asked(tasks, partial(buffer.lookup, "map", "b", max_age=0.5))
+        await clock.advance(3.0)
+        bus.publish(driving("map", "a", 7.0))
+        await settle()
+        assert not asked.ended
+        bus.publish(driving("map", "a", 7.5))
+        await settle()
+        assert asked.answer.stamp == 7_500_000_000
+
+
+async def test_max_age_judges_the_edge_that_lags_most() -> None:
+    clock, bus, buffer = make()
+    bus.publish([driving("map", "a", 0), driving("a", "b", 0), driving("a", "b", 2)])
+    await clock.advance(2.0)
+    with pytest.raises(FutureExtrapolationError, match="'a'"):
+        buffer.lookup_nowait("map", "b", max_age=1.0)
+
+
+async def test_static_answers_have_no_age() -> None:
+    clock, bus, buffer = make()
+    bus.publish(static("map", "a"))
+    await clock.advance(1e6)
+    found = await buffer.lookup("map", "a", max_age=0.001)
+    assert found.static
+
+
+async def test_an_infinite_max_age_is_none() -> None:
+    clock, bus, buffer = make()
+    bus.publish(driving("map", "a", 0))
+    await clock.advance(1e6)
+    assert (await buffer.lookup("map", "a", max_age=math.inf)).stamp == 0
+
+
+# Who is woken
+
+
+def waiting(bus: Bus) -> int:
+    """How many lookups are parked; one that was woken is not, until its turn comes and it parks again."""
+    return bus.statistics().buffers[0].waiting
+
+
+async def test_ten_thousand_waiters_on_one_edge_sleep_through_samples_of_another_and_can_be_cancelled() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "quiet", 0), driving("map", "busy", 0), driving("map", "x", 0), static("map", "s")])
+    async with anyio.create_task_group() as tasks:
+        for k in range(10_000):
+            tasks.start_soon(buffer.lookup, "map", "quiet", (1 + k) * SECOND)
+        await settle()
+        for second in range(1, 50):
+            bus.publish([driving("map", "busy", second), static("map", "s"), driving("map", "x", second / 2)])
+            bus.publish([driving("map", f"new_{second}", second), driving("map", "quiet", 0.5)])
+            assert waiting(bus) == 10_000
+        bus.publish(driving("map", "quiet", 3))
+        assert waiting(bus) == 9_997
+        tasks.cancel_scope.cancel()
+    assert waiting(bus) == 0
+    assert buffer.pending() == ()
+
+
+@pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])
+async def test_cancelling_waiters_leaves_nothing_behind_whatever_they_wait_for(source: str) -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "edge", 0), driving("moon", "elsewhere", 0)])
+    async with anyio.create_task_group() as tasks:
+        for k in range(100):
+            tasks.start_soon(buffer.lookup, "map", source, SECOND + k % 10)
+        await settle()
+        assert waiting(bus) == 100
+        tasks.cancel_scope.cancel()
+    assert waiting(bus) == 0
+    assert buffer.pending() == ()
+    assert "waiting" not in buffer.describe()
+
+
+async def test_cancelling_one_waiter_leaves_the_others() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = [Asked(tasks, partial(buffer.lookup, "map", "a", 5)) for _ in range(3)]
+        await settle()
+        asked[1].cancel()
+        await settle()
+        assert len(buffer.pending()) == 2
+        bus.publish(moving("map", "a", 5))
+    assert asked[1].cancelled
+    assert asked[0].answer == asked[2].answer
+
+
+@pytest.mark.parametrize("data_first", [True, False])
+async def test_cancelling_and_waking_in_one_turn_leaves_nothing_behind(data_first: bool) -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        other = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        await settle()
+        steps: list[Callable[[], object]] = [asked.cancel, lambda: bus.publish(moving("map", "a", 5))]
+        for step in reversed(steps) if data_first else steps:
+            step()
+        await settle()
+        assert asked.ended
+        assert other.answer.stamp == 5
+    assert buffer.pending() == ()
+
+
+# What waits is visible
+
+
+async def test_pending_says_who_waits_since_when_and_what_for() -> None:
+    clock, bus, buffer = make()
+    bus.publish([driving("map", "a", 1), driving("moon", "b", 1)])
+    async with anyio.create_task_group() as tasks:
+        await clock.advance(2.0)
+        tasks.start_soon(buffer.lookup, "map", "a", 3 * SECOND)
+        await settle()
+        await clock.advance(1.0)
+        tasks.start_soon(buffer.lookup, "map", "b")
+        await settle()
+        tasks.start_soon(partial(buffer.lookup, "map", "c", LATEST, source_at=LATEST, fixed="map"))
+        await settle()
+        edge, trees, unknown = buffer.pending()
+        text = buffer.describe()
+        tasks.cancel_scope.cancel()
+    assert edge.question == Question("map", "a", 3 * SECOND)
+    assert (edge.since, trees.since) == (2 * SECOND, 3 * SECOND)
+    assert isinstance(edge.blocked_by, FutureExtrapolationError)
+    assert edge.blocked_by.child == "a"
+    assert isinstance(trees.blocked_by, DisconnectedError)
+    assert set(trees.blocked_by.roots) == {"map", "moon"}
+    assert unknown.question == Question("map", "c", LATEST, LATEST, "map")
+    assert isinstance(unknown.blocked_by, UnknownFrameError)
+    assert unknown.blocked_by.frame == "c"
+    for pending in (edge, trees, unknown):
+        assert f"waiting: {pending}" in text.splitlines()
+
+
+async def test_a_long_wait_is_logged_once_a_cause(caplog: pytest.LogCaptureFixture) -> None:
+    clock, bus, buffer = make()
+    bus.publish(driving("map", "base", 0))
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(buffer.lookup, "map", "basse")
+        await clock.advance(0.5)
+        tasks.start_soon(buffer.lookup, "base", "basse", SECOND)
+        tasks.start_soon(buffer.lookup, "map", "base", 60 * SECOND)
+        # This one is woken by every sample, and finds each of them too old.
+        tasks.start_soon(partial(buffer.lookup, "map", "base", max_age=0.4))
+        await clock.advance(4.499)
+        assert caplog.messages == []
+        await clock.advance(0.001)
+        (misspelt,) = caplog.messages
+        assert "'basse'" in misspelt
+        assert "did you mean 'base'" in misspelt
+        for second in range(5, 30):
+            bus.publish(driving("map", "base", second - 0.5))
+            await clock.advance(1.0)
+        assert len(caplog.messages) == 2
+        assert "newest sample is" in caplog.messages[1]
+        assert {(record.name, record.levelno) for record in caplog.records} == {("tfbus", logging.WARNING)}
+        assert len(buffer.pending()) == 4
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_long_wait_that_finds_another_cause_logs_that_too(caplog: pytest.LogCaptureFixture) -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(buffer.lookup, "map", "a", 60 * SECOND)
+        await clock.advance(6.0)
+        bus.publish(driving("map", "a", 1))
+        await clock.advance(1.0)
+        first, second = caplog.messages
+        tasks.cancel_scope.cancel()
+    assert "not known" in first
+    assert "newest sample is 1.000 s" in second
+
+
+async def test_short_waits_are_nobody_s_business(caplog: pytest.LogCaptureFixture) -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        timed_out = Asked(tasks, partial(buffer.lookup, "map", "a", 60 * SECOND, timeout=5.0))
+        answered = Asked(tasks, partial(buffer.lookup, "map", "a"))
+        await clock.advance(4.0)
+        bus.publish(driving("map", "a", 1))
+        await clock.advance(10.0)
+        assert timed_out.ended
+        assert answered.ended
+    assert caplog.messages == []
+
+
+# Clock jumps
+
+
+async def test_a_jump_back_ends_every_wait_with_both_stamps() -> None:
+    clock, bus, buffer = make(start=100 * SECOND)
+    bus.publish(driving("map", "a", 100))
+    async with anyio.create_task_group() as tasks:
+        asked = [
+            Asked(tasks, partial(buffer.lookup, "map", source, 101 * SECOND, timeout=timeout))
+            for source in ("a", "nowhere")
+            for timeout in (None, 1.0, 60.0)
+        ]
+        await settle()
+        clock.set(90 * SECOND)
+        await settle()
+    for each in asked:
+        assert isinstance(each.error, ClockResetError)
+        assert (each.error.before, each.error.after) == (100 * SECOND, 90 * SECOND)
+    assert len({id(each.error) for each in asked}) == len(asked)
+    assert buffer.pending() == ()
+
+
+async def test_a_wait_that_is_answered_and_reset_in_one_turn_is_reset() -> None:
+    clock, bus, buffer = make(start=100)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 101))
+        await settle()
+        bus.publish(moving("map", "a", 101))
+        clock.set(50)
+        bus.publish(moving("map", "a", 101))
+        await settle()
+        assert isinstance(asked.error, ClockResetError)
+
+
+async def test_lookups_after_a_jump_back_are_of_the_new_time() -> None:
+    clock, bus, buffer = make(start=100 * SECOND)
+    bus.publish(driving("map", "a", 100))
+    clock.set(0)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a"))
+        await settle()
+        assert not asked.ended
+        bus.publish(driving("map", "a", 1))
+    assert asked.answer.stamp == 1 * SECOND
+
+
+async def test_a_jump_forward_disturbs_no_wait() -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        await settle()
+        clock.set(10**12)
+        await settle()
+        assert not asked.ended
+        bus.publish(moving("map", "a", 5))
+    assert asked.answer.stamp == 5
+
+
+# The end
+
+
+@pytest.mark.parametrize(
+    ("close", "message"),
+    [
+        pytest.param(lambda bus, _: bus.close(), "the bus is closed", id="bus"),
+        pytest.param(lambda _, buffer: buffer.close(), "the buffer is closed", id="buffer"),
+    ],
+)
+async def test_closing_ends_waits_and_what_is_buffered_can_still_be_looked_up(
+    close: Callable[[Bus, Buffer], None], message: str
+) -> None:
+    _, bus, buffer = make()
+    bus.publish(driving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        asked = [Asked(tasks, partial(buffer.lookup, "map", source, 2 * SECOND)) for source in ("a", "nowhere")]
+        await settle()
+        close(bus, buffer)
+        close(bus, buffer)
+        await settle()
+    for each, cause in zip(asked, (FutureExtrapolationError, UnknownFrameError), strict=True):
+        assert isinstance(each.error, BusClosedError)
+        assert str(each.error) == message
+        assert isinstance(each.error.__cause__, cause)
+    assert (await buffer.lookup("map", "a")).stamp == 1 * SECOND
+    with pytest.raises(BusClosedError):
+        await buffer.lookup("map", "a", 2 * SECOND)
+    with pytest.raises(PastExtrapolationError):
+        await buffer.lookup("map", "a", 0)
+
+
+async def test_a_closed_buffer_hears_nothing_more_and_the_others_do() -> None:
+    _, bus, closed = make()
+    with Buffer(bus) as buffer:
+        bus.publish(moving("map", "a", 1))
+        closed.close()
+        bus.publish(moving("map", "a", 2))
+        bus.remove_frame("a")
+        assert (await closed.lookup("map", "a")).stamp == 1
+        assert not buffer.can_transform("map", "a")
+        assert len(bus.statistics().buffers) == 1
+    assert bus.statistics().buffers == ()
+
+
+async def test_what_was_answered_before_the_close_in_the_same_turn_stays_answered() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        await settle()
+        bus.publish(moving("map", "a", 5))
+        bus.close()
+        await settle()
+    assert asked.answer.stamp == 5
+
+
+@pytest.mark.parametrize("keep", [-1.0, math.nan])
+def test_a_buffer_with_a_bad_window_is_not_attached(keep: float) -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(ValueError, match="keep"):
+        Buffer(bus, keep)
+    bus.publish(moving("map", "a", 1))
+    assert bus.statistics().buffers == ()
+
+
+# Data, and the way from the broadcaster to the listener
+
+
+async def test_transform_waits_for_the_stamp_of_the_data() -> None:
+    _, bus, buffer = make()
+    bus.publish(static("base", "laser", x=1.0))
+    point = PointStamped("laser", 5 * SECOND, (2.0, 0.0, 0.0))
+    with pytest.raises(UnknownFrameError):
+        buffer.transform_nowait(point, "map")
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.transform, point, "map"))
+        await settle()
+        bus.publish([driving("map", "base", 4), driving("map", "base", 6)])
+    assert asked.answer == PointStamped("map", 5 * SECOND, (8.0, 0.0, 0.0))
+    assert buffer.transform_nowait(point, "map") == asked.answer
+
+
+async def test_transformed_data_that_asked_for_the_latest_carry_its_stamp() -> None:
+    _, bus, buffer = make()
+    bus.publish(driving("map", "base", 4))
+    moved = await buffer.transform(Vector3Stamped("base", LATEST, (1.0, 0.0, 0.0)), "map")
+    assert moved == Vector3Stamped("map", 4 * SECOND, (1.0, 0.0, 0.0))
+
+
+async def test_transform_passes_its_limits_on() -> None:
+    clock, bus, buffer = make()
+    bus.publish(driving("map", "base", 0))
+    await clock.advance(9.0)
+    point = PointStamped("base", LATEST, (0.0, 0.0, 0.0))
+    with pytest.raises(LookupTimeoutError):
+        await buffer.transform(point, "map", timeout=0, max_age=1.0)
+    with pytest.raises(FutureExtrapolationError):
+        buffer.transform_nowait(point, "map", max_age=1.0)
+
+
+async def test_data_of_an_unknown_type_are_refused() -> None:
+    class Smell:
+        frame = "map"
+        stamp = LATEST
+
+    _, bus, buffer = make()
+    bus.publish(static("map", "base"))
+    with pytest.raises(TypeError, match=r"do_transform\.register"):
+        await buffer.transform(Smell(), "base")
+
+
+async def test_transform_moves_data_to_another_instant_through_a_fixed_frame() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "base", 1), driving("map", "base", 6), static("base", "laser", x=0.5)])
+    # Seen at 2 s, at 3.5 m in map; at 5 s the base has driven 3 m on.
+    point = PointStamped("laser", 2 * SECOND, (1.0, 0.0, 0.0))
+    moved = await buffer.transform(point, "base", at=5 * SECOND, fixed="map")
+    assert moved == PointStamped("base", 5 * SECOND, (-1.5, 0.0, 0.0))
+    assert buffer.transform_nowait(point, "base", at=5 * SECOND, fixed="map") == moved
+    back = PointStamped("laser", 5 * SECOND, (-2.0, 0.0, 0.0))
+    assert buffer.transform_nowait(back, "laser", at=2 * SECOND, fixed="map").point == (1.0, 0.0, 0.0)
+
+
+async def test_transform_moves_data_to_the_latest_and_says_which_stamp_that_was() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
+    point = PointStamped("base", 2 * SECOND, (1.0, 0.0, 0.0))
+    moved = await buffer.transform(point, "base", at=LATEST, fixed="map")
+    assert moved == PointStamped("base", 6 * SECOND, (-3.0, 0.0, 0.0))
+    assert buffer.transform_nowait(point, "base", at=LATEST, fixed="map") == moved
+
+
+async def test_transform_moves_what_is_the_latest_to_a_given_stamp() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
+    newest = PointStamped("base", LATEST, (1.0, 0.0, 0.0))
+    moved = await buffer.transform(newest, "base", at=2 * SECOND, fixed="map")
+    assert moved == PointStamped("base", 2 * SECOND, (5.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("stamp", "at"), [(2, 5), (5, 2)], ids=["to the future", "to the past"])
+async def test_transform_to_another_instant_waits_for_both_ends(stamp: int, at: int) -> None:
+    _, bus, buffer = make()
+    bus.publish(driving("map", "base", 1))
+    point = PointStamped("base", stamp * SECOND, (1.0, 0.0, 0.0))
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.transform, point, "base", at=at * SECOND, fixed="map"))
+        await settle()
+        bus.publish(driving("map", "base", 3))
+        await settle()
+        assert not asked.ended
+        with pytest.raises(FutureExtrapolationError):
+            buffer.transform_nowait(point, "base", at=at * SECOND, fixed="map")
+        bus.publish(driving("map", "base", 5))
+        await settle()
+    assert asked.answer == PointStamped("base", at * SECOND, (1.0 + stamp - at, 0.0, 0.0))
+
+
+async def test_transform_to_another_instant_keeps_its_limits() -> None:
+    clock, bus, buffer = make()
+    bus.publish([driving("map", "base", 0), driving("map", "base", 2)])
+    await clock.advance(9.0)
+    point = PointStamped("base", SECOND, (0.0, 0.0, 0.0))
+    with pytest.raises(LookupTimeoutError):
+        await buffer.transform(point, "base", timeout=0, max_age=1.0, at=LATEST, fixed="map")
+    with pytest.raises(FutureExtrapolationError):
+        buffer.transform_nowait(point, "base", max_age=1.0, at=LATEST, fixed="map")
+    with pytest.raises(TypeError, match="max_age goes with LATEST"):
+        await buffer.transform(point, "base", max_age=1.0, at=2 * SECOND, fixed="map")
+
+
+@pytest.mark.parametrize("half", [{"at": 5}, {"at": LATEST}, {"fixed": "map"}], ids=["at", "at latest", "fixed"])
+async def test_half_a_journey_is_refused_before_anything_is_awaited(half: dict[str, Any]) -> None:
+    _, _, buffer = make()
+    point = PointStamped("nowhere", 0, (0.0, 0.0, 0.0))
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        with pytest.raises(TypeError, match="at and fixed go together"):
+            await buffer.transform(point, "map", **half)
+    with pytest.raises(TypeError, match="at and fixed go together"):
+        buffer.transform_nowait(point, "map", **half)
+
+
+class Message:
+    """As a message of ROS: its frame and stamp are in a header."""
+
+    header = ("base", 0)
+
+
+@do_transform.register
+def _(data: Message, transform: TransformStamped) -> Message:
+    assert transform.child == "base"
+    return data
+
+
+async def test_registered_data_without_frame_and_stamp_are_refused_with_the_way_out() -> None:
+    _, bus, buffer = make()
+    bus.publish(static("map", "base"))
+    way_out = "Message has no frame and stamp of its own: look the transform up and call do_transform"
+    with pytest.raises(TypeError, match=way_out):
+        await buffer.transform(Message(), "map")  # type: ignore[type-var]
+    with pytest.raises(TypeError, match=way_out):
+        buffer.transform_nowait(Message(), "map")  # type: ignore[type-var]
+    message = Message()
+    assert do_transform(message, await buffer.lookup("map", "base")) is message
+
+
+async def test_a_scan_is_refused_with_what_to_move_instead() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "laser", 1), driving("map", "laser", 3)])
+    scan = LaserScan("laser", 2 * SECOND, np.array([4.0]), angle_min=0.0, angle_increment=0.0)
+    with pytest.raises(TypeError, match=r"transform its to_points\(\) instead"):
+        await buffer.transform(scan, "map")
+    cloud = await buffer.transform(scan.to_points(), "map")
+    assert cloud.points.tolist() == [[6.0, 0.0, 0.0]]
+
+
+async def test_a_listener_once_a_second_follows_a_broadcaster_at_100_hz() -> None:
+    clock, bus, buffer = make()
+    broadcaster = TransformBroadcaster(bus, "odometry")
+
+    async def broadcast() -> None:
+        async for _ in clock.ticks(100):
+            broadcaster.send("odom", "base", driving("odom", "base", clock.now() / SECOND).transform)
+
+    async def listen() -> list[float]:
+        seen = []
+        async for tick in clock.ticks(1):
+            found = await buffer.lookup("odom", "base", clock.now())
+            seen.append(found.transform.translation[0])
+            if tick == 10:
+                break
+        return seen
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(broadcast)
+        listener = Asked(tasks, listen)
+        await clock.advance(10.0)
+        assert listener.answer == [float(second) for second in range(11)]
+        tasks.cancel_scope.cancel()
+    assert buffer.tree.edges()[0].samples == 1001
+
+
+def test_a_buffer_may_be_built_before_a_loop_and_waited_on_in_several(
+    run: Callable[[Callable[[], Awaitable[None]]], None],
+) -> None:
+    _, bus, buffer = make()
+
+    async def wait(stamp: int) -> None:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, partial(buffer.lookup, "map", "a", stamp))
+            await settle()
+            bus.publish(moving("map", "a", stamp))
+        assert asked.answer.stamp == stamp
+
+    for stamp in (1, 2, 3):
+        run(partial(wait, stamp))
+
+
+async def test_an_unregistered_type_is_refused_before_anything_is_awaited() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        for wrong in (("map", 0), 5):
+            with pytest.raises(TypeError, match=r"@do_transform\.register"):
+                await buffer.transform(wrong, "map")  # type: ignore[type-var]
+            with pytest.raises(TypeError, match=r"@do_transform\.register"):
+                buffer.transform_nowait(wrong, "map")  # type: ignore[type-var]
+
+
+async def test_max_age_with_a_stamp_is_refused_by_its_own_name() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 0))
+        with pytest.raises(TypeError, match="max_age goes with LATEST"):
+            await buffer.lookup("map", "base", 0, max_age=1.0)
+
+
+async def test_a_name_that_no_frame_can_have_comes_with_close_matches() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 0))
+        with pytest.raises(UnknownFrameError) as caught:
+            await buffer.lookup("/map", "base")
+        assert caught.value.close_matches == ("map",)

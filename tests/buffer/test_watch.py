@@ -1,0 +1,1013 @@
+import asyncio
+import logging
+import math
+import threading
+from collections.abc import Awaitable, Callable
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import pytest
+from anyio.abc import TaskGroup
+from support.asking import Asked, HandClock, driving, settle
+from support.samples import moving, static
+
+from tfbus import (
+    SECOND,
+    Buffer,
+    Bus,
+    ClockResetError,
+    Hold,
+    SimulatedClock,
+    Transform,
+    TransformStamped,
+    UnknownFrameError,
+    Watch,
+    from_seconds,
+)
+
+pytestmark = pytest.mark.anyio
+
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+
+
+def make(start: int = 0, keep: float | None = 10.0) -> tuple[SimulatedClock, Bus, Buffer]:
+    clock = SimulatedClock(start)
+    bus = Bus(clock)
+    return clock, bus, Buffer(bus, keep)
+
+
+def turned(angle: float, stamp: int, sign: float = 1.0, x: float = 0.0) -> TransformStamped:
+    """The frame a in map, turned about the third axis by `angle` rad; `sign` is that of the quaternion."""
+    half = angle / 2.0
+    rotation = (0.0, 0.0, sign * math.sin(half), sign * math.cos(half))
+    return TransformStamped("map", "a", stamp, Transform((x, 0.0, 0.0), rotation))
+
+
+def x_of(answer: TransformStamped) -> float:
+    return answer.transform.translation[0]
+
+
+class Reader:
+    """Reads a watch to its end in a task of its own, and notes each answer and when it came."""
+
+    def __init__(self, tasks: TaskGroup, watch: Watch, clock: SimulatedClock | None = None) -> None:
+        self.answers: list[TransformStamped] = []
+        self.times: list[float] = []
+        self._clock = clock
+        self._watch = watch
+        self.asked = Asked(tasks, self._read)
+
+    @property
+    def xs(self) -> list[float]:
+        return [x_of(answer) for answer in self.answers]
+
+    @property
+    def stamps(self) -> list[int]:
+        return [answer.stamp for answer in self.answers]
+
+    async def _read(self) -> None:
+        async for answer in self._watch:
+            self.answers.append(answer)
+            if self._clock is not None:
+                self.times.append(self._clock.now() / SECOND)
+
+
+async def read_along(
+    watch: Watch, bus: Bus, samples: list[TransformStamped], tasks: TaskGroup
+) -> list[TransformStamped]:
+    """The answers of a reader that keeps up with samples published one by one."""
+    reader = Reader(tasks, watch)
+    await settle()
+    for sample in samples:
+        bus.publish(sample)
+        await settle()
+    watch.close()
+    await settle()
+    assert reader.asked.answer is None
+    return reader.answers
+
+
+# What comes
+
+
+async def test_it_starts_with_what_holds_now_and_then_gives_each_new_answer() -> None:
+    _, bus, buffer = make()
+    bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])
+    samples = [driving("map", "a", second) for second in (3.0, 4.0, 5.0)]
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a") as changes:
+            got = await read_along(changes, bus, samples, tasks)
+    assert [(answer.parent, answer.child, answer.stamp) for answer in got] == [
+        ("map", "a", second * SECOND) for second in (2, 3, 4, 5)
+    ]
+    assert [x_of(answer) for answer in got] == [2.0, 3.0, 4.0, 5.0]
+    assert changes.skipped == 0
+
+
+async def test_without_thresholds_another_stamp_or_another_value_is_a_change_and_the_same_again_is_none() -> None:
+    _, bus, buffer = make()
+    samples = [
+        moving("map", "a", 1, 5.0),
+        moving("map", "a", 2, 5.0),
+        moving("map", "a", 2, 6.0),
+        moving("map", "a", 2, 6.0),
+        moving("map", "a", 1, 9.0),
+        moving("map", "a", 3, 6.0),
+    ]
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a") as changes:
+            got = await read_along(changes, bus, samples, tasks)
+    assert [(answer.stamp, x_of(answer)) for answer in got] == [(1, 5.0), (2, 5.0), (2, 6.0), (3, 6.0)]
+
+
+async def test_a_movement_is_counted_from_the_last_answer_and_not_from_the_last_sample() -> None:
+    _, bus, buffer = make()
+    xs = [0.0, 0.25, 0.375, 0.5, 0.75, 0.25, 0.125, 0.0, -0.25, -0.5, 5.0]
+    samples = [moving("map", "a", stamp, x) for stamp, x in enumerate(xs)]
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", min_translation=0.5) as changes:
+            got = await read_along(changes, bus, samples, tasks)
+    assert [x_of(answer) for answer in got] == [0.0, 0.5, 0.0, -0.5, 5.0]
+    assert changes.skipped == 0
+
+
+async def test_a_movement_is_the_distance_in_space() -> None:
+    _, bus, buffer = make()
+    places = [(0.0, 0.0, 0.0), (2.0, 3.0, 5.9), (2.0, 3.0, 6.0)]
+    samples = [TransformStamped("map", "a", stamp, Transform(place)) for stamp, place in enumerate(places)]
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", min_translation=7.0) as changes:
+            got = await read_along(changes, bus, samples, tasks)
+    assert [answer.stamp for answer in got] == [0, 2]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "angle"),
+    [
+        (0.0, 0.2, 0.2),
+        (0.3, 0.1, 0.2),
+        (math.pi - 0.1, -math.pi + 0.1, 0.2),
+        (0.0, math.pi, math.pi),
+        (0.1, 0.1 + 2 * math.pi, 0.0),
+        (0.0, 1e-6, 1e-6),
+        (-2.0, 2.0, 2 * math.pi - 4.0),
+    ],
+)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+async def test_a_turn_is_the_true_angle_whatever_the_sign_of_the_quaternion(
+    before: float, after: float, angle: float, sign: float
+) -> None:
+    _, bus, buffer = make()
+    bus.publish(turned(before, 1))
+    with (
+        buffer.watch("map", "a", min_rotation=max(angle * (1 - 1e-6), 1e-9)) as reached,
+        buffer.watch("map", "a", min_rotation=min(angle * (1 + 1e-6) + 1e-9, math.pi)) as missed,
+    ):
+        for watch in (reached, missed):
+            assert (await anext(watch)).stamp == 1
+        bus.publish(turned(after, 2, sign))
+        for watch in (reached, missed):
+            watch.close()
+        came = [[answer.stamp async for answer in watch] for watch in (reached, missed)]
+    assert came[0] == ([2] if angle > 0.0 else [])
+    assert came[1] == ([] if angle < math.pi else [2])
+
+
+async def test_with_two_thresholds_either_will_do_and_a_threshold_of_zero_is_not_given() -> None:
+    _, bus, buffer = make()
+    samples = [
+        turned(0.0, 0),
+        turned(0.9, 1, x=0.9),
+        turned(0.9, 2, x=1.0),
+        turned(1.8, 3, x=1.0),
+        turned(2.0, 4, x=1.0),
+        turned(2.0, 5, x=3.0),
+    ]
+    expected = {(1.0, 1.0): [0, 2, 4, 5], (1.0, 0.0): [0, 2, 5], (0.0, 1.0): [0, 3]}
+    for (translation, rotation), stamps in expected.items():
+        async with anyio.create_task_group() as tasks:
+            with buffer.watch("map", "a", min_translation=translation, min_rotation=rotation) as changes:
+                got = await read_along(changes, bus, samples, tasks)
+        assert [answer.stamp for answer in got] == stamps
+        bus.remove_frame("a")
+
+
+async def test_several_edges_are_followed_at_the_newest_stamp_that_all_have() -> None:
+    _, bus, buffer = make()
+    reader_sees = []
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "base") as changes:
+            reader = Reader(tasks, changes)
+            for sample in [
+                driving("map", "odom", 1.0),
+                driving("odom", "base", 1.0),
+                driving("odom", "base", 2.0),
+                driving("odom", "base", 3.0),
+                driving("map", "odom", 2.0),
+                driving("map", "odom", 9.0),
+            ]:
+                bus.publish(sample)
+                await settle()
+                reader_sees.append((reader.stamps or [0])[-1] // SECOND)
+    # Where map has not come further, neither has the answer.
+    assert reader_sees == [0, 1, 1, 1, 2, 3]
+    assert reader.xs == [2.0, 4.0, 6.0]
+
+
+async def test_statics_are_followed_and_change_what_lies_behind_them() -> None:
+    _, bus, buffer = make()
+    bus.publish([static("base", "laser", 1.0), moving("map", "base", 5, 10.0)])
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "laser") as changes, buffer.watch("base", "laser") as mounted:
+            reader, fixed = Reader(tasks, changes), Reader(tasks, mounted)
+            await settle()
+            bus.publish(static("base", "laser", 2.0))
+            await settle()
+            bus.publish(static("base", "laser", 2.0))
+            await settle()
+            bus.publish(moving("map", "base", 6, 20.0))
+            await settle()
+    assert [(answer.stamp, x_of(answer)) for answer in reader.answers] == [(5, 11.0), (5, 12.0), (6, 22.0)]
+    assert (fixed.xs, [answer.static for answer in fixed.answers]) == ([1.0, 2.0], [True, True])
+
+
+async def test_a_frame_in_itself_is_followed_as_the_frame_is() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("a", "a") as changes:
+            got = await read_along(changes, bus, [moving("map", "a", 1), moving("map", "a", 2)], tasks)
+    assert [(answer.stamp, answer.transform) for answer in got] == [(1, Transform()), (2, Transform())]
+
+
+async def test_it_follows_a_frame_to_another_parent() -> None:
+    _, bus, buffer = make()
+    bus.publish([static("map", "left", 100.0), static("map", "right", 200.0)])
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "box") as changes:
+            samples = [
+                moving("left", "box", 1, 1.0),
+                moving("right", "box", 2, 2.0),
+                static("map", "right", 300.0),
+                moving("right", "box", 3, 3.0),
+                moving("left", "box", 4, 4.0),
+            ]
+            got = await read_along(changes, bus, samples, tasks)
+    assert [(answer.stamp, x_of(answer)) for answer in got] == [
+        (1, 101.0),
+        (2, 202.0),
+        (2, 302.0),
+        (3, 303.0),
+        (4, 104.0),
+    ]
+
+
+# Rates
+
+
+@pytest.mark.parametrize("hz", [10.0, 4.0, 3.0])
+async def test_answers_come_no_faster_than_the_rate_with_what_is_newest_then(hz: float) -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_rate=hz) as changes:
+            reader = Reader(tasks, changes, clock)
+            for tick in range(200):
+                bus.publish(driving("map", "a", tick / 100))
+                await clock.advance(0.01)
+            times, xs, skipped = list(reader.times), reader.xs, changes.skipped
+    period = math.ceil(SECOND / hz) / SECOND
+    assert times == pytest.approx([period * k for k in range(math.floor(2.0 / period) + 1)], abs=1e-9)
+    for time, x in zip(times, xs, strict=True):
+        assert time - 0.01 - 1e-9 <= x <= time + 1e-9
+    # All that came in between was left out, and counted.
+    assert skipped == sum(round(after * 100) - round(before * 100) - 1 for before, after in pairwise(xs))
+
+
+async def test_after_a_silence_that_is_longer_than_the_period_an_answer_comes_at_once() -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_rate=1.0) as changes:
+            reader = Reader(tasks, changes, clock)
+            for at, stamp in ((0.0, 1), (5.0, 2), (5.25, 3), (5.5, 4), (9.0, 5)):
+                await clock.advance(at - clock.now() / SECOND)
+                bus.publish(moving("map", "a", stamp))
+            await clock.advance(10.0)
+    assert list(zip(reader.times, reader.stamps, strict=True)) == [(0.0, 1), (5.0, 2), (6.0, 4), (9.0, 5)]
+    assert changes.skipped == 1
+
+
+async def test_the_period_is_over_when_the_reader_took_longer_than_it() -> None:
+    clock, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    with buffer.watch("map", "a", max_rate=1.0) as changes:
+        await anext(changes)
+        bus.publish(moving("map", "a", 2))
+        await clock.advance(1.0)
+        assert (await anext(changes)).stamp == 2
+
+
+async def test_a_movement_below_the_threshold_costs_no_period() -> None:
+    clock, bus, buffer = make()
+    bus.publish(moving("map", "a", 1, 0.0))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_rate=1.0, min_translation=1.0) as changes:
+            reader = Reader(tasks, changes, clock)
+            await clock.advance(0.5)
+            bus.publish(moving("map", "a", 2, 0.5))
+            await clock.advance(0.75)
+            bus.publish(moving("map", "a", 3, 1.0))
+            await clock.advance(10.0)
+    assert list(zip(reader.times, reader.xs, strict=True)) == [(0.0, 0.0), (1.25, 1.0)]
+
+
+@pytest.mark.parametrize("resting", [True, False])
+async def test_a_jump_forward_keeps_an_answer_back_for_no_more_than_one_period(resting: bool) -> None:
+    clock, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_rate=1.0) as changes:
+            await anext(changes)
+            if not resting:
+                clock.set(100 * SECOND)
+            bus.publish(moving("map", "a", 2))
+            asked = Asked(tasks, changes.__anext__)
+            await clock.advance(0.5)
+            assert asked.ended is not resting
+            clock.set(200 * SECOND)
+            await clock.advance(0.5)
+            assert asked.answer.stamp == 2
+
+
+class BackwardClock(SimulatedClock):
+    """A clock whose stamps can be set back without a word, as those of the machine can."""
+
+    behind = 0
+
+    def now(self) -> int:
+        return super().now() - self.behind
+
+
+async def test_a_clock_that_is_set_back_in_silence_keeps_an_answer_back_for_no_more_than_one_period() -> None:
+    clock = BackwardClock()
+    bus = Bus(clock)
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        with Buffer(bus) as buffer, buffer.watch("map", "a", max_rate=1.0) as changes:
+            bus.publish(moving("map", "a", 2))
+            await anext(changes)
+            clock.behind = 3600 * SECOND
+            bus.publish(moving("map", "a", 3))
+            asked = Asked(tasks, changes.__anext__)
+            await clock.advance(0.9)
+            assert not asked.ended
+            clock.behind = 7200 * SECOND
+            await clock.advance(0.1)
+            assert asked.answer.stamp == 3
+
+
+# Slow readers
+
+
+async def test_a_slow_reader_gets_the_newest_and_what_it_missed_is_counted() -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 0))
+    with buffer.watch("map", "a") as changes:
+        for stamp in range(1, 11):
+            bus.publish(moving("map", "a", stamp))
+        assert ((await anext(changes)).stamp, changes.skipped) == (10, 9)
+        for stamp in range(11, 14):
+            bus.publish([moving("map", "a", stamp), moving("map", "b", stamp)])
+            bus.publish(moving("map", "b", stamp))
+        assert ((await anext(changes)).stamp, changes.skipped) == (13, 11)
+
+
+async def test_a_batch_is_one_update_however_many_of_its_samples_are_on_the_path() -> None:
+    _, bus, buffer = make()
+    bus.publish([moving("map", "a", 0), moving("a", "b", 0)])
+    with buffer.watch("map", "b") as changes:
+        await anext(changes)
+        bus.publish(
+            [moving(parent, child, stamp) for stamp in (1, 2, 3) for parent, child in (("map", "a"), ("a", "b"))]
+        )
+        assert ((await anext(changes)).stamp, changes.skipped) == (3, 0)
+
+
+async def test_what_was_evaluated_but_lay_below_the_threshold_was_not_skipped() -> None:
+    _, bus, buffer = make()
+    samples = [moving("map", "a", stamp, 0.0) for stamp in range(5)]
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", min_translation=1.0) as changes:
+            got = await read_along(changes, bus, samples, tasks)
+    assert (len(got), changes.skipped) == (1, 0)
+
+
+# Who is left alone
+
+
+def hand_made() -> tuple[HandClock, Bus, Buffer]:
+    """With a clock that notes every time that a task goes to wait: one that is woken for nothing is seen there."""
+    clock = HandClock()
+    bus = Bus(clock)
+    return clock, bus, Buffer(bus)
+
+
+ELSEWHERE = [
+    pytest.param([moving("map", "other", 3)], id="a sibling"),
+    pytest.param([moving("base", "tool", 3)], id="a child below"),
+    pytest.param([moving("world", "map", 3)], id="above the common ancestor"),
+    pytest.param([moving("mars", "map", 3)], id="another parent above the common ancestor"),
+    pytest.param([static("base", "laser")], id="a new static below"),
+    pytest.param([moving("sea", "ship", 3)], id="another tree"),
+]
+
+
+@pytest.mark.parametrize("elsewhere", ELSEWHERE)
+async def test_nobody_is_woken_by_what_happens_elsewhere(elsewhere: list[TransformStamped]) -> None:
+    clock, bus, buffer = hand_made()
+    bus.publish([moving("world", "map", 1), moving("map", "odom", 1), moving("odom", "base", 1)])
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "base") as changes:
+            reader = Reader(tasks, changes)
+            await settle()
+            waits = len(clock.scopes)
+            for _ in range(3):
+                bus.publish(elsewhere)
+                await settle()
+            bus.remove_frame(elsewhere[0].child)
+            await settle()
+            assert len(clock.scopes) == waits
+            # One on the path does wake it, although nothing comes of it.
+            bus.publish(moving("map", "odom", 2))
+            await settle()
+            assert len(clock.scopes) == waits + 1
+            assert (len(reader.answers), changes.skipped) == (1, 0)
+
+
+async def test_who_has_no_answer_is_not_woken_by_what_cannot_give_one() -> None:
+    clock, bus, buffer = hand_made()
+    bus.publish([moving("map", "odom", 1), moving("odom", "base", 5)])
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "base") as changes:
+            reader = Reader(tasks, changes)
+            await settle()
+            waits = len(clock.scopes)
+            for stamp in range(6, 10):
+                bus.publish([moving("odom", "base", stamp), moving("map", "other", stamp)])
+                await settle()
+            assert len(clock.scopes) == waits
+            bus.publish(moving("map", "odom", 7))
+            await settle()
+            assert (reader.stamps, changes.skipped) == ([7], 0)
+
+
+async def test_updates_that_come_while_the_rate_holds_an_answer_back_wake_nobody() -> None:
+    clock, bus, buffer = hand_made()
+    bus.publish(moving("map", "a", 0))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_rate=1e-9) as changes:
+            reader = Reader(tasks, changes)
+            await settle()
+            bus.publish(moving("map", "a", 1))
+            await settle()
+            waits = len(clock.scopes)
+            for stamp in range(2, 10):
+                bus.publish(moving("map", "a", stamp))
+                await settle()
+            assert (len(clock.scopes), reader.stamps) == (waits, [0])
+            clock.scopes[-1].cancel()
+            await settle()
+            assert (reader.stamps, changes.skipped) == ([0, 9], 8)
+
+
+# While there is no answer
+
+
+async def test_it_waits_until_there_is_an_answer_and_buffer_pending_shows_it() -> None:
+    clock, bus, buffer = make(start=7)
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "base", max_age=100.0) as changes:
+            reader = Reader(tasks, changes)
+            await settle()
+            (pending,) = buffer.pending()
+            assert (pending.question.target, pending.question.source, pending.since) == ("map", "base", 7)
+            assert isinstance(pending.blocked_by, UnknownFrameError)
+            await clock.advance(1.0)
+            bus.publish([moving("map", "odom", 1), moving("odom", "base", 2)])
+            await settle()
+            # Still the same wait, now for another thing.
+            assert [(pending.since, str(pending.blocked_by)[:12]) for pending in buffer.pending()] == [
+                (7, "frame 'odom'")
+            ]
+            bus.publish(moving("map", "odom", 3))
+            await settle()
+            assert (reader.stamps, buffer.pending()) == ([2], ())
+
+
+@pytest.mark.parametrize("reading", [True, False])
+async def test_a_frame_that_is_removed_is_waited_for_and_comes_back(reading: bool) -> None:
+    _, bus, buffer = make()
+    first, second = moving("map", "a", 1, 1.0), moving("map", "a", 2, 2.0)
+    bus.publish(first)
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a") as changes:
+            assert await anext(changes) == first
+            asked = Asked(tasks, changes.__anext__) if reading else None
+            await settle()
+            bus.remove_frame("a")
+            await settle()
+            assert len(buffer.pending()) == reading
+            bus.publish(first)
+            await settle()
+            asked = asked or Asked(tasks, changes.__anext__)
+            await settle()
+            # The same answer as before is no change.
+            assert not asked.ended
+            bus.publish(second)
+            await settle()
+            assert asked.answer == second
+
+
+async def test_an_answer_that_is_too_old_counts_as_none() -> None:
+    clock, bus, buffer = make()
+    bus.publish(moving("map", "a", 0, 1.0))
+    await clock.advance(2.0)
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_age=1.0) as changes:
+            reader = Reader(tasks, changes, clock)
+            await settle()
+            assert len(buffer.pending()) == 1
+            bus.publish(moving("map", "a", from_seconds(0.5), 2.0))
+            await clock.advance(1.0)
+            bus.publish(moving("map", "a", from_seconds(2.0), 3.0))
+            await settle()
+            assert (reader.xs, reader.times) == ([3.0], [3.0])
+            # It grows old in silence.
+            await clock.advance(5.0)
+            assert (reader.xs, buffer.pending()) == ([3.0], ())
+
+
+async def test_an_answer_that_was_lost_to_age_is_followed_again_when_it_is_back() -> None:
+    clock, bus, buffer = make()
+    bus.publish([driving("map", "a", 0.0), driving("a", "b", 0.0)])
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "b", max_age=1.0) as changes:
+            reader = Reader(tasks, changes)
+            await clock.advance(2.0)
+            for second in (1.0, 1.5, 2.0):
+                bus.publish(driving("a", "b", second))
+                await settle()
+                assert len(buffer.pending()) == 1
+            for second in (1.0, 2.0):
+                bus.publish(driving("map", "a", second))
+                await settle()
+    assert reader.xs == [0.0, 2.0, 4.0]
+    # What came while there was no answer was not skipped.
+    assert changes.skipped == 0
+
+
+async def test_a_gap_holds_the_answer_back_until_the_slowest_edge_is_past_it() -> None:
+    _, bus, buffer = make()
+    samples = [moving("map", "a", 10), moving("a", "b", 10), moving("a", "b", 20), moving("a", "b", 30)]
+    with buffer.watch("map", "b", max_gap=10e-9) as strict, buffer.watch("map", "b", max_gap=9e-9) as stricter:
+        async with anyio.create_task_group() as tasks:
+            readers = [Reader(tasks, strict), Reader(tasks, stricter)]
+            for sample in [*samples, *(moving("map", "a", stamp) for stamp in range(11, 22))]:
+                bus.publish(sample)
+                await settle()
+            assert readers[0].stamps == [*range(10, 22)]
+            assert readers[1].stamps == [10, 20]
+            for reader in readers:
+                reader.asked.cancel()
+    assert [answer.gap for answer in readers[0].answers] == [0, *[10] * 9, 0, 10]
+
+
+async def test_a_policy_lets_an_answer_come_that_would_not_and_the_answer_says_so() -> None:
+    _, bus, buffer = make()
+    bus.publish([moving("map", "a", 10, 1.0), moving("a", "b", 12, 2.0)])
+    with (
+        buffer.watch("map", "b", tolerance=2e-9) as near,
+        buffer.watch("map", "b", tolerance=1e-9) as far,
+        buffer.watch("map", "b", extrapolate=Hold(5e-9)) as held,
+    ):
+        answer = await anext(near)
+        assert (answer.stamp, x_of(answer), answer.extrapolated_by) == (10, 3.0, 2)
+        answer = await anext(held)
+        assert (answer.stamp, x_of(answer), answer.extrapolated_by) == (12, 3.0, 2)
+        far.close()
+        assert [answer async for answer in far] == []
+
+
+async def test_a_long_wait_for_the_first_answer_is_logged_once_a_cause(caplog: pytest.LogCaptureFixture) -> None:
+    clock, bus, buffer = make()
+    with caplog.at_level(logging.WARNING, "tfbus"), buffer.watch("map", "bse") as changes:
+        async with anyio.create_task_group() as tasks:
+            bus.publish(moving("map", "base", 1))
+            Asked(tasks, changes.__anext__)
+            await clock.advance(4.9)
+            assert caplog.messages == []
+            for _ in range(4):
+                await clock.advance(2.0)
+                bus.remove_frame("base")
+                bus.publish(moving("map", "base", 1))
+            (message,) = caplog.messages
+            assert "'bse' in 'map' has waited for more than 5 s: frame 'bse' is not known" in message
+            bus.publish(moving("sea", "bse", 1))
+            await settle()
+            assert "different trees" in caplog.messages[1]
+            tasks.cancel_scope.cancel()
+
+
+async def test_an_answer_is_not_a_long_wait_however_long_nothing_changes(caplog: pytest.LogCaptureFixture) -> None:
+    clock, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a") as changes:
+            Reader(tasks, changes)
+            await clock.advance(1000.0)
+    assert caplog.messages == []
+
+
+# The end
+
+
+Close = Callable[[Bus, Buffer, Watch], None]
+CLOSES = [
+    pytest.param(lambda _bus, _buffer, watch: watch.close(), id="watch"),
+    pytest.param(lambda _bus, buffer, _watch: buffer.close(), id="buffer"),
+    pytest.param(lambda bus, _buffer, _watch: bus.close(), id="bus"),
+]
+
+
+@pytest.mark.parametrize("close", CLOSES)
+@pytest.mark.parametrize("source", ["a", "nobody"])
+async def test_closing_ends_a_reader_that_waits(close: Close, source: str) -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        watch = buffer.watch("map", source)
+        reader = Reader(tasks, watch)
+        await settle()
+        assert not reader.asked.ended
+        close(bus, buffer, watch)
+        await settle()
+        assert reader.asked.answer is None
+        assert reader.stamps == ([1] if source == "a" else [])
+    assert buffer.pending() == ()
+    with pytest.raises(StopAsyncIteration):
+        await anext(watch)
+
+
+@pytest.mark.parametrize("close", CLOSES)
+@pytest.mark.parametrize("rate", [None, 1.0])
+@pytest.mark.parametrize("reading", [True, False])
+async def test_what_had_changed_before_the_end_still_comes(close: Close, rate: float | None, reading: bool) -> None:
+    clock, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        watch = buffer.watch("map", "a", max_rate=rate)
+        await anext(watch)
+        reader = Reader(tasks, watch, clock) if reading else None
+        await settle()
+        bus.publish(moving("map", "a", 2))
+        if rate is not None and reading:
+            # Now it rests.
+            await settle()
+            assert reader is not None
+            assert reader.stamps == []
+        close(bus, buffer, watch)
+        reader = reader or Reader(tasks, watch, clock)
+        await settle()
+        assert reader.asked.answer is None
+        assert (reader.stamps, reader.times) == ([2], [0.0])
+
+
+@pytest.mark.parametrize("close", CLOSES)
+async def test_a_watch_that_nobody_had_read_gives_what_holds_before_it_ends(close: Close) -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    watch = buffer.watch("map", "a")
+    close(bus, buffer, watch)
+    assert [answer.stamp async for answer in watch] == [1]
+
+
+async def test_a_closed_watch_hears_nothing_more() -> None:
+    clock, bus, buffer = make(start=10)
+    bus.publish(moving("map", "a", 1))
+    with buffer.watch("map", "a") as watch:
+        await anext(watch)
+    watch.close()
+    bus.publish(moving("map", "a", 2))
+    clock.set(5)
+    with pytest.raises(StopAsyncIteration):
+        await anext(watch)
+    assert nothing_is_left(buffer)
+
+
+@pytest.mark.parametrize("end", ["buffer", "bus"])
+async def test_a_closed_buffer_can_be_watched_for_what_it_still_knows(end: str) -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    (buffer if end == "buffer" else bus).close()
+    assert [answer.stamp async for answer in buffer.watch("map", "a")] == [1]
+    assert [answer async for answer in buffer.watch("map", "nobody")] == []
+    assert nothing_is_left(buffer)
+
+
+def nothing_is_left(buffer: Buffer) -> bool:
+    """Whether no watch is registered, neither for an answer nor for the lack of one."""
+    index = buffer._feed.watching
+    return buffer.pending() == () and len(index) == 0 and index.under == {}
+
+
+async def test_what_the_body_of_the_loop_raises_comes_out_as_it_is() -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    with pytest.raises(ZeroDivisionError), buffer.watch("map", "a") as changes:
+        async for _ in changes:
+            _ = 1 / 0
+    assert nothing_is_left(buffer)
+
+
+# Jumps
+
+
+@pytest.mark.parametrize("doing", ["waiting", "resting", "without an answer", "nothing"])
+async def test_a_jump_back_is_raised_once_and_the_iteration_starts_over(doing: str) -> None:
+    clock, bus, buffer = make(start=10)
+    bus.publish([moving("map", "a", 10, 1.0), static("map", "b", 2.0)])
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "nobody" if doing == "without an answer" else "a", max_rate=1.0) as changes:
+            if doing != "without an answer":
+                await anext(changes)
+            asked = None if doing == "nothing" else Asked(tasks, changes.__anext__)
+            await settle()
+            if doing == "resting":
+                bus.publish(moving("map", "a", 11, 1.0))
+                await settle()
+            clock.set(5)
+            asked = asked or Asked(tasks, changes.__anext__)
+            await settle()
+            assert isinstance(asked.error, ClockResetError)
+            assert (asked.error.before, asked.error.after) == (10, 5)
+            again = Asked(tasks, changes.__anext__)
+            await settle()
+            assert len(buffer.pending()) == 1
+            bus.publish([moving("map", "a", 5, 1.0), moving("map", "nobody", 5)])
+            await settle()
+            assert again.answer.stamp == 5
+
+
+async def test_after_a_jump_back_a_static_answer_comes_again_and_a_jump_forward_disturbs_nobody() -> None:
+    clock, bus, buffer = make(start=10)
+    bus.publish(static("map", "a", 1.0))
+    with buffer.watch("map", "a", min_translation=1.0) as changes:
+        assert x_of(await anext(changes)) == 1.0
+        clock.set(20)
+        clock.set(5)
+        clock.set(3)
+        with pytest.raises(ClockResetError) as caught:
+            await anext(changes)
+        assert caught.value.after == 3
+        assert x_of(await anext(changes)) == 1.0
+        bus.close()
+        with pytest.raises(StopAsyncIteration):
+            await anext(changes)
+
+
+async def test_what_a_jump_back_took_away_before_it_was_read_is_counted() -> None:
+    clock, bus, buffer = make(start=10)
+    bus.publish(moving("map", "a", 1))
+    with buffer.watch("map", "a") as changes:
+        await anext(changes)
+        for stamp in (2, 3):
+            bus.publish(moving("map", "a", stamp))
+        clock.set(0)
+        with pytest.raises(ClockResetError):
+            await anext(changes)
+        assert changes.skipped == 2
+        for stamp in (0, 1):
+            bus.publish(moving("map", "a", stamp))
+        assert (await anext(changes)).stamp == 1
+
+
+async def test_each_of_two_watches_hears_of_a_jump_back() -> None:
+    clock, bus, buffer = make(start=10)
+    bus.publish(moving("map", "a", 10))
+    with buffer.watch("map", "a") as first, buffer.watch("map", "a") as second:
+        clock.set(5)
+        for watch in (first, second):
+            with pytest.raises(ClockResetError):
+                await anext(watch)
+
+
+# Cancellation, readers and threads
+
+
+@pytest.mark.parametrize("doing", ["waiting", "resting", "without an answer", "beginning"])
+async def test_a_cancelled_reader_leaves_nothing_behind_and_loses_nothing(doing: str) -> None:
+    clock, bus, buffer = make()
+    if doing != "without an answer":
+        bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_rate=1.0) as changes:
+            if doing in ("waiting", "resting"):
+                await anext(changes)
+            if doing == "resting":
+                bus.publish(moving("map", "a", 2))
+            asked = Asked(tasks, changes.__anext__)
+            if doing != "beginning":
+                await settle()
+            asked.cancel()
+            await settle()
+            assert asked.cancelled
+            assert buffer.pending() == ()
+            if doing in ("waiting", "without an answer"):
+                bus.publish(moving("map", "a", 2))
+            again = Asked(tasks, changes.__anext__)
+            await clock.advance(1.0)
+            assert again.answer.stamp == (1 if doing == "beginning" else 2)
+    assert nothing_is_left(buffer)
+
+
+@pytest.mark.parametrize("data_first", [True, False])
+@pytest.mark.parametrize("known", [True, False])
+async def test_an_answer_that_comes_in_the_turn_of_the_cancellation_comes_once(data_first: bool, known: bool) -> None:
+    _, bus, buffer = make()
+    if known:
+        bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a") as changes:
+            if known:
+                await anext(changes)
+            asked = Asked(tasks, changes.__anext__)
+            await settle()
+            steps: list[Callable[[], object]] = [asked.cancel, lambda: bus.publish(moving("map", "a", 2))]
+            for step in reversed(steps) if data_first else steps:
+                step()
+            await settle()
+            assert asked.ended
+            changes.close()
+            rest = [answer.stamp async for answer in changes]
+            assert rest == ([2] if asked.cancelled else [])
+            assert asked.cancelled or asked.answer.stamp == 2
+
+
+async def test_a_second_reader_is_told_and_the_first_goes_on() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a") as changes:
+            first = Asked(tasks, changes.__anext__)
+            await settle()
+            with pytest.raises(anyio.BusyResourceError):
+                await anext(changes)
+            bus.publish(moving("map", "a", 1))
+            await settle()
+            assert first.answer.stamp == 1
+
+
+async def test_even_an_answer_that_is_there_passes_a_checkpoint() -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    with buffer.watch("map", "a") as changes:
+        with anyio.CancelScope() as scope:
+            scope.cancel()
+            await anext(changes)
+        assert scope.cancelled_caught
+        assert (await anext(changes)).stamp == 1
+
+
+async def test_another_thread_may_neither_open_nor_read_a_watch_nor_close_what_a_reader_waits_for() -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a") as changes:
+            await anext(changes)
+            asked = Asked(tasks, changes.__anext__)
+            await settle()
+            refused: list[str] = []
+
+            def elsewhere() -> None:
+                for use in (
+                    partial(buffer.watch, "map", "a"),
+                    lambda: asyncio.run(partial(anext, changes)()),
+                    changes.close,
+                    buffer.close,
+                    bus.close,
+                ):
+                    try:
+                        use()
+                    except RuntimeError as error:
+                        refused.append(str(error))
+
+            thread = threading.Thread(target=elsewhere)
+            thread.start()
+            thread.join()
+            assert ["another thread" in message for message in refused] == [True] * 5
+            bus.publish(moving("map", "a", 2))
+            await settle()
+            assert asked.answer.stamp == 2
+
+
+async def test_another_thread_may_close_what_nobody_waits_for() -> None:
+    _, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        changes = buffer.watch("map", "a")
+        asked = Asked(tasks, changes.__anext__)
+        await settle()
+        bus.publish(moving("map", "a", 1))
+        await settle()
+        assert asked.ended
+        for close in (changes.close, buffer.close):
+            await anyio.to_thread.run_sync(close)
+    assert nothing_is_left(buffer)
+
+
+def test_a_watch_may_be_made_before_a_loop_runs_and_read_on_several(run: Run) -> None:
+    _, bus, buffer = make()
+    watch = buffer.watch("map", "a")
+
+    async def read_one(second: int) -> None:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, watch.__anext__)
+            await settle()
+            bus.publish(driving("map", "a", second))
+            await settle()
+            assert x_of(asked.answer) == second
+
+    for second in range(3):
+        run(partial(read_one, second))
+
+
+def test_asyncio_s_own_timeout_and_cancellation_work_round_a_watch() -> None:
+    _, bus, buffer = make()
+
+    async def main() -> None:
+        with buffer.watch("map", "a") as changes:
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.0):
+                    await anext(changes)
+            task = asyncio.ensure_future(anext(changes))
+            await settle()
+            task.cancel()
+            bus.publish(moving("map", "a", 1))
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            assert (await asyncio.wait_for(anext(changes), 10)).stamp == 1
+        assert nothing_is_left(buffer)
+
+    asyncio.run(main())
+
+
+# Arguments
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"min_translation": -1.0}, ValueError, "min_translation must be from 0 to inf m, got -1.0"),
+        ({"min_translation": math.nan}, ValueError, "min_translation"),
+        ({"min_translation": "1"}, TypeError, "min_translation must be a number in m, not '1'"),
+        ({"min_translation": True}, TypeError, "min_translation"),
+        ({"min_rotation": -0.1}, ValueError, "min_rotation"),
+        ({"min_rotation": 5.0}, ValueError, "min_rotation must be from 0 to 3.142 rad, got 5.0"),
+        ({"min_rotation": None}, TypeError, "min_rotation"),
+        ({"max_rate": 0.0}, ValueError, "max_rate"),
+        ({"max_rate": -1.0}, ValueError, "max_rate"),
+        ({"max_rate": math.inf}, ValueError, "max_rate"),
+        ({"max_rate": math.nan}, ValueError, "max_rate"),
+        ({"max_rate": "10"}, TypeError, "max_rate must be a number in Hz, not '10'"),
+        ({"max_age": -1.0}, ValueError, "max_age"),
+        ({"max_age": "1"}, TypeError, "max_age"),
+        ({"tolerance": -1.0}, ValueError, "tolerance"),
+        ({"max_gap": "1"}, TypeError, "max_gap"),
+        ({"extrapolate": 1.0}, TypeError, "extrapolate"),
+        ({"source": "/a"}, UnknownFrameError, "'/a'"),
+        ({"target": ""}, UnknownFrameError, "''"),
+        ({"target": 5}, TypeError, "5"),
+    ],
+)
+def test_a_wrong_argument_is_refused_where_the_watch_is_made(
+    arguments: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    _, _, buffer = make()
+    with pytest.raises(error, match=message):
+        buffer.watch(**{"target": "map", "source": "a", **arguments})
+    assert nothing_is_left(buffer)
+
+
+@pytest.mark.parametrize("max_rate", [5e-324, 1e300, 1])
+async def test_every_rate_and_every_threshold_that_is_a_number_will_do(max_rate: float) -> None:
+    _, bus, buffer = make()
+    bus.publish(moving("map", "a", 1))
+    async with anyio.create_task_group() as tasks:
+        with buffer.watch("map", "a", max_rate=max_rate, min_translation=math.inf, min_rotation=math.pi) as changes:
+            reader = Reader(tasks, changes)
+            await settle()
+            bus.publish(moving("map", "a", 2, 1e9))
+            await settle()
+            bus.publish(turned(math.pi, 3))
+            changes.close()
+            await settle()
+    assert reader.stamps == [1, 3]

@@ -1,0 +1,180 @@
+import pytest
+
+from tfbus import (
+    AuthorityConflict,
+    ClockReset,
+    Event,
+    FrameAdded,
+    FrameRemoved,
+    FrameStale,
+    KindChanged,
+    QueueStatistics,
+    Reparented,
+    SampleRejected,
+)
+from tfbus.bus._event_queue import EventQueue
+
+
+def emptied(queue: EventQueue) -> list[Event]:
+    events = []
+    while (event := queue.get()) is not None:
+        events.append(event)
+    return events
+
+
+def added(frame: str) -> FrameAdded:
+    return FrameAdded(0, frame, "map", "", static=False)
+
+
+def test_events_come_out_in_the_order_in_which_they_happened() -> None:
+    queue = EventQueue(10)
+    happened: list[Event] = [added("a"), FrameRemoved(1, "a"), added("a"), ClockReset(0, 9)]
+    for event in happened:
+        queue.put(event)
+    assert len(queue) == 4
+    assert emptied(queue) == happened
+    assert queue.dropped == 0
+
+
+def test_when_there_are_too_many_the_oldest_go_and_are_counted() -> None:
+    queue = EventQueue(2)
+    for name in "abcde":
+        queue.put(FrameRemoved(0, name))
+    assert queue.statistics() == QueueStatistics("events", "drop_oldest", capacity=2, pending=2, dropped=3)
+    assert emptied(queue) == [FrameRemoved(0, "d"), FrameRemoved(0, "e")]
+
+
+def test_what_was_known_at_the_beginning_comes_first_and_is_never_dropped() -> None:
+    known = [added(f"frame {number}") for number in range(50)]
+    queue = EventQueue(1, known)
+    queue.put(FrameRemoved(0, "frame 7"))
+    queue.put(FrameRemoved(0, "frame 8"))
+    assert (len(queue), queue.dropped) == (51, 1)
+    assert emptied(queue) == [*known, FrameRemoved(0, "frame 8")]
+
+
+def test_a_pair_of_authorities_is_told_once_a_frame_until_it_is_removed() -> None:
+    queue = EventQueue(100)
+    one, two = AuthorityConflict(1, "a", "x", "y"), AuthorityConflict(1, "a", "y", "x")
+    third, elsewhere = AuthorityConflict(2, "a", "x", "z"), AuthorityConflict(3, "b", "x", "y")
+    for event in (one, two, one, third, one, third, elsewhere, elsewhere):
+        queue.put(event)
+    assert emptied(queue) == [one, third, elsewhere]
+    queue.put(FrameRemoved(4, "a"))
+    for event in (one, elsewhere):
+        queue.put(event)
+    assert emptied(queue) == [FrameRemoved(4, "a"), one]
+    queue.put(ClockReset(0, 5))
+    queue.put(elsewhere)
+    assert emptied(queue) == [ClockReset(0, 5), elsewhere]
+
+
+def test_in_a_quarrel_each_parent_and_kind_that_an_authority_claims_is_told_once() -> None:
+    queue = EventQueue(100)
+    queue.put(AuthorityConflict(0, "a", "x", "y"))
+    to_p, to_q = Reparented(1, "a", "p", "q", "x"), Reparented(1, "a", "q", "p", "y")
+    still, moves = KindChanged(1, "a", static=True, authority="x"), KindChanged(1, "a", static=False, authority="y")
+    for _ in range(5):
+        for event in (to_p, to_q, still, moves):
+            queue.put(event)
+    new = Reparented(2, "a", "r", "q", "x")
+    queue.put(new)
+    assert emptied(queue)[1:] == [to_p, to_q, still, moves, new]
+
+
+def test_one_authority_that_hands_a_frame_to_and_fro_is_told_of_each_time() -> None:
+    queue = EventQueue(100)
+    queue.put(AuthorityConflict(0, "elsewhere", "x", "y"))
+    taken, put_down = Reparented(1, "cup", "hand", "table", "x"), Reparented(2, "cup", "table", "hand", "x")
+    froze = KindChanged(3, "cup", static=True, authority="x")
+    for event in (taken, put_down, taken, put_down, froze, froze):
+        queue.put(event)
+    assert emptied(queue)[1:] == [taken, put_down, taken, put_down, froze, froze]
+
+
+def rejected(frame: str | None, authority: str | None, reason: str = "authority") -> SampleRejected:
+    return SampleRejected(1, reason, frame, "map", authority, ValueError())
+
+
+def test_a_rejection_is_told_once_a_frame_authority_and_reason_until_it_is_removed_added_or_the_clock_reset() -> None:
+    queue = EventQueue(100)
+    different: list[Event] = [
+        rejected("a", "x"),
+        rejected("b", "x"),
+        rejected("a", "y"),
+        rejected("a", "x", "cycle"),
+        rejected(None, None, "not a sample"),
+    ]
+    for event in different * 3:
+        queue.put(event)
+    assert emptied(queue) == different
+    for end, again in (
+        (FrameRemoved(2, "a"), [rejected("a", "x")]),
+        (added("a"), [rejected("a", "x")]),
+        (ClockReset(2, 3), [rejected("a", "x"), rejected("b", "x")]),
+    ):
+        for event in (end, *[rejected("a", "x"), rejected("b", "x")] * 2):
+            queue.put(event)
+        assert emptied(queue) == [end, *again]
+
+
+def test_a_rejection_is_no_quarrel() -> None:
+    queue = EventQueue(100)
+    events: list[Event] = [rejected("cup", "x"), *[Reparented(1, "cup", "hand", "table", "y")] * 3]
+    for event in events:
+        queue.put(event)
+    assert emptied(queue) == events
+
+
+def test_rejections_of_ever_new_frames_and_authorities_fill_no_memory() -> None:
+    queue = EventQueue(1)
+    for number in range(3_000):
+        queue.put(rejected(f"frame {number}", "x"))
+        queue.put(rejected("frame 0", f"process {number}"))
+    dropped = queue.dropped
+    queue.put(rejected("frame 2999", "x"))
+    queue.put(rejected("frame 2500", "x"))
+    assert queue.dropped == dropped, "still remembered"
+    queue.put(rejected("frame 1", "x"))
+    assert queue.dropped == dropped + 1, "forgotten in favour of later ones"
+
+
+def test_a_frame_that_is_handed_to_and_fro_for_ever_pushes_nobody_else_out() -> None:
+    queue = EventQueue(5)
+    others: list[Event] = [added("a"), Reparented(0, "b", "map", "odom", "x"), FrameRemoved(0, "a")]
+    for event in others:
+        queue.put(event)
+    moves: list[Event] = []
+    for stamp in range(100):
+        moves += [Reparented(stamp, "cup", "hand", "table", ""), KindChanged(stamp, "cup", stamp % 2 == 0, "")]
+    for event in moves:
+        queue.put(event)
+    assert queue.dropped == len(moves) - 2
+    assert emptied(queue) == [*others, *moves[-2:]]
+
+
+def test_news_for_the_reader_come_next_and_are_never_dropped() -> None:
+    queue = EventQueue(1)
+    news = [FrameStale(5, f"frame {number}", 0, "") for number in range(10)]
+    queue.put_news(news)
+    queue.put(FrameRemoved(6, "frame 1"))
+    queue.put(FrameRemoved(7, "frame 2"))
+    assert queue.statistics() == QueueStatistics("events", "drop_oldest", capacity=1, pending=11, dropped=1)
+    assert emptied(queue) == [*news, FrameRemoved(7, "frame 2")]
+
+
+def test_who_quarrels_under_ever_new_names_fills_no_memory() -> None:
+    queue = EventQueue(1)
+    for number in range(1_000):
+        queue.put(AuthorityConflict(0, "a", f"process {number}", f"process {number + 1}"))
+    assert queue.dropped == 999
+    queue.put(AuthorityConflict(0, "a", "process 998", "process 999"))
+    assert queue.dropped == 999, "still remembered"
+    queue.put(AuthorityConflict(0, "a", "process 0", "process 1"))
+    assert queue.dropped == 1000, "forgotten in favour of the last hundred"
+
+
+@pytest.mark.parametrize("capacity", [0, -1, 1.5, True])
+def test_a_bad_capacity_is_refused(capacity: int) -> None:
+    with pytest.raises((TypeError, ValueError), match="capacity"):
+        EventQueue(capacity)

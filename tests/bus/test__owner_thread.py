@@ -1,0 +1,45 @@
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from tfbus.bus._owner_thread import OwnerThread
+
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+
+
+def in_thread(call: Callable[[], object]) -> BaseException | None:
+    """What a call raises in another thread."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(call).exception()
+
+
+def test_without_a_loop_it_is_the_thread_that_made_it() -> None:
+    claim = OwnerThread()
+    claim.check()
+    error = in_thread(claim.check)
+    assert isinstance(error, RuntimeError)
+    assert "bus.threadsafe" in str(error)
+    claim.check()
+
+
+def test_the_first_loop_takes_it_over_and_keeps_it(run: Run) -> None:
+    claim = OwnerThread()
+
+    async def use() -> None:
+        claim.check()
+
+    assert in_thread(lambda: run(use)) is None
+    with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+        claim.check()
+
+
+def test_made_on_a_loop_it_is_that_loop_s(run: Run) -> None:
+    claims: list[OwnerThread] = []
+
+    async def make() -> None:
+        claims.append(OwnerThread())
+
+    assert in_thread(lambda: run(make)) is None
+    with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+        claims[0].check()

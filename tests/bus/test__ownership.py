@@ -1,0 +1,134 @@
+from dataclasses import dataclass
+
+import pytest
+from support.samples import moving, static
+
+from tfbus import InvalidTransformError
+from tfbus.bus._ownership import OnConflict, Ownership
+
+POLICIES: list[OnConflict] = ["last", "reject"]
+
+
+@dataclass(frozen=True)
+class Known:
+    authority: str
+
+
+def test_under_last_everybody_may_publish_everything() -> None:
+    ownership = Ownership("last")
+    assert not ownership
+    batch = (moving("a", "b", 0, authority="odometry"), moving("a", "b", 1, authority="slam"))
+    assert ownership.split(batch, {"b": Known("gps")}) == (batch, [])
+
+
+def test_under_reject_the_first_authority_keeps_the_child() -> None:
+    ownership = Ownership("reject")
+    assert ownership
+    mine, other = moving("a", "b", 1, authority="odometry"), moving("x", "b", 2, authority="slam")
+    allowed, (error,) = ownership.split((other, mine), {"b": Known("odometry")})
+    assert allowed == (mine,)
+    assert (error.reason, error.child, error.parent, error.authority, error.owner) == (
+        "authority",
+        "b",
+        "x",
+        "slam",
+        "odometry",
+    )
+    assert str(error) == "frame 'b' comes from 'odometry', who was first: no sample of it is taken from 'slam'"
+
+
+def test_of_a_new_child_the_first_in_the_batch_counts() -> None:
+    batch = (
+        moving("a", "b", 1, authority="one"),
+        static("a", "b", authority="two"),
+        moving("a", "c", 1, authority="two"),
+    )
+    allowed, refused = Ownership("reject").split(batch, {})
+    assert allowed == (batch[0], batch[2])
+    assert [error.owner for error in refused] == ["one"]
+
+
+@pytest.mark.parametrize("first", ["", "odometry"])
+def test_what_is_remembered_is_kept_for_its_authority_until_it_is_forgotten(first: str) -> None:
+    ownership = Ownership("reject")
+    ownership.remember({"b": Known(first)})
+    mine, other = moving("a", "b", 1, authority=first), moving("a", "b", 2, authority="slam")
+    allowed, (error,) = ownership.split((other, mine), {})
+    assert (allowed, error.owner) == ((mine,), first)
+    assert ownership.split((other,), {"b": Known("slam")}) == ((other,), []), "what is known now counts more"
+    ownership.remember({"c": Known("gps")})
+    assert ownership.remembers("b")
+    ownership.forget("b")
+    assert not ownership.remembers("b")
+    assert ownership.split((other,), {}) == ((other,), [])
+
+
+def test_under_last_nothing_is_remembered() -> None:
+    ownership = Ownership("last")
+    ownership.remember({"b": Known("odometry")})
+    assert not ownership.remembers("b")
+    assert not ownership
+
+
+@pytest.mark.parametrize(("first", "second"), [("", "slam"), ("slam", "")])
+def test_no_authority_is_one_like_any_other(first: str, second: str) -> None:
+    ownership = Ownership("reject")
+    (_, refused) = ownership.split((moving("a", "b", 1, authority=second),), {"b": Known(first)})
+    assert [(error.owner, error.authority) for error in refused] == [(first, second)]
+    with ownership.reserve("c", first), pytest.raises(InvalidTransformError):
+        ownership.reserve("c", second)
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_a_reserved_frame_is_for_one_authority_only_whoever_was_first(policy: OnConflict) -> None:
+    ownership = Ownership(policy)
+    known = {"b": Known("odometry")}
+    old, new = moving("a", "b", 1, authority="odometry"), moving("a", "b", 1, authority="slam")
+    with ownership.reserve("b", "slam"):
+        assert ownership
+        assert ownership.reserved_for("b") == "slam"
+        allowed, (error,) = ownership.split((old, new), known)
+        assert allowed == (new,)
+        assert (error.reason, error.owner, error.authority) == ("reserved", "slam", "odometry")
+        assert str(error) == "frame 'b' is reserved for 'slam': no sample of it is taken from 'odometry'"
+    assert ownership.reserved_for("b") is None
+    assert ownership.split((old,), known) == ((old,), [])
+
+
+def test_what_somebody_else_has_reserved_cannot_be_reserved_and_the_error_names_both() -> None:
+    ownership = Ownership("last")
+    with ownership.reserve("b", "slam"):
+        with pytest.raises(InvalidTransformError) as caught:
+            ownership.reserve("b", "odometry")
+        error = caught.value
+        assert (error.reason, error.child, error.authority, error.owner) == ("reserved", "b", "odometry", "slam")
+        assert str(error) == "frame 'b' is reserved for 'slam' and cannot be reserved for 'odometry'"
+    ownership.reserve("b", "odometry").close()
+
+
+def test_one_authority_may_reserve_a_frame_twice_and_has_it_until_both_end() -> None:
+    ownership = Ownership("last")
+    first, second = ownership.reserve("b", "slam"), ownership.reserve("b", "slam")
+    first.close()
+    first.close()
+    assert ownership.reserved_for("b") == "slam"
+    second.close()
+    assert ownership.reserved_for("b") is None
+    assert not ownership
+
+
+def test_only_a_good_name_and_a_good_authority_can_have_a_reservation() -> None:
+    ownership = Ownership("last")
+    for name in ("", "/odom"):
+        with pytest.raises(InvalidTransformError, match="frame name"):
+            ownership.reserve(name, "slam")
+    with pytest.raises(TypeError):
+        ownership.reserve(7, "slam")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="authority must be a str, not None"):
+        ownership.reserve("odom", None)  # type: ignore[arg-type]
+    assert not ownership
+
+
+def test_a_misspelt_policy_is_refused() -> None:
+    with pytest.raises(ValueError, match="on_conflict must be 'last' or 'reject', not 'first'"):
+        Ownership("first")  # type: ignore[arg-type]

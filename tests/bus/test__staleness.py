@@ -1,0 +1,187 @@
+from dataclasses import dataclass
+
+from hypothesis import given
+from hypothesis import strategies as st
+from support.samples import moving, static
+
+from tfbus import FrameLive, FrameStale
+from tfbus.bus._staleness import Staleness
+
+LIMIT = 10
+
+
+@dataclass(frozen=True)
+class Known:
+    newest: int | None
+    authority: str = ""
+
+    @property
+    def static(self) -> bool:
+        return self.newest is None
+
+
+class World:
+    """What a bus would know, and who watches it."""
+
+    def __init__(self) -> None:
+        self.edges: dict[str, Known] = {}
+        self.staleness = Staleness(LIMIT, self.edges.get)
+
+    def send(self, frame: str, stamp: int | None) -> bool:
+        before = self.edges.get(frame, Known(None)).newest
+        newest = stamp if stamp is None or before is None else max(stamp, before)
+        self.edges[frame] = Known(newest)
+        sample = static("map", frame) if stamp is None else moving("map", frame, stamp)
+        return self.staleness.arrived((sample,))
+
+    def remove(self, frame: str) -> None:
+        self.edges.pop(frame, None)
+        self.staleness.forget(frame)
+
+
+def test_a_frame_is_stale_once_it_is_more_than_the_limit_behind_and_says_so_once() -> None:
+    world = World()
+    world.send("a", 100)
+    assert world.staleness.due() == 111
+    assert world.staleness.news(110) == []
+    assert world.staleness.news(111) == [FrameStale(111, "a", 100, "")]
+    assert world.staleness.news(500) == []
+    assert world.staleness.due() is None
+
+
+def test_samples_that_keep_coming_keep_it_live() -> None:
+    world = World()
+    for stamp in range(100, 200, 9):
+        world.send("a", stamp)
+        assert world.staleness.news(stamp + 9) == []
+    assert world.staleness.due() == 199 + LIMIT + 1
+
+
+def test_it_is_live_again_when_its_newest_is_not_too_old_any_more() -> None:
+    world = World()
+    world.send("a", 100)
+    world.staleness.news(200)
+    assert world.send("a", 189)
+    assert world.staleness.news(200) == [], "newer, but still too old"
+    assert world.send("a", 190)
+    assert world.staleness.news(200) == [FrameLive(200, "a", 190, "")]
+    assert world.staleness.due() == 201
+
+
+def test_a_late_sample_of_a_stale_frame_is_nothing_new() -> None:
+    world = World()
+    world.send("a", 100)
+    world.staleness.news(200)
+    world.send("a", 50)
+    assert world.staleness.news(200) == []
+    assert world.staleness.news(111) == [], "only what arrived is looked at"
+
+
+def test_static_frames_are_never_stale() -> None:
+    world = World()
+    assert not world.send("a", None)
+    world.send("b", 100)
+    world.send("b", None)
+    assert world.staleness.news(500) == []
+    assert world.staleness.due() is None
+
+
+def test_a_stale_frame_that_becomes_static_is_live() -> None:
+    world = World()
+    world.send("a", 100)
+    world.staleness.news(200)
+    assert world.send("a", None)
+    assert world.staleness.news(200) == [FrameLive(200, "a", None, "")]
+
+
+def test_a_static_frame_that_moves_is_watched_from_its_own_stamp() -> None:
+    world = World()
+    world.send("a", 100)
+    world.send("a", None)
+    assert world.send("a", 50)
+    assert world.staleness.due() == 61
+    assert world.staleness.news(61) == [FrameStale(61, "a", 50, "")]
+
+
+def test_several_go_stale_in_the_order_of_their_newest_stamps_however_often_they_were_heard() -> None:
+    world = World()
+    for name, stamp in (("a", 1), ("b", 3), ("c", 3), ("a", 5)):
+        world.send(name, stamp)
+    assert [event.frame for event in world.staleness.news(100)] == ["b", "c", "a"]
+
+
+def test_a_frame_that_was_removed_is_neither_stale_nor_live_and_may_come_back() -> None:
+    world = World()
+    world.send("a", 100)
+    world.remove("a")
+    assert world.staleness.news(200) == []
+    world.send("a", 200)
+    world.staleness.news(211)
+    world.send("a", 211)
+    world.remove("a")
+    world.send("a", 300)
+    assert world.staleness.news(300) == []
+    assert world.staleness.news(311) == [FrameStale(311, "a", 300, "")]
+
+
+def test_after_a_reset_nothing_is_known() -> None:
+    world = World()
+    world.send("a", 100)
+    world.send("b", 100)
+    world.staleness.news(111)
+    world.send("a", 111)
+    world.edges.clear()
+    world.staleness.clear()
+    assert (len(world.staleness), world.staleness.due(), world.staleness.news(500)) == (0, None, [])
+
+
+def test_names_that_come_and_go_while_the_clock_stands_fill_no_memory() -> None:
+    world = World()
+    world.send("base", 100)
+    for number in range(10_000):
+        world.send(f"object {number}", 100)
+        world.remove(f"object {number}")
+    assert len(world.staleness) < 200
+    assert world.staleness.news(111) == [FrameStale(111, "base", 100, "")]
+
+
+def test_a_sample_of_a_live_frame_costs_no_entry() -> None:
+    world = World()
+    world.send("a", 0)
+    for stamp in range(1, 1_000):
+        assert not world.send("a", stamp)
+    assert len(world.staleness) == 1
+
+
+STEPS = st.one_of(
+    st.tuples(st.just("send"), st.sampled_from("abc"), st.integers(0, 60) | st.none()),
+    st.tuples(st.just("remove"), st.sampled_from("abc"), st.none()),
+    st.tuples(st.just("look"), st.just(""), st.integers(0, 8)),
+)
+
+
+@given(st.lists(STEPS, max_size=30))
+def test_what_is_told_adds_up_to_what_is_stale(steps: list[tuple[str, str, int | None]]) -> None:
+    world = World()
+    told: set[str] = set()
+    now = 0
+    for kind, frame, number in steps:
+        if kind == "send":
+            world.send(frame, number)
+        elif kind == "remove":
+            world.remove(frame)
+            told.discard(frame)
+        else:
+            now += number or 0
+            due = world.staleness.due()
+            events = world.staleness.news(now)
+            for event in events:
+                assert (event.frame in told) == isinstance(event, FrameLive)
+                told ^= {event.frame}
+            stale = {
+                name for name, known in world.edges.items() if known.newest is not None and known.newest + LIMIT < now
+            }
+            assert told == stale
+            if any(isinstance(event, FrameStale) for event in events):
+                assert due is not None
+                assert due <= now, "nobody turns stale before the announced moment"

@@ -1,0 +1,497 @@
+import logging
+
+import pytest
+from support.samples import moving, static
+
+from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, SubscriberFailed, TransformStamped, UnknownFrameError
+from tfbus.registration import Registration
+
+Batch = tuple[TransformStamped, ...]
+
+
+def children(batches: list[Batch]) -> list[str]:
+    return [sample.child for batch in batches for sample in batch]
+
+
+def test_a_subscriber_gets_each_batch_as_a_tuple_until_it_is_closed() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    with bus.subscribe(got.append):
+        bus.publish(moving("map", "a", 1))
+        bus.publish(moving("map", name, 2) for name in "ab")
+    bus.publish(moving("map", "a", 3))
+    assert got == [(moving("map", "a", 1),), (moving("map", "a", 2), moving("map", "b", 2))]
+
+
+def test_an_empty_batch_calls_nobody() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish([])
+    assert got == []
+
+
+def test_the_buffers_have_a_batch_before_a_subscriber_is_called() -> None:
+    bus = Bus(SimulatedClock())
+    stamps = []
+    bus.subscribe(lambda _: stamps.append(buffer.lookup_nowait("map", "a").stamp))
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "a", 2))
+    assert stamps == [1, 2]
+
+
+def test_who_subscribes_late_gets_the_latched_statics_first() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish([static("map", "a"), static("map", "b"), moving("map", "c", 1)])
+    bus.publish(static("map", "b", x=2.0))
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    assert [set(batch) for batch in got] == [{static("map", "a"), static("map", "b", x=2.0)}]
+    bus.publish(moving("map", "c", 2))
+    assert got[1:] == [(moving("map", "c", 2),)]
+
+
+def test_subscribers_are_called_in_the_order_of_their_registration() -> None:
+    bus = Bus(SimulatedClock())
+    calls = []
+    for name in range(5):
+        bus.subscribe(lambda _, name=name: calls.append(name))  # type: ignore[misc]
+    bus.publish(moving("map", "a", 1))
+    assert calls == [0, 1, 2, 3, 4]
+
+
+def test_a_subscriber_that_raises_disturbs_nobody_and_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def clumsy(_batch: Batch) -> None:
+        raise ValueError("spilt the coffee")
+
+    bus.subscribe(clumsy)
+    bus.subscribe(got.append)
+    for stamp in range(3):
+        bus.publish(moving("map", "a", stamp))
+    assert len(got) == 3
+    assert bus.statistics().callbacks_failed == 3
+    (record,) = caplog.records
+    assert (record.name, record.levelno) == ("tfbus", logging.WARNING)
+    assert "clumsy" in record.getMessage()
+    assert record.exc_info is not None
+    assert str(record.exc_info[1]) == "spilt the coffee"
+
+
+def test_what_is_no_exception_is_not_swallowed_and_the_bus_goes_on() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def interrupted(batch: Batch) -> None:
+        got.append(batch)
+        if batch[0].stamp == 1:
+            raise KeyboardInterrupt
+
+    bus.subscribe(interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "a", 2))
+    assert [batch[0].stamp for batch in got] == [1, 2]
+
+
+def test_a_subscriber_may_close_itself() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def once(batch: Batch) -> None:
+        got.append(batch)
+        registration.close()
+
+    registration = bus.subscribe(once)
+    bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "a", 2))
+    assert got == [(moving("map", "a", 1),)]
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_a_subscriber_that_another_one_closes_is_not_called_any_more() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(lambda _: victim.close())
+    victim = bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    assert got == []
+
+
+def test_a_subscriber_may_subscribe_another_which_sees_every_batch_from_the_next_one_on() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def recruit(batch: Batch) -> None:
+        if batch[0].child == "a":
+            bus.subscribe(got.append)
+
+    bus.subscribe(recruit)
+    bus.publish(static("map", "s"))
+    bus.publish(moving("map", "a", 1))
+    bus.publish(moving("map", "b", 2))
+    assert children(got) == ["s", "b"]
+
+
+def test_what_a_subscriber_publishes_is_buffered_at_once_and_delivered_behind_the_current_batch() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    echoes = {"a": ["b", "c"], "b": ["d"]}
+    first: list[Batch] = []
+    last: list[Batch] = []
+
+    def echo(batch: Batch) -> None:
+        for child in echoes.get(batch[0].child, []):
+            bus.publish(moving("map", child, 1))
+            assert buffer.can_transform("map", child, 1)
+
+    bus.subscribe(first.append)
+    bus.subscribe(echo)
+    bus.subscribe(last.append)
+    bus.publish(moving("map", "a", 1))
+    assert children(first) == children(last) == ["a", "b", "c", "d"]
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_what_a_subscriber_publishes_on_being_registered_reaches_everybody_at_once() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish(static("map", "a"))
+
+    def answer(batch: Batch) -> None:
+        if batch[0].child == "a":
+            bus.publish(moving("a", "b", 1))
+
+    bus.subscribe(answer)
+    assert children(got) == ["a", "b"]
+
+
+def test_a_subscriber_that_publishes_without_end_is_stopped_by_an_error_that_names_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    bus = Bus(SimulatedClock())
+    errors: list[RuntimeError] = []
+
+    def chatterbox(batch: Batch) -> None:
+        try:
+            bus.publish(moving("map", "a", batch[0].stamp + 1))
+        except RuntimeError as error:
+            errors.append(error)
+            raise
+
+    bus.subscribe(chatterbox)
+    bus.publish(moving("map", "a", 0))
+    (error,) = errors
+    assert "chatterbox" in str(error)
+    assert bus.statistics().samples == 1_001
+    assert bus.statistics().callbacks_failed == 1
+    assert len(caplog.records) == 1
+    bus.publish(moving("map", "a", 5_000))
+    assert len(errors) == 2
+
+
+def test_a_thousand_batches_from_inside_a_callback_are_still_fine() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def burst(batch: Batch) -> None:
+        if batch[0].child == "a":
+            for stamp in range(1_000):
+                bus.publish(moving("map", "b", stamp))
+
+    bus.subscribe(burst)
+    bus.subscribe(got.append)
+    for _ in range(2):
+        got.clear()
+        bus.publish(moving("map", "a", 0))
+        assert [batch[0].stamp for batch in got[1:]] == list(range(1_000))
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_a_subscriber_that_closes_the_bus_ends_publishing_but_not_the_batch() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(lambda _: bus.close())
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    assert got == [(moving("map", "a", 1),)]
+    with pytest.raises(BusClosedError):
+        bus.publish(moving("map", "a", 2))
+
+
+def test_only_callables_can_subscribe_and_only_on_an_open_bus() -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(TypeError, match="callable"):
+        bus.subscribe("print")  # type: ignore[arg-type]
+    bus.publish(moving("map", "a", 1))
+    bus.close()
+    with pytest.raises(BusClosedError):
+        bus.subscribe(print)
+
+
+def test_an_async_subscriber_is_refused_because_nobody_would_await_it() -> None:
+    async def callback(batch: object) -> None: ...
+
+    with Bus() as bus, pytest.raises(TypeError, match=r"must not be async.*bus\.stream"):
+        bus.subscribe(callback)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_frame_that_a_subscriber_removes_is_not_brought_back_by_those_behind_it(together: bool) -> None:
+    bus = Bus(SimulatedClock())
+    front: list[Batch] = []
+    behind: list[Batch] = []
+
+    def remove(batch: Batch) -> None:
+        front.append(batch)
+        if any(sample.child == "b" for sample in batch):
+            bus.remove_frame("b")
+
+    bus.subscribe(remove)
+    bus.subscribe(behind.append)
+    a, b, c = moving("map", "a", 1), static("map", "b"), moving("map", "c", 1)
+    bus.publish([a, b] if together else b)
+    bus.publish(c)
+    assert front == [(a, b) if together else (b,), (c,)]
+    assert behind == ([(a,)] if together else []) + [(c,)]
+
+
+def test_when_a_subscriber_turns_the_clock_back_those_behind_it_get_what_is_static() -> None:
+    clock = SimulatedClock(start=10)
+    bus = Bus(clock)
+    got: list[Batch] = []
+    bus.subscribe(lambda _: clock.set(clock.now() - 1))
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 10))
+    bus.publish([moving("map", "b", 9), static("map", "s")])
+    assert got == [(static("map", "s"),)]
+
+
+def test_what_a_subscriber_publishes_anew_after_a_removal_reaches_those_behind_it() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+
+    def replace(batch: Batch) -> None:
+        if batch[0].stamp == 1:
+            bus.remove_frame("a")
+            bus.publish(moving("map", "a", 2))
+
+    bus.subscribe(replace)
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    assert got == [(moving("map", "a", 2),)]
+
+
+def test_what_waits_for_subscribers_when_the_clock_jumps_back_is_dropped() -> None:
+    clock = SimulatedClock(start=10)
+    seen: list[str] = []
+    with Bus(clock) as bus:
+
+        def callback(batch: tuple[TransformStamped, ...]) -> None:
+            seen.extend(sample.child for sample in batch)
+            if batch[0].child == "a":
+                bus.publish([moving("map", "b", 10)])
+                bus.publish([static("map", "c")])
+                clock.set(0)
+
+        bus.subscribe(callback)
+        bus.publish(moving("map", "a", 10))
+    assert seen == ["a", "c"]
+
+
+# Removals
+
+
+def noting(bus: Bus, log: list[object]) -> Registration:
+    """Note the children of each batch, and each frame that is removed."""
+    return bus.subscribe(lambda batch: log.append([sample.child for sample in batch]), log.append)
+
+
+def test_a_subscriber_is_told_of_removals_in_order_with_the_batches_until_it_is_closed() -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+    with noting(bus, log):
+        bus.publish([moving("map", "a", 1), static("map", "b")])
+        bus.remove_frame("a")
+        bus.publish(moving("map", "a", 1))
+        bus.remove_frame("b")
+        bus.remove_frame("a")
+        bus.publish(moving("map", "c", 1))
+    bus.remove_frame("c")
+    bus.publish(moving("map", "d", 1))
+    assert log == [["a", "b"], "a", ["a"], "b", "a", ["c"]]
+
+
+def test_only_what_is_removed_while_one_is_there_is_told() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish([static("map", "a"), static("map", "b")])
+    bus.remove_frame("a")
+    log: list[object] = []
+    noting(bus, log)
+    with pytest.raises(UnknownFrameError):
+        bus.remove_frame("a")
+    bus.remove_frame("b")
+    assert log == [["b"], "b"]
+
+
+def test_a_frame_that_only_a_buffer_still_lists_is_told_of_when_it_goes() -> None:
+    clock = SimulatedClock(start=10)
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    log: list[object] = []
+    noting(bus, log)
+    bus.publish(moving("map", "a", 10))
+    clock.set(0)
+    bus.remove_frame("a")
+    assert log == [["a"], "a"]
+    assert buffer.tree.frames() == []
+
+
+@pytest.mark.parametrize("first", [True, False], ids=["in front", "behind"])
+def test_a_removal_inside_a_callback_is_told_between_what_was_and_what_is_published_anew(first: bool) -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+    stamps: list[int] = []
+
+    def replace(batch: Batch) -> None:
+        if batch[0].stamp == 1:
+            bus.publish(moving("map", "b", 2))
+            bus.publish(moving("map", "a", 3))
+            bus.remove_frame("a")
+            bus.publish(moving("map", "a", 4))
+
+    registrations = [noting(bus, log)] if first else []
+    bus.subscribe(replace)
+    bus.subscribe(lambda batch: stamps.extend(sample.stamp for sample in batch))
+    registrations += [] if first else [noting(bus, log)]
+    bus.publish([moving("map", "a", 1), moving("map", "c", 1)])
+    before: list[object] = [["a", "c"], "a"] if first else ["a", ["c"]]
+    assert log == [*before, ["b"], ["a"]]
+    assert stamps == [1, 2, 4]
+
+
+def test_what_is_published_on_hearing_of_a_removal_comes_behind_it_for_everybody() -> None:
+    bus = Bus(SimulatedClock())
+    logs: list[list[object]] = [[], []]
+    noting(bus, logs[0])
+
+    def keep(frame: str) -> None:
+        if frame == "a":
+            bus.publish(moving("map", "a", 2))
+            bus.publish(moving("map", "b", 2))
+
+    bus.subscribe(lambda _: None, keep)
+    noting(bus, logs[1])
+    bus.publish(moving("map", "a", 1))
+    bus.remove_frame("a")
+    assert logs[0] == logs[1] == [["a"], "a", ["a"], ["b"]]
+
+
+def test_what_is_removed_on_hearing_of_a_removal_is_told_to_everybody() -> None:
+    bus = Bus(SimulatedClock())
+    logs: list[list[object]] = [[], []]
+    noting(bus, logs[0])
+    bus.subscribe(lambda _: None, lambda frame: bus.remove_frame("tool") if frame == "arm" else None)
+    noting(bus, logs[1])
+    bus.publish([static("map", "arm"), static("arm", "tool")])
+    bus.remove_frame("arm")
+    assert logs[0] == [["arm", "tool"], "arm", "tool"]
+    assert sorted(map(str, logs[1][1:])) == ["arm", "tool"]
+    assert bus.statistics().callbacks_failed == 0
+
+
+def test_one_that_raises_on_a_removal_disturbs_nobody_and_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+
+    def clumsy(frame: str) -> None:
+        raise ValueError(frame)
+
+    bus.subscribe(lambda _: None, clumsy)
+    noting(bus, log)
+    with bus.events() as events:
+        for stamp in range(3):
+            bus.publish(moving("map", "a", stamp))
+            bus.remove_frame("a")
+        pending = [event for event in iter(events.queue.get, None) if isinstance(event, SubscriberFailed)]
+    assert log == [["a"], "a"] * 3
+    assert bus.statistics().callbacks_failed == 3
+    assert [str(event.error) for event in pending] == ["a", "a", "a"]
+    assert all("clumsy" in event.subscriber for event in pending)
+    (record,) = caplog.records
+    assert "clumsy" in record.getMessage()
+
+
+def test_what_is_no_exception_is_not_swallowed_on_a_removal_either() -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+
+    def interrupted(frame: str) -> None:
+        bus.publish(moving("map", "b", 1))
+        raise KeyboardInterrupt(frame)
+
+    noting(bus, log)
+    registration = bus.subscribe(lambda _: None, interrupted)
+    bus.publish(moving("map", "a", 1))
+    with pytest.raises(KeyboardInterrupt):
+        bus.remove_frame("a")
+    registration.close()
+    bus.publish(moving("map", "c", 1))
+    assert log == [["a"], "a", ["b"], ["c"]]
+
+
+def test_a_registration_that_ends_on_a_removal_ends_both() -> None:
+    bus = Bus(SimulatedClock())
+    log: list[object] = []
+    other: list[object] = []
+
+    def once(frame: str) -> None:
+        log.append(frame)
+        registration.close()
+        victim.close()
+
+    registration = bus.subscribe(log.append, once)
+    victim = noting(bus, other)
+    bus.publish([static("map", "a"), static("map", "b")])
+    bus.remove_frame("a")
+    bus.remove_frame("b")
+    bus.publish(moving("map", "c", 1))
+    assert log == [(static("map", "a"), static("map", "b")), "a"]
+    assert other == [["a", "b"]]
+
+
+def test_one_that_publishes_without_end_on_removals_is_stopped_by_an_error_that_names_it() -> None:
+    bus = Bus(SimulatedClock())
+    errors: list[RuntimeError] = []
+
+    def chatterbox(_frame: str) -> None:
+        try:
+            for stamp in range(5_000):
+                bus.publish(moving("map", "a", stamp))
+        except RuntimeError as error:
+            errors.append(error)
+
+    got: list[Batch] = []
+    bus.subscribe(got.append, chatterbox)
+    bus.publish(moving("map", "a", 0))
+    bus.remove_frame("a")
+    assert "chatterbox" in str(errors[0])
+    assert len(got) == 1_001
+    bus.publish(moving("map", "a", 0))
+    assert len(got) == 1_002
+
+
+def test_what_hears_of_removals_must_be_callable_and_not_async() -> None:
+    async def callback(frame: str) -> None: ...
+
+    with Bus() as bus:
+        with pytest.raises(TypeError, match="callable"):
+            bus.subscribe(print, "print")  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="must not be async"):
+            bus.subscribe(print, callback)
+        bus.publish(moving("map", "a", 1))
+        assert bus.statistics().callbacks_failed == 0

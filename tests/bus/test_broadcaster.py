@@ -1,0 +1,284 @@
+import math
+from collections.abc import Callable
+
+import anyio
+import pytest
+from support.asking import settle
+from support.samples import moving, static
+
+from tfbus import (
+    Buffer,
+    Bus,
+    BusClosedError,
+    InvalidTransformError,
+    SimulatedClock,
+    Transform,
+    TransformBroadcaster,
+    TransformStamped,
+)
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+
+pytestmark = pytest.mark.anyio
+
+HERE = Transform((1.0, 2.0, 3.0))
+
+
+def test_a_sample_carries_the_clock_s_stamp_and_the_authority() -> None:
+    clock = SimulatedClock(start=42)
+    bus = Bus(clock)
+    got: list[TransformStamped] = []
+    bus.subscribe(got.extend)
+    broadcaster = TransformBroadcaster(bus, "odometry")
+    broadcaster.send("odom", "base", HERE)
+    clock.set(99)
+    broadcaster.send("odom", "base", HERE)
+    broadcaster.send("odom", "base", HERE, at=50)
+    assert [sample.stamp for sample in got] == [42, 99, 50]
+    assert {(sample.parent, sample.child, sample.transform, sample.authority) for sample in got} == {
+        ("odom", "base", HERE, "odometry")
+    }
+
+
+def test_stamp_zero_is_a_stamp_like_any_other() -> None:
+    bus = Bus(SimulatedClock(start=42))
+    buffer = Buffer(bus)
+    TransformBroadcaster(bus).send("odom", "base", HERE, at=0)
+    assert buffer.lookup_nowait("odom", "base").stamp == 0
+
+
+def test_the_authority_shows_in_the_errors_about_its_frames() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    TransformBroadcaster(bus, "odometry").send("odom", "base", HERE, at=1)
+    with pytest.raises(LookupError, match="from 'odometry'"):
+        buffer.lookup_nowait("odom", "base", 2)
+
+
+def test_send_all_gives_one_stamp_to_all_and_lets_samples_keep_theirs() -> None:
+    bus = Bus(SimulatedClock(start=42))
+    got: list[tuple[TransformStamped, ...]] = []
+    bus.subscribe(got.append)
+    broadcaster = TransformBroadcaster(bus, "arm")
+    broadcaster.send_all([("base", "shoulder", HERE), ("shoulder", "elbow", HERE), moving("elbow", "hand", 7)])
+    (batch,) = got
+    assert [(sample.child, sample.stamp, sample.authority) for sample in batch] == [
+        ("shoulder", 42, "arm"),
+        ("elbow", 42, "arm"),
+        ("hand", 7, "arm"),
+    ]
+    broadcaster.send_all([("base", "shoulder", HERE)], at=50)
+    assert got[1][0].stamp == 50
+
+
+def test_send_all_is_seen_whole_or_not_at_all() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    with pytest.raises(InvalidTransformError):
+        TransformBroadcaster(bus).send_all([("base", "shoulder", HERE), ("shoulder", "/hand", HERE)])
+    assert buffer.tree.frames() == []
+
+
+def test_send_static_holds_at_every_stamp_and_can_be_sent_again() -> None:
+    bus = Bus(SimulatedClock())
+    broadcaster = TransformBroadcaster(bus)
+    broadcaster.send_static("base", "laser", HERE)
+    broadcaster.send_static("base", "laser", HERE.inverse())
+    buffer = Buffer(bus)
+    for at in (STAMP_MIN, 0, STAMP_MAX):
+        found = buffer.lookup_nowait("base", "laser", at)
+        assert (found.stamp, found.transform, found.static) == (at, HERE.inverse(), True)
+
+
+NAN = math.nan
+BAD_CALLS: dict[str, Callable[[TransformBroadcaster], None]] = {
+    "NaN": lambda tf: tf.send("map", "a", Transform((0.0, NAN, 0.0))),
+    "infinity": lambda tf: tf.send("map", "a", Transform((0.0, -math.inf, 0.0))),
+    "NaN rotation": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, NAN, 1.0))),
+    "zero quaternion": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, 0.0, 0.0))),
+    "norm 1.02": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, 0.0, 1.02))),
+    "short translation": lambda tf: tf.send("map", "a", Transform((0.0, 0.0))),
+    "long rotation": lambda tf: tf.send("map", "a", Transform(rotation=(0.0, 0.0, 0.0, 1.0, 0.0))),
+    "empty child": lambda tf: tf.send("map", "", HERE),
+    "empty parent": lambda tf: tf.send("", "a", HERE),
+    "leading slash": lambda tf: tf.send("/map", "a", HERE),
+    "child equal to parent": lambda tf: tf.send("a", "a", HERE),
+    "cycle": lambda tf: tf.send("base", "map", HERE),
+    "static cycle": lambda tf: tf.send_static("base", "map", HERE),
+    "stamp beyond int64": lambda tf: tf.send("map", "a", HERE, at=STAMP_MAX + 1),
+    "cycle in a batch": lambda tf: tf.send_all([("map", "a", HERE), ("base", "map", HERE)]),
+    "loop in a batch": lambda tf: tf.send_all([("p", "q", HERE), ("q", "p", HERE)]),
+}
+MISTAKES: dict[str, Callable[[TransformBroadcaster], None]] = {
+    "float stamp": lambda tf: tf.send("map", "a", HERE, at=1.5),  # type: ignore[arg-type]
+    "float stamp of a batch": lambda tf: tf.send_all([("map", "a", HERE)], at=1.5),  # type: ignore[arg-type]
+    "numbers for a transform": lambda tf: tf.send("map", "a", (0.0, 0.0, 0.0)),  # type: ignore[arg-type]
+    "text for numbers": lambda tf: tf.send("map", "a", Transform("123")),  # type: ignore[arg-type]
+    "number for a name": lambda tf: tf.send("map", 7, HERE),  # type: ignore[arg-type]
+    "pair in a batch": lambda tf: tf.send_all([("map", "a")]),  # type: ignore[list-item]
+    "no batch": lambda tf: tf.send_all(5),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize(
+    ("call", "error"),
+    [pytest.param(call, InvalidTransformError, id=name) for name, call in BAD_CALLS.items()]
+    + [pytest.param(call, TypeError, id=name) for name, call in MISTAKES.items()],
+)
+def test_bad_input_raises_at_its_own_call_stores_nothing_and_leaves_the_bus_working(
+    call: Callable[[TransformBroadcaster], None], error: type[Exception]
+) -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    got: list[tuple[TransformStamped, ...]] = []
+    broadcaster = TransformBroadcaster(bus)
+    broadcaster.send("map", "base", HERE)
+    with bus.stream() as stream, bus.subscribe(got.append):
+        with pytest.raises(error):
+            call(broadcaster)
+        assert got == []
+        assert len(stream.queue) == 0
+        assert buffer.tree.frames() == ["base", "map"]
+        assert buffer.tree.inserted == 1
+        broadcaster.send("map", "a", HERE)
+        assert buffer.can_transform("a", "base")
+        assert len(got) == 1
+
+
+async def test_a_broadcaster_does_not_die_of_somebody_else_s_bad_samples() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    good, bad = TransformBroadcaster(bus, "good"), TransformBroadcaster(bus, "bad")
+    refused = 0
+
+    async def broadcast() -> None:
+        async for _ in clock.ticks(100):
+            good.send("map", "base", HERE)
+
+    async def disturb() -> None:
+        nonlocal refused
+        async for tick in clock.ticks(100):
+            with pytest.raises((InvalidTransformError, TypeError)):
+                (*BAD_CALLS.values(), *MISTAKES.values())[tick % (len(BAD_CALLS) + len(MISTAKES))](bad)
+            bus.publish([moving("base", "map", clock.now()), "noise"], invalid="drop")  # type: ignore[list-item]
+            refused += 1
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(broadcast)
+        await settle()
+        tasks.start_soon(disturb)
+        await clock.advance(1.0)
+        tasks.cancel_scope.cancel()
+    assert refused == 101
+    (edge,) = buffer.tree.edges()
+    assert (edge.child, edge.samples, edge.newest, edge.authority) == ("base", 101, 1_000_000_000, "good")
+    assert bus.statistics().rejected["not a sample"] == 101
+
+
+def test_a_broadcaster_needs_a_name_that_is_text() -> None:
+    with pytest.raises(TypeError, match="authority"):
+        TransformBroadcaster(Bus(SimulatedClock()), 5)  # type: ignore[arg-type]
+
+
+def test_a_closed_bus_refuses_every_way_of_sending() -> None:
+    bus = Bus(SimulatedClock())
+    broadcaster = TransformBroadcaster(bus)
+    bus.publish(static("map", "s"))
+    bus.close()
+    with pytest.raises(BusClosedError):
+        broadcaster.send("map", "a", HERE)
+    with pytest.raises(BusClosedError):
+        broadcaster.send_all([("map", "a", HERE)])
+    with pytest.raises(BusClosedError):
+        broadcaster.send_static("map", "a", HERE)
+
+
+# Owning
+
+
+def test_an_owned_frame_is_reserved_meanwhile_and_removed_at_the_end() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    arm, other = TransformBroadcaster(bus, "arm"), TransformBroadcaster(bus, "other")
+    with arm.owning("tool0", "tool1"):
+        for name in ("tool0", "tool1"):
+            arm.send_static("flange", name, HERE)
+            with pytest.raises(InvalidTransformError, match="reserved for 'arm'") as caught:
+                other.send("flange", name, HERE)
+            assert (caught.value.reason, caught.value.authority, caught.value.owner) == ("reserved", "other", "arm")
+        assert buffer.can_transform("tool0", "tool1")
+    assert buffer.tree.frames() == []
+    assert Buffer(bus).tree.frames() == []
+    other.send("flange", "tool0", HERE)
+    assert buffer.can_transform("flange", "tool0")
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, GeneratorExit])
+def test_whatever_ends_the_block_the_frame_is_gone(error: type[BaseException]) -> None:
+    bus = Bus(SimulatedClock())
+    arm = TransformBroadcaster(bus, "arm")
+    with pytest.raises(error), arm.owning("tool0"):
+        arm.send_static("flange", "tool0", HERE)
+        raise error
+    assert bus.statistics().frames == 0
+    bus.reserve("tool0", "other").close()
+
+
+async def test_cancellation_removes_the_frame_too() -> None:
+    bus = Bus(SimulatedClock())
+    arm = TransformBroadcaster(bus, "arm")
+
+    async def work() -> None:
+        with arm.owning("tool0"):
+            arm.send_static("flange", "tool0", HERE)
+            await anyio.sleep_forever()
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(work)
+        await settle()
+        assert bus.statistics().frames == 1
+        tasks.cancel_scope.cancel()
+    assert bus.statistics().frames == 0
+
+
+def test_a_frame_that_was_never_published_or_is_gone_already_makes_no_trouble() -> None:
+    bus = Bus(SimulatedClock())
+    arm = TransformBroadcaster(bus, "arm")
+    with arm.owning("tool0", "tool1", "tool2"):
+        arm.send_static("flange", "tool1", HERE)
+        arm.send_static("flange", "tool2", HERE)
+        bus.remove_frame("tool1")
+    assert bus.statistics().frames == 0
+
+
+def test_the_bus_may_be_closed_before_the_block_ends() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    arm = TransformBroadcaster(bus, "arm")
+    with arm.owning("tool0"):
+        arm.send_static("flange", "tool0", HERE)
+        bus.close()
+    assert buffer.can_transform("flange", "tool0"), "nothing changes any more on a closed bus"
+
+
+def test_of_several_frames_all_are_reserved_or_none() -> None:
+    bus = Bus(SimulatedClock())
+    arm, other = TransformBroadcaster(bus, "arm"), TransformBroadcaster(bus, "other")
+    arm.send_static("flange", "tool0", HERE)
+    block = arm.owning("tool0", "tool1")
+    with other.owning("tool1"), pytest.raises(InvalidTransformError, match="'tool1' is reserved for 'other'"), block:
+        pytest.fail("the block began")
+    assert bus.statistics().frames == 1, "what could not be owned is not removed either"
+    other.send("flange", "tool0", HERE)
+
+
+def test_owning_needs_a_frame() -> None:
+    with pytest.raises(TypeError, match="at least one frame"), TransformBroadcaster(Bus()).owning():
+        pytest.fail("the block began")
+
+
+def test_nothing_is_owned_before_the_block_begins() -> None:
+    bus = Bus(SimulatedClock())
+    block = TransformBroadcaster(bus, "arm").owning("tool0")
+    with bus.reserve("tool0", "other"), pytest.raises(InvalidTransformError), block:
+        pytest.fail("the block began")

@@ -1,0 +1,744 @@
+import gc
+import sys
+import tracemalloc
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import asdict
+from functools import partial
+
+import anyio
+import anyio.to_thread
+import pytest
+from support.asking import Asked, driving, settle
+from support.samples import moving, static
+
+from tfbus import (
+    Buffer,
+    Bus,
+    BusClosedError,
+    FutureExtrapolationError,
+    InvalidTransformError,
+    PeerJoined,
+    PeerLost,
+    SimulatedClock,
+    SystemClock,
+    TransformBroadcaster,
+    TransformStamped,
+    UnknownFrameError,
+)
+from tfbus.bus._ownership import OnConflict
+
+pytestmark = pytest.mark.anyio
+
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+Batch = tuple[TransformStamped, ...]
+
+
+# Publishing
+
+
+def test_a_lookup_right_after_publish_sees_the_sample_without_any_event_loop() -> None:
+    bus = Bus()
+    buffers = [Buffer(bus), Buffer(bus, keep=None)]
+    bus.publish(moving("map", "a", 1, 3.0))
+    for buffer in buffers:
+        assert buffer.lookup_nowait("map", "a", 1).transform.translation == (3.0, 0.0, 0.0)
+
+
+def test_one_sample_a_list_and_a_generator_can_be_published() -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    bus.publish([moving("map", "a", 2)])
+    bus.publish(moving("map", "a", stamp) for stamp in (3, 4))
+    assert [[sample.stamp for sample in batch] for batch in got] == [[1], [2], [3, 4]]
+    assert bus.statistics().samples == 4
+
+
+def test_a_loop_of_parents_is_refused_whole_and_the_error_names_all_of_it() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish([moving("map", "odom", 1), moving("odom", "base", 1)])
+    with pytest.raises(InvalidTransformError) as caught:
+        bus.publish([moving("base", "laser", 2), moving("base", "map", 2, authority="rogue")])
+    error = caught.value
+    assert (error.reason, error.parent, error.child, error.authority) == ("cycle", "base", "map", "rogue")
+    assert error.loop == ("map", "base", "odom", "map")
+    assert "map -> base -> odom -> map" in str(error)
+    assert len(got) == 1
+    assert buffer.tree.frames() == ["base", "map", "odom"]
+    assert bus.statistics().rejected == {"cycle": 1}
+    bus.publish(moving("base", "laser", 1))
+    assert buffer.can_transform("map", "laser", 1)
+
+
+def test_loops_are_judged_after_the_whole_batch_so_an_edge_can_be_turned_round() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    bus.publish([moving("world", "a", 1), moving("a", "b", 1)])
+    bus.publish([moving("b", "a", 2), moving("world", "b", 2)])
+    assert buffer.tree.parent("a") == "b"
+    assert buffer.tree.parent("b") == "world"
+
+
+def test_a_loop_inside_one_batch_is_refused() -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(InvalidTransformError, match="loop"):
+        bus.publish([moving("a", "b", 1), moving("b", "c", 1), moving("c", "a", 1)])
+    assert bus.statistics().samples == 0
+    assert bus.statistics().frames == 0
+
+
+def test_drop_leaves_out_the_offenders_only_and_logs_them_once(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(SimulatedClock())
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish(moving("map", "a", 1))
+    for stamp in (2, 3):
+        bus.publish(
+            [moving("a", "map", stamp, authority="rogue"), "noise", moving("map", "b", stamp)],  # type: ignore[list-item]
+            invalid="drop",
+        )
+    assert got[1:] == [(moving("map", "b", 2),), (moving("map", "b", 3),)]
+    assert bus.statistics().rejected == {"cycle": 2, "not a sample": 2}
+    assert sum("loop" in message for message in caplog.messages) == 1
+
+
+def test_a_dropped_batch_calls_nobody() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(moving("map", "a", 1))
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    bus.publish(moving("a", "map", 2), invalid="drop")
+    assert got == []
+
+
+@pytest.mark.parametrize("nonsense", [None, 5, "map", b"map", [moving("map", "a", 1), None], ["map"], {"map": 1}])
+def test_what_is_no_sample_is_refused_with_everything_beside_it(nonsense: object) -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    with pytest.raises(TypeError, match="TransformStamped"):
+        bus.publish(nonsense)  # type: ignore[arg-type]
+    assert buffer.tree.frames() == []
+    bus.publish(moving("map", "a", 1))
+    assert buffer.tree.frames() == ["a", "map"]
+
+
+def test_an_iterable_that_raises_stores_nothing() -> None:
+    bus = Bus(SimulatedClock())
+
+    def broken() -> Iterator[TransformStamped]:
+        yield moving("map", "a", 1)
+        raise OSError("the file has ended")
+
+    with pytest.raises(OSError, match="the file has ended"):
+        bus.publish(broken())
+    assert bus.statistics().samples == 0
+
+
+def test_a_sample_that_is_too_old_for_a_buffer_expires_there_and_raises_nothing() -> None:
+    bus = Bus(SimulatedClock())
+    short, long = Buffer(bus, keep=1.0), Buffer(bus, keep=5.0)
+    bus.publish(driving("map", "a", 10.0))
+    bus.publish(driving("map", "a", 7.0))
+    assert (short.can_transform("map", "a", 9_000_000_000), long.can_transform("map", "a", 9_000_000_000)) == (
+        False,
+        True,
+    )
+    assert [statistics.expired for statistics in bus.statistics().buffers] == [1, 0]
+
+
+# Topology
+
+
+def test_two_authorities_on_one_child_are_counted_and_logged_once_with_both_names(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    bus = Bus(SimulatedClock())
+    for stamp in range(10):
+        bus.publish(moving("map", "a", stamp, authority=("odometry", "slam")[stamp % 2]))
+        bus.publish(moving("map", "b", stamp, authority="odometry"))
+    assert bus.statistics().authority_conflicts == 9
+    (message,) = caplog.messages
+    assert "'a'" in message
+    assert "'odometry'" in message
+    assert "'slam'" in message
+
+
+def test_static_and_moving_samples_of_one_child_the_last_kind_wins(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    bus.publish([moving("map", "a", 1, 1.0), moving("map", "a", 5, 5.0)])
+    bus.publish(static("map", "a", x=7.0))
+    assert buffer.lookup_nowait("map", "a", 999).transform.translation == (7.0, 0.0, 0.0)
+    bus.publish(moving("map", "a", 6, 6.0))
+    assert not buffer.can_transform("map", "a", 5)
+    assert buffer.lookup_nowait("map", "a").stamp == 6
+    late = Buffer(bus)
+    assert late.tree.frames() == []
+    assert bus.statistics().kind_changes == 2
+    assert any("static" in message and "'a'" in message for message in caplog.messages)
+
+
+def test_a_static_sample_that_is_sent_again_replaces_what_is_latched() -> None:
+    bus = Bus(SimulatedClock())
+    early = Buffer(bus)
+    bus.publish(static("map", "a", x=1.0))
+    bus.publish(static("world", "a", x=2.0))
+    for buffer in (early, Buffer(bus)):
+        assert buffer.lookup_nowait("world", "a", 3).transform.translation == (2.0, 0.0, 0.0)
+        assert "map" not in buffer.tree
+    assert bus.statistics().reparented == 1
+
+
+def test_reparenting_follows_the_stamps_and_is_counted() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    bus.publish([static("world", "hand"), static("world", "table")])
+    bus.publish([moving("table", "cup", 1), moving("table", "cup", 3), moving("hand", "cup", 5)])
+    assert [buffer.tree.parent("cup", at) for at in (1, 4, 5)] == ["table", "table", "hand"]
+    bus.publish(moving("table", "cup", 2))
+    assert bus.statistics().reparented == 1
+
+
+def test_a_late_sample_with_the_old_parent_does_not_count_as_the_newest_edge() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish([moving("a", "c", 10), moving("b", "c", 20), moving("a", "c", 15)])
+    with pytest.raises(InvalidTransformError, match="loop"):
+        bus.publish(moving("c", "b", 21))
+    bus.publish(moving("c", "a", 21))
+
+
+def test_a_removed_frame_disappears_for_everybody_and_may_come_back() -> None:
+    bus = Bus(SimulatedClock())
+    early = Buffer(bus)
+    bus.publish([static("map", "arm"), moving("arm", "tool", 1), moving("map", "b", 1)])
+    bus.remove_frame("arm")
+    late = Buffer(bus)
+    assert early.tree.frames() == ["arm", "b", "map", "tool"]
+    assert early.tree.parent("arm") is None
+    assert "arm" not in late.tree
+    assert not early.can_transform("map", "tool")
+    bus.publish(static("b", "arm"))
+    assert early.can_transform("map", "tool", 1)
+
+
+def test_only_what_was_published_can_be_removed() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(moving("map", "base", 1))
+    with pytest.raises(UnknownFrameError) as caught:
+        bus.remove_frame("bass")
+    assert caught.value.close_matches == ("base",)
+
+
+def test_a_removed_frame_is_gone_from_streams_threads_queues_and_what_waits_for_subscribers() -> None:
+    bus = Bus(SimulatedClock())
+    batches: list[Batch] = []
+
+    def remove_once(batch: Batch) -> None:
+        if batch[0].child == "a":
+            bus.publish([moving("map", "b", 1), moving("map", "c", 1)])
+            bus.remove_frame("b")
+
+    bus.subscribe(remove_once)
+    bus.subscribe(batches.append)
+    with bus.stream(overflow="drop_oldest") as stream:
+        bus.publish(moving("map", "a", 1))
+        assert len(stream.queue) == 2
+        assert [queue.dropped for queue in bus.statistics().queues] == [1]
+    assert batches == [(moving("map", "a", 1),), (moving("map", "c", 1),)]
+
+
+async def test_a_waiter_learns_that_a_frame_was_removed() -> None:
+    bus = Bus(SimulatedClock())
+    with Buffer(bus) as buffer:
+        bus.publish([driving("map", "base", 1.0), static("base", "laser")])
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, partial(buffer.lookup, "map", "laser", 2_000_000_000))
+            await settle()
+            (before,) = buffer.pending()
+            assert isinstance(before.blocked_by, FutureExtrapolationError)
+            bus.remove_frame("laser")
+            await settle()
+            (after,) = buffer.pending()
+            assert isinstance(after.blocked_by, UnknownFrameError)
+            assert after.blocked_by.frame == "laser"
+            bus.publish([driving("map", "base", 2.0), static("base", "laser")])
+            await settle()
+            assert asked.answer.stamp == 2_000_000_000
+
+
+def test_removing_a_frame_looks_at_no_other() -> None:
+    bus = Bus(SimulatedClock())
+    with Buffer(bus), bus.stream(), bus.events():
+        bus.publish(moving("map", f"frame {number}", 1) for number in range(2_000))
+        visited = 0
+
+        def count(*_: object) -> None:
+            nonlocal visited
+            visited += 1
+
+        sys.setprofile(count)
+        try:
+            bus.remove_frame("frame 7")
+        finally:
+            sys.setprofile(None)
+    assert visited < 200
+
+
+# Authorities
+
+
+def test_the_first_authority_keeps_a_child_and_another_one_hears_of_it() -> None:
+    bus = Bus(SimulatedClock(), on_conflict="reject")
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "odom", 1, 1.0, authority="slam"))
+    with pytest.raises(
+        InvalidTransformError, match="'slam', who was first: no sample of it is taken from ''"
+    ) as caught:
+        bus.publish([moving("map", "new", 2), moving("map", "odom", 2, 2.0)])
+    assert (caught.value.reason, caught.value.owner, caught.value.authority) == ("authority", "slam", "")
+    assert buffer.tree.frames() == ["map", "odom"]
+    bus.publish([moving("map", "new", 2), moving("map", "odom", 2, 2.0)], invalid="drop")
+    assert buffer.lookup_nowait("map", "odom").transform.translation == (1.0, 0.0, 0.0)
+    assert buffer.can_transform("map", "new")
+    assert bus.statistics().rejected == {"authority": 2}
+    assert bus.statistics().authority_conflicts == 0
+
+
+@pytest.mark.parametrize("resets", [0, 1, 2])
+def test_the_first_authority_keeps_a_child_across_clock_resets_until_it_is_removed(resets: int) -> None:
+    clock = SimulatedClock(start=5)
+    bus = Bus(clock, on_conflict="reject")
+    bus.publish(moving("map", "odom", 5, authority="slam"))
+    for stamp in range(resets, 0, -1):
+        clock.set(stamp)
+        assert bus.statistics().frames == 0
+        with pytest.raises(InvalidTransformError, match="'slam', who was first"):
+            bus.publish(moving("map", "odom", stamp, authority="odometry"))
+    bus.publish(moving("map", "odom", 1, authority="slam"))
+    clock.set(0)
+    bus.remove_frame("odom")
+    with pytest.raises(UnknownFrameError):
+        bus.remove_frame("odom")
+    bus.publish(moving("map", "odom", 1, authority="odometry"))
+    with pytest.raises(InvalidTransformError, match="'odometry', who was first"):
+        bus.publish(moving("map", "odom", 6, authority="slam"))
+
+
+@pytest.mark.parametrize("policy", ["last", "reject"])
+@pytest.mark.parametrize("make", [moving, static])
+def test_from_a_reservation_on_only_the_new_authority_may_publish(
+    policy: OnConflict, make: Callable[..., TransformStamped]
+) -> None:
+    bus = Bus(SimulatedClock(), on_conflict=policy)
+    old, new = (make("map", "odom", stamp=3, authority=name) for name in ("odometry", "slam"))
+    bus.publish(old)
+    bus.publish(old)
+    with bus.reserve("odom", authority="slam"):
+        for samples in (old, [moving("map", "base", 4), old]):
+            with pytest.raises(InvalidTransformError) as caught:
+                bus.publish(samples)
+            assert (caught.value.reason, caught.value.owner, caught.value.authority) == ("reserved", "slam", "odometry")
+        bus.publish(new)
+        bus.publish(new)
+        with pytest.raises(InvalidTransformError):
+            bus.publish(old)
+        assert bus.statistics().authority_conflicts == 0, "a reservation is a handover, and no quarrel"
+    assert bus.statistics().frames == 1
+    assert bus.statistics().rejected == {"reserved": 3}
+    if policy == "last":
+        bus.publish(old)
+        assert bus.statistics().authority_conflicts == 1
+    else:
+        with pytest.raises(InvalidTransformError, match="'slam', who was first"):
+            bus.publish(old)
+
+
+def test_a_reservation_that_nobody_used_leaves_all_as_it_was() -> None:
+    bus = Bus(SimulatedClock(), on_conflict="reject")
+    bus.publish(moving("map", "odom", 1, authority="odometry"))
+    with bus.reserve("odom", authority="slam"):
+        pass
+    bus.publish(moving("map", "odom", 2, authority="odometry"))
+    bus.publish(moving("map", "odom", 3, authority="odometry"))
+    assert bus.statistics().samples == 3
+
+
+def test_a_reservation_outlives_the_removal_of_its_frame_and_the_bus() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.reserve("odom", authority="slam"):
+        bus.publish(moving("map", "odom", 1, authority="slam"))
+        bus.remove_frame("odom")
+        with pytest.raises(InvalidTransformError, match="reserved for 'slam'"):
+            bus.publish(moving("map", "odom", 1, authority="odometry"))
+        bus.close()
+
+
+def test_a_quarrel_fills_neither_the_log_nor_the_events(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    bus = Bus(SimulatedClock())
+    with bus.events() as events:
+        for stamp in range(1_000):
+            parent, authority = (("map", "slam"), ("world", "gps"))[stamp % 2]
+            bus.publish(moving(parent, "odom", stamp, authority=authority))
+        assert len(events.queue) == 4, "a new frame, the conflict, and what each of the two claims"
+    statistics = bus.statistics()
+    assert (statistics.authority_conflicts, statistics.reparented) == (999, 999)
+    assert len(caplog.messages) == 3
+
+
+def test_a_misspelt_policy_for_conflicts_is_refused() -> None:
+    with pytest.raises(ValueError, match="on_conflict must be 'last' or 'reject', not 'first'"):
+        Bus(on_conflict="first")  # type: ignore[arg-type]
+
+
+# Events of others
+
+
+async def test_what_is_announced_reaches_everybody_who_reads_events() -> None:
+    bus = Bus(SimulatedClock(start=5))
+    joined, lost = PeerJoined(5, "tf", "other"), PeerLost(6, "tf", "other", ("slam",), ("odom",))
+    bus.announce(joined)
+    with bus.events() as first, bus.events() as second:
+        for event in (joined, lost):
+            bus.announce(event)
+        for events in (first, second):
+            assert [await anext(events), await anext(events)] == [joined, lost]
+    bus.announce(joined)
+    bus.close()
+    bus.announce(joined)
+
+
+async def test_who_waits_for_events_is_woken_by_what_is_announced() -> None:
+    bus = Bus(SimulatedClock())
+    joined = PeerJoined(0, "tf", "other")
+    with bus.events() as events:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, events.__anext__)
+            await settle()
+            bus.announce(joined)
+            await settle()
+            assert asked.answer == joined
+
+
+async def test_nothing_is_announced_from_another_thread() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.events() as events:
+        bus.check_thread()
+        with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+            await anyio.to_thread.run_sync(bus.announce, PeerJoined(0, "tf", "other"))
+        assert len(events.queue) == 0
+
+
+# Latched statics
+
+
+def test_a_buffer_that_joins_late_gets_what_is_latched_and_nothing_else() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish([static("map", "a"), static("a", "b"), moving("b", "c", 1)])
+    buffer = Buffer(bus)
+    assert buffer.tree.frames() == ["a", "b", "map"]
+    (statistics,) = bus.statistics().buffers
+    assert (statistics.offered, statistics.inserted) == (2, 2)
+
+
+# Clock jumps
+
+
+async def test_a_jump_back_drops_moving_samples_and_keeps_statics() -> None:
+    clock = SimulatedClock(start=100)
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    bus.publish([moving("map", "base", 90), moving("map", "base", 100), static("base", "laser")])
+    clock.set(90)
+    with pytest.raises(FutureExtrapolationError) as caught:
+        buffer.lookup_nowait("map", "base", 90)
+    assert (caught.value.oldest, caught.value.newest) == (None, None)
+    assert buffer.can_transform("base", "laser", 90)
+    assert Buffer(bus).tree.frames() == ["base", "laser"]
+    assert bus.statistics().clock_resets == 1
+    bus.publish(moving("map", "base", 91))
+    assert buffer.can_transform("map", "laser", 91)
+
+
+def test_a_jump_forward_drops_nothing() -> None:
+    clock = SimulatedClock(start=100)
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "base", 90))
+    clock.set(10**15)
+    assert buffer.can_transform("map", "base", 90)
+    assert bus.statistics().clock_resets == 0
+
+
+def test_after_a_jump_back_a_child_may_hang_the_other_way_round() -> None:
+    clock = SimulatedClock(start=100)
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    bus.publish([moving("a", "b", 90), moving("b", "c", 90)])
+    clock.set(0)
+    bus.publish([moving("c", "b", 1), moving("b", "a", 1)])
+    assert buffer.tree.chain("c", "a") == ["c", "b", "a"]
+
+
+# The end
+
+
+async def test_closing_ends_waiters_and_streams_and_buffers_go_on_answering() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    bus.publish(driving("map", "a", 1.0))
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 2_000_000_000))
+        with bus.stream() as stream:
+            read = Asked(tasks, stream.__anext__)
+            await settle()
+            bus.close()
+            bus.close()
+            await settle()
+    assert bus.closed
+    assert isinstance(asked.error, BusClosedError)
+    assert isinstance(asked.error.__cause__, FutureExtrapolationError)
+    assert isinstance(read.error, StopAsyncIteration)
+    assert (await buffer.lookup("map", "a")).stamp == 1_000_000_000
+
+
+CALLS: list[Callable[[Bus], object]] = [
+    lambda bus: bus.publish(moving("map", "a", 1)),
+    lambda bus: bus.publish(moving("map", "a", 1), invalid="drop"),
+    lambda bus: bus.remove_frame("s"),
+    lambda bus: bus.subscribe(print),
+    lambda bus: bus.stream(),
+    lambda bus: bus.threadsafe(),
+    lambda bus: bus.events(),
+    lambda bus: bus.reserve("map", authority="slam"),
+    lambda bus: Buffer(bus),
+    lambda bus: TransformBroadcaster(bus).send_static("map", "a", moving("map", "a", 1).transform),
+]
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_a_closed_bus_takes_nothing_more(call: Callable[[Bus], object], capsys: pytest.CaptureFixture[str]) -> None:
+    with Bus(SimulatedClock()) as bus:
+        buffer = Buffer(bus)
+        bus.publish(static("map", "s"))
+    with pytest.raises(BusClosedError):
+        call(bus)
+    assert buffer.tree.frames() == ["map", "s"]
+    assert capsys.readouterr().out == ""
+
+
+def test_a_closed_bus_leaves_its_clock_alone() -> None:
+    clock = SimulatedClock(start=10)
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "a", 10))
+    bus.close()
+    clock.set(0)
+    assert buffer.can_transform("map", "a", 10)
+
+
+# Loops
+
+
+def test_everything_can_be_built_before_a_loop_runs_and_used_on_several(run: Run) -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    broadcaster = TransformBroadcaster(bus)
+    got: list[Batch] = []
+    bus.subscribe(got.append)
+    publisher = bus.threadsafe()
+
+    async def wait_and_send() -> None:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, partial(buffer.lookup, "map", "a", clock.now() + 1))
+            await clock.advance(1.0)
+            broadcaster.send("map", "a", moving("map", "a", 1).transform)
+            await settle()
+            assert asked.answer.stamp == clock.now() - 999_999_999
+
+    broadcaster.send("map", "a", moving("map", "a", 1).transform)
+    for _ in range(3):
+        run(wait_and_send)
+    publisher.end()
+    assert len(got) == 4
+
+
+def test_the_default_clock_is_the_machine_s() -> None:
+    assert isinstance(Bus().clock, SystemClock)
+
+
+# Statistics and the long run
+
+
+def test_statistics_are_plain_data() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    bus.publish([moving("map", "a", 1), static("map", "s")])
+    with bus.stream(capacity=7), bus.subscribe(lambda _: None):
+        bus.publish(moving("map", "a", 2))
+        assert asdict(bus.statistics()) == {
+            "samples": 3,
+            "rejected": {},
+            "reparented": 0,
+            "kind_changes": 0,
+            "authority_conflicts": 0,
+            "clock_resets": 0,
+            "callbacks_failed": 0,
+            "frames": 2,
+            "buffers": ({"offered": 3, "inserted": 3, "replaced": 0, "expired": 0, "waiting": 0},),
+            "queues": (
+                {"kind": "stream", "overflow": "conflate", "capacity": 7, "pending": 2, "dropped": 0, "conflated": 0},
+            ),
+        }
+    buffer.close()
+    assert bus.statistics().buffers == ()
+
+
+def test_a_long_run_keeps_memory_flat() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus, keep=0.5)
+    bus.subscribe(lambda _: None)
+
+    def run_for(seconds: int) -> None:
+        for _ in range(1_000 * seconds):
+            clock.set(clock.now() + 1_000_000)
+            now = clock.now()
+            bus.publish([moving("map", "odom", now), moving("odom", "base", now), static("base", "laser", stamp=now)])
+            bus.publish(moving("odom", "base", now - 100_000))
+            bus.publish(moving("laser", "odom", now), invalid="drop")
+
+    with bus.stream(capacity=10, overflow="drop_oldest"), bus.stream():
+        tracemalloc.start()
+        try:
+            run_for(1)
+            before, _ = tracemalloc.get_traced_memory()
+            run_for(2)
+            after, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert after - before < 10_000
+    assert [edge.samples for edge in buffer.tree.edges()] == [1001, 1, 501]
+    statistics = bus.statistics()
+    assert statistics.samples == 12_000
+    assert sum(asdict(statistics.buffers[0])[outcome] for outcome in ("inserted", "replaced")) == 12_000
+
+
+def test_frames_that_come_and_go_keep_memory_flat(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("CRITICAL", logger="tfbus")
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    ours, theirs = TransformBroadcaster(bus, "tools"), TransformBroadcaster(bus, "rogue")
+    transform = static("map", "hand").transform
+    ours.send_static("map", "hand", transform)
+
+    def come_and_go(numbers: range) -> None:
+        for number in numbers:
+            name = f"object {number}"
+            if number % 3 == 0:
+                with ours.owning(name):
+                    ours.send_static("hand", name, transform)
+                    buffer.lookup_nowait("map", name)
+            elif number % 3 == 1:
+                with bus.reserve(name, authority="tools"):
+                    ours.send("hand", name, transform)
+                    buffer.lookup_nowait("map", name)
+                    bus.remove_frame(name)
+            else:
+                ours.send_static("hand", name, transform)
+                theirs.send("map", name, transform)
+                buffer.lookup_nowait("map", name)
+                bus.remove_frame(name)
+
+    with bus.stream(capacity=10, overflow="drop_oldest"), bus.stream(), bus.events(capacity=10):
+        come_and_go(range(2_000))
+        tracemalloc.start()
+        try:
+            come_and_go(range(2_000, 4_000))
+            gc.collect()
+            before, _ = tracemalloc.get_traced_memory()
+            come_and_go(range(4_000, 20_000))
+            gc.collect()
+            after, _ = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+    assert after - before < 20_000, "not two bytes a name"
+    assert bus.statistics().frames == 1
+    assert buffer.tree.frames() == ["hand", "map"]
+
+
+@pytest.mark.anyio
+async def test_nothing_but_threadsafe_may_touch_a_bus_in_use_from_another_thread() -> None:
+    clock = SimulatedClock(start=10)
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 0))
+        bus.check_thread()
+        for touch in (
+            partial(Buffer, bus),
+            partial(bus.subscribe, print),
+            bus.stream,
+            partial(bus.remove_frame, "base"),
+            partial(clock.set, 0),
+        ):
+            with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+                await anyio.to_thread.run_sync(touch)
+        assert bus.statistics().frames == 1
+        assert not bus.closed
+        assert await buffer.lookup("map", "base", 0)
+
+
+def test_a_misspelt_policy_for_invalid_samples_is_refused() -> None:
+    with Bus() as bus, pytest.raises(ValueError, match="invalid must be 'raise' or 'drop', not 'ignore'"):
+        bus.publish(moving("map", "base", 0), invalid="ignore")  # type: ignore[arg-type]
+
+
+@pytest.mark.anyio
+async def test_closing_from_another_thread_is_refused_only_while_somebody_waits_on_the_loop() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(buffer.lookup, "map", "base")
+            await anyio.wait_all_tasks_blocked()
+            for close in (bus.close, buffer.close):
+                with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+                    await anyio.to_thread.run_sync(close)
+            assert len(buffer.pending()) == 1
+            tasks.cancel_scope.cancel()
+        await anyio.to_thread.run_sync(buffer.close)
+        await anyio.to_thread.run_sync(bus.close)
+        assert bus.closed
+
+
+def test_a_frame_that_only_a_buffer_still_lists_can_be_removed() -> None:
+    clock = SimulatedClock(start=10)
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", 10))
+        clock.set(0)
+        assert buffer.tree.frames() == ["base", "map"]
+        bus.remove_frame("base")
+        assert buffer.tree.frames() == []
+        with pytest.raises(UnknownFrameError):
+            bus.remove_frame("base")
+
+
+def test_a_way_in_for_threads_that_is_never_entered_is_not_registered() -> None:
+    with Bus() as bus:
+        bus.threadsafe()
+        assert bus.statistics().queues == ()
+
+
+async def test_a_buffer_that_closes_another_at_the_end_keeps_nobody_from_being_woken() -> None:
+    bus = Bus()
+    first, second, third = (Buffer(bus) for _ in range(3))
+    first.on_close(second.close)
+    first.on_close(lambda: 1 / 0)
+    async with anyio.create_task_group() as tasks:
+        asked: Asked[TransformStamped] = Asked(tasks, partial(third.lookup, "map", "a"))
+        await settle()
+        bus.close()
+    assert isinstance(asked.error, BusClosedError)
+    assert bus.closed

@@ -1,0 +1,444 @@
+import math
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+import anyio
+import pytest
+from support.asking import Asked, driving, settle
+from support.samples import moving, static
+
+from tfbus import (
+    SECOND,
+    AuthorityConflict,
+    Bus,
+    BusClosedError,
+    ClockReset,
+    Event,
+    EventStream,
+    FrameAdded,
+    FrameLive,
+    FrameRemoved,
+    FrameStale,
+    InvalidTransformError,
+    QueueStatistics,
+    SampleRejected,
+    SimulatedClock,
+    SubscriberFailed,
+)
+
+pytestmark = pytest.mark.anyio
+
+Events = list[Event]
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+ENDS: list[Callable[[Bus, EventStream], None]] = [lambda bus, _: bus.close(), lambda _, events: events.close()]
+
+
+async def read(events: EventStream, got: Events) -> None:
+    async for event in events:
+        got.append(event)
+
+
+async def test_a_reader_that_waits_is_woken_by_what_happens() -> None:
+    bus = Bus(SimulatedClock(start=5))
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events() as events:
+            tasks.start_soon(read, events, got)
+            await settle()
+            bus.publish(moving("map", "base", 5, authority="odometry"))
+            await settle()
+            assert got == [FrameAdded(5, "base", "map", "odometry", static=False)]
+            bus.remove_frame("base")
+            await settle()
+            assert got[1:] == [FrameRemoved(5, "base")]
+
+
+async def test_a_stream_begins_with_every_frame_that_has_a_parent_by_then() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    bus.publish([static("base", "laser", authority="urdf"), moving("map", "base", 1), moving("map", "gone", 1)])
+    bus.remove_frame("gone")
+    clock.set(9)
+    with bus.events(capacity=1) as events:
+        bus.publish(moving("base", "tool", 9))
+        assert [await anext(events) for _ in range(3)] == [
+            FrameAdded(9, "laser", "base", "urdf", static=True),
+            FrameAdded(9, "base", "map", "", static=False),
+            FrameAdded(9, "tool", "base", "", static=False),
+        ]
+        assert events.dropped == 0
+
+
+async def test_two_readers_have_their_own_streams() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.events() as first, bus.events() as second:
+        bus.publish(static("map", "a"))
+        assert await anext(first) == await anext(second) == FrameAdded(0, "a", "map", "", static=True)
+
+
+async def test_who_joins_a_quarrel_late_hears_of_it_within_two_samples() -> None:
+    bus = Bus(SimulatedClock())
+    for stamp in range(10):
+        bus.publish(moving("map", "base", stamp, authority=("odometry", "slam")[stamp % 2]))
+    with bus.events(stale_after=None) as events:
+        for stamp in (10, 11):
+            bus.publish(moving("map", "base", stamp, authority=("odometry", "slam")[stamp % 2]))
+        assert isinstance(await anext(events), FrameAdded)
+        assert await anext(events) == AuthorityConflict(0, "base", "odometry", "slam")
+        assert len(events.queue) == 0
+
+
+async def test_what_a_slow_reader_misses_is_counted_in_the_statistics() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.events(capacity=2) as events:
+        bus.publish([static("map", name) for name in "abcde"])
+        assert bus.statistics().queues == (QueueStatistics("events", "drop_oldest", 2, pending=2, dropped=3),)
+        assert [str(await anext(events)) for _ in range(2)] == [
+            f"0.000 s: static frame {name!r} is new under 'map', from ''" for name in "de"
+        ]
+        assert events.dropped == 3
+    assert bus.statistics().queues == ()
+
+
+# Stale and live
+
+
+async def test_a_frame_turns_stale_while_the_reader_waits_at_that_very_instant() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events(stale_after=1.5) as events:
+            tasks.start_soon(read, events, got)
+            bus.publish(driving("map", "base", 0.0, "odometry"))
+            await clock.advance(1.5)
+            assert len(got) == 1
+            await clock.advance(10.0)
+            stale = SECOND * 3 // 2 + 1
+            assert got[1:] == [FrameStale(stale, "base", 0, "odometry")]
+            bus.publish(driving("map", "base", 11.5, "odometry"))
+            await settle()
+            assert got[2:] == [FrameLive(23 * SECOND // 2, "base", 23 * SECOND // 2, "odometry")]
+            await clock.advance(2.0)
+            assert got[3:] == [FrameStale(13 * SECOND + 1, "base", 23 * SECOND // 2, "odometry")]
+
+
+async def test_samples_in_time_keep_the_reader_asleep() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events() as events:
+            tasks.start_soon(read, events, got)
+            for tenth in range(100):
+                bus.publish(driving("map", "base", tenth / 10))
+                await clock.advance(0.1)
+            assert [type(event) for event in got] == [FrameAdded]
+
+
+async def test_nothing_is_worked_out_while_nobody_reads() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    with bus.events() as events:
+        bus.publish(driving("map", "base", 0.0))
+        await clock.advance(100.0)
+        bus.publish(driving("map", "base", 100.0))
+        assert isinstance(await anext(events), FrameAdded)
+        with clock.move_on_after(0.0) as scope:
+            await anext(events)
+        assert scope.cancelled_caught, "it was quiet for 100 s, but it is not stale now"
+        await clock.advance(50.0)
+        assert await anext(events) == FrameStale(150 * SECOND, "base", 100 * SECOND, "")
+
+
+@pytest.mark.parametrize("stale_after", [None, math.inf])
+async def test_without_a_limit_no_frame_is_ever_stale(stale_after: float | None) -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events(stale_after=stale_after) as events:
+            tasks.start_soon(read, events, got)
+            bus.publish(driving("map", "base", 0.0))
+            await clock.advance(1e6)
+            assert [type(event) for event in got] == [FrameAdded]
+
+
+async def test_a_frame_that_is_stale_before_anybody_reads_is_told_behind_what_is_pending() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    bus.publish(driving("map", "base", 0.0))
+    await clock.advance(5.0)
+    with bus.events() as events:
+        bus.publish(static("map", "table"))
+        assert [type(await anext(events)) for _ in range(3)] == [FrameAdded, FrameAdded, FrameStale]
+
+
+async def test_however_many_frames_go_stale_together_a_reader_loses_none_of_them() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    names = [f"frame {number}" for number in range(100)]
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events(capacity=10) as events:
+            for name in names:
+                bus.publish(driving("map", name, 0.0))
+                assert isinstance(await anext(events), FrameAdded)
+            tasks.start_soon(read, events, got)
+            await clock.advance(2.0)
+            assert got == [FrameStale(SECOND + 1, name, 0, "") for name in sorted(names)]
+            got.clear()
+            bus.publish(driving("map", name, 2.0) for name in names)
+            await settle()
+            assert got == [FrameLive(2 * SECOND, name, 2 * SECOND, "") for name in names]
+            assert events.dropped == 0
+
+
+async def test_what_happens_while_news_are_read_comes_behind_them_and_pushes_none_out() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    bus.publish(driving("map", name, 0.0) for name in "abc")
+    with bus.events(capacity=1) as events:
+        for _ in "abc":
+            assert isinstance(await anext(events), FrameAdded)
+        await clock.advance(5.0)
+        assert await anext(events) == FrameStale(5 * SECOND, "a", 0, "")
+        bus.remove_frame("b")
+        bus.publish(driving("map", "c", 5.0))
+        assert [await anext(events) for _ in range(4)] == [
+            FrameStale(5 * SECOND, "b", 0, ""),
+            FrameStale(5 * SECOND, "c", 0, ""),
+            FrameRemoved(5 * SECOND, "b"),
+            FrameLive(5 * SECOND, "c", 5 * SECOND, ""),
+        ]
+
+
+async def test_a_jump_forward_makes_frames_stale_at_once() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events() as events:
+            tasks.start_soon(read, events, got)
+            bus.publish(driving("map", "base", 0.0))
+            await settle()
+            clock.set(60 * SECOND)
+            await settle()
+            assert got[1:] == [FrameStale(60 * SECOND, "base", 0, "")]
+
+
+async def test_a_jump_back_is_an_event_and_what_is_pending_stays() -> None:
+    clock = SimulatedClock(start=10 * SECOND)
+    bus = Bus(clock)
+    with bus.events() as events:
+        bus.publish([driving("map", "base", 5.0), static("base", "laser")])
+        clock.set(2 * SECOND)
+        bus.publish(driving("map", "base", 2.0))
+        bus.close()
+        got: Events = []
+        await read(events, got)
+        assert got == [
+            FrameAdded(10 * SECOND, "base", "map", "", static=False),
+            FrameAdded(10 * SECOND, "laser", "base", "", static=True),
+            ClockReset(2 * SECOND, 10 * SECOND),
+            FrameAdded(2 * SECOND, "base", "map", "", static=False),
+        ], "a moving frame is forgotten by a jump back, so it is new"
+
+
+# The end
+
+
+@pytest.mark.parametrize("end", ENDS)
+async def test_a_closed_stream_ends_after_what_is_pending(end: Callable[[Bus, EventStream], None]) -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    events = bus.events()
+    bus.publish(driving("map", "base", 0.0))
+    end(bus, events)
+    await clock.advance(100.0)
+    got: Events = []
+    await read(events, got)
+    assert [type(event) for event in got] == [FrameAdded]
+    with pytest.raises(StopAsyncIteration):
+        await anext(events)
+
+
+@pytest.mark.parametrize("end", ENDS)
+async def test_closing_wakes_a_reader_that_waits(end: Callable[[Bus, EventStream], None]) -> None:
+    bus = Bus(SimulatedClock())
+    events = bus.events()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(read, events, []))
+        await settle()
+        assert not asked.ended
+        end(bus, events)
+    assert asked.answer is None
+
+
+async def test_a_closed_stream_is_off_the_bus() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.events() as events:
+        pass
+    events.close()
+    bus.publish(static("map", "a"))
+    assert len(events.queue) == 0
+
+
+@pytest.mark.parametrize("parked", [True, False])
+async def test_a_second_reader_is_told_and_the_first_goes_on(parked: bool) -> None:
+    bus = Bus(SimulatedClock())
+    events = bus.events()
+    async with anyio.create_task_group() as tasks:
+        readers = [Asked(tasks, events.__anext__)]
+        if parked:
+            await settle()
+        readers.append(Asked(tasks, events.__anext__))
+        await settle()
+        (refused,) = [reader for reader in readers if reader.ended]
+        assert isinstance(refused.error, anyio.BusyResourceError)
+        bus.publish(static("map", "a"))
+        readers.remove(refused)
+        await settle()
+        assert isinstance(readers[0].answer, FrameAdded)
+
+
+async def test_a_cancelled_reader_loses_nothing_and_leaves_no_timer() -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    bus.publish(driving("map", "base", 0.0))
+    events = bus.events()
+    assert isinstance(await anext(events), FrameAdded)
+    async with anyio.create_task_group() as tasks:
+        before = Asked(tasks, events.__anext__)
+        await settle()
+        before.cancel()
+        bus.remove_frame("base")
+        await settle()
+        assert before.cancelled
+    await clock.advance(10.0)
+    assert await anext(events) == FrameRemoved(0, "base")
+
+
+async def test_every_event_is_a_checkpoint() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(static("map", "a"))
+    events = bus.events()
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        await anext(events)
+    assert scope.cancelled_caught
+    assert isinstance(await anext(events), FrameAdded)
+
+
+async def test_what_the_body_of_the_loop_raises_comes_out_as_it_is() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(static("map", "a"))
+    with pytest.raises(ZeroDivisionError), bus.events() as events:
+        async for _ in events:
+            _ = 1 / 0
+    assert bus.statistics().queues == ()
+
+
+async def test_a_failing_subscriber_is_told_of_each_time_with_its_name_and_its_error() -> None:
+    bus = Bus(SimulatedClock(start=3))
+    errors = [ValueError("first"), OSError("second")]
+
+    def fragile(_: object) -> None:
+        raise errors[len(events.queue) - 1]
+
+    with bus.events() as events, bus.subscribe(fragile):
+        bus.publish(moving("map", "a", 1))
+        bus.publish(moving("map", "a", 2))
+        await anext(events)
+        name = fragile.__qualname__
+        assert [await anext(events), await anext(events)] == [SubscriberFailed(3, name, error) for error in errors]
+
+
+async def test_the_error_of_a_rejected_sample_holds_on_to_nothing_of_its_sender() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(static("a", "b"))
+    with bus.events() as events:
+        with pytest.raises(InvalidTransformError) as caught:
+            bus.publish(static("b", "a", authority="rogue"))
+        await anext(events)
+        rejected = await anext(events)
+        assert isinstance(rejected, SampleRejected)
+        assert (rejected.reason, rejected.frame, rejected.parent, rejected.authority) == ("cycle", "a", "b", "rogue")
+        assert str(rejected.error) == str(caught.value)
+        assert rejected.error.__traceback__ is None
+
+
+async def test_samples_of_threads_are_rejected_in_an_event_too() -> None:
+    bus = Bus(SimulatedClock(), on_conflict="reject")
+    bus.publish(moving("map", "base", 1, authority="odometry"))
+    with bus.events() as events:
+        with bus.threadsafe() as publish:
+            await anyio.to_thread.run_sync(publish, moving("map", "base", 2, authority="driver"))
+        await anext(events)
+        rejected = await anext(events)
+        assert isinstance(rejected, SampleRejected)
+        assert (rejected.reason, rejected.authority) == ("authority", "driver")
+
+
+async def test_what_is_no_sample_is_rejected_in_an_event_too() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.events() as events:
+        bus.publish(["noise", moving("map", "a", 1)], invalid="drop")  # type: ignore[list-item]
+        rejected = await anext(events)
+        assert isinstance(rejected, SampleRejected)
+        assert (rejected.reason, rejected.frame) == ("not a sample", None)
+        assert "'noise'" in str(rejected)
+
+
+# Loops and threads
+
+
+def test_a_stream_may_be_made_before_a_loop_runs_and_read_on_several(run: Run) -> None:
+    bus = Bus(SimulatedClock())
+    events = bus.events()
+
+    async def read_one(name: str) -> None:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, events.__anext__)
+            await settle()
+            bus.publish(static("map", name))
+            await settle()
+            assert asked.answer == FrameAdded(0, name, "map", "", static=True)
+
+    for name in "abc":
+        run(partial(read_one, name))
+
+
+async def test_another_thread_may_not_touch_the_events_of_a_bus_in_use() -> None:
+    bus = Bus(SimulatedClock())
+    bus.check_thread()
+    with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+        await anyio.to_thread.run_sync(bus.events)
+    with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+        await anyio.to_thread.run_sync(bus.reserve, "odom", "slam")
+    bus.publish(static("map", "a"))
+    with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+        await anyio.to_thread.run_sync(anyio.run, bus.events().__anext__)
+    async with anyio.create_task_group() as tasks:
+        events = bus.events()
+        await anext(events)
+        asked = Asked(tasks, events.__anext__)
+        await settle()
+        with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+            await anyio.to_thread.run_sync(bus.close)
+        asked.cancel()
+
+
+@pytest.mark.parametrize("bad", [{"capacity": 0}, {"stale_after": -1.0}, {"stale_after": math.nan}])
+def test_a_stream_with_bad_bounds_is_not_registered(bad: dict[str, float]) -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(ValueError, match=r"capacity|stale_after"):
+        bus.events(**bad)  # type: ignore[arg-type]
+    assert bus.statistics().queues == ()
+
+
+def test_a_closed_bus_gives_no_events() -> None:
+    bus = Bus(SimulatedClock())
+    bus.close()
+    with pytest.raises(BusClosedError):
+        bus.events()

@@ -1,0 +1,243 @@
+import copy
+from collections.abc import Iterable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.samples import moving, static
+
+from tfbus import QueueStatistics, TransformStamped
+from tfbus.bus.sample_queue import Overflow, SampleQueue
+
+Batches = list[tuple[TransformStamped, ...]]
+
+
+def emptied(queue: SampleQueue) -> Batches:
+    batches = []
+    while (batch := queue.get()) is not None:
+        batches.append(batch)
+    return batches
+
+
+def test_drop_oldest_keeps_batches_whole_and_in_order() -> None:
+    queue = SampleQueue(10, "drop_oldest")
+    batches = [(moving("map", "a", 1), moving("map", "b", 1)), (moving("map", "a", 2),), (static("map", "c"),)]
+    for batch in batches:
+        queue.put(batch)
+    assert len(queue) == 4
+    assert emptied(queue) == batches
+    assert queue.dropped == 0
+
+
+def test_drop_oldest_drops_the_oldest_whole_batches_and_counts_their_samples() -> None:
+    queue = SampleQueue(3, "drop_oldest")
+    queue.put((moving("map", "a", 1), moving("map", "b", 1)))
+    queue.put((moving("map", "a", 2),))
+    queue.put((moving("map", "a", 3), moving("map", "b", 3)))
+    assert emptied(queue) == [(moving("map", "a", 2),), (moving("map", "a", 3), moving("map", "b", 3))]
+    assert queue.dropped == 2
+
+
+def test_the_newest_batch_stays_even_if_it_is_larger_than_the_queue() -> None:
+    queue = SampleQueue(2, "drop_oldest")
+    large = tuple(moving("map", f"joint_{number}", 1) for number in range(5))
+    queue.put((moving("map", "a", 0),))
+    queue.put(large)
+    assert emptied(queue) == [large]
+    assert queue.dropped == 1
+
+
+def test_the_newest_static_sample_of_each_child_outlives_its_batch() -> None:
+    queue = SampleQueue(1, "drop_oldest")
+    queue.put((static("map", "a", x=1.0), moving("map", "b", 1)))
+    queue.put((static("map", "a", x=2.0), static("map", "c"), moving("map", "b", 2)))
+    queue.put((moving("map", "b", 3),))
+    first, second = emptied(queue)
+    assert set(first) == {static("map", "a", x=2.0), static("map", "c")}
+    assert second == (moving("map", "b", 3),)
+    assert queue.dropped == 2
+
+
+def test_static_samples_that_are_sent_again_and_again_do_not_fill_the_queue() -> None:
+    queue = SampleQueue(10, "drop_oldest")
+    for time in range(1_000):
+        queue.put((static("map", "a", stamp=time),))
+    assert len(queue) <= 11
+    assert emptied(queue)[-1] == (static("map", "a", stamp=999),)
+    assert queue.dropped == 0
+
+
+def test_conflate_keeps_the_newest_sample_of_each_child_and_gives_all_as_one_batch() -> None:
+    queue = SampleQueue(10, "conflate")
+    for stamp in range(1, 6):
+        queue.put((moving("map", "a", stamp), moving("map", "b", 10 * stamp)))
+    assert len(queue) == 2
+    (batch,) = emptied(queue)
+    assert set(batch) == {moving("map", "a", 5), moving("map", "b", 50)}
+    assert queue.dropped == 0
+
+
+def test_conflate_goes_by_stamp_and_the_last_of_equal_stamps_wins() -> None:
+    queue = SampleQueue(10, "conflate")
+    for sample in (moving("map", "a", 5, 1.0), moving("map", "a", 4, 2.0), moving("map", "a", 5, 3.0)):
+        queue.put((sample,))
+    assert emptied(queue) == [(moving("map", "a", 5, 3.0),)]
+
+
+@pytest.mark.parametrize("first_static", [True, False])
+def test_conflate_keeps_the_last_kind_of_a_child_whatever_the_stamps(first_static: bool) -> None:
+    pair = [static("map", "a", stamp=9), moving("map", "a", 1)]
+    first, last = pair if first_static else pair[::-1]
+    queue = SampleQueue(1, "conflate")
+    queue.put((first,))
+    queue.put((last,))
+    queue.put((moving("map", "b", 1),))
+    assert emptied(queue) == [((moving("map", "b", 1),) if first_static else (last, moving("map", "b", 1)))]
+    assert queue.dropped == first_static
+
+
+def test_conflate_drops_the_children_that_have_waited_longest_but_nothing_static() -> None:
+    queue = SampleQueue(2, "conflate")
+    queue.put((static("map", "s"), moving("map", "a", 1), moving("map", "b", 1)))
+    queue.put((moving("map", "a", 2), static("map", "t")))
+    queue.put((moving("map", "c", 1),))
+    (batch,) = emptied(queue)
+    assert set(batch) == {static("map", "s"), static("map", "t"), moving("map", "a", 2), moving("map", "c", 1)}
+    assert queue.dropped == 1
+
+
+def test_an_emptied_queue_has_its_whole_capacity_again() -> None:
+    for overflow in ("conflate", "drop_oldest"):
+        queue = SampleQueue(2, overflow)
+        for _ in range(3):
+            queue.put((moving("map", "a", 1), moving("map", "b", 1)))
+            assert [set(batch) for batch in emptied(queue)] == [{moving("map", "a", 1), moving("map", "b", 1)}]
+        assert queue.dropped == 0
+
+
+@pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])
+def test_of_a_forgotten_child_the_moving_samples_count_as_dropped(overflow: Overflow) -> None:
+    queue = SampleQueue(2, overflow)
+    queue.put((moving("map", "a", 1), static("map", "s")))
+    queue.put((moving("map", "b", 1),))
+    queue.forget("a")
+    queue.forget("s")
+    queue.forget("never heard of")
+    assert emptied(queue) == [(moving("map", "b", 1),)]
+    assert queue.dropped == 1
+    queue.put((moving("map", "c", 1), moving("map", "d", 1)))
+    assert queue.dropped == 1, "there is room for two again"
+
+
+@pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])
+def test_discarded_moving_samples_count_as_dropped_and_static_ones_stay(overflow: Overflow) -> None:
+    queue = SampleQueue(5, overflow)
+    queue.put((moving("map", "a", 1), static("map", "s")))
+    queue.put((moving("map", "b", 1),))
+    queue.discard_moving()
+    assert emptied(queue) == [(static("map", "s"),)]
+    assert queue.dropped == 2
+
+
+def test_statistics_say_what_the_queue_is_and_holds() -> None:
+    queue = SampleQueue(1, "drop_oldest")
+    queue.put((moving("map", "a", 1),))
+    queue.put((moving("map", "a", 2),))
+    expected = QueueStatistics(kind="stream", overflow="drop_oldest", capacity=1, pending=1, dropped=1)
+    assert queue.statistics("stream") == expected
+
+
+def test_moving_samples_that_give_way_to_another_of_their_child_are_counted_apart() -> None:
+    queue = SampleQueue(1, "conflate")
+    queue.put((moving("map", "a", 2), moving("map", "a", 3), moving("map", "a", 1)))
+    queue.put((static("map", "a"), static("map", "a")))
+    queue.put((moving("map", "a", 4), moving("map", "b", 4)))
+    assert emptied(queue) == [(moving("map", "b", 4),)]
+    # Offered 5: two gave way to newer ones, one to a static one, one was dropped for the capacity, one was read.
+    assert (queue.conflated, queue.dropped) == (3, 1)
+    assert queue.statistics("stream").conflated == 3
+
+
+@pytest.mark.parametrize(
+    ("capacity", "overflow", "error"),
+    [(0, "conflate", ValueError), (True, "conflate", TypeError), (1.5, "conflate", TypeError), (1, "grow", ValueError)],
+)
+def test_bad_bounds_are_refused(capacity: int, overflow: Overflow, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        SampleQueue(capacity, overflow)
+
+
+CHILDREN = st.sampled_from("abcd")
+SAMPLES = st.builds(moving, st.just("map"), CHILDREN, st.integers(0, 9)) | st.builds(
+    static, st.just("map"), CHILDREN, x=st.integers(0, 9).map(float)
+)
+BATCHES = st.lists(SAMPLES, min_size=1, max_size=4).map(tuple)
+
+
+def count_moving(batch: Iterable[TransformStamped]) -> int:
+    return sum(not sample.static for sample in batch)
+
+
+@settings(deadline=None)
+@given(capacity=st.integers(1, 6), steps=st.lists(BATCHES | st.none(), max_size=40))
+def test_drop_oldest_accounts_for_every_sample_and_loses_no_newest_static(
+    capacity: int, steps: list[tuple[TransformStamped, ...] | None]
+) -> None:
+    queue = SampleQueue(capacity, "drop_oldest")
+    got: list[TransformStamped] = []
+    put: list[TransformStamped] = []
+    for batch in steps:
+        if batch is None:
+            got.extend(queue.get() or ())
+        else:
+            queue.put(batch)
+            put.extend(batch)
+            newest_batch = count_moving(batch)
+        assert count_moving(put) == count_moving(got) + queue.dropped + _pending_moving(queue)
+        assert batch is None or _pending_moving(queue) <= max(capacity, newest_batch)
+    got.extend(sample for batch in emptied(queue) for sample in batch)
+    last_put = {sample.child: sample for sample in put if sample.static}
+    last_got = {sample.child: sample for sample in got if sample.static}
+    assert last_got == last_put
+    came = iter(sample for sample in put if not sample.static)
+    assert all(sample in came for sample in got if not sample.static), "samples came in another order"
+
+
+def _pending_moving(queue: SampleQueue) -> int:
+    twin = copy.deepcopy(queue)
+    return sum(map(count_moving, emptied(twin)))
+
+
+@settings(deadline=None)
+@given(steps=st.lists(BATCHES | st.none(), max_size=40))
+def test_conflate_gives_what_a_dict_of_the_newest_samples_would(
+    steps: list[tuple[TransformStamped, ...] | None],
+) -> None:
+    queue = SampleQueue(4, "conflate")
+    model: dict[str, TransformStamped] = {}
+    for batch in steps:
+        for sample in batch or ():
+            had = model.get(sample.child)
+            if had is None or sample.static or had.static or sample.stamp >= had.stamp:
+                model[sample.child] = sample
+        if batch is None:
+            assert {sample.child: sample for sample in queue.get() or ()} == model
+            model.clear()
+        else:
+            queue.put(batch)
+            assert len(queue) == len(model)
+    assert queue.dropped == 0
+
+
+@settings(deadline=None)
+@given(capacity=st.integers(1, 3), batches=st.lists(BATCHES, max_size=20))
+def test_conflate_never_holds_more_moving_children_than_its_capacity(
+    capacity: int, batches: list[tuple[TransformStamped, ...]]
+) -> None:
+    queue = SampleQueue(capacity, "conflate")
+    for batch in batches:
+        queue.put(batch)
+        assert _pending_moving(queue) <= capacity
+    last_kinds = {sample.child: sample.static for batch in batches for sample in batch}
+    pending = {sample.child for batch in emptied(queue) for sample in batch if sample.static}
+    assert pending == {child for child, is_static in last_kinds.items() if is_static}

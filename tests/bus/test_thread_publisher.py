@@ -1,0 +1,370 @@
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import anyio
+import anyio.to_thread
+import pytest
+from support.asking import Asked, settle
+from support.samples import moving, static
+from support.threads import threads_that
+
+from tfbus import LATEST, Buffer, Bus, BusClosedError, PointStamped, SimulatedClock, ThreadPublisher, TransformStamped
+
+pytestmark = pytest.mark.anyio
+
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+
+PATIENCE = 30.0
+"""Real seconds after which a test that hangs is given up."""
+
+
+def in_thread(function: Callable[[], object]) -> list[Exception]:
+    """Run a function in a thread of its own while this one is blocked; give back what it raised."""
+    errors: list[Exception] = []
+
+    def call() -> None:
+        try:
+            function()
+        except Exception as error:  # noqa: BLE001 - the test looks at it
+            errors.append(error)
+
+    thread = threading.Thread(target=call)
+    thread.start()
+    thread.join(PATIENCE)
+    assert not thread.is_alive()
+    return errors
+
+
+@contextmanager
+def threads_running(*functions: Callable[[], object]) -> Iterator[list[threading.Thread]]:
+    threads = [threading.Thread(target=function) for function in functions]
+    for thread in threads:
+        thread.start()
+    yield threads
+    for thread in threads:
+        thread.join(PATIENCE)
+        assert not thread.is_alive()
+
+
+async def test_a_thread_wakes_a_lookup_on_a_loop_that_has_nothing_else_to_do() -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    with anyio.fail_after(PATIENCE), bus.threadsafe() as publish:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+            await settle()
+            assert in_thread(lambda: publish([moving("map", "a", 4, 4.0), moving("map", "a", 6, 6.0)])) == []
+        assert asked.answer.transform.translation == (5.0, 0.0, 0.0)
+
+
+async def test_the_order_of_each_thread_is_kept_and_nothing_is_lost() -> None:
+    bus = Bus()
+    seen: dict[str, list[int]] = {"a": [], "b": [], "c": [], "d": []}
+    everything = anyio.Event()
+
+    def note(batch: tuple[TransformStamped, ...]) -> None:
+        for sample in batch:
+            seen[sample.child].append(sample.stamp)
+        if sum(map(len, seen.values())) == 8_000:
+            everything.set()
+
+    def produce(child: str) -> None:
+        for stamp in range(2_000):
+            publish(moving("map", child, stamp))
+
+    produce_all = [partial(produce, child) for child in seen]
+    with anyio.fail_after(PATIENCE), bus.subscribe(note), bus.threadsafe() as publish, threads_running(*produce_all):
+        # No more samples come that could wake the loop for one that it has overlooked.
+        await everything.wait()
+    assert all(stamps == list(range(2_000)) for stamps in seen.values())
+    assert bus.statistics().samples == 8_000
+
+
+async def test_a_batch_from_a_thread_is_seen_whole() -> None:
+    bus = Bus()
+    got: list[tuple[TransformStamped, ...]] = []
+    with bus.subscribe(got.append), bus.threadsafe() as publish:
+        assert in_thread(lambda: publish(moving("map", name, 1) for name in "abc")) == []
+    assert got == [tuple(moving("map", name, 1) for name in "abc")]
+
+
+async def test_what_a_blocked_loop_has_no_room_for_is_dropped_and_counted() -> None:
+    bus = Bus()
+    got: list[int] = []
+
+    def produce() -> None:
+        for stamp in range(25):
+            publish(moving("map", "a", stamp))
+
+    with bus.subscribe(lambda batch: got.extend(s.stamp for s in batch)), bus.threadsafe(capacity=10) as publish:
+        assert in_thread(produce) == []
+        (queue,) = bus.statistics().queues
+        assert (queue.kind, queue.pending, queue.dropped) == ("threadsafe", 10, 15)
+        await settle()
+        assert got == list(range(15, 25))
+
+
+async def test_the_end_of_the_with_publishes_what_is_still_queued() -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    with bus.threadsafe() as publish:
+        in_thread(lambda: publish(moving("map", "a", 1)))
+        assert not buffer.can_transform("map", "a", 1)
+    assert buffer.can_transform("map", "a", 1)
+    assert bus.statistics().queues == ()
+
+
+async def test_publishing_after_the_end_of_the_with_raises_in_the_thread() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        pass
+    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
+    assert isinstance(error, BusClosedError)
+    assert bus.statistics().samples == 0
+
+
+async def test_publishing_to_a_closed_bus_raises_in_the_thread() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        bus.close()
+        (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
+        assert isinstance(error, BusClosedError)
+    with pytest.raises(BusClosedError):
+        bus.threadsafe()
+
+
+async def test_samples_that_the_bus_was_closed_upon_are_not_published() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        in_thread(lambda: publish(moving("map", "a", 1)))
+        bus.close()
+        await settle()
+    assert bus.statistics().samples == 0
+
+
+def test_publishing_when_the_loop_has_gone_raises_and_hangs_nothing(run: Run) -> None:
+    bus = Bus()
+    publishers: list[ThreadPublisher] = []
+
+    async def leave_without_a_word() -> None:
+        publishers.append(bus.threadsafe().__enter__())
+
+    run(leave_without_a_word)
+    for _ in range(2):
+        (error,) = in_thread(lambda: publishers[0](moving("map", "a", 1)))
+        assert isinstance(error, BusClosedError)
+
+
+async def test_publishing_before_the_with_raises() -> None:
+    bus = Bus()
+    publish = bus.threadsafe()
+    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
+    assert isinstance(error, RuntimeError)
+    assert "with" in str(error)
+
+
+def test_the_with_is_entered_on_an_event_loop_only() -> None:
+    bus = Bus()
+    with pytest.raises(RuntimeError), bus.threadsafe():
+        pass
+
+
+async def test_bad_values_raise_in_the_thread_and_store_nothing() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        (error,) = in_thread(lambda: publish([moving("map", "a", 1), "map"]))  # type: ignore[list-item]
+        assert isinstance(error, TypeError)
+        await settle()
+        assert bus.statistics().samples == 0
+        in_thread(lambda: publish(moving("map", "a", 1)))
+    assert bus.statistics().samples == 1
+
+
+async def test_what_only_the_bus_can_judge_is_dropped_and_counted_there() -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    with bus.threadsafe() as publish:
+        assert in_thread(lambda: publish(moving("map", "a", 1))) == []
+        assert in_thread(lambda: publish([moving("a", "map", 1), moving("map", "b", 1)])) == []
+        await settle()
+    assert bus.statistics().rejected == {"cycle": 1}
+    assert buffer.can_transform("a", "b", 1)
+
+
+async def test_samples_queued_before_a_jump_back_are_discarded_and_statics_stay() -> None:
+    clock = SimulatedClock(start=100)
+    bus = Bus(clock)
+    got: list[TransformStamped] = []
+    with bus.subscribe(got.extend), bus.threadsafe() as publish:
+        in_thread(lambda: publish([moving("map", "a", 100), static("map", "s")]))
+        clock.set(50)
+        in_thread(lambda: publish(moving("map", "a", 50)))
+        await settle()
+        assert got == [static("map", "s"), moving("map", "a", 50)]
+        assert [queue.dropped for queue in bus.statistics().queues] == [1]
+
+
+async def test_a_jump_forward_discards_nothing() -> None:
+    clock = SimulatedClock(start=100)
+    bus = Bus(clock)
+    with bus.threadsafe() as publish:
+        in_thread(lambda: publish(moving("map", "a", 100)))
+        clock.set(200)
+    assert bus.statistics().samples == 1
+
+
+async def test_samples_of_a_frame_that_is_removed_meanwhile_do_not_bring_it_back() -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "a", 1))
+    with bus.threadsafe() as publish:
+        in_thread(lambda: publish([moving("map", "a", 2), moving("map", "b", 2)]))
+        bus.remove_frame("a")
+    assert buffer.tree.frames() == ["b", "map"]
+
+
+async def test_plain_publish_from_another_thread_is_an_error_that_names_the_way() -> None:
+    bus = Bus()
+    errors = in_thread(lambda: bus.publish(moving("map", "a", 1)))
+    errors += await anyio.to_thread.run_sync(lambda: in_thread(lambda: bus.publish(moving("map", "a", 1))))
+    assert [type(error) for error in errors] == [RuntimeError, RuntimeError]
+    assert all("bus.threadsafe" in str(error) for error in errors)
+    assert bus.statistics().samples == 0
+    bus.publish(moving("map", "a", 1))
+
+
+USES: list[Callable[[Bus, Buffer], object]] = [
+    lambda bus, _: bus.publish(moving("map", "a", 1)),
+    lambda bus, _: bus.threadsafe().__enter__(),
+]
+
+
+@pytest.mark.parametrize("use", USES, ids=["publish", "threadsafe"])
+def test_a_bus_that_is_made_before_the_loop_belongs_to_the_thread_whose_loop_uses_it_first(
+    run: Run, use: Callable[[Bus, Buffer], object]
+) -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+
+    async def take_over() -> None:
+        use(bus, buffer)
+
+    assert in_thread(lambda: run(take_over)) == []
+    with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+        bus.publish(moving("map", "a", 2))
+
+
+async def test_a_bus_that_is_made_on_a_loop_is_not_taken_over_by_another_one() -> None:
+    bus = Bus()
+
+    async def intrude() -> None:
+        bus.publish(moving("map", "a", 1))
+
+    (error,) = in_thread(lambda: anyio.run(intrude))
+    assert isinstance(error, RuntimeError)
+    bus.publish(moving("map", "a", 2))
+    assert bus.statistics().samples == 1
+
+
+def test_threads_reach_a_bus_that_was_made_in_another_thread_than_its_loop_runs_in(run: Run) -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    ready, done = threading.Event(), threading.Event()
+    publishers: list[ThreadPublisher] = []
+    found: list[TransformStamped] = []
+
+    async def serve() -> None:
+        with bus.threadsafe() as publish:
+            publishers.append(publish)
+            ready.set()
+            with anyio.fail_after(PATIENCE):
+                found.append(await buffer.lookup("map", "a", 7))
+        done.set()
+
+    with threads_running(lambda: run(serve)):
+        assert ready.wait(PATIENCE)
+        publishers[0](moving("map", "a", 7, 7.0))
+        assert done.wait(PATIENCE)
+    assert found[0].transform.translation == (7.0, 0.0, 0.0)
+
+
+async def test_lookups_that_must_wait_are_for_the_thread_of_the_bus() -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "a", 1))
+
+    async def ask() -> None:
+        assert (await buffer.lookup("map", "a", 1)).stamp == 1
+        await buffer.lookup("map", "a", 2)
+
+    (error,) = in_thread(lambda: anyio.run(ask))
+    assert isinstance(error, RuntimeError)
+    assert buffer.pending() == ()
+
+
+async def test_worker_threads_may_read_while_the_loop_publishes() -> None:
+    bus = Bus()
+    buffer = Buffer(bus, keep=1e-6)
+    bus.publish(moving("map", "a", 0))
+    stop = threading.Event()
+    wrong: list[TransformStamped] = []
+
+    def watch() -> None:
+        while not stop.is_set():
+            found = buffer.lookup_nowait("map", "a")
+            if found.transform.translation[0] != found.stamp:
+                wrong.append(found)
+
+    with threads_running(watch, watch):
+        for stamp in range(5_000):
+            bus.publish(moving("map", "a", stamp, float(stamp)))
+        stop.set()
+    assert wrong == []
+
+
+@pytest.mark.parametrize("names", [{}, {"prefix": "robot/", "shared": {"map"}}], ids=["whole names", "prefix"])
+async def test_all_that_only_reads_may_be_asked_by_threads_while_lookups_wait_and_are_woken(names: Any) -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus, keep=1e-6, **names)
+    frame = names.get("prefix", "") + "a"
+    bus.publish(moving("map", frame, 0))
+
+    def ask() -> None:
+        seen = buffer.lookup_nowait("map", "a", max_age=1.0)
+        moved = buffer.transform_nowait(PointStamped("a", LATEST, (0.0, 0.0, 0.0)), "map")
+        told = buffer.explain("map", "a")
+        assert seen.transform.translation[0] == seen.stamp
+        assert moved.point[0] == moved.stamp
+        assert told.answerable
+        assert buffer.can_transform("map", "a", tolerance=0.1)
+        assert not buffer.can_transform("map", "b")
+        waiting = buffer.pending()
+        assert {pending.question.source for pending in waiting} <= {"a"}
+        assert "a" in buffer.describe()
+
+    with threads_that(ask):
+        for stamp in range(1, 500):
+            async with anyio.create_task_group() as tasks:
+                for _ in range(3):
+                    tasks.start_soon(buffer.lookup, "map", "a", stamp)
+                await settle()
+                bus.publish([moving("map", frame, stamp, float(stamp)), moving("map", f"other{stamp % 7}", stamp)])
+
+
+@pytest.mark.parametrize("closes", ["buffer", "bus"])
+async def test_what_has_to_be_told_of_the_end_on_the_loop_keeps_other_threads_from_closing(closes: str) -> None:
+    bus = Bus()
+    buffer = Buffer(bus)
+    told: list[str] = []
+    registration = buffer.on_close(lambda: told.append("the end"))
+    (error,) = in_thread(buffer.close if closes == "buffer" else bus.close)
+    assert isinstance(error, RuntimeError)
+    assert told == []
+    bus.publish(moving("map", "a", 1))
+    assert buffer.can_transform("map", "a", 1)
+    registration.close()
+    assert in_thread(buffer.close if closes == "buffer" else bus.close) == []
+    assert told == []

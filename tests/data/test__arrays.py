@@ -1,0 +1,145 @@
+import copy
+import pickle
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from support.stamped_data import ANSWER, HOLDERS, ONE_OF_EACH, SCAN, VALUES, arrays_of, contents, name_of
+
+from tfbus import LaserScan, PointCloud, Polygon, PoseWithCovarianceStamped, Transform, do_transform
+
+COPIES = [
+    pytest.param(copy.copy, id="copy"),
+    pytest.param(copy.deepcopy, id="deepcopy"),
+    pytest.param(lambda data: pickle.loads(pickle.dumps(data)), id="pickle"),
+    pytest.param(lambda data: replace(data, stamp=data.stamp), id="replace"),
+]
+
+OWNERS = [data for data in HOLDERS if isinstance(data, (Polygon, PoseWithCovarianceStamped))]
+"""Data that copy the array that they are given."""
+
+POINTS_OF = [
+    pytest.param(lambda values: Polygon("map", 0, values).points, id="polygon"),
+    pytest.param(lambda values: PointCloud("map", 0, values).points, id="cloud"),
+]
+
+
+@pytest.mark.parametrize("data", HOLDERS, ids=name_of)
+def test_held_arrays_are_read_only(data: Any) -> None:
+    assert arrays_of(data)
+    for array in arrays_of(data):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+
+
+@pytest.mark.parametrize("twin_of", COPIES)
+@pytest.mark.parametrize("data", ONE_OF_EACH, ids=name_of)
+def test_copies_have_the_same_contents_and_are_read_only_too(data: Any, twin_of: Callable[[Any], Any]) -> None:
+    twin = twin_of(data)
+    assert type(twin) is type(data)
+    assert contents(twin) == contents(data)
+    assert not any(array.flags.writeable for array in arrays_of(twin))
+
+
+@pytest.mark.parametrize("made", [*COPIES, pytest.param(lambda data: do_transform(data, ANSWER), id="moved")])
+@pytest.mark.parametrize("data", OWNERS, ids=name_of)
+def test_nobody_can_make_a_copied_array_writable_again(data: Any, made: Callable[[Any], Any]) -> None:
+    for array in arrays_of(data) + arrays_of(made(data)):
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            array.flags.writeable = True
+
+
+@pytest.mark.parametrize("data", HOLDERS, ids=name_of)
+def test_a_deep_copy_shares_no_array(data: Any) -> None:
+    for mine, other in zip(arrays_of(data), arrays_of(copy.deepcopy(data)), strict=True):
+        assert not np.shares_memory(mine, other)
+
+
+@pytest.mark.parametrize("data", HOLDERS, ids=name_of)
+def test_what_holds_arrays_is_equal_only_to_itself(data: Any) -> None:
+    assert data == data
+    assert data != copy.copy(data)
+    assert len({data, copy.copy(data)}) == 2
+
+
+@pytest.mark.parametrize("data", VALUES, ids=name_of)
+def test_what_holds_no_array_is_a_value(data: Any) -> None:
+    twin = copy.deepcopy(data)
+    assert twin == data
+    assert hash(twin) == hash(data)
+    assert replace(data, stamp=8) != data
+
+
+@pytest.mark.parametrize("data", ONE_OF_EACH, ids=name_of)
+def test_data_are_immutable(data: Any) -> None:
+    with pytest.raises(FrozenInstanceError):
+        data.frame = "odom"
+    assert not hasattr(data, "__dict__")
+
+
+def test_clouds_and_scans_look_at_the_arrays_of_their_owner_and_leave_them_writable() -> None:
+    points, stamps, column = np.zeros((2, 3), np.float32), np.array([1, 2]), np.array([5.0, 6.0])
+    cloud = PointCloud("map", 0, points, stamps, {"ring": column})
+    scan = LaserScan("map", 0, column, angle_min=0.0, angle_increment=1.0, intensities=stamps)
+    for owned, held in [
+        (points, cloud.points),
+        (stamps, cloud.stamps),
+        (column, cloud.fields["ring"]),
+        (column, scan.ranges),
+        (stamps, scan.intensities),
+    ]:
+        assert held is not None
+        assert np.shares_memory(owned, held)
+        assert owned.flags.writeable
+
+
+def test_what_is_small_is_copied() -> None:
+    points, covariance = np.zeros((3, 3)), np.eye(6)
+    polygon = Polygon("map", 0, points)
+    pose = PoseWithCovarianceStamped("map", 0, Transform(), covariance)
+    points[...] = 9.0
+    covariance[...] = 9.0
+    assert (polygon.points == 0.0).all()
+    assert (pose.covariance == np.eye(6)).all()
+
+
+@pytest.mark.parametrize("build", POINTS_OF)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.float16])
+def test_floats_keep_their_dtype(build: Any, dtype: Any) -> None:
+    assert build(np.zeros((2, 3), dtype)).dtype == dtype
+
+
+@pytest.mark.parametrize("build", POINTS_OF)
+@pytest.mark.parametrize("dtype", [np.int64, np.uint8])
+def test_integers_become_float64(build: Any, dtype: Any) -> None:
+    points = build(np.array([(1, 2, 3)], dtype))
+    assert points.dtype == np.float64
+    assert points.tolist() == [[1.0, 2.0, 3.0]]
+
+
+@pytest.mark.parametrize("build", POINTS_OF)
+def test_lists_and_missing_points_are_allowed(build: Any) -> None:
+    points = build([(1.0, 2.0, 3.0), (np.nan, np.nan, np.nan)])
+    assert np.isnan(points).tolist() == [[False] * 3, [True] * 3]
+
+
+@pytest.mark.parametrize("build", POINTS_OF)
+@pytest.mark.parametrize("shape", [(0,), (3,), (2, 2), (2, 4), (3, 3, 3), ()])
+def test_points_of_another_shape_are_refused_with_the_shape(build: Any, shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"points must have shape \(n, 3\), got") as caught:
+        build(np.zeros(shape))
+    assert str(caught.value).endswith(f"got {shape}")
+
+
+@pytest.mark.parametrize("build", POINTS_OF)
+@pytest.mark.parametrize("wrong", [[("1", "2", "3")], [(True, False, True)], [(1j, 0, 0)], [(None, None, None)]])
+def test_points_that_are_no_numbers_are_refused_with_the_dtype(build: Any, wrong: Any) -> None:
+    with pytest.raises(TypeError, match="points must be numbers, not of dtype"):
+        build(wrong)
+
+
+def test_a_scan_survives_its_keyword_only_fields() -> None:
+    scan = replace(SCAN, angle_min=-0.5, time_increment=0.001, range_max=30.0)
+    assert contents(pickle.loads(pickle.dumps(scan))) == contents(scan)

@@ -1,0 +1,109 @@
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from support.stamped_data import ONE_OF_EACH, name_of
+from support.strategies import data_stamps, frame_names
+
+from tfbus import InvalidTransformError, Latest, PointStamped, TwistStamped, Vector3Stamped, WrenchStamped
+
+TRIPLES = [
+    pytest.param(lambda value: PointStamped("map", 0, value).point, id="point"),
+    pytest.param(lambda value: Vector3Stamped("map", 0, value).vector, id="vector"),
+    pytest.param(lambda value: TwistStamped("map", 0, value, (0.0, 0.0, 0.0)).linear, id="linear"),
+    pytest.param(lambda value: TwistStamped("map", 0, (0.0, 0.0, 0.0), value).angular, id="angular"),
+    pytest.param(lambda value: WrenchStamped("map", 0, value, (0.0, 0.0, 0.0)).force, id="force"),
+    pytest.param(lambda value: WrenchStamped("map", 0, (0.0, 0.0, 0.0), value).torque, id="torque"),
+]
+
+
+@given(frame_names(), data_stamps())
+def test_any_frame_and_stamp_are_kept(frame: str, stamp: int | Latest) -> None:
+    for data in ONE_OF_EACH:
+        kept = replace(data, frame=frame, stamp=stamp)
+        assert kept.frame == frame
+        assert kept.stamp == stamp
+
+
+@pytest.mark.parametrize("frame", ["", "/map"])
+@pytest.mark.parametrize("data", ONE_OF_EACH, ids=name_of)
+def test_a_bad_frame_name_is_refused(data: Any, frame: str) -> None:
+    with pytest.raises(InvalidTransformError, match="frame name"):
+        replace(data, frame=frame)
+
+
+@pytest.mark.parametrize("stamp", [1.5, None, True, "LATEST"])
+@pytest.mark.parametrize("data", ONE_OF_EACH, ids=name_of)
+def test_a_stamp_is_an_int_or_latest(data: Any, stamp: Any) -> None:
+    with pytest.raises(TypeError, match="int of nanoseconds"):
+        replace(data, stamp=stamp)
+
+
+@pytest.mark.parametrize("data", ONE_OF_EACH, ids=name_of)
+def test_a_stamp_of_numpy_becomes_a_plain_int(data: Any) -> None:
+    assert type(replace(data, stamp=np.int64(3)).stamp) is int
+
+
+@pytest.mark.parametrize("build", TRIPLES)
+@pytest.mark.parametrize("numbers", [[1, 2, 3], np.array([1, 2, 3]), np.array([1, 2, 3], np.float32)])
+def test_three_numbers_of_any_kind_become_a_tuple_of_floats(build: Any, numbers: Any) -> None:
+    triple = build(numbers)
+    assert triple == (1.0, 2.0, 3.0)
+    assert [type(part) for part in triple] == [float, float, float]
+
+
+@pytest.mark.parametrize("build", TRIPLES)
+def test_three_numbers_may_be_missing(build: Any) -> None:
+    missing, beyond, there = build((math.nan, -math.inf, -0.0))
+    assert math.isnan(missing)
+    assert beyond == -math.inf
+    assert math.copysign(1.0, there) == -1.0
+
+
+@pytest.mark.parametrize("build", TRIPLES)
+@pytest.mark.parametrize(
+    ("numbers", "shape"),
+    [
+        ((), r"\(0,\)"),
+        ((1.0, 2.0), r"\(2,\)"),
+        ((1.0, 2.0, 3.0, 1.0), r"\(4,\)"),
+        (np.zeros((4, 3)), r"\(4, 3\)"),
+        (np.zeros((3, 1)), r"\(3, 1\)"),
+    ],
+    ids=["none", "two", "four", "a matrix", "a column"],
+)
+def test_another_number_of_numbers_is_refused_with_the_shape(build: Any, numbers: Any, shape: str) -> None:
+    with pytest.raises(ValueError, match=rf"must be three numbers, got shape {shape}"):
+        build(numbers)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "123",
+        b"123",
+        5,
+        None,
+        ["1", "2", "3"],
+        (math.nan, "1", "2"),
+        [1.0, math.nan, None],
+        [None, 1.0, 2.0],
+        [[1.0], [2.0], [3.0]],
+        {1.0, 2.0, 3.0},
+        {1.0: 0, 2.0: 0, 3.0: 0},
+        np.array(["nan", "1", "2"]),
+    ],
+)
+@pytest.mark.parametrize("build", TRIPLES)
+def test_what_is_no_number_is_refused_with_what_was_given(build: Any, wrong: Any) -> None:
+    with pytest.raises(TypeError, match="must be three numbers, not") as caught:
+        build(wrong)
+    assert repr(wrong) in str(caught.value)
+
+
+def test_the_error_names_the_field() -> None:
+    with pytest.raises(TypeError, match=r"^angular must be"):
+        TwistStamped("map", 0, (0.0, 0.0, 0.0), "123")  # type: ignore[arg-type]

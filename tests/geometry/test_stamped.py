@@ -1,0 +1,194 @@
+import copy
+import pickle
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from support.strategies import frame_names, samples
+
+from tfbus import LATEST, InvalidTransformError, Transform, TransformStamped
+from tfbus.frames import is_frame
+from tfbus.geometry.stamped import as_batch
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+
+MOVE = Transform((1.0, 2.0, 3.0))
+
+
+def test_a_sample_gives_back_what_it_was_made_of() -> None:
+    sample = TransformStamped("map", "base_link", 7, MOVE, "odometry", True)
+    assert (sample.parent, sample.child, sample.stamp) == ("map", "base_link", 7)
+    assert sample.transform == MOVE
+    assert (sample.authority, sample.static) == ("odometry", True)
+
+
+def test_a_sample_moves_and_has_no_sender_unless_it_says_so() -> None:
+    sample = TransformStamped("map", "base_link", 7, MOVE)
+    assert sample.authority == ""
+    assert sample.static is False
+
+
+@given(frame_names())
+def test_any_name_without_a_leading_slash_is_a_frame(name: str) -> None:
+    assert is_frame(name)
+    assert TransformStamped(name, f"{name}/child", 0, MOVE).parent == name
+
+
+@pytest.mark.parametrize("end", ["parent", "child"])
+@pytest.mark.parametrize(
+    ("bad", "text"),
+    [
+        ("", "a frame name must not be empty"),
+        ("/map", "a frame name must not start with '/', got '/map': write 'map'"),
+        ("//a/b", "a frame name must not start with '/', got '//a/b': write 'a/b'"),
+        ("/", "a frame name must not start with '/', got '/'"),
+    ],
+)
+def test_a_bad_frame_name_is_refused_with_the_facts(end: str, bad: str, text: str) -> None:
+    names = {"parent": "map", "child": "base_link", end: bad}
+    with pytest.raises(InvalidTransformError) as caught:
+        TransformStamped(names["parent"], names["child"], 0, MOVE, "odometry")
+    error = caught.value
+    assert str(error) == text
+    assert error.reason == "frame name"
+    assert (error.parent, error.child, error.authority) == (names["parent"], names["child"], "odometry")
+    assert not is_frame(bad)
+
+
+def test_a_frame_cannot_be_its_own_parent() -> None:
+    with pytest.raises(InvalidTransformError, match="frame 'map' cannot be its own parent") as caught:
+        TransformStamped("map", "map", 0, MOVE, "odometry")
+    error = caught.value
+    assert (error.reason, error.parent, error.child) == ("self transform", "map", "map")
+    assert error.authority == "odometry"
+
+
+@pytest.mark.parametrize("stamp", [STAMP_MIN - 1, STAMP_MAX + 1])
+def test_a_stamp_beyond_64_bits_is_refused(stamp: int) -> None:
+    with pytest.raises(InvalidTransformError, match="64-bit") as caught:
+        TransformStamped("map", "base_link", stamp, MOVE, "odometry")
+    error = caught.value
+    assert (error.reason, error.parent, error.child) == ("stamp", "map", "base_link")
+    assert error.authority == "odometry"
+
+
+@pytest.mark.parametrize("stamp", [STAMP_MIN, 0, STAMP_MAX, np.int64(5)])
+def test_a_stamp_is_kept_as_a_plain_int(stamp: int) -> None:
+    sample = TransformStamped("map", "base_link", stamp, MOVE)
+    assert type(sample.stamp) is int
+    assert sample.stamp == stamp
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"stamp": 1.5}, "from_seconds"),
+        ({"stamp": LATEST}, "int of nanoseconds"),
+        ({"stamp": None}, "int of nanoseconds"),
+        ({"stamp": True}, "int of nanoseconds"),
+        ({"parent": b"map"}, "a frame name must be a str, not b'map'"),
+        ({"child": None}, "a frame name must be a str, not None"),
+        ({"transform": np.eye(4)}, "transform must be a Transform"),
+        ({"transform": None}, "transform must be a Transform"),
+        ({"authority": None}, "authority must be a str"),
+    ],
+)
+def test_an_argument_of_the_wrong_type_is_a_type_error_that_shows_it(changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(TypeError, match=text):
+        TransformStamped(**{"parent": "map", "child": "base_link", "stamp": 0, "transform": MOVE, **changes})
+
+
+@pytest.mark.parametrize("name", ["parent", "child", "stamp", "transform", "authority", "static", "colour"])
+def test_a_sample_cannot_be_changed(name: str) -> None:
+    sample = TransformStamped("map", "base_link", 7, MOVE)
+    with pytest.raises(AttributeError):
+        setattr(sample, name, "other")
+    assert sample == TransformStamped("map", "base_link", 7, MOVE)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("parent", "odom"),
+        ("child", "tool0"),
+        ("stamp", 8),
+        ("transform", Transform()),
+        ("authority", "slam"),
+        ("static", True),
+    ],
+)
+def test_a_changed_copy_differs_in_that_field_only(name: str, value: Any) -> None:
+    sample = TransformStamped("map", "base_link", 7, MOVE, "odometry")
+    changed = sample.replace(**{name: value})
+    assert getattr(changed, name) == value
+    assert changed != sample
+    assert hash(changed) != hash(sample)
+    assert changed.replace(**{name: getattr(sample, name)}) == sample
+
+
+def test_a_changed_copy_is_checked_again() -> None:
+    sample = TransformStamped("map", "base_link", 7, MOVE, "odometry")
+    with pytest.raises(InvalidTransformError, match="own parent"):
+        sample.replace(parent="base_link")
+    with pytest.raises(TypeError, match="from_seconds"):
+        sample.replace(stamp=7.0)
+    with pytest.raises(TypeError, match="colour"):
+        sample.replace(colour="red")
+
+
+@given(samples())
+def test_equal_samples_have_equal_hashes_and_survive_pickling_and_copying(sample: TransformStamped) -> None:
+    for twin in (sample.replace(), pickle.loads(pickle.dumps(sample)), copy.copy(sample), copy.deepcopy(sample)):
+        assert twin == sample
+        assert hash(twin) == hash(sample)
+
+
+def test_a_sample_equals_nothing_else() -> None:
+    assert TransformStamped("map", "base_link", 7, MOVE) != ("map", "base_link", 7, MOVE)
+
+
+@given(samples())
+def test_the_repr_makes_the_same_sample(sample: TransformStamped) -> None:
+    names = {"Transform": Transform, "TransformStamped": TransformStamped}
+    assert eval(repr(sample), names) == sample
+
+
+def test_the_text_for_people_has_frames_and_seconds() -> None:
+    sample = TransformStamped("map", "base_link", 12_500_000_000, MOVE)
+    assert str(sample).startswith("map <- base_link at 12.500 s: ")
+    assert str(sample.replace(static=True)).startswith("map <- base_link static: ")
+
+
+# Batches
+
+FIRST = TransformStamped("map", "odom", 1, MOVE)
+SECOND = TransformStamped("odom", "base_link", 1, MOVE)
+
+
+def test_one_sample_is_a_batch() -> None:
+    assert as_batch(FIRST) == (FIRST,)
+
+
+def test_any_iterable_of_samples_is_a_batch_in_its_order() -> None:
+    def generated() -> Iterator[TransformStamped]:
+        yield SECOND
+        yield FIRST
+
+    assert as_batch(generated()) == (SECOND, FIRST)
+    assert as_batch([FIRST, SECOND]) == (FIRST, SECOND)
+    assert as_batch([]) == ()
+
+
+@pytest.mark.parametrize(
+    ("samples", "shown"), [(None, "None"), ("map", "'map'"), (b"map", "b'map'"), (7, "7"), (MOVE, "Transform")]
+)
+def test_what_is_no_batch_is_a_type_error_that_shows_it(samples: Any, shown: str) -> None:
+    with pytest.raises(TypeError, match=shown):
+        as_batch(samples)
+
+
+@pytest.mark.parametrize("bad", [None, MOVE, ("map", "odom", 1, MOVE)])
+def test_what_is_no_sample_in_a_batch_is_a_type_error(bad: Any) -> None:
+    with pytest.raises(TypeError, match="expected a TransformStamped"):
+        as_batch([FIRST, bad])

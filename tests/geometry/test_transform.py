@@ -1,0 +1,686 @@
+import copy
+import math
+import pickle
+from collections.abc import Sequence
+from decimal import Decimal, localcontext
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from support.strategies import angles, rotations, small_angles, transforms, unit_vectors, vectors
+from transforms3d import affines, axangles, euler, quaternions
+
+from tfbus import InvalidTransformError, Transform, TransformError
+from tfbus.geometry.rows import Columns, Quaternion, Vector, compose, invert, rotate
+
+HALF = math.sqrt(0.5)
+QUARTER_TURN_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)
+
+
+def angle_between(a: Sequence[float], b: Sequence[float]) -> float:
+    """The angle in rad between two rotations, from the chord of their quaternions: good to the last digit."""
+    chord = min(math.dist(a, b), math.dist(a, [-part for part in b]))
+    return 4.0 * math.asin(min(1.0, chord / 2.0))
+
+
+def assert_same(actual: Transform, expected: Transform, metres: float = 1e-9, rad: float = 1e-12) -> None:
+    assert math.dist(actual.translation, expected.translation) <= metres
+    assert angle_between(actual.rotation, expected.rotation) <= rad
+
+
+def rotation(angle: float, axis: Vector = (0.0, 0.0, 1.0)) -> Quaternion:
+    x, y, z = (math.sin(angle / 2.0) * part for part in axis)
+    return x, y, z, math.cos(angle / 2.0)
+
+
+# Group laws
+
+
+@given(transforms(), transforms(), transforms())
+def test_composition_is_associative(a: Transform, b: Transform, c: Transform) -> None:
+    assert_same((a @ b) @ c, a @ (b @ c))
+
+
+@given(transforms())
+def test_the_identity_changes_nothing(a: Transform) -> None:
+    assert_same(a @ Transform.identity(), a)
+    assert_same(Transform.identity() @ a, a)
+
+
+@given(transforms())
+def test_the_inverse_undoes_from_both_sides(a: Transform) -> None:
+    assert_same(a @ a.inverse(), Transform.identity())
+    assert_same(a.inverse() @ a, Transform.identity())
+
+
+@given(transforms())
+def test_the_inverse_of_the_inverse_is_the_transform(a: Transform) -> None:
+    assert_same(a.inverse().inverse(), a)
+
+
+@given(rotations())
+def test_the_inverse_keeps_the_sign_of_w(q: Quaternion) -> None:
+    x, y, z, w = Transform(rotation=q).rotation
+    assert Transform(rotation=q).inverse().rotation == (-x, -y, -z, w)
+
+
+@given(transforms(), transforms())
+def test_the_inverse_of_a_product_is_the_product_of_the_inverses_turned_round(a: Transform, b: Transform) -> None:
+    assert_same((a @ b).inverse(), b.inverse() @ a.inverse())
+
+
+@given(transforms(), transforms(), vectors())
+def test_applying_a_product_is_applying_one_after_the_other(a: Transform, b: Transform, point: Vector) -> None:
+    assert math.dist((a @ b).apply(point), a.apply(b.apply(point))) <= 1e-9
+
+
+@given(transforms(), vectors())
+def test_the_inverse_brings_a_point_back(a: Transform, point: Vector) -> None:
+    assert math.dist(a.inverse().apply(a.apply(point)), point) <= 1e-9
+
+
+@given(transforms(), vectors(), vectors())
+def test_distances_stay(a: Transform, p: Vector, q: Vector) -> None:
+    assert math.dist(a.apply(p), a.apply(q)) == pytest.approx(math.dist(p, q), abs=1e-9)
+
+
+def test_a_thousand_products_stay_a_unit_quaternion() -> None:
+    step = Transform((1.0, 0.0, 0.0), rotation(math.tau / 1_000, (0.6, 0.0, 0.8)))
+    total = Transform.identity()
+    for _ in range(1_000):
+        total = total @ step
+    assert abs(math.hypot(*total.rotation) - 1.0) <= 1e-12
+    assert angle_between(total.rotation, (0.0, 0.0, 0.0, 1.0)) <= 1e-11
+
+
+# transforms3d as the oracle
+
+
+def matrix_of(t: Transform) -> Any:
+    x, y, z, w = t.rotation
+    return affines.compose(t.translation, quaternions.quat2mat((w, x, y, z)), np.ones(3))
+
+
+@given(transforms())
+def test_the_matrix_is_that_of_transforms3d(a: Transform) -> None:
+    np.testing.assert_allclose(a.matrix(), matrix_of(a), rtol=0, atol=1e-15)
+
+
+@given(transforms(), transforms())
+def test_composition_is_the_product_of_matrices(a: Transform, b: Transform) -> None:
+    np.testing.assert_allclose((a @ b).matrix(), matrix_of(a) @ matrix_of(b), rtol=0, atol=1e-9)
+
+
+@given(rotations(), rotations())
+def test_rotations_compose_as_quaternions_do_sign_included(a: Quaternion, b: Quaternion) -> None:
+    product = Transform(rotation=a) @ Transform(rotation=b)
+    expected = quaternions.qmult((a[3], *a[:3]), (b[3], *b[:3]))
+    np.testing.assert_allclose(product.as_wxyz(), expected, rtol=0, atol=1e-15)
+
+
+@given(transforms())
+def test_the_inverse_is_the_inverse_matrix(a: Transform) -> None:
+    np.testing.assert_allclose(a.inverse().matrix(), np.linalg.inv(matrix_of(a)), rtol=0, atol=1e-9)
+
+
+@given(unit_vectors(), angles(), vectors())
+def test_an_axis_and_an_angle_are_those_of_transforms3d(axis: Vector, angle: float, translation: Vector) -> None:
+    t = Transform.from_axis_angle(axis, angle, translation)
+    np.testing.assert_allclose(t.matrix()[:3, :3], axangles.axangle2mat(axis, angle), rtol=0, atol=1e-15)
+    assert t.translation == translation
+
+
+@given(vectors(), vectors(4.0))
+def test_roll_pitch_and_yaw_are_the_fixed_axes_of_transforms3d(xyz: Vector, rpy: Vector) -> None:
+    t = Transform.from_xyz_rpy(xyz, rpy)
+    np.testing.assert_allclose(t.matrix()[:3, :3], euler.euler2mat(*rpy, "sxyz"), rtol=0, atol=1e-14)
+    assert t.translation == xyz
+
+
+@given(vectors(4.0))
+def test_roll_pitch_and_yaw_are_read_as_transforms3d_does(rpy: Vector) -> None:
+    t = Transform.from_xyz_rpy((0, 0, 0), rpy)
+    if abs(math.cos(rpy[1])) > 0.01:
+        apart = np.subtract(t.as_rpy(), euler.quat2euler(t.as_wxyz(), "sxyz"))
+        np.testing.assert_allclose(np.sin(apart / 2.0), 0.0, rtol=0, atol=1e-12)
+
+
+@given(transforms())
+def test_a_matrix_is_read_as_transforms3d_does(a: Transform) -> None:
+    expected = quaternions.mat2quat(matrix_of(a)[:3, :3])
+    assert angle_between(Transform.from_matrix(matrix_of(a)).as_wxyz(), expected) <= 1e-14
+
+
+# Conversions both ways
+
+
+@given(transforms())
+def test_a_matrix_comes_back(a: Transform) -> None:
+    assert_same(Transform.from_matrix(a.matrix()), a)
+
+
+@given(transforms())
+def test_wxyz_comes_back_exactly(a: Transform) -> None:
+    w, x, y, z = a.as_wxyz()
+    assert (x, y, z, w) == a.rotation
+    assert Transform.from_wxyz(a.translation, a.as_wxyz()) == a
+
+
+@given(transforms())
+def test_roll_pitch_and_yaw_come_back(a: Transform) -> None:
+    roll, pitch, yaw = a.as_rpy()
+    assert_same(Transform.from_xyz_rpy(a.translation, (roll, pitch, yaw)), a)
+    assert -math.pi <= roll <= math.pi
+    assert -math.pi / 2 <= pitch <= math.pi / 2
+    assert -math.pi <= yaw <= math.pi
+
+
+@given(
+    st.floats(-math.pi, math.pi),
+    st.sampled_from((1.0, -1.0)),
+    st.just(0.0) | st.floats(-17.0, -3.0).map(lambda exponent: 10.0**exponent),
+    st.floats(-math.pi, math.pi),
+)
+def test_roll_pitch_and_yaw_come_back_at_and_near_the_gimbal_lock(
+    roll: float, sign: float, off: float, yaw: float
+) -> None:
+    t = Transform.from_xyz_rpy((0, 0, 0), (roll, sign * (math.pi / 2 - off), yaw))
+    assert_same(Transform.from_xyz_rpy((0, 0, 0), t.as_rpy()), t)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_at_the_gimbal_lock_yaw_is_zero_and_roll_has_it_all(sign: float) -> None:
+    roll, pitch, yaw = Transform.from_xyz_rpy((0, 0, 0), (0.7, sign * math.pi / 2, 0.3)).as_rpy()
+    assert yaw == 0.0
+    assert pitch == pytest.approx(sign * math.pi / 2, abs=1e-15)
+    assert roll == pytest.approx(0.7 - sign * 0.3, abs=1e-14)
+
+
+def test_roll_is_turned_first_and_yaw_last() -> None:
+    t = Transform.from_xyz_rpy((1, 2, 3), (0.1, 0.2, 0.3))
+    about_x, about_y, about_z = (
+        Transform.from_axis_angle(axis, angle) for axis, angle in (((1, 0, 0), 0.1), ((0, 1, 0), 0.2), ((0, 0, 1), 0.3))
+    )
+    assert_same(t, Transform((1, 2, 3)) @ about_z @ about_y @ about_x)
+    assert t.as_rpy() == pytest.approx((0.1, 0.2, 0.3), abs=1e-15)
+
+
+@given(unit_vectors(), st.one_of(small_angles(), st.floats(0.0, math.pi)))
+def test_axis_and_angle_come_back(axis: Vector, angle: float) -> None:
+    found_axis, found_angle = Transform.from_axis_angle(axis, angle).as_axis_angle()
+    assert found_angle == pytest.approx(angle, rel=1e-14, abs=1e-300)
+    if 1e-12 <= angle <= math.pi - 1e-9:
+        assert math.dist(found_axis, axis) <= 1e-12
+
+
+@given(rotations())
+def test_the_angle_is_the_shorter_way_round_and_the_axis_is_a_unit_vector(q: Quaternion) -> None:
+    assume(not 0.0 < math.hypot(*q[:3]) < 1e-300)  # denormal numbers have no digits left for a direction
+    axis, angle = Transform(rotation=q).as_axis_angle()
+    assert 0.0 <= angle <= math.pi
+    assert math.hypot(*axis) == pytest.approx(1.0, abs=1e-15)
+    assert angle_between(Transform.from_axis_angle(axis, angle).rotation, q) <= 1e-14
+
+
+def test_no_rotation_has_an_axis_too() -> None:
+    assert Transform.identity().as_axis_angle() == ((1.0, 0.0, 0.0), 0.0)
+
+
+@pytest.mark.parametrize("tiny", [5e-324, 1e-310])
+def test_the_smallest_rotation_there_is_has_a_unit_axis(tiny: float) -> None:
+    axis, angle = Transform(rotation=(0.0, tiny, 0.0, 1.0)).as_axis_angle()
+    assert axis == (0.0, 1.0, 0.0)
+    assert angle == 2.0 * tiny
+
+
+@pytest.mark.parametrize("length", [1e-300, 1e-200, 1e-9, 7.0, 1e200, 1e300])
+def test_an_axis_may_have_any_length(length: float) -> None:
+    t = Transform.from_axis_angle((0.0, 0.6 * length, -0.8 * length), 1.0)
+    assert angle_between(t.rotation, rotation(1.0, (0.0, 0.6, -0.8))) <= 1e-15
+
+
+@given(transforms(), st.floats(0.996, 1.004))
+def test_a_matrix_within_one_percent_is_projected_on_a_rotation(a: Transform, scale: float) -> None:
+    matrix = a.matrix()
+    matrix[:3, :3] *= scale
+    t = Transform.from_matrix(matrix.tolist())
+    assert_same(t, a)
+    assert math.hypot(*t.rotation) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_a_matrix_is_a_new_one_each_time() -> None:
+    t = Transform((1, 2, 3))
+    t.matrix()[:] = 0.0
+    np.testing.assert_array_equal(t.matrix()[:3, 3], (1.0, 2.0, 3.0))
+
+
+# What is not a transform
+
+
+BAD_NUMBERS = [math.nan, math.inf, -math.inf]
+
+
+@pytest.mark.parametrize("bad", BAD_NUMBERS)
+@pytest.mark.parametrize("at", range(7))
+def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(at: int, bad: float) -> None:
+    row = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    row[at] = bad
+    with pytest.raises(InvalidTransformError) as caught:
+        Transform(row[:3], row[3:])
+    assert caught.value.reason == "not finite"
+    assert ("translation" if at < 3 else "rotation") in str(caught.value)
+
+
+@pytest.mark.parametrize("tiny", [0, 0.0, -0.0, 5e-324, 1e-200])
+def test_the_zero_quaternion_is_refused(tiny: float) -> None:
+    with pytest.raises(InvalidTransformError) as caught:
+        Transform(rotation=(0, 0, tiny, 0))
+    assert caught.value.reason == "zero quaternion"
+
+
+@pytest.mark.parametrize("norm", [0.9899, 1.0101, 1e-100, 0.5, 2.0, 1e200])
+def test_a_norm_that_is_off_by_more_than_one_percent_is_refused(norm: float) -> None:
+    with pytest.raises(InvalidTransformError) as caught:
+        Transform(rotation=[part * norm for part in (0.5, -0.5, 0.5, 0.5)])
+    assert caught.value.reason == "not a unit quaternion"
+
+
+@given(rotations(), st.floats(0.9901, 1.0099))
+def test_a_norm_within_one_percent_is_normalised_and_the_sign_stays(q: Quaternion, norm: float) -> None:
+    assert Transform(rotation=[part * norm for part in q]).rotation == pytest.approx(q, rel=1e-15, abs=1e-15)
+
+
+@given(rotations(), st.floats(0.9901, 1.0099))
+def test_what_was_normalised_once_is_left_as_it_is(q: Quaternion, norm: float) -> None:
+    once = Transform(rotation=[part * norm for part in q])
+    assert Transform(rotation=once.rotation).rotation == once.rotation
+
+
+@pytest.mark.parametrize(
+    ("arguments", "shape"),
+    [
+        (((1, 2),), r"\(2,\)"),
+        (((1, 2, 3, 4),), r"\(4,\)"),
+        (((),), r"\(0,\)"),
+        (((0, 0, 0), (0, 0, 1)), r"\(3,\)"),
+        ((np.zeros((3, 1)),), r"\(3, 1\)"),
+        (((0, 0, 0), np.eye(4)), r"\(4, 4\)"),
+        ((np.zeros((2, 3)),), r"\(2, 3\)"),
+    ],
+)
+def test_the_wrong_number_of_numbers_is_refused_with_the_shape(arguments: tuple[Any, ...], shape: str) -> None:
+    with pytest.raises(InvalidTransformError, match=shape) as caught:
+        Transform(*arguments)
+    assert caught.value.reason == "wrong length"
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("bad", [None, 1.0, "123", b"123", {1, 2, 3}, ("1", "2", "3"), (None, 0, 0), (1j, 0, 0)])
+def test_what_is_not_numbers_at_all_is_a_type_error(bad: Any) -> None:
+    with pytest.raises(TypeError):
+        Transform(bad)
+
+
+SHEARED = np.eye(4)
+SHEARED[0, 1] = 0.1
+MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
+PROJECTIVE = np.eye(4)
+PROJECTIVE[3, 0] = 0.1
+
+
+@pytest.mark.parametrize(
+    ("matrix", "reason", "text"),
+    [
+        (np.eye(3), "wrong length", r"\(3, 3\)"),
+        (np.zeros((2, 4, 4)), "wrong length", r"\(2, 4, 4\)"),
+        (np.full((4, 4), math.nan), "not finite", "not finite"),
+        (np.diag([1.0, 1.0, math.inf, 1.0]), "not finite", "not finite"),
+        (SHEARED, "not a rotation", "rigid"),
+        (MIRRORED, "not a rotation", "rigid"),
+        (np.diag([1.05, 1.05, 1.05, 1.0]), "not a rotation", "rigid"),
+        (np.diag([1.0, 1.0, 1.0, 2.0]), "not a rotation", "last row"),
+        (PROJECTIVE, "not a rotation", "last row"),
+        (np.zeros((4, 4)), "not a rotation", "rigid"),
+    ],
+)
+def test_a_matrix_that_is_not_rigid_is_refused(matrix: npt.NDArray[np.float64], reason: str, text: str) -> None:
+    with pytest.raises(InvalidTransformError, match=text) as caught:
+        Transform.from_matrix(matrix)
+    assert caught.value.reason == reason
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("bad", BAD_NUMBERS)
+def test_the_other_constructors_refuse_what_is_not_finite(bad: float) -> None:
+    with pytest.raises(InvalidTransformError, match="finite"):
+        Transform.from_xyz_rpy((0, 0, 0), (0, bad, 0))
+    with pytest.raises(InvalidTransformError, match="finite"):
+        Transform.from_axis_angle((0, 0, 1), bad)
+    with pytest.raises(InvalidTransformError, match="finite"):
+        Transform.from_axis_angle((0, bad, 1), 1.0)
+    with pytest.raises(InvalidTransformError, match="finite"):
+        Transform.from_wxyz((0, 0, 0), (bad, 0, 0, 1))
+
+
+def test_an_axis_without_a_direction_is_refused() -> None:
+    with pytest.raises(InvalidTransformError) as caught:
+        Transform.from_axis_angle((0, 0, 0), 1.0)
+    assert caught.value.reason == "zero axis"
+
+
+def test_what_is_refused_is_a_value_error_and_one_of_ours() -> None:
+    assert issubclass(InvalidTransformError, ValueError)
+    assert issubclass(InvalidTransformError, TransformError)
+
+
+# Interpolation
+
+
+def exact_slerp(a: Quaternion, b: Quaternion, bits: Sequence[bool]) -> list[Decimal]:
+    """Slerp at a binary fraction in 50 digits: the middle of an arc is the normalised sum of its ends."""
+
+    def unit(q: Sequence[Decimal]) -> list[Decimal]:
+        norm = sum(part * part for part in q).sqrt()  # type: ignore[union-attr]
+        return [part / norm for part in q]
+
+    low, high = unit([Decimal(part) for part in a]), unit([Decimal(part) for part in b])
+    if sum(p * q for p, q in zip(low, high, strict=True)) < 0:
+        high = [-part for part in high]
+    for bit in bits:
+        middle = unit([p + q for p, q in zip(low, high, strict=True)])
+        low, high = (middle, high) if bit else (low, middle)
+    return low
+
+
+@given(
+    rotations(),
+    unit_vectors(),
+    st.one_of(
+        st.floats(-9.0, math.log10(3.0)).map(lambda exponent: 10.0**exponent),
+        st.floats(0.0, 3.0),
+        st.floats(-9.0, -1.0).map(lambda exponent: math.pi - 10.0**exponent),
+    ),
+    st.booleans(),
+    st.lists(st.booleans(), min_size=1, max_size=20),
+)
+def test_slerp_is_right_to_a_billionth_of_a_rad_at_every_angle(
+    start: Quaternion, axis: Vector, angle: float, flipped: bool, bits: list[bool]
+) -> None:
+    a = Transform(rotation=start)
+    b = a @ Transform.from_axis_angle(axis, angle)
+    if flipped:
+        b = Transform(rotation=[-part for part in b.rotation])
+    fraction = sum(bit / 2.0**place for place, bit in enumerate(bits, 1))
+    found = a.interpolate(b, fraction).rotation
+    with localcontext(prec=50):
+        expected = exact_slerp(a.rotation, b.rotation, bits)
+        chord = sum((Decimal(p) - q) ** 2 for p, q in zip(found, expected, strict=True)).sqrt()  # type: ignore[union-attr]
+    assert 2.0 * float(chord) <= 1e-12
+
+
+@given(transforms(), transforms(), st.floats(0.0, 1.0))
+def test_interpolation_moves_on_the_chord_and_turns_about_one_axis(a: Transform, b: Transform, fraction: float) -> None:
+    t = a.interpolate(b, fraction)
+    on_the_chord = [p + fraction * (q - p) for p, q in zip(a.translation, b.translation, strict=True)]
+    assert math.dist(t.translation, on_the_chord) <= 1e-9
+    turn = angle_between(a.rotation, b.rotation)
+    assert angle_between(a.rotation, t.rotation) == pytest.approx(fraction * turn, abs=1e-7)
+    assert angle_between(t.rotation, b.rotation) == pytest.approx((1.0 - fraction) * turn, abs=1e-7)
+    assert math.hypot(*t.rotation) == pytest.approx(1.0, abs=1e-14)
+
+
+@given(transforms(), transforms())
+def test_interpolation_starts_at_one_end_and_ends_at_the_other(a: Transform, b: Transform) -> None:
+    assert_same(a.interpolate(b, 0.0), a)
+    assert_same(a.interpolate(b, 1.0), b)
+
+
+@given(transforms(), transforms(), st.floats(0.0, 1.0))
+def test_interpolation_is_the_same_whichever_sign_the_quaternions_have(
+    a: Transform, b: Transform, fraction: float
+) -> None:
+    flipped = Transform(b.translation, [-part for part in b.rotation])
+    # Half a turn has two shorter arcs.
+    assume(abs(sum(p * q for p, q in zip(a.rotation, b.rotation, strict=True))) > 1e-15)
+    assert_same(a.interpolate(flipped, fraction), a.interpolate(b, fraction))
+
+
+@given(transforms(), st.floats(0.0, 1.0))
+def test_between_a_rotation_and_its_other_sign_nothing_turns(a: Transform, fraction: float) -> None:
+    flipped = Transform(a.translation, [-part for part in a.rotation])
+    assert_same(a.interpolate(flipped, fraction), a)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_from_170_to_190_degrees_is_over_180(sign: float) -> None:
+    a = Transform(rotation=rotation(math.radians(170.0)))
+    b = Transform(rotation=[sign * part for part in rotation(math.radians(-170.0))])
+    assert_same(a.interpolate(b, 0.5), Transform(rotation=(0.0, 0.0, 1.0, 0.0)))
+    assert_same(a.interpolate(b, 0.25), Transform(rotation=rotation(math.radians(175.0))))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_half_a_turn_goes_the_way_the_sign_of_the_second_says(sign: float) -> None:
+    about_x = Transform(rotation=(sign, 0.0, 0.0, 0.0))
+    middle = Transform.identity().interpolate(about_x, 0.5)
+    assert middle.rotation == pytest.approx((sign * HALF, 0.0, 0.0, HALF), abs=1e-15)
+
+
+@pytest.mark.parametrize("fraction", [-1e-12, 1.0 + 1e-12, math.nan, math.inf, -math.inf])
+def test_nothing_extrapolates(fraction: float) -> None:
+    with pytest.raises(ValueError, match="from 0 to 1"):
+        Transform.identity().interpolate(Transform((1, 0, 0)), fraction)
+
+
+# Points
+
+
+def test_a_point_is_turned_and_then_shifted() -> None:
+    t = Transform((10.0, 20.0, 30.0), QUARTER_TURN_ABOUT_Z)
+    assert t.apply((1.0, 2.0, 3.0)) == pytest.approx((8.0, 21.0, 33.0), abs=1e-14)
+    assert t.apply([1, 2, 3]) == pytest.approx((8.0, 21.0, 33.0), abs=1e-14)
+
+
+def test_one_point_comes_back_as_plain_floats() -> None:
+    moved = Transform((1, 0, 0)).apply((np.float64(0.5), 2, 3))
+    assert moved == (1.5, 2.0, 3.0)
+    assert [type(part) for part in moved] == [float, float, float]
+
+
+@given(transforms(), st.sampled_from(((3,), (0, 3), (1, 3), (5, 3), (2, 4, 3), (2, 0, 3))))
+def test_an_array_of_points_is_moved_point_by_point(t: Transform, shape: tuple[int, ...]) -> None:
+    points = np.linspace(-100.0, 100.0, math.prod(shape)).reshape(shape)
+    moved = t.apply(points)
+    assert moved.shape == shape
+    expected = [t.apply((float(x), float(y), float(z))) for x, y, z in points.reshape(-1, 3)]
+    np.testing.assert_allclose(moved.reshape(-1, 3), np.reshape(expected, (-1, 3)), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("given_type", "returned"),
+    [
+        (np.float64, np.float64),
+        (np.float32, np.float32),
+        (np.int64, np.float64),
+        (np.int32, np.float64),
+        (np.uint8, np.float64),
+    ],
+)
+def test_float32_stays_and_integers_become_float64(given_type: type[Any], returned: type[Any]) -> None:
+    points = np.array([[1, 2, 3], [4, 5, 6]], dtype=given_type)
+    moved = Transform((0.5, 0.0, 0.0), QUARTER_TURN_ABOUT_Z).apply(points)
+    assert moved.dtype == returned
+    np.testing.assert_allclose(moved, [[-1.5, 1.0, 3.0], [-4.5, 4.0, 6.0]], rtol=0, atol=1e-6)
+
+
+def test_points_are_not_changed_in_place() -> None:
+    points = np.ones((4, 3))
+    moved = Transform((1, 0, 0)).apply(points)
+    assert not np.shares_memory(points, moved)
+    np.testing.assert_array_equal(points, 1.0)
+
+
+def test_a_strided_view_is_read_right() -> None:
+    columns = np.arange(12.0).reshape(3, 4)
+    moved = Transform((1, 0, 0), QUARTER_TURN_ABOUT_Z).apply(columns.T)
+    np.testing.assert_allclose(moved, np.stack([1.0 - columns[1], columns[0], columns[2]], axis=1), atol=1e-14)
+
+
+def test_a_missing_point_stays_missing_and_spoils_no_other() -> None:
+    moved = Transform((1, 0, 0)).apply(np.array([[math.nan] * 3, [1.0, 2.0, 3.0]]))
+    assert np.isnan(moved[0]).all()
+    np.testing.assert_array_equal(moved[1], (2.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize("shape", [(), (0,), (2,), (4,), (3, 1), (3, 4), (2, 3, 2)])
+def test_an_array_that_does_not_end_in_3_is_refused_with_its_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"\(\.\.\., 3\), got " + str(shape).replace("(", r"\(").replace(")", r"\)")):
+        Transform.identity().apply(np.zeros(shape))
+
+
+@pytest.mark.parametrize("point", [(), (1.0, 2.0), (1.0, 2.0, 3.0, 1.0), [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]])
+def test_a_sequence_that_is_not_a_point_is_refused_with_its_shape(point: Any) -> None:
+    with pytest.raises(ValueError, match=rf"\({len(point)},\)"):
+        Transform.identity().apply(point)
+
+
+# Closeness
+
+
+@pytest.mark.parametrize("tolerance", [1e-12, 1e-9, 1e-3, 0.5])
+@given(a=transforms(10.0), axis=unit_vectors())
+def test_close_means_within_the_tolerances_and_no_further(tolerance: float, a: Transform, axis: Vector) -> None:
+    def close(b: Transform) -> bool:
+        return a.is_close(b, translation_tolerance=tolerance, rotation_tolerance=tolerance)
+
+    # Some room for rounding: the question is about the tolerance.
+    inside, outside = 0.99 * tolerance - 1e-14, 1.01 * tolerance + 1e-14
+    assert close(a @ Transform.from_axis_angle(axis, inside))
+    assert not close(a @ Transform.from_axis_angle(axis, outside))
+    assert close(shifted(a, axis, inside))
+    assert not close(shifted(a, axis, outside))
+
+
+def shifted(a: Transform, axis: Vector, distance: float) -> Transform:
+    return Transform([p + distance * q for p, q in zip(a.translation, axis, strict=True)], a.rotation)
+
+
+@given(transforms())
+def test_a_transform_is_close_to_itself_with_the_other_sign_but_not_equal(a: Transform) -> None:
+    flipped = Transform(a.translation, [-part for part in a.rotation])
+    assert a.is_close(flipped)
+    assert flipped.is_close(a)
+    assert a != flipped
+
+
+# A value
+
+
+@given(transforms())
+def test_equal_transforms_have_equal_hashes(a: Transform) -> None:
+    twin = Transform(a.translation, a.rotation)
+    assert twin == a
+    assert hash(twin) == hash(a)
+
+
+def test_equality_is_exact() -> None:
+    assert Transform((1, 2, 3)) == Transform(np.array([1, 2, 3]), [0, 0, 0, 1])
+    assert Transform((0.0, 0.0, 0.0)) == Transform((-0.0, 0.0, 0.0))
+    assert hash(Transform((0.0, 0.0, 0.0))) == hash(Transform((-0.0, 0.0, 0.0)))
+    assert Transform((1, 2, 3)) != Transform((1, 2, math.nextafter(3, 4)))
+    assert Transform() == Transform.identity()
+
+
+def test_a_transform_equals_nothing_else() -> None:
+    assert Transform() != (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    assert Transform() != None  # noqa: E711 - the operator is what is tested
+
+
+@pytest.mark.parametrize("other", [2.0, None, (1.0, 2.0, 3.0), "map"])
+def test_a_transform_composes_with_transforms_only(other: Any) -> None:
+    with pytest.raises(TypeError):
+        Transform() @ other
+    with pytest.raises(TypeError):
+        other @ Transform()
+
+
+@pytest.mark.parametrize("name", ["translation", "rotation", "stamp"])
+def test_a_transform_cannot_be_changed(name: str) -> None:
+    t = Transform((1, 2, 3))
+    with pytest.raises(AttributeError):
+        setattr(t, name, (0.0, 0.0, 0.0))
+    assert t == Transform((1, 2, 3))
+
+
+def test_a_transform_does_not_follow_the_list_it_was_made_of() -> None:
+    translation, quaternion = [1.0, 2.0, 3.0], np.array([0.0, 0.0, 0.0, 1.0])
+    t = Transform(translation, quaternion)
+    translation[0] = 9.0
+    quaternion[:] = 0.5
+    assert t == Transform((1.0, 2.0, 3.0))
+
+
+def test_the_parts_are_tuples_of_plain_floats() -> None:
+    t = Transform(np.array([1, 2, 3], np.float32), np.array([0, 0, 0, 1], np.int8))
+    assert t.translation == (1.0, 2.0, 3.0)
+    assert {type(part) for part in (*t.translation, *t.rotation, *t.as_wxyz(), *t.as_rpy())} == {float}
+
+
+@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
+@given(a=transforms())
+def test_a_transform_pickles(protocol: int, a: Transform) -> None:
+    assert pickle.loads(pickle.dumps(a, protocol)) == a
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy])
+def test_a_transform_copies(duplicate: Any) -> None:
+    assert duplicate(Transform((1, 2, 3), QUARTER_TURN_ABOUT_Z)) == Transform((1, 2, 3), QUARTER_TURN_ABOUT_Z)
+
+
+@given(transforms())
+def test_the_repr_makes_the_same_transform(a: Transform) -> None:
+    assert eval(repr(a), {"Transform": Transform}) == a
+
+
+def test_an_integer_beyond_every_float_is_not_finite() -> None:
+    with pytest.raises(InvalidTransformError, match="not finite"):
+        Transform((10**400, 0, 0))
+
+
+# Columns: many rows at once
+
+
+def columns_of(many: list[Transform]) -> Columns:
+    x, y, z, qx, qy, qz, qw = np.array([(*t.translation, *t.rotation) for t in many]).T
+    return x, y, z, qx, qy, qz, qw
+
+
+def rows_of(columns: Columns) -> list[list[float]]:
+    rows: list[list[float]] = np.array(columns).T.tolist()
+    return rows
+
+
+@given(st.lists(st.tuples(transforms(), transforms()), min_size=1, max_size=4))
+def test_columns_compose_and_invert_to_the_bit_as_their_rows_do(both: list[tuple[Transform, Transform]]) -> None:
+    a, b = columns_of([one for one, _ in both]), columns_of([other for _, other in both])
+    products = [one @ other for one, other in both]
+    assert rows_of(compose(a, b)) == rows_of(columns_of(products))
+    assert rows_of(invert(a)) == rows_of(columns_of([one.inverse() for one, _ in both]))
+
+
+@given(transforms(), st.lists(transforms(), min_size=1, max_size=4))
+def test_a_row_composes_with_columns_from_either_side(one: Transform, many: list[Transform]) -> None:
+    row: Columns = (*one.translation, *one.rotation)
+    columns = columns_of(many)
+    assert rows_of(compose(row, columns)) == rows_of(columns_of([one @ other for other in many]))
+    assert rows_of(compose(columns, row)) == rows_of(columns_of([other @ one for other in many]))
+
+
+@given(st.lists(st.tuples(rotations(), vectors()), min_size=1, max_size=4))
+def test_columns_of_vectors_are_turned_to_the_bit_as_each(both: list[tuple[Quaternion, Vector]]) -> None:
+    turns, points = np.array([turn for turn, _ in both]).T, np.array([point for _, point in both]).T
+    found = np.array(rotate((*turns,), *points)).T.tolist()
+    assert found == [list(rotate(turn, *point)) for turn, point in both]

@@ -1,0 +1,337 @@
+import copy
+import math
+import operator
+import pickle
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from support.samples import over, tree_of
+from support.strategies import rotations, transforms, vectors
+
+from tfbus import InvalidTransformError, Transform, TransformArray
+from tfbus.geometry.rows import Quaternion, Vector
+from tfbus.tree._lookup_many import FEW
+
+ONE = (0.0, 0.0, 0.0, 1.0)
+HALF_TURN_ABOUT_Z = (0.0, 0.0, 1.0, 0.0)
+
+Floats = npt.NDArray[np.float64]
+lists = st.lists(transforms(10.0), max_size=5)
+pairs = st.lists(st.tuples(transforms(10.0), transforms(10.0)), max_size=5)
+
+
+def array_of(poses: Sequence[Transform]) -> TransformArray:
+    translations = np.array([pose.translation for pose in poses]).reshape(-1, 3)
+    return TransformArray(translations, np.array([pose.rotation for pose in poses]).reshape(-1, 4))
+
+
+def ahead(*xs: float) -> TransformArray:
+    """Transforms that shift along the first axis; NaN for none."""
+    missing = np.isnan(xs)
+    translations, rotations = np.zeros((len(xs), 3)), np.tile(ONE, (len(xs), 1))
+    translations[:, 0] = xs
+    translations[missing] = rotations[missing] = math.nan
+    return TransformArray(translations, rotations)
+
+
+def assert_close(found: TransformArray, expected: Sequence[Transform]) -> None:
+    assert len(found) == len(expected)
+    rows = [(*pose.translation, *pose.rotation) for pose in expected]
+    columns = np.hstack((found.translations, found.rotations))
+    np.testing.assert_allclose(columns, np.reshape(rows, (-1, 7)), rtol=0, atol=1e-12)
+
+
+# Making
+
+
+def test_the_parts_are_those_that_were_given() -> None:
+    steps = TransformArray([[1, 2, 3], [4, 5, 6]], [ONE, HALF_TURN_ABOUT_Z])
+    assert steps.translations.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    assert steps.rotations.tolist() == [[*ONE], [*HALF_TURN_ABOUT_Z]]
+    assert steps.translations.dtype == steps.rotations.dtype == np.float64
+    assert (len(steps), repr(steps)) == (2, "<TransformArray of 2>")
+
+
+@given(st.lists(transforms(), min_size=1, max_size=5), st.floats(0.991, 1.009))
+def test_a_norm_within_one_percent_is_normalised_and_the_sign_stays(poses: list[Transform], norm: float) -> None:
+    rotations = np.array([pose.rotation for pose in poses])
+    found = TransformArray([pose.translation for pose in poses], rotations * norm)
+    np.testing.assert_allclose(found.rotations, rotations, rtol=0, atol=1e-15)
+
+
+# By their squares, the first two are units but for rounding; the third is not, though its norm would be.
+@example([((0.0, 0.0, 0.0), (-0.49, -0.01, -0.1, 0.8659099260315708))], 1.0)
+@example([((0.0, 0.0, 0.0), (0.9474015346938999, 0.006046331364519918, 0.29874456871007093, -0.114653637547647))], 1.0)
+@example([((0.0, 0.0, 0.0), (0.08, 0.88, -0.24, 0.401995024844837))], 1.0)
+@given(st.lists(st.tuples(vectors(), rotations()), min_size=1, max_size=5), st.just(1.0) | st.floats(0.991, 1.009))
+def test_rotations_are_kept_or_normalised_to_the_last_digit_as_in_a_transform(
+    parts: list[tuple[Vector, Quaternion]], norm: float
+) -> None:
+    scaled = [(move, tuple(norm * part for part in turn)) for move, turn in parts]
+    found = TransformArray([move for move, _ in scaled], [turn for _, turn in scaled])
+    assert list(found) == [Transform(*each) for each in scaled]
+
+
+@pytest.mark.parametrize(
+    ("translation", "rotation"),
+    [
+        ((0, 0, 0), (0, 0, 0, 1.02)),
+        ((0, 0, 0), (0, 0, 0, 0)),
+        ((0, 0, 0), (0, 0, math.inf, 1)),
+        ((0, math.inf, 0), ONE),
+        ((0, -math.inf, 0), ONE),
+        ((0, math.nan, 0), ONE),
+        ((math.nan,) * 3, ONE),
+        ((0, 0, 0), (math.nan,) * 4),
+        ((math.nan,) * 3, (math.nan, 0, 0, 1)),
+        ((math.nan, 0, 0), (math.nan,) * 4),
+    ],
+)
+def test_a_row_that_is_neither_rigid_nor_nan_throughout_is_refused_and_named(
+    translation: Sequence[float], rotation: Sequence[float]
+) -> None:
+    with pytest.raises(InvalidTransformError, match="transform 2 "):
+        TransformArray([(0, 0, 0), (math.nan,) * 3, translation], [ONE, (math.nan,) * 4, rotation])
+
+
+@pytest.mark.parametrize(
+    ("translations", "rotations"), [((3,), (4,)), ((2, 3), (3, 4)), ((2, 4), (2, 3)), ((2, 2, 3), (2, 2, 4)), ((), ())]
+)
+def test_wrong_shapes_are_refused_with_both(translations: tuple[int, ...], rotations: tuple[int, ...]) -> None:
+    with pytest.raises(InvalidTransformError) as caught:
+        TransformArray(np.ones(translations), np.ones(rotations))
+    assert f"got {translations} and {rotations}" in str(caught.value)
+
+
+def test_transforms_do_not_follow_the_arrays_they_were_made_of() -> None:
+    translations, rotations = np.zeros((2, 3)), np.tile(ONE, (2, 1))
+    steps = TransformArray(translations, rotations)
+    translations[:], rotations[:] = 7.0, 0.0
+    assert steps.translations.tolist() == [[0.0] * 3] * 2
+    assert steps.rotations.tolist() == [[*ONE]] * 2
+
+
+DUPLICATES = [
+    *(
+        pytest.param(lambda steps, by=protocol: pickle.loads(pickle.dumps(steps, by)), id=f"pickle {protocol}")
+        for protocol in range(pickle.HIGHEST_PROTOCOL + 1)
+    ),
+    pytest.param(copy.copy, id="copy"),
+    pytest.param(copy.deepcopy, id="deep copy"),
+]
+OTHERS = [
+    pytest.param(lambda steps: steps, id="as made"),
+    pytest.param(lambda steps: steps[::2], id="slice"),
+    pytest.param(lambda steps: steps[np.array([0, 2])], id="indices"),
+    pytest.param(lambda steps: steps[[0, 2]], id="list"),
+    pytest.param(lambda steps: steps[steps.valid], id="mask"),
+    pytest.param(lambda steps: copy.deepcopy(steps[[0, 2]]), id="copy of some"),
+    pytest.param(lambda steps: steps.inverse(), id="inverse"),
+    pytest.param(lambda steps: steps @ steps, id="product"),
+]
+
+
+@pytest.mark.parametrize("made", DUPLICATES + OTHERS)
+def test_transforms_cannot_be_changed_however_they_were_made(made: Callable[[TransformArray], TransformArray]) -> None:
+    tree = tree_of(*over("a", "b", [0, 10, 20]))
+    few, many = (tree.lookup_many("a", "b", [0, 5, 20] * count) for count in (1, FEW))
+    lenient = tree.lookup_many("a", "b", [0, 5, 30], tolerance=1.0)
+    for steps in map(made, (ahead(0.0, 1.0, 2.0), few, many, lenient)):
+        for array in (steps.translations, steps.rotations, steps.extrapolated_by, steps.gap):
+            if array is not None:
+                with pytest.raises(ValueError, match="read-only"):
+                    array[...] = 5
+                with pytest.raises(ValueError, match="WRITEABLE"):
+                    array.flags.writeable = True
+    for name in ("translations", "rotations", "valid", "something"):
+        with pytest.raises(AttributeError):
+            setattr(steps, name, None)
+
+
+@pytest.mark.parametrize("made", DUPLICATES)
+def test_transforms_pickle_and_copy(made: Callable[[TransformArray], TransformArray]) -> None:
+    steps = array_of([Transform((1.0, 2.0, 3.0), (0.1, -0.7, 0.1, -0.7)), Transform()])
+    twin = made(steps)
+    assert twin is not steps
+    assert list(twin) == list(steps)
+    assert len(made(steps[:0])) == 0
+    assert made(ahead(math.nan, 1.0)).valid.tolist() == [False, True]
+
+
+# Taking some
+
+
+@given(lists)
+def test_each_is_there_by_its_index_from_either_end_and_in_turn(poses: list[Transform]) -> None:
+    steps = array_of(poses)
+    assert_close(steps, poses)
+    assert list(steps) == [steps[i] for i in range(len(poses))]
+    assert [steps[i - len(poses)] for i in range(len(poses))] == list(steps)
+    for pose in steps:
+        assert type(pose) is Transform
+        assert {type(part) for part in (*pose.translation, *pose.rotation)} == {float}
+
+
+@pytest.mark.parametrize(
+    "index",
+    [
+        slice(None),
+        slice(1, 3),
+        slice(None, None, -1),
+        slice(5, 9),
+        np.array([True, False, False, True, False]),
+        np.array([4, 0, 0, -1]),
+        np.array([], np.intp),
+    ],
+)
+def test_a_slice_a_mask_or_indices_take_some_as_in_numpy(index: slice | npt.NDArray[Any]) -> None:
+    xs = np.arange(5.0)
+    taken = ahead(*xs)[index]
+    assert isinstance(taken, TransformArray)
+    assert taken.translations[:, 0].tolist() == xs[index].tolist()
+    assert taken.rotations.shape == (len(taken), 4)
+
+
+@pytest.mark.parametrize(
+    "index", [(), (0,), (0, 1), (slice(2),), np.array([[0, 1]]), [0, 2], np.array([True]), None, True, 0.0, "0"]
+)
+def test_what_takes_no_transforms_in_a_row_is_refused_with_what_does(index: Any) -> None:
+    with pytest.raises(IndexError) as caught:
+        ahead(1.0, 2.0)[index]
+    assert str(caught.value) == (
+        f"index {index!r} does not fit 2 transforms: give an int, a slice, or a mask or indices in a list or an array"
+    )
+
+
+@pytest.mark.parametrize("count", [0, 2])
+@pytest.mark.parametrize("beyond", [2, -3])
+def test_there_is_nothing_beyond_either_end(count: int, beyond: int) -> None:
+    with pytest.raises(IndexError, match=f"index {beyond} does not fit {count} transforms"):
+        ahead(*range(count))[beyond]
+
+
+def test_a_numpy_integer_and_a_list_are_indices_too() -> None:
+    steps = ahead(3.0, 4.0)
+    assert steps[np.argmax([0.5, 1.5])].translation == (4.0, 0.0, 0.0)
+    assert steps[[1, 0]].translations[:, 0].tolist() == [4.0, 3.0]
+    assert steps[[False, True]].translations[:, 0].tolist() == [4.0]
+
+
+def test_where_there_is_no_transform_none_is_valid_and_none_is_given() -> None:
+    steps = ahead(1.0, math.nan, 3.0)
+    assert steps.valid.tolist() == [True, False, True]
+    assert steps[0] == Transform((1.0, 0.0, 0.0))
+    for index in (1, -2):
+        with pytest.raises(InvalidTransformError, match="NaN"):
+            steps[index]
+    assert [*steps[steps.valid]] == [Transform((1.0, 0.0, 0.0)), Transform((3.0, 0.0, 0.0))]
+
+
+def test_what_is_not_there_stays_not_there_and_spoils_no_other() -> None:
+    steps = ahead(1.0, math.nan, 3.0)
+    assert (steps @ steps).valid.tolist() == [True, False, True]
+    assert (ahead(1.0, 2.0, 3.0) @ steps).valid.tolist() == [True, False, True]
+    assert steps.inverse().valid.tolist() == [True, False, True]
+    assert np.isnan(steps.matrices()[:, :3]).all(axis=(1, 2)).tolist() == [False, True, False]
+    assert np.isnan(steps.apply(np.zeros((3, 3)))).tolist() == [[False] * 3, [True] * 3, [False] * 3]
+
+
+# What they do
+
+
+@given(lists)
+def test_matrices_are_those_of_each(poses: list[Transform]) -> None:
+    expected = [pose.matrix() for pose in poses]
+    found = array_of(poses).matrices()
+    np.testing.assert_allclose(found, np.reshape(expected, (-1, 4, 4)), rtol=0, atol=1e-14)
+    found[:] = 5.0
+    np.testing.assert_allclose(array_of(poses).matrices(), np.reshape(expected, (-1, 4, 4)), rtol=0, atol=1e-14)
+
+
+@given(st.lists(st.tuples(transforms(10.0), vectors(10.0)), max_size=5))
+def test_each_point_is_moved_by_its_own_transform(both: list[tuple[Transform, Vector]]) -> None:
+    points = np.reshape([point for _, point in both], (-1, 3))
+    found = array_of([pose for pose, _ in both]).apply(points)
+    expected = [pose.apply(point) for pose, point in both]
+    np.testing.assert_allclose(found, np.reshape(expected, (-1, 3)), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given_type", "returned"),
+    [(np.float32, np.float32), (np.float16, np.float16), (np.float64, np.float64), (np.int32, np.float64)],
+)
+def test_float32_stays_and_integers_become_float64(given_type: type[Any], returned: type[Any]) -> None:
+    points = np.array([[1, 2, 3], [4, 5, 6]], given_type)
+    found = ahead(0.5, 1.5).apply(points)
+    assert found.dtype == returned
+    assert found.tolist() == [[1.5, 2.0, 3.0], [5.5, 5.0, 6.0]]
+    assert points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_points_of_float32_lose_no_more_than_their_own_rounding() -> None:
+    # In float32 the sum of a million and a tenth would already have lost the tenth.
+    moved = ahead(1e6).apply(np.array([[0.1 - 1e6, 0.0, 0.0]]))
+    assert moved[0, 0] == pytest.approx(0.1, abs=1e-9)
+    near = TransformArray([[-1e6, 0.0, 0.0]], [ONE]).apply(np.array([[1e6 + 0.25, 0.0, 0.0]], np.float32))
+    assert near.tolist() == [[0.25, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_an_infinite_point_stays_not_finite_without_a_warning(dtype: Any) -> None:
+    points = np.array([(np.inf, 0, 0), (0, -np.inf, 0), (np.inf, -np.inf, np.nan), (1, 2, 3)], dtype)
+    for rotation in (ONE, HALF_TURN_ABOUT_Z, (0.1, -0.7, 0.1, -0.7)):
+        moved = TransformArray([(1.0, 2.0, 3.0)] * 4, [rotation] * 4).apply(points)
+        assert np.isfinite(moved).all(axis=1).tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("shape", [(3,), (3, 3), (2, 2), (1, 3), (2, 3, 1), (0, 3)])
+def test_points_must_be_as_many_as_transforms(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"shape \(2, 3\)") as caught:
+        ahead(0.0, 1.0).apply(np.zeros(shape))
+    assert f"got {shape}" in str(caught.value)
+
+
+@given(lists)
+def test_the_inverse_is_that_of_each_and_undoes_from_both_sides(poses: list[Transform]) -> None:
+    steps = array_of(poses)
+    assert_close(steps.inverse(), [pose.inverse() for pose in steps])
+    for product in (steps @ steps.inverse(), steps.inverse() @ steps):
+        assert_close(product, [Transform.identity()] * len(poses))
+
+
+@given(pairs)
+def test_a_product_is_that_of_each_pair(both: list[tuple[Transform, Transform]]) -> None:
+    product = array_of([a for a, _ in both]) @ array_of([b for _, b in both])
+    assert_close(product, [a @ b for a, b in both])
+
+
+@given(transforms(10.0), lists)
+def test_a_product_with_one_transform_is_that_with_each_from_either_side(
+    one: Transform, poses: list[Transform]
+) -> None:
+    steps = array_of(poses)
+    assert_close(one @ steps, [one @ pose for pose in poses])
+    assert_close(steps @ one, [pose @ one for pose in poses])
+
+
+@given(st.lists(st.tuples(transforms(10.0), transforms(10.0), transforms(10.0)), max_size=3))
+def test_composition_is_associative(three: list[tuple[Transform, Transform, Transform]]) -> None:
+    a, b, c = (array_of([poses[place] for poses in three]) for place in range(3))
+    assert_close((a @ b) @ c, list(a @ (b @ c)))
+
+
+def test_only_as_many_transforms_can_be_combined_one_by_one() -> None:
+    with pytest.raises(ValueError, match="3 and 2"):
+        ahead(1.0, 2.0, 3.0) @ ahead(1.0, 2.0)
+
+
+@pytest.mark.parametrize("other", [np.eye(4), np.zeros((2, 3)), np.float64(2.0), [Transform()] * 2, None, 2.0])
+def test_transforms_compose_with_transforms_only(other: Any) -> None:
+    for a, b in ((ahead(1.0, 2.0), other), (other, ahead(1.0, 2.0))):
+        with pytest.raises(TypeError):
+            operator.matmul(a, b)

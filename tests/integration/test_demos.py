@@ -1,0 +1,290 @@
+"""The demos as a user runs them."""
+
+import cmath
+import math
+import re
+import runpy
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import anyio
+import httpx
+import pytest
+from support.processes import new_domain
+from support.programs import Program
+
+from tfbus import SimulatedClock
+from tfbus.cli import tutorial
+from tfbus.testing import simulate
+
+DEMOS = Path(__file__).parents[2] / "demos"
+
+
+def load(name: str) -> dict[str, Any]:
+    return runpy.run_path(str(DEMOS / name))
+
+
+@pytest.mark.anyio
+async def test_the_script_prints_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    await tutorial.run(SimulatedClock(), duration=3.0)
+    command = capsys.readouterr().out
+
+    demo = load("robot_setup.py")
+    clock = SimulatedClock()
+    with anyio.move_on_after(30):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(lambda: demo["main"](clock))
+            await clock.advance(3.5)
+            tasks.cancel_scope.cancel()
+    assert capsys.readouterr().out == command
+
+
+@pytest.mark.anyio
+async def test_a_detection_comes_out_80_ms_later_one_fails_at_once_and_one_times_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = SimulatedClock()
+    demo = load("future_transform.py")
+    await simulate(clock, lambda: demo["main"](clock))
+    now, old, unknown = capsys.readouterr().out.splitlines()
+    # At 0.5 s the robot is at 0.5 m, its camera 0.3 m further, and the thing 2 m before that.
+    assert now == "seen just now: after 80 ms: (2.800, 0.000, 0.500) in the map"
+    assert old == (
+        "seen a minute ago: after 0 ms: PastExtrapolationError: frame 'base_link': asked for -59.420 s, "
+        "oldest sample is -0.080 s (59.3 s too early), from 'odometry'"
+    )
+    assert unknown == (
+        "seen by an unknown camera: after 500 ms: LookupTimeoutError: no transform from 'arm_camera' to 'map' "
+        "within 0.5 s: frame 'arm_camera' is not known, did you mean 'camera'?"
+    )
+
+
+def test_the_demo_of_future_transforms_runs_as_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "future_transform.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) == 3
+
+
+def test_the_demo_of_a_drop_out_tells_how_far_off_each_answer_is() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "drop_out.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+    held, straight, refused, nearest = done.stdout.splitlines()
+    # The chord of the turn since the sample, on a circle of radius 2 m and with 4 s a turn.
+    assert f"{4 * math.sin(math.pi / 4 * 0.2):.2f} m off (extrapolated by 0.20 s, gap 0.00 s)" in held
+    assert f"{2 - 2 * math.cos(math.pi / 4):.2f} m off (extrapolated by 0.00 s, gap 1.00 s)" in straight
+    assert "between samples at 2.000 s and 3.000 s, which are 1 s apart" in refused
+    assert f"{4 * math.sin(math.pi / 4 * 0.1):.2f} m off (extrapolated by 0.10 s, gap 0.00 s)" in nearest
+
+
+@pytest.mark.anyio
+async def test_one_robot_sees_the_gripper_of_another_with_the_same_frames(capsys: pytest.CaptureFixture[str]) -> None:
+    clock = SimulatedClock()
+    demo = load("two_robots.py")
+    await simulate(clock, lambda: demo["main"](clock))
+    *moments, heading, first, _, _, last = capsys.readouterr().out.splitlines()
+    assert len(moments) == 3
+    for seconds, line in zip((0.2, 0.6, 1.0), moments, strict=True):
+        # The map's plane as complex numbers; each robot looks along its circle.
+        angles = cmath.exp(0.5j * seconds), cmath.exp(1j * seconds)
+        camera, gripper = 2 * angles[0] + 0.2j * angles[0], 3 * angles[1] + 0.5j * angles[1]
+        seen = (gripper - camera) / (1j * angles[0])
+        assert line == (
+            f"after {seconds} s, gripper in map: ({gripper.real:.3f}, {gripper.imag:.3f}, 0.400); "
+            f"robot2/gripper in robot1/camera: ({seen.real:.3f}, {seen.imag:.3f}, -0.600)"
+        )
+    assert heading == "'robot2/gripper' in 'robot1/camera', latest: 1.000 s"
+    assert re.fullmatch(r"  robot1/camera -> robot1/base_link +static +from 'robot1'", first)
+    assert re.fullmatch(r"  robot2/base_link <- robot2/gripper +static +from 'robot2'", last)
+
+
+def test_the_demo_of_two_robots_runs_as_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "two_robots.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+    assert len(done.stdout.splitlines()) == 8
+
+
+def test_the_demo_of_a_watch_redraws_no_more_than_can_be_seen() -> None:
+    done = subprocess.run([sys.executable, DEMOS / "watch.py"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0
+    *redrawn, summary = done.stdout.splitlines()
+    numbers = [re.findall(r"\d+\.\d+", line) for line in redrawn]
+    # In a hurry ten times a second, with the sample of the turn before; then whenever 0.1 m is full at 2.4 mm a sample.
+    hurried = [(0.0, 0.0), *((k / 10, 1.5 * (k / 10 - 0.01)) for k in range(1, 11))]
+    crept = [(2.36 + 0.42 * k, 1.5 + 0.24 * (0.36 + 0.42 * k)) for k in range(7)]
+    expected = [[f"{time:.2f}", f"{x:.3f}"] for time, x in hurried + crept]
+    assert numbers == expected
+    # While a redraw is held back, all samples but the last go by: of 9 at first, of 10 in a hurry, of 9 in a creep.
+    assert summary == f"redrawn {len(expected)} times; {8 + 9 * 10 + 7 * 8} updates went by unseen"
+
+
+@pytest.mark.anyio
+async def test_the_demo_of_a_message_filter_places_five_detections_and_tells_of_the_other_two(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = SimulatedClock()
+    demo = load("message_filter.py")
+    await simulate(clock, lambda: demo["main"](clock))
+    lines = capsys.readouterr().out.splitlines()
+    # At t s the robot is at t m, and what it sees is 2 m ahead; odometry is 80 ms late.
+    placed = [f"x = {2.5 + 0.1 * tick:.3f} m, 80 ms after it was seen" for tick in range(5)]
+    assert [line for line in lines if line.startswith("x")] == placed
+    old, unknown = (line for line in lines if line.startswith("dropped"))
+    assert old.startswith("dropped, too old: frame 'camera': asked for -59.300 s, oldest sample is -0.080 s")
+    assert unknown.endswith("frame 'arm_camera' is not known, did you mean 'camera'?")
+    assert lines[-1] == "7 detections, 5 placed, dropped: {'too old': 1, 'unknown frame': 1}"
+
+
+def test_the_demo_of_a_message_filter_runs_as_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "message_filter.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.splitlines()[-1].startswith("7 detections")
+
+
+@pytest.mark.anyio
+async def test_what_the_camera_of_the_arm_sees_is_where_the_closed_form_puts_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    clock = SimulatedClock()
+    demo = load("robot_arm.py")
+    await simulate(clock, lambda: demo["main"](clock))
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 5
+    for detection, line in enumerate(lines):
+        # Each is seen half way between two messages of the joints, 195 ms after the one before was placed.
+        place = arm_sees(0.195 + 0.2 * detection)
+        found = re.fullmatch(r"\((.+)\) in the base, after 5 ms; by the closed form \((.+)\)", line)
+        assert found
+        # Between two messages the joints are taken to move evenly: a tenth of a mm, and another half is rounded off.
+        for numbers in found.groups():
+            assert [float(number) for number in numbers.split(", ")] == pytest.approx(place, abs=7e-4)
+
+
+def arm_sees(seconds: float) -> tuple[float, float, float]:
+    """Where a thing 0.6 m ahead of the camera is, seen from the foot of the arm."""
+    swing = math.sin(2.0 * seconds)
+    pan, angles = 1.2 * swing, (0.4 * swing, (0.4 - 0.9) * swing, (0.4 - 0.9 + 0.8) * swing)
+    parts = (0.4, 0.35, 0.1 + 0.05 + 0.6)
+    reach = sum(part * math.cos(angle) for part, angle in zip(parts, angles, strict=True))
+    height = 0.5 - sum(part * math.sin(angle) for part, angle in zip(parts, angles, strict=True))
+    return reach * math.cos(pan), reach * math.sin(pan), height
+
+
+def test_the_demo_of_the_arm_runs_as_a_script() -> None:
+    done = subprocess.run(
+        [sys.executable, DEMOS / "robot_arm.py"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert len(done.stdout.splitlines()) == 5
+
+
+def test_the_tutorials_two_programs_find_each_other_in_either_order_and_one_goes_on_without_the_other() -> None:
+    domain = new_domain()
+    info = (
+        r"^\[ INFO\] \d+\.\d{9}: base_laser: \(1\.00, 0\.20\. 0\.00\) -----> "
+        r"base_link: \(1\.10, 0\.20, 0\.20\) at time \d+\.\d\d$"
+    )
+    with Program(sys.executable, DEMOS / "tf_listener.py", domain) as listener:
+        listener.output.expect(r"^\[ERROR\] .*: frame 'base_link' is not known$")
+        with Program(sys.executable, DEMOS / "tf_broadcaster.py", domain) as broadcaster:
+            listener.output.expect(info)
+            assert broadcaster.end() == 130
+        listener.output.expect(r"^\[ERROR\] .*: frame 'base_laser': asked for .*, from 'robot_tf_publisher'$")
+        with Program(sys.executable, DEMOS / "tf_broadcaster.py", domain):
+            listener.output.expect(info)
+        assert listener.end() == 130
+    assert (listener.errors.text, broadcaster.errors.text, broadcaster.output.text) == ("", "", "")
+
+
+def test_the_demo_of_a_recording_finds_the_camera_where_it_was_and_keeps_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "kept.mcap"
+    expected = []
+    for second in (1, 2, 4):
+        # The map's plane as complex numbers: 2 m from its origin, and 0.3 m on along the circle.
+        camera = (2 + 0.3j) * cmath.exp(2j * math.pi * second / 8)
+        expected.append(f"({camera.real:.3f}, {camera.imag:.3f}, 0.500) at {second}.00 s")
+    for arguments in ([], [str(path)]):
+        done = subprocess.run(
+            [sys.executable, DEMOS / "record_and_replay.py", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.splitlines() == [
+            # 50 a second for 8 s with both ends, and the camera's place.
+            "recorded: 402 samples",
+            *(f"the camera was at {place}" for place in expected),
+            f"and once more at {expected[-1]}",
+        ]
+    assert path.stat().st_size > 0
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """The web application under a real server on loopback; its address."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        fd = str(listener.fileno())
+        command = [sys.executable, "-m", "uvicorn", "web_app:app", "--fd", fd, "--app-dir", str(DEMOS)]
+        with subprocess.Popen(command, pass_fds=[listener.fileno()], stderr=subprocess.PIPE, text=True) as process:
+            assert process.stderr is not None
+            for line in process.stderr:
+                if "startup complete" in line:
+                    break
+            yield f"http://127.0.0.1:{listener.getsockname()[1]}/transforms"
+            process.terminate()
+            log = process.communicate(timeout=30)[1]
+            assert "Traceback" not in log
+            assert "shutdown complete" in log
+
+
+def get(url: str) -> httpx.Response:
+    return httpx.get(url, timeout=30, trust_env=False)
+
+
+def test_the_web_application_answers_a_transform_as_json(server: str) -> None:
+    response = get(f"{server}/map/base_link")
+    assert response.status_code == 200
+    answer = response.json()
+    x, y, z = answer["translation"]
+    qx, qy, qz, qw = answer["rotation"]
+    assert x * x + y * y == pytest.approx(1.0)
+    # The robot looks along its circle, a quarter turn ahead of where it stands.
+    assert (2 * qw * qz, 1 - 2 * qz * qz) == pytest.approx((x, -y))
+    assert (z, qx, qy) == (0, 0, 0)
+
+
+def test_the_web_application_waits_for_a_transform_of_the_future(server: str) -> None:
+    stamp = get(f"{server}/map/base_link").json()["stamp"] + 200_000_000
+    response = get(f"{server}/map/base_link?at={stamp}&timeout=10")
+    assert (response.status_code, response.json()["stamp"]) == (200, stamp)
+
+
+def test_the_web_application_says_504_when_the_time_is_up(server: str) -> None:
+    stamp = get(f"{server}/map/base_link").json()["stamp"] + 3_600_000_000_000
+    response = get(f"{server}/map/base_link?at={stamp}&timeout=0.1")
+    assert response.status_code == 504
+    assert re.search(r"frame 'base_link': asked for .* short\), from 'odometry'", response.json()["error"])
+
+
+def test_the_web_application_says_404_with_close_matches_for_an_unknown_frame(server: str) -> None:
+    response = get(f"{server}/map/base_lnk?timeout=0.1")
+    assert response.status_code == 404
+    assert response.json()["close_matches"] == ["base_link"]
+
+
+@pytest.mark.parametrize("question", ["at=5", "at=1.5", "timeout=-1", "timeout=nan", "at=99999999999999999999"])
+def test_the_web_application_says_400_for_a_question_without_an_answer(server: str, question: str) -> None:
+    assert get(f"{server}/map/base_link?{question}").status_code == 400

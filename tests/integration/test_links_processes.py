@@ -1,0 +1,462 @@
+"""Buses in processes of their own, joined over the loopback or between namespaces; all are ended by their own id."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from support.processes import PATIENCE, Crowd, PeerProcess, crowd, free_ports, new_domain
+
+BACKENDS = ("asyncio", "trio", "asyncio+uvloop")
+SECONDS = 10
+RATE = 500 / 3
+"""Batches of 20 that each of three processes sends a second: 10,000 samples in all."""
+
+
+@pytest.fixture
+def processes() -> Iterator[Crowd]:
+    with crowd() as together:
+        yield together
+
+
+class Place:
+    """A domain of one test, and the addresses of some who listen."""
+
+    def __init__(self, listeners: int = 1) -> None:
+        self.domain = new_domain()
+        self.addresses = [f"tcp/127.0.0.1:{port}" for port in free_ports(listeners)]
+
+    def first(self, **options: Any) -> dict[str, Any]:
+        return {"domain": self.domain, "listen": self.addresses[0], **options}
+
+    def other(self, **options: Any) -> dict[str, Any]:
+        return {"domain": self.domain, "connect": self.addresses[0], **options}
+
+
+@pytest.fixture
+def place() -> Place:
+    return Place()
+
+
+def meet(*processes: PeerProcess) -> None:
+    for process in processes:
+        process.ask("until", peers=len(processes) - 1)
+
+
+def send_in_turn(processes: list[PeerProcess]) -> None:
+    """Each publishes for some seconds, all at once, until everybody has the last of everything."""
+    batches = round(RATE * SECONDS)
+    names = [f"p{number}" for number in range(len(processes))]
+    started = [
+        process.start("stream", authority=name, batches=batches, rate=RATE)
+        for process, name in zip(processes, names, strict=True)
+    ]
+    for process, number in zip(processes, started, strict=True):
+        process.finish(number)
+    for process in processes:
+        process.ask("until", last=dict.fromkeys(names, batches - 1))
+    for process in processes:
+        facts = process.ask("facts")
+        whole = {"batches": batches, "samples": 20 * batches, "last": batches - 1}
+        faults = {"missing": 0, "not_in_order": 0, "not_whole": 0}
+        assert facts["tallies"] == dict.fromkeys(names, whole | faults)
+        assert facts["bus"]["samples"] == 3 * 20 * batches
+        for link in facts["links"]:
+            assert (link["lost"], link["rejected"], link["queue"]["dropped"]) == (0, {}, 0)
+
+
+def test_three_processes_in_a_ring_have_every_sample_once(processes: Crowd) -> None:
+    place = Place(3)
+    ring = zip(place.addresses, [*place.addresses[1:], place.addresses[0]], BACKENDS, strict=True)
+    members = [
+        processes.begin({"domain": place.domain, "listen": here, "connect": there}, backend=backend)
+        for here, there, backend in ring
+    ]
+    meet(*members)
+    send_in_turn(members)
+    for member in members:
+        (link,) = member.ask("facts")["links"]
+        # All of them hear each other directly, and nobody passes on what is for everybody.
+        assert link["duplicates"] == 0
+        assert link["sent_samples"] == link["received_samples"] / 2
+
+
+def test_a_ring_of_three_domains_brings_every_sample_once(processes: Crowd) -> None:
+    places = [Place(), Place(), Place()]
+    members = [
+        processes.begin(places[number].first(), places[number - 1].other(), backend=backend)
+        for number, backend in enumerate(BACKENDS)
+    ]
+    for member in members:
+        for link in (0, 1):
+            member.ask("until", peers=1, link=link)
+    send_in_turn(members)
+
+
+def test_a_late_joiner_has_all_static_frames(processes: Crowd, place: Place) -> None:
+    names = [f"static{number}" for number in range(50)]
+    early = processes.add(place.first())
+    early.ask("statics", names=names, x=1.0)
+    early.ask("stream", authority="moving", batches=10, rate=1_000)
+    late = processes.add(place.other(), backend="trio")
+    late.ask("until", static=names)
+    assert late.ask("lookup", target="map", source="static49")["x"] == 1.0
+    assert late.ask("facts")["moving"] == []
+
+
+def test_nobody_has_to_be_first(processes: Crowd, place: Place) -> None:
+    late = processes.add(place.other())
+    late.ask("statics", names=["before"])
+    first = processes.add(place.first())
+    first.ask("until", static=["before"])
+    first.ask("statics", names=["after"])
+    late.ask("until", static=["after"])
+    # And whoever was first may go and come back.
+    first.kill()
+    late.wait(event="PeerLost")
+    again = processes.add(place.first(), backend="trio")
+    again.ask("until", static=["before"])
+    again.ask("statics", names=["again"])
+    late.ask("until", static=["again"])
+
+
+@pytest.mark.parametrize("drop_lost", [True, False])
+def test_a_killed_broadcaster_is_lost_and_refreshes_its_static_frames_when_it_is_back(
+    drop_lost: bool, processes: Crowd, place: Place
+) -> None:
+    listener = processes.add(place.first(drop_lost=drop_lost))
+    listener.ask("statics", names=["own"])
+    broadcaster = processes.add(place.other())
+    broadcaster.ask("statics", names=["lidar", "camera"], x=1.0, authority="urdf")
+    broadcaster.ask("stream", authority="wheels", batches=5, rate=1_000, size=2)
+    listener.ask("until", static=["lidar", "camera"], last={"wheels": 4})
+    joined = listener.wait(event="PeerJoined")
+    broadcaster.kill()
+    lost = listener.wait(event="PeerLost")
+    assert lost == {
+        "event": "PeerLost",
+        "link": place.domain,
+        "peer": joined["peer"],
+        "authorities": ["urdf", "wheels"],
+        "frames": ["camera", "lidar", "wheels/0", "wheels/1"],
+    }
+    if drop_lost:
+        listener.ask("until", lacks=lost["frames"])
+    facts = listener.ask("facts")
+    assert facts["static"] == (["own"] if drop_lost else ["camera", "lidar", "own"])
+    assert facts["moving"] == ([] if drop_lost else ["wheels/0", "wheels/1"])
+    again = processes.add(place.other(), backend="trio")
+    again.ask("until", static=["own"])
+    again.ask("statics", names=["lidar", "camera"], x=2.0, authority="urdf")
+    assert listener.wait(event="PeerJoined")["peer"] != joined["peer"]
+    # What is latched goes to whoever comes now, with the new value.
+    third = processes.add(place.other())
+    for process in (listener, third):
+        process.ask("until", static=["lidar", "camera"], x={"lidar": 2.0, "camera": 2.0})
+
+
+def test_a_frozen_process_is_lost_and_comes_back_with_its_static_frames(processes: Crowd, place: Place) -> None:
+    listener = processes.add(place.first(lease=1.0, drop_lost=True))
+    frozen = processes.add(place.other(lease=1.0))
+    frozen.ask("statics", names=["lidar"], authority="urdf")
+    # Whoever comes later has it from the cache.
+    other = processes.add(place.other(lease=1.0, drop_lost=True), backend="trio")
+    for process in (listener, other):
+        process.ask("until", static=["lidar"], peers=2)
+    frozen.signal(signal.SIGSTOP)
+    for process in (listener, other):
+        lost = process.wait(event="PeerLost")
+        assert (lost["authorities"], lost["frames"]) == (["urdf"], ["lidar"])
+        process.ask("until", lacks=["lidar"], peers=1)
+    listener.ask("statics", names=["meanwhile"])
+    frozen.signal(signal.SIGCONT)
+    for process in (listener, other):
+        process.ask("until", static=["lidar"], peers=2)
+    frozen.ask("until", static=["meanwhile"], peers=2)
+
+
+def test_a_process_that_is_too_slow_and_one_that_is_frozen_delay_nobody(processes: Crowd, place: Place) -> None:
+    # A lease that does not end while this goes on, so that nobody is spared by being lost.
+    broadcaster = processes.add(place.first(lease=60.0))
+    reader, slow, frozen = (processes.add(place.other(lease=60.0), backend=backend) for backend in BACKENDS)
+    meet(broadcaster, reader, slow, frozen)
+    frozen.signal(signal.SIGSTOP)
+    blocked = slow.start("block", seconds=3.0)
+    sent = broadcaster.ask("stream", authority="wheels", batches=3_000, rate=1_000)
+    reader.ask("until", last={"wheels": 2_999})
+    tally = reader.ask("facts")["tallies"]["wheels"]
+    assert (tally["missing"], tally["not_in_order"], tally["not_whole"]) == (0, 0, 0)
+    # A put that waits for the others waits for seconds.
+    assert sent["longest_call"] < 1.0
+    assert broadcaster.ask("facts")["longest_pause"] < 1.0
+    # All of it was kept for the slow one.
+    slow.finish(blocked)
+    slow.ask("until", last={"wheels": 2_999})
+    facts = slow.ask("facts")
+    assert facts["tallies"]["wheels"]["missing"] == 0
+    assert facts["links"][0]["queue"]["dropped"] == 0
+    # And what stays true is not lost for the frozen one.
+    broadcaster.ask("statics", names=["lidar"])
+    reader.ask("until", static=["lidar"])
+    frozen.signal(signal.SIGCONT)
+    frozen.ask("until", static=["lidar"])
+
+
+def test_a_process_that_is_much_too_slow_loses_the_oldest_and_says_so(processes: Crowd, place: Place) -> None:
+    broadcaster = processes.add(place.first(lease=60.0))
+    slow = processes.add(place.other(lease=60.0, capacity=100))
+    meet(broadcaster, slow)
+    blocked = slow.start("block", seconds=1.0)
+    broadcaster.ask("stream", authority="wheels", batches=500, rate=1_000)
+    broadcaster.ask("statics", names=["lidar"])
+    slow.finish(blocked)
+    slow.ask("until", last={"wheels": 499}, static=["lidar"])
+    facts = slow.ask("facts")
+    queue, tally = facts["links"][0]["queue"], facts["tallies"]["wheels"]
+    assert tally["batches"] + tally["missing"] == 500
+    assert queue["dropped"] == tally["missing"] >= 1
+    assert (tally["not_in_order"], tally["not_whole"]) == (0, 0)
+
+
+def test_when_the_first_one_dies_the_others_go_on_and_another_one_joins_them(processes: Crowd) -> None:
+    # At the meeting point, where other programs of this machine may be.
+    domain = {"domain": new_domain()}
+    first = processes.add(domain)
+    second, third = processes.add(domain), processes.add(domain, backend="trio")
+    meet(first, second, third)
+    first.kill()
+    for process in (second, third):
+        process.wait(event="PeerLost")
+    second.ask("statics", names=["lidar"])
+    second.ask("stream", authority="wheels", batches=10, rate=1_000)
+    third.ask("until", static=["lidar"], last={"wheels": 9})
+    late = processes.add(domain)
+    meet(second, third, late)
+    late.ask("until", static=["lidar"])
+    late.ask("statics", names=["camera"])
+    for process in (second, third):
+        process.ask("until", static=["camera"])
+
+
+def test_a_lookup_in_one_process_is_answered_by_another(processes: Crowd, place: Place) -> None:
+    asking = processes.add(place.first(), backend="trio")
+    answering = processes.add(place.other())
+    meet(asking, answering)
+    question = asking.start("lookup", target="map", source="lidar", at=1_500)
+    answering.ask("statics", names=["unrelated"])
+    answering.ask("publish", samples=[{"parent": "map", "child": "base", "stamp": 1_000, "x": 1.0, "authority": "w"}])
+    answering.ask("publish", samples=[{"parent": "base", "child": "lidar", "stamp": 0, "x": 0.5, "static": True}])
+    asking.ask("until", has=["base", "lidar", "unrelated"])
+    assert asking.said(id=question) == []
+    answering.ask("publish", samples=[{"parent": "map", "child": "base", "stamp": 2_000, "x": 2.0, "authority": "w"}])
+    found = asking.finish(question)
+    assert (found["x"], found["stamp"]) == (2.0, 1_500)
+
+
+def test_removed_frames_leave_everywhere_and_those_who_come_later_never_hear_of_them(
+    processes: Crowd, place: Place
+) -> None:
+    owner, other = processes.add(place.first()), processes.add(place.other(), backend="trio")
+    meet(owner, other)
+    owner.ask("statics", names=["lidar", "camera"])
+    owner.ask("stream", authority="wheels", batches=3, rate=1_000, size=2)
+    other.ask("until", static=["lidar", "camera"], last={"wheels": 2})
+    owner.ask("remove", frame="lidar")
+    # Also by somebody who has not published it.
+    other.ask("remove", frame="wheels/0")
+    for process in (owner, other):
+        process.ask("until", lacks=["lidar", "wheels/0"], has=["wheels/1"])
+    late = processes.add(place.other())
+    late.ask("until", static=["camera"], peers=2)
+    owner.ask("stream", authority="last", batches=1, rate=1, size=1)
+    late.ask("until", has=["last/0"])
+    facts = late.ask("facts")
+    assert (facts["static"], facts["moving"]) == (["camera"], ["last/0"])
+    assert facts["bus"]["samples"] == 2
+
+
+def test_a_static_frame_that_comes_and_goes_is_there_at_last(processes: Crowd, place: Place) -> None:
+    owner, other = processes.add(place.first()), processes.add(place.other(), backend="trio")
+    meet(owner, other)
+    owner.ask("churn", frame="lidar", times=1_000)
+    late = processes.add(place.other())
+    for process in (other, late):
+        process.ask("until", x={"lidar": 1_000.0})
+
+
+# A loop that ends, and a program that does, without the end of its link; somebody sends to it all the time.
+CRASHES = {
+    "the loop is closed": "loop.close(); time.sleep(0.1)",
+    "the loop is left": "",
+    "the link is forgotten": "loop.close(); del link; gc.collect()",
+    "the program exits": "sys.exit(0)",
+}
+
+
+@pytest.mark.parametrize("end", CRASHES.values(), ids=CRASHES.keys())
+def test_a_link_that_was_never_ended_does_not_keep_the_program(end: str, processes: Crowd, place: Place) -> None:
+    broadcaster = processes.add(place.first())
+    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=2_000, size=5)
+    program = f"""
+import asyncio, gc, sys, time
+from tfbus import Bus
+from tfbus.links.zenoh import ZenohLink
+
+async def main():
+    bus, heard = Bus(), asyncio.Event()
+    bus.subscribe(lambda batch: heard.set())
+    link = ZenohLink(bus, {place.domain!r}, connect={place.addresses[0]!r})
+    await link.__aenter__()
+    await heard.wait()
+    return link
+
+loop = asyncio.new_event_loop()
+link = loop.run_until_complete(main())
+print("crash", flush=True)
+{end}
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, check=False
+    )
+    assert (done.returncode, done.stdout) == (0, "crash\n"), done.stderr
+    broadcaster.wait(event="PeerLost")
+
+
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_ctrl_c_ends_a_program_with_a_link(backend: str, processes: Crowd, place: Place) -> None:
+    broadcaster = processes.add(place.first())
+    broadcaster.start("stream", authority="wheels", batches=1_000_000, rate=1_000, size=5)
+    program = f"""
+import anyio
+from tfbus import Bus
+from tfbus.links.zenoh import ZenohLink
+
+async def main():
+    with Bus() as bus, bus.stream() as batches:
+        async with ZenohLink(bus, {place.domain!r}, connect={place.addresses[0]!r}):
+            async for batch in batches:
+                print("ready", flush=True)
+
+try:
+    anyio.run(main, backend={backend!r})
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        try:
+            output, errors = process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
+    assert (output.splitlines()[-1], errors, process.returncode) == ("interrupted", "", 0)
+    broadcaster.wait(event="PeerLost")
+
+
+Hosts = list[tuple[str, tuple[str, ...]]]
+
+
+@pytest.fixture
+def hosts() -> Iterator[Hosts]:
+    """Three hosts on one network: the address of each, and what to begin a command with so that it runs there."""
+    ip = shutil.which("ip")
+    if ip is None or os.geteuid() != 0:
+        pytest.skip("network namespaces need root and the program ip")
+    tag = uuid4().hex[:6]
+    names = [f"tf{tag}{letter}" for letter in "abc"]
+    switch = f"tf{tag}s"
+
+    def call(*arguments: str) -> None:
+        done = subprocess.run([ip, *arguments], capture_output=True, text=True, timeout=PATIENCE, check=False)
+        if done.returncode:
+            pytest.skip(f"no network namespaces here: {done.stderr.strip()}")
+
+    try:
+        for name in (switch, *names):
+            call("netns", "add", name)
+        call("-n", switch, "link", "add", "bridge", "type", "bridge")
+        call("-n", switch, "link", "set", "bridge", "up")
+        found: Hosts = []
+        for number, name in enumerate(names, 1):
+            call("-n", switch, "link", "add", name, "type", "veth", "peer", "eth0", "netns", name)
+            call("-n", switch, "link", "set", name, "master", "bridge", "up")
+            call("-n", name, "address", "add", f"10.98.76.{number}/24", "dev", "eth0")
+            call("-n", name, "link", "set", "eth0", "up")
+            call("-n", name, "link", "set", "lo", "up")
+            found.append((f"10.98.76.{number}", (ip, "netns", "exec", name)))
+        yield found
+    finally:
+        for name in (switch, *names):
+            subprocess.run([ip, "netns", "delete", name], capture_output=True, timeout=PATIENCE, check=False)
+
+
+def test_hosts_find_each_other_through_one_whose_address_they_know(hosts: Hosts, processes: Crowd) -> None:
+    domain = new_domain()
+    known = f"tcp/{hosts[0][0]}:17447"
+    members = [
+        processes.begin(
+            # Where it can be reached itself, so that the other two need the first one only to find each other.
+            {"domain": domain, "listen": known if number == 0 else f"tcp/{address}:0", "connect": [known][:number]},
+            prefix=prefix,
+            backend=BACKENDS[number],
+        )
+        for number, (address, prefix) in enumerate(hosts)
+    ]
+    meet(*members)
+    members[1].ask("statics", names=["lidar"])
+    members[2].ask("stream", authority="wheels", batches=100, rate=1_000)
+    for member in members:
+        member.ask("until", static=["lidar"], last={"wheels": 99})
+    members[0].kill()
+    members[1].wait(event="PeerLost")
+    members[1].ask("statics", names=["camera"])
+    members[2].ask("until", static=["camera"])
+
+
+def test_a_host_that_is_cut_off_is_lost_and_comes_back(hosts: Hosts, processes: Crowd) -> None:
+    (address, first), (_, second), _ = hosts
+    place = {"domain": new_domain(), "lease": 1.0, "drop_lost": True}
+    stays = processes.add({**place, "listen": f"tcp/{address}:17447"}, prefix=first)
+    apart = processes.add({**place, "connect": f"tcp/{address}:17447"}, prefix=second, backend="trio")
+    meet(stays, apart)
+    stays.ask("statics", names=["map lidar"])
+    apart.ask("statics", names=["lidar"], authority="urdf")
+    stays.ask("until", static=["lidar"])
+    apart.ask("until", static=["map lidar"])
+    subprocess.run([*second, "ip", "link", "set", "eth0", "down"], check=True, timeout=PATIENCE)
+    assert stays.wait(event="PeerLost")["authorities"] == ["urdf"]
+    apart.wait(event="PeerLost")
+    stays.ask("until", lacks=["lidar"])
+    apart.ask("until", lacks=["map lidar"])
+    apart.ask("statics", names=["meanwhile"])
+    subprocess.run([*second, "ip", "link", "set", "eth0", "up"], check=True, timeout=PATIENCE)
+    stays.ask("until", static=["lidar", "meanwhile"])
+    apart.ask("until", static=["map lidar"])
+
+
+def test_hosts_that_are_told_no_address_stay_by_themselves(hosts: Hosts, processes: Crowd) -> None:
+    domain = {"domain": new_domain()}
+    (_, first), (_, second), _ = hosts
+    apart, one, two = (processes.add(domain, prefix=prefix) for prefix in (first, second, second))
+    meet(one, two)
+    apart.ask("statics", names=["apart"])
+    one.ask("statics", names=["together"])
+    two.ask("until", static=["together"])
+    assert two.ask("facts")["static"] == ["together"]
+    assert apart.ask("facts")["links"][0]["peers"] == 0
+
+
+def test_the_program_of_these_tests_says_what_is_wrong_with_it(processes: Crowd) -> None:
+    broken = processes.begin({"domain": "not a domain"})
+    with pytest.raises(EOFError, match="not a domain"):
+        broken.wait(event="ready")
+    assert Path(f"/proc/{broken.pid}").exists()

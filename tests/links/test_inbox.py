@@ -1,0 +1,623 @@
+import math
+import random
+import struct
+import sys
+from collections import Counter
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import groupby
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support import strategies as some
+from support.samples import moving, static
+from support.wires import size_of
+
+from tfbus import Buffer, Bus, BusClosedError, FrameAdded, SimulatedClock, TransformStamped
+from tfbus.bus._ownership import OnConflict
+from tfbus.links.attachment import MAX_ENTRIES, Entry, PublishedBatch, RemovedFrame, pack
+from tfbus.links.inbox import Inbox
+from tfbus.links.outbox import Outbox
+from tfbus.links.peers import MAX_AUTHORITIES, MAX_PEERS, Peers
+from tfbus.links.provenance import ReceivedTransform
+from tfbus.links.relay import join, leave
+from tfbus.tf_message import encode
+
+ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
+Batch = tuple[TransformStamped, ...]
+
+
+class Receiver:
+    """A bus with one link, what it has heard, and peers that write their messages by hand."""
+
+    def __init__(
+        self, frames: Collection[str] | None = None, max_frames: int = 10_000, on_conflict: OnConflict = "last"
+    ) -> None:
+        self.bus = Bus(SimulatedClock(), on_conflict)
+        self.heard: list[Batch] = []
+        self.bus.subscribe(self.heard.append)
+        self.reports: list[tuple[str, str]] = []
+        self.outbox = Outbox(None, lambda: None, lambda _: None)
+        self.peers = Peers(lambda peer, reason, _: self.reports.append((peer, reason)))
+        self.relay = join(self.bus, self.outbox)
+        self.inbox = Inbox(self.bus, self.relay, self.outbox, frames, max_frames, self.peers)
+
+    def receive(
+        self,
+        *samples: TransformStamped,
+        origin: bytes = ORIGIN,
+        sequence: int = 1,
+        number: int = 1,
+        sender: str = "peer",
+    ) -> None:
+        """One batch in a message of its own."""
+        self.inbox.receive(sender, encode(samples), pack(number, [batch(samples, origin, sequence)]))
+
+    def remove(
+        self, frame: str, origin: bytes = ORIGIN, sequence: int = 1, sender: str = "peer", lost: bool = False
+    ) -> None:
+        self.inbox.receive(sender, encode(()), pack(1, [RemovedFrame(origin, sequence, frame, lost)]))
+
+    @property
+    def frames(self) -> list[str]:
+        """The children that the bus knows."""
+        with self.bus.events() as events:
+            return [event.frame for event in iter(events.queue.get, None) if isinstance(event, FrameAdded)]
+
+    @property
+    def counts(self) -> tuple[int, int, int, int]:
+        """Messages, samples, duplicates, lost."""
+        return self.inbox.messages, self.inbox.samples, self.inbox.duplicates, self.inbox.lost
+
+
+@contextmanager
+def receiver(
+    frames: Collection[str] | None = None, max_frames: int = 10_000, on_conflict: OnConflict = "last"
+) -> Iterator[Receiver]:
+    made = Receiver(frames, max_frames, on_conflict)
+    yield made
+    leave(made.bus, made.outbox)
+
+
+def batch(samples: Sequence[TransformStamped], origin: bytes = ORIGIN, sequence: int = 1) -> PublishedBatch:
+    tags = groupby(samples, lambda sample: (sample.authority, sample.static))
+    return PublishedBatch(origin, sequence, tuple((*tag, len(list(run))) for tag, run in tags))
+
+
+def spoilt(samples: Sequence[TransformStamped], x: float = math.nan) -> bytes:
+    """A message in which every x that was 7 m is something else."""
+    return encode(samples).replace(struct.pack("<d", 7.0), struct.pack("<d", x))
+
+
+# Good messages.
+
+
+def test_a_message_is_published_batch_by_batch_with_everything_that_was_said() -> None:
+    first = [moving("map", "a", 1, 1.0, "slam"), static("a", "b", 2.0, 5), moving("map", "c", 2, authority="odometry")]
+    second = [moving("map", "a", 3, authority="slam")]
+    entries: list[Entry] = [batch(first, ORIGIN, 8), RemovedFrame(OTHER, 3, "c"), batch(second, ORIGIN, 9)]
+    with receiver() as here, Buffer(here.bus) as buffer:
+        here.inbox.receive("peer", encode([*first, *second]), pack(1, entries))
+        assert here.heard == [tuple(first), tuple(second)]
+        assert "c" not in buffer.tree
+        assert buffer.lookup_nowait("map", "b", 1).transform.translation == (3.0, 0.0, 0.0)
+        assert here.counts == (1, 4, 0, 0)
+        assert here.outbox.flush() == [], "nothing goes back where it came from"
+
+
+@given(samples=st.lists(some.samples(names=st.sampled_from("abc"), at=some.stamps(0, 2**60)), min_size=1, max_size=6))
+def test_what_was_published_there_is_published_here_to_the_bit(samples: list[TransformStamped]) -> None:
+    with receiver() as here, Bus(SimulatedClock()) as there:
+        heard: list[Batch] = []
+        there.subscribe(heard.append)
+        there.publish(samples, invalid="drop")
+        here.receive(*samples)
+        assert here.heard == heard
+        for got in here.heard:
+            assert all(type(sample) is ReceivedTransform and sample._source.origin == ORIGIN for sample in got)
+
+
+def test_an_empty_message_and_an_empty_batch_call_nobody() -> None:
+    with receiver() as here:
+        here.inbox.receive("peer", encode(()), pack(1, []))
+        here.inbox.receive("peer", encode(()), pack(2, [PublishedBatch(ORIGIN, 1, ())]))
+        assert (here.heard, here.counts) == ([], (2, 0, 0, 0))
+
+
+def test_only_wanted_frames_come_in_or_go() -> None:
+    with receiver(frames={"a", "s"}) as here, Buffer(here.bus) as buffer:
+        here.bus.publish(moving("map", "c", 1))
+        here.receive(moving("map", "a", 1), moving("map", "b", 1), static("map", "s"), sequence=1)
+        here.receive(moving("a", "b", 1), sequence=2)
+        here.remove("c", sequence=3)
+        assert here.heard[1:] == [(moving("map", "a", 1), static("map", "s"))]
+        here.remove("a", sequence=4)
+        assert {frame for frame in buffer.tree.frames() if buffer.tree.parent(frame)} == {"c", "s"}
+        assert here.counts == (4, 2, 0, 0)
+
+
+# Numbers.
+
+
+def numbers(*given: int, sender: str = "peer") -> tuple[Receiver, int]:
+    with receiver() as here:
+        for stamp, number in enumerate(given):
+            here.receive(moving("map", "a", stamp), sequence=stamp, number=number, sender=sender)
+        assert here.inbox.samples == len(given)
+        return here, here.inbox.lost
+
+
+@pytest.mark.parametrize(
+    ("given", "lost"),
+    [
+        ((1, 2, 3), 0),
+        ((1, 4, 5, 8), 4),
+        ((7, 8), 0),
+        ((1_000_000, 1_000_003), 2),
+        ((5, 1, 2, 3), 0),
+        ((5, 0, 0, 6), 0),
+        ((0, 0, 0), 0),
+        ((1, 3, 3, 3), 1),
+        ((1, 3, 2, 4), 1),
+        ((1, 2**64 - 1), 0),
+        ((1, 2**63, 2**64 - 1, 1, 2), 0),
+        ((2**64 - 1, 1), 0),
+    ],
+    ids=str,
+)
+def test_gaps_in_the_numbers_of_a_peer_are_messages_that_were_lost(given: tuple[int, ...], lost: int) -> None:
+    assert numbers(*given)[1] == lost
+
+
+def test_each_peer_has_numbers_of_its_own_and_begins_anew_when_it_comes_back() -> None:
+    here, lost = numbers(1, 2, 5)
+    assert lost == 2
+    here.receive(moving("map", "b", 1), sequence=1, number=9, sender="other")
+    assert here.inbox.lost == 2
+    here.peers.forget("peer")
+    here.receive(moving("map", "b", 1), sequence=2, number=1)
+    here.receive(moving("map", "b", 1), sequence=3, number=3)
+    assert here.inbox.lost == 3
+
+
+# What has come already.
+
+
+def test_what_comes_again_or_late_is_counted_and_not_published() -> None:
+    with receiver() as here:
+        for sequence, stamp in ((5, 10), (5, 10), (4, 9), (6, 8), (1, 1)):
+            here.receive(moving("map", "a", stamp), moving("map", f"new in {sequence}", 1), sequence=sequence)
+        assert [[sample.child for sample in heard] for heard in here.heard] == [
+            ["a", "new in 5"],
+            ["new in 4"],
+            ["a", "new in 6"],
+            ["new in 1"],
+        ]
+        assert here.counts == (5, 6, 4, 0)
+
+
+def test_other_origins_are_other_sources() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 10), origin=ORIGIN, sequence=5)
+        here.receive(moving("map", "a", 9), origin=OTHER, sequence=1)
+        assert here.counts == (2, 2, 0, 0)
+
+
+# What was removed.
+
+
+def test_an_older_removal_does_not_take_what_is_newer() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 5), sequence=5)
+        here.remove("a", sequence=4)
+        assert here.bus.statistics().frames == 1
+        here.remove("a", sequence=6)
+        assert here.bus.statistics().frames == 0
+
+
+def test_what_was_removed_comes_back_only_with_a_higher_number() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1)
+        here.remove("a", sequence=3)
+        here.receive(moving("map", "a", 2), sequence=2)
+        here.receive(moving("map", "a", 3), sequence=3)
+        assert here.bus.statistics().frames == 0
+        here.receive(moving("map", "a", 4), sequence=4)
+        assert here.bus.statistics().frames == 1
+        assert here.counts[1:3] == (2, 2)
+
+
+def test_a_removal_that_overtakes_what_it_removes_is_remembered() -> None:
+    with receiver() as here:
+        here.remove("a", sequence=2)
+        here.receive(moving("map", "a", 1), moving("map", "b", 1), sequence=1)
+        assert [[sample.child for sample in heard] for heard in here.heard] == [["b"]]
+
+
+def test_a_removal_that_comes_twice_does_not_take_what_somebody_else_has_published_since() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1)
+        here.remove("a", sequence=2)
+        here.receive(moving("map", "a", 1), origin=OTHER)
+        here.remove("a", sequence=2)
+        assert here.bus.statistics().frames == 1
+        here.bus.remove_frame("a")
+        here.bus.publish(static("map", "a"))
+        here.remove("a", sequence=2)
+        assert here.bus.statistics().frames == 1
+
+
+def test_who_removes_what_others_publish_removes_their_samples_up_to_now() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 5), sequence=5)
+        here.remove("a", origin=OTHER, sequence=1)
+        here.receive(moving("map", "a", 4), sequence=4)
+        here.receive(moving("map", "a", 5), sequence=5)
+        assert here.bus.statistics().frames == 0
+        here.receive(moving("map", "a", 6), sequence=6)
+        here.bus.remove_frame("a")
+        here.receive(moving("map", "a", 6), sequence=6)
+        assert here.bus.statistics().frames == 0
+
+
+def test_of_very_many_removals_the_highest_number_is_remembered_for_live_messages() -> None:
+    with receiver() as here:
+        for start in (10, 6_010):
+            entries: list[Entry] = [RemovedFrame(ORIGIN, start + n, f"{start + n}") for n in range(6_000)]
+            here.inbox.receive("peer", encode(()), pack(start, entries))
+        here.receive(moving("map", "10", 1), sequence=9, number=20_000)
+        here.receive(moving("map", "new", 1), sequence=8, number=20_001)
+        assert here.heard == []
+        here.receive(moving("map", "new", 1), origin=OTHER, sequence=8, number=20_002)
+        here.receive(static("map", "old"), sequence=1, number=0)
+        here.receive(moving("map", "10", 1), sequence=20_000, number=20_003)
+        assert [[sample.child for sample in heard] for heard in here.heard] == [["new"], ["old"], ["10"]]
+
+
+def test_removals_of_very_many_origins_are_not_remembered_without_end() -> None:
+    with receiver() as here:
+        for number in range(15_000):
+            here.remove("a", origin=number.to_bytes(16))
+        assert 10_000 <= size_of(here.relay) < 11_100
+
+
+def test_the_loss_of_a_frame_is_about_what_that_peer_has_brought() -> None:
+    with receiver() as here:
+        for name in "abcd":
+            here.receive(moving("map", name, 1), sequence=1, sender="bridge")
+        here.receive(moving("map", "b", 1), sequence=2, sender="other")
+        here.bus.publish(static("map", "c"))
+        for name in "abcde":
+            here.remove(name, origin=OTHER, sequence=9, sender="bridge", lost=True)
+        assert set(here.frames) == {"b", "c"}
+        here.receive(moving("map", "d", 0), sequence=0, sender="bridge")
+        here.receive(moving("map", "d", 1), sequence=1, sender="other")
+        assert set(here.frames) == {"b", "c"}, "what is still on its way does not bring it back"
+        here.receive(moving("map", "d", 1), sequence=1, sender="bridge")
+        assert set(here.frames) == {"b", "c", "d"}, "but who had lost it has it again"
+        here.remove("d", origin=OTHER, sequence=9, sender="bridge", lost=True)
+        here.receive(moving("map", "d", 1), sequence=1, sender="new")
+        assert set(here.frames) == {"b", "c", "d"}, "and so has who has come since then"
+
+
+def test_after_a_loss_a_removal_counts_as_ever() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=18)
+        here.remove("a", origin=OTHER, sequence=20)
+        here.receive(moving("map", "a", 1), sequence=19)
+        here.remove("a", origin=OTHER, sequence=15, lost=True)
+        assert here.frames == []
+        here.receive(moving("map", "a", 1), origin=OTHER, sequence=18)
+        assert here.frames == []
+        here.receive(moving("map", "a", 1), sequence=19)
+        assert here.frames == ["a"]
+        here.remove("a", sequence=30)
+        here.receive(moving("map", "a", 1), sequence=19)
+        assert here.frames == []
+
+
+@pytest.mark.parametrize("drop", [True, False])
+def test_when_a_peer_is_lost_only_who_comes_later_may_say_the_same_again(drop: bool) -> None:
+    with receiver() as here:
+        here.receive(moving("map", "b", 1), sequence=1, sender="old")
+        here.receive(moving("map", "a", 5), sequence=5)
+        lost = here.peers.forget("peer")
+        assert lost is not None
+        assert here.relay.lose(lost, here.outbox, drop) == ("a",)
+        here.receive(moving("map", "a", 5), sequence=5, sender="old")
+        here.receive(moving("map", "a", 4), sequence=4, sender="new")
+        assert here.counts[1:3] == (2, 2)
+        here.receive(moving("map", "a", 5), sequence=5)
+        assert here.counts[1:3] == (3, 2)
+        here.receive(moving("map", "a", 5), sequence=5, sender="new")
+        assert here.counts[1:3] == (3, 3)
+
+
+def test_the_highest_of_all_sequences_does_no_harm() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=2**64 - 1)
+        here.receive(moving("map", "a", 2), sequence=2**64 - 1)
+        here.remove("a", sequence=2**64 - 1)
+        here.receive(moving("map", "a", 3), origin=OTHER)
+        assert here.counts[1:3] == (2, 1)
+
+
+def test_what_this_bus_has_published_itself_is_no_news() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), origin=here.relay.origin, sequence=100)
+        here.bus.publish(static("map", "s"))
+        here.remove("s", origin=here.relay.origin, sequence=2**64 - 1)
+        assert here.heard == [(static("map", "s"),)]
+        assert here.counts == (2, 0, 1, 0)
+
+
+# Refusals.
+
+
+def test_what_is_wrong_with_a_sample_is_counted_by_reason_while_the_rest_of_its_batch_goes() -> None:
+    samples = [moving("map", "a", 1), moving("map", "bad", 1, 7.0), moving("map", "b", 1), moving("map", "bad", 2, 7.0)]
+    with receiver() as here:
+        entries = [batch(samples[:3]), batch(samples[3:], sequence=2)]
+        for number in (1, 2):
+            here.inbox.receive("peer", spoilt(samples), pack(number, entries))
+        assert here.heard == [(samples[0], samples[2])]
+        assert here.peers.rejected == {"not finite": 4}
+        assert here.reports == [("peer", "not finite")]
+        assert here.counts == (2, 2, 2, 0)
+
+
+def test_what_only_the_bus_can_judge_is_refused_and_counted_there() -> None:
+    with receiver(on_conflict="reject") as here:
+        here.bus.publish([moving("map", "a", 1), moving("map", "mine", 1, authority="slam")])
+        with here.bus.reserve("tool", authority="arm"):
+            here.receive(
+                moving("a", "map", 2),
+                moving("map", "mine", 2, authority="rogue"),
+                moving("map", "tool", 2, authority="rogue"),
+                moving("map", "b", 2),
+            )
+        assert here.heard[1:] == [(moving("map", "b", 2),)]
+        assert here.bus.statistics().rejected == {"cycle": 1, "authority": 1, "reserved": 1}
+        assert here.peers.rejected == {}
+
+
+def test_samples_that_close_a_loop_one_after_the_other_are_refused_and_the_bus_goes_on() -> None:
+    with receiver() as here:
+        here.receive(moving("a", "b", 1), moving("b", "c", 1), sequence=1)
+        here.receive(moving("c", "a", 2), moving("x", "y", 2), moving("y", "x", 2), moving("map", "x", 2), sequence=2)
+        here.receive(moving("map", "a", 3), moving("a", "b", 3), sequence=3)
+        assert here.heard[1:] == [
+            (moving("x", "y", 2), moving("y", "x", 2), moving("map", "x", 2)),
+            (moving("map", "a", 3), moving("a", "b", 3)),
+        ]
+        assert here.bus.statistics().rejected == {"cycle": 1}
+
+
+def wrong(number: int, *entries: Entry, samples: Sequence[TransformStamped] = ()) -> tuple[bytes, bytes]:
+    return encode(samples), pack(number, entries)
+
+
+TWO = [moving("map", "a", 1), moving("map", "b", 1)]
+MALFORMED = [
+    pytest.param(encode(TWO), b"", "version", id="no attachment"),
+    pytest.param(encode(TWO), b"\2" + bytes(15), "version", id="another version"),
+    pytest.param(encode(TWO), pack(1, [batch(TWO)])[:-1], "attachment", id="cut off"),
+    pytest.param(b"", pack(1, [batch(TWO)]), "truncated", id="no message"),
+    pytest.param(encode(TWO)[:-1], pack(1, [batch(TWO)]), "truncated", id="a message cut off"),
+    pytest.param(encode(TWO) + bytes(4), pack(1, [batch(TWO)]), "oversized", id="a message with more behind it"),
+    pytest.param(b"\0\3" + encode(TWO)[2:], pack(1, [batch(TWO)]), "encoding", id="another encoding"),
+    pytest.param(encode(TWO), pack(1, [batch(TWO[:1])]), "tags", id="a batch too small"),
+    pytest.param(encode(TWO), pack(1, [batch(TWO), batch(TWO[:1])]), "tags", id="a batch too many"),
+    pytest.param(encode(TWO), pack(1, []), "tags", id="no batch"),
+    pytest.param(
+        encode(TWO), pack(1, [PublishedBatch(ORIGIN, 1, (("", False, 2**32 - 1),) * 60_000)]), "tags", id="billions"
+    ),
+]
+
+
+@pytest.mark.parametrize(("payload", "attachment", "reason"), MALFORMED)
+def test_nothing_is_taken_of_what_is_no_message(payload: bytes, attachment: bytes, reason: str) -> None:
+    with receiver() as here:
+        for _ in range(3):
+            here.inbox.receive("peer", payload, attachment)
+        assert (here.heard, here.counts) == ([], (0, 0, 0, 0))
+        assert here.peers.rejected == {reason: 3}
+        assert here.reports == [("peer", reason)]
+        here.receive(*TWO)
+        assert here.heard == [tuple(TWO)]
+
+
+# Limits.
+
+
+def test_a_peer_has_so_many_frames_and_the_rest_is_refused_and_counted() -> None:
+    with receiver(max_frames=3) as here:
+        here.receive(*[moving("map", f"{number}", 1) for number in range(5)], sequence=1)
+        here.receive(*[moving("map", f"{number}", 2) for number in range(5)], sequence=2)
+        assert [[sample.child for sample in heard] for heard in here.heard] == [["0", "1", "2"]] * 2
+        assert here.peers.rejected == {"too many frames": 4}
+        assert here.counts == (2, 6, 0, 0)
+        here.receive(moving("map", "3", 1), sender="other", sequence=3)
+        assert here.inbox.samples == 7, "what one peer has is nothing to another"
+
+
+def test_several_samples_of_one_frame_in_a_batch_are_one_frame() -> None:
+    with receiver(max_frames=2) as here:
+        samples = [moving("map", name, stamp) for stamp in range(3) for name in "abc"]
+        here.receive(*samples)
+        assert here.heard == [tuple(sample for sample in samples if sample.child != "c")]
+        assert here.peers.rejected == {"too many frames": 3}
+
+
+def test_many_origins_do_not_get_around_the_limit() -> None:
+    with receiver(max_frames=10) as here:
+        for number in range(1_000):
+            here.receive(moving("map", "a", number), origin=number.to_bytes(16), sequence=number)
+            here.receive(moving("map", f"{number}", 1), origin=number.to_bytes(16), sequence=number)
+        assert here.bus.statistics().frames <= 10
+        assert here.inbox.samples == 10
+        assert size_of(here.relay) < 100
+        assert here.peers.rejected == {"too many frames": 1_990}
+
+
+def test_frames_are_given_back_by_whoever_removes_them() -> None:
+    with receiver(max_frames=2) as here:
+        for number in range(20):
+            here.receive(moving("map", f"{number}", 1), moving("map", f"{number} too", 1), sequence=10 * number)
+            here.remove(f"{number}", sequence=10 * number + 1)
+            here.bus.remove_frame(f"{number} too")
+        assert here.inbox.samples == 40
+        assert here.peers.rejected == {}
+
+
+def test_frames_that_the_bus_refused_are_given_back_with_their_removal_too() -> None:
+    with receiver(max_frames=2) as here:
+        here.bus.publish(moving("map", "base", 1))
+        for number in range(20):
+            here.receive(moving("base", "map", 1), moving("base", f"x{number}", 1), sequence=10 * number)
+            here.remove("map", sequence=10 * number + 1)
+            here.remove(f"x{number}", sequence=10 * number + 2)
+        assert here.bus.statistics().rejected == {"cycle": 20}
+        assert here.inbox.samples == 40
+        assert here.peers.rejected == {}
+
+
+def test_frames_are_given_back_when_the_peer_is_lost() -> None:
+    with receiver(max_frames=2) as here:
+        for number in range(20):
+            here.receive(moving("map", f"{number}", 1), moving("map", f"{number} too", 1), sequence=number)
+            peer = here.peers.forget("peer")
+            assert peer is not None
+            here.relay.lose(peer, here.outbox, drop=number % 2 == 0)
+            assert peer.frames == set()
+        assert here.inbox.samples == 40
+
+
+def test_a_peer_speaks_for_so_many_authorities_and_batches_of_others_are_refused_and_counted() -> None:
+    with receiver() as here:
+        for number in range(MAX_AUTHORITIES + 3):
+            sample = moving("map", "a", number, authority=f"{number}")
+            here.receive(sample, moving("map", "b", number, authority="0"), sequence=number)
+        assert here.inbox.samples == 2 * MAX_AUTHORITIES
+        assert here.peers.rejected == {"too many authorities": 6}
+        here.receive(moving("map", "a", 1, authority="7"), sequence=10**6)
+        here.receive(moving("map", "a", 1, authority="new"), sequence=10**6 + 1, sender="other")
+        assert here.inbox.samples == 2 * MAX_AUTHORITIES + 2
+        found = here.peers.find("peer")
+        assert found is not None
+        assert found.authorities == {f"{number}" for number in range(MAX_AUTHORITIES)}
+
+
+def test_there_are_so_many_peers_and_what_others_send_is_refused_and_counted() -> None:
+    with receiver() as here:
+        for number in range(MAX_PEERS + 5):
+            here.receive(moving("map", "a", number), sequence=number, sender=f"{number}")
+        assert here.inbox.samples == MAX_PEERS
+        assert here.peers.rejected == {"too many peers": 5}
+        assert here.reports == [(f"{MAX_PEERS}", "too many peers")]
+
+
+def test_removals_of_what_nobody_knows_do_not_trouble_the_bus() -> None:
+    entries: list[Entry] = [RemovedFrame(ORIGIN, number, f"no {number}") for number in range(MAX_ENTRIES)]
+    calls: Counter[str] = Counter()
+    with receiver() as here:
+        here.bus.publish(moving("map", "a", 1))
+        here.outbox.flush()
+        sys.setprofile(lambda frame, event, _: calls.update([frame.f_code.co_name] if event == "call" else []))
+        try:
+            here.inbox.receive("peer", encode(()), pack(1, entries))
+            here.remove("a", sequence=MAX_ENTRIES)
+        finally:
+            sys.setprofile(None)
+        assert calls["remove_frame"] == 1, "it would look at all names for each"
+        assert here.bus.statistics().frames == 0
+        assert here.outbox.flush() == []
+
+
+# The end.
+
+
+def test_a_closed_bus_takes_nothing_in() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1))
+        here.bus.close()
+        here.receive(moving("map", "a", 2), sequence=2)
+        here.remove("a", sequence=3)
+        assert here.heard == [(moving("map", "a", 1),)]
+        assert here.counts == (1, 1, 0, 0)
+
+
+def test_a_subscriber_that_closes_the_bus_in_the_middle_of_a_message_ends_it() -> None:
+    with receiver() as here:
+        here.bus.subscribe(lambda _: here.bus.close())
+        samples = [moving("map", "a", stamp) for stamp in range(3)]
+        entries: list[Entry] = [batch(samples[:1]), RemovedFrame(ORIGIN, 2, "a"), batch(samples[1:], sequence=3)]
+        here.inbox.receive("peer", encode(samples), pack(1, entries))
+        assert here.heard == [tuple(samples[:1])]
+        with pytest.raises(BusClosedError):
+            here.bus.publish(samples)
+
+
+def test_a_peer_that_is_lost_when_the_bus_is_closed_does_no_harm() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1))
+        peer = here.peers.forget("peer")
+        here.bus.close()
+        assert peer is not None
+        assert here.relay.lose(peer, here.outbox, drop=True) == ("a",)
+
+
+# Anything at all.
+
+
+def test_many_damaged_messages_do_no_harm() -> None:
+    chance = random.Random(2)
+    samples = [moving("map", "a", 1, authority="slam"), static("a", "b"), moving("b", "c", 1), moving("map", "d", 2)]
+    entries: list[Entry] = [batch(samples[:2]), RemovedFrame(OTHER, 1, "c"), batch(samples[2:], OTHER, 2)]
+    payload, attachment = encode(samples), pack(1, entries)
+    with receiver(max_frames=50) as here:
+        here.bus.subscribe(lambda _: None, lambda _: None)
+        for _ in range(5_000):
+            parts = [bytearray(payload), bytearray(attachment)]
+            for _ in range(chance.randrange(1, 4)):
+                part = parts[chance.randrange(2)]
+                part[chance.randrange(len(part))] = chance.randrange(256)
+            here.inbox.receive(f"peer {chance.randrange(3)}", bytes(parts[0]), bytes(parts[1]))
+        assert here.bus.statistics().callbacks_failed == 0
+        assert here.inbox.messages > 1_000
+        assert sum(here.peers.rejected.values()) > 1_000
+        assert here.bus.statistics().frames <= 150
+
+
+names = st.sampled_from(("a", "b", "c", "map", "", "/a", "\0", "x" * 2_000))
+any_batch = st.builds(
+    PublishedBatch,
+    st.sampled_from((ORIGIN, OTHER)),
+    st.integers(0, 5) | st.integers(0, 2**64 - 1),
+    st.lists(st.tuples(st.sampled_from(("", "slam")), st.booleans(), st.integers(0, 2)), max_size=2).map(tuple),
+)
+any_removal = st.builds(RemovedFrame, st.sampled_from((ORIGIN, OTHER)), st.integers(0, 5), names, st.booleans())
+
+
+@given(
+    messages=st.lists(
+        st.tuples(st.lists(any_batch | any_removal, max_size=4), st.integers(0, 2**64 - 1), st.sampled_from("pq")),
+        max_size=5,
+    ),
+    data=st.data(),
+)
+def test_messages_of_any_content_do_no_harm(messages: list[tuple[list[Entry], int, str]], data: st.DataObject) -> None:
+    with receiver(max_frames=2) as here:
+        for entries, number, sender in messages:
+            count = sum(entry.count for entry in entries if isinstance(entry, PublishedBatch))
+            count += data.draw(st.sampled_from((0, 0, 0, 1)))
+            wanted = [
+                data.draw(some.samples(names=st.sampled_from("abcd"), at=st.integers(0, 9))) for _ in range(count)
+            ]
+            try:
+                attachment = pack(number, entries)
+            except ValueError:
+                continue
+            here.inbox.receive(sender, encode(wanted), attachment)
+        assert here.inbox.samples == sum(map(len, here.heard)) + sum(here.bus.statistics().rejected.values())

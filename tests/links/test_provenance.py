@@ -1,0 +1,82 @@
+import copy
+import pickle
+import struct
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from support import strategies as some
+from support.samples import moving
+
+from tfbus import SECOND, Buffer, Bus, SimulatedClock, TransformStamped
+from tfbus.links.peers import Peer
+from tfbus.links.provenance import ReceivedTransform, Source
+from tfbus.tf_message import decode, encode
+
+SOURCE = Source(b"0123456789abcdef", 7, object(), Peer("other"))
+SHARED: list[Callable[[TransformStamped], TransformStamped]] = [
+    copy.copy,
+    copy.deepcopy,
+    *[lambda sample, n=n: pickle.loads(pickle.dumps(sample, n)) for n in range(2, pickle.HIGHEST_PROTOCOL + 1)],
+]
+
+
+def received(sample: TransformStamped) -> ReceivedTransform:
+    """The same sample as if it had come over a link."""
+    (twin,) = decode(encode([sample]), [(sample.authority, sample.static)], ReceivedTransform).samples
+    assert twin is not None
+    twin._source = SOURCE
+    return twin
+
+
+def bits(sample: TransformStamped) -> tuple[object, ...]:
+    """Everything in a sample, with numbers that only a bit tells apart kept apart."""
+    parent, child, stamp, row, authority, static = sample._fields
+    return parent, child, stamp, struct.pack("<7d", *row), authority, static
+
+
+@given(sample=some.samples(at=some.stamps(0, 2**31 * SECOND - 1)))
+def test_it_is_equal_to_a_sample_that_was_never_on_a_link(sample: TransformStamped) -> None:
+    twin = received(sample)
+    assert twin == sample
+    assert sample == twin
+    assert {sample: 1}[twin] == 1
+    assert {twin, sample} == {sample}
+    assert (repr(twin), str(twin)) == (repr(sample), str(sample))
+    assert isinstance(twin, TransformStamped)
+
+
+def test_another_sample_is_another_one_wherever_it_came_from() -> None:
+    assert received(moving("map", "a", 1)) != moving("map", "a", 2)
+    assert received(moving("map", "a", 1)) != "a"
+
+
+@pytest.mark.parametrize("share", SHARED)
+@given(sample=some.samples(at=some.stamps(0, 2**31 * SECOND - 1)))
+def test_a_copy_is_a_plain_sample_bit_for_bit(
+    share: Callable[[TransformStamped], TransformStamped], sample: TransformStamped
+) -> None:
+    twin = share(received(sample))
+    assert type(twin) is TransformStamped
+    assert bits(twin) == bits(sample)
+
+
+def test_a_quaternion_that_is_a_little_off_is_normalised_once_and_then_copied_as_it_is() -> None:
+    message = bytearray(encode([moving("map", "a", 1)]))
+    message[-32:] = struct.pack("<4d", 0.1, 0.2, 0.3, 0.93)
+    (twin,) = decode(bytes(message), None, ReceivedTransform).samples
+    assert twin is not None
+    for share in SHARED:
+        assert bits(share(twin)) == bits(twin)
+
+
+def test_a_sample_with_a_change_is_a_plain_one() -> None:
+    changed = received(moving("map", "a", 1, 2.0, "odometry")).replace(stamp=5)
+    assert type(changed) is TransformStamped
+    assert changed == moving("map", "a", 5, 2.0, "odometry")
+
+
+def test_what_a_buffer_answers_has_no_way_here() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        bus.publish([received(moving("map", "a", 1))])
+        assert type(buffer.lookup_nowait("map", "a", 1)) is TransformStamped

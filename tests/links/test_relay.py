@@ -1,0 +1,795 @@
+import gc
+import weakref
+from collections.abc import Callable
+from functools import partial
+from itertools import combinations
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.samples import moving, static
+from support.wires import (
+    CHAIN,
+    CIRCLE,
+    MESH,
+    PAIR,
+    RING,
+    RING_WITH_A_TAIL,
+    TWO_BRIDGES,
+    Domain,
+    Graph,
+    Network,
+    latched,
+    size_of,
+)
+
+from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
+from tfbus.links import relay as relay_module
+from tfbus.links.relay import join
+
+Step = tuple[str, int, int, list[int]]
+"""What happens, to whom, where, and a few numbers to do it with."""
+
+graphs = pytest.mark.parametrize(
+    "graph", [MESH, CHAIN, RING, CIRCLE, TWO_BRIDGES], ids=["mesh", "chain", "ring", "circle", "two bridges"]
+)
+
+
+def frames_of(bus: Bus) -> set[str]:
+    """The children that a bus knows now, through what it would tell a new reader of events."""
+    with bus.events() as events:
+        return {event.frame for event in iter(events.queue.get, None) if hasattr(event, "frame")}
+
+
+# What is published.
+
+
+@graphs
+def test_what_is_published_anywhere_is_heard_everywhere_once_and_as_it_was(graph: Graph) -> None:
+    with Network(graph) as net:
+        for member, bus in enumerate(net.buses):
+            bus.publish(
+                [
+                    moving("map", f"a{member}", 5, 1.0, "odometry"),
+                    static("map", f"s{member}", authority="calibration"),
+                    moving("map", f"a{member}", 4, 2.0),
+                ]
+            )
+            bus.publish(moving("map", f"b{member}", 6))
+        net.settle()
+        for member, bus in enumerate(net.buses):
+            assert len(net.published(member)) == 2
+            assert bus.statistics().samples == 4 * len(net.buses)
+            for origin in set(range(len(net.buses))) - {member}:
+                assert net.received(member, origin) == net.published(origin)
+
+
+@graphs
+def test_who_joins_late_has_all_that_is_static_and_nothing_else(graph: Graph) -> None:
+    with Network(graph) as net:
+        for member, bus in enumerate(net.buses):
+            bus.publish([moving("map", f"a{member}", 1), static("map", f"s{member}", float(member))])
+        net.settle()
+        late = [net.add_bus() for _ in net.domains]
+        for bus, domain in zip(late, net.domains, strict=True):
+            domain.join(bus)
+        net.settle()
+        expected = {f"s{member}": static("map", f"s{member}", float(member)) for member in range(len(net.buses))}
+        for bus in late:
+            assert frames_of(bus) == set(latched(bus))
+            assert latched(bus).items() <= expected.items()
+            assert len(latched(bus)) == len(net.buses) - len(late)
+
+
+def test_a_link_that_begins_later_brings_what_is_latched_to_another_domain() -> None:
+    with Network(PAIR) as net:
+        net.buses[0].publish([static("map", "s"), static("map", "t")])
+        net.buses[1].publish(static("map", "u"))
+        net.settle()
+        other = Domain()
+        net.domains.append(other)
+        far = net.add_bus()
+        other.join(far)
+        other.join(net.buses[1])
+        net.settle()
+        assert latched(far) == latched(net.buses[0])
+        assert [bus.statistics().samples for bus in net.buses[:2]] == [3, 3]
+
+
+def test_samples_of_several_origins_in_one_batch_keep_their_origins() -> None:
+    with Network(RING) as net:
+        a, b, c = net.buses
+        a.publish(moving("map", "a", 1))
+        b.publish(moving("map", "b", 1))
+        net.settle()
+        mixed = [net.received(2, 0)[0][0], moving("map", "c", 1), net.received(2, 1)[0][0], moving("map", "d", 1)]
+        c.publish(mixed)
+        net.settle()
+        assert [bus.statistics().samples for bus in (a, b, c)] == [4, 4, 6]
+
+
+@graphs
+def test_who_passes_on_what_a_stream_gives_does_not_start_a_loop(graph: Graph) -> None:
+    with Network(graph) as net:
+        streams = [bus.stream(capacity=100, overflow="drop_oldest") for bus in net.buses]
+        for member, bus in enumerate(net.buses):
+            bus.publish([moving("map", f"a{member}", 1), static("map", f"s{member}")])
+        net.settle()
+        for bus, stream in zip(net.buses, streams, strict=True):
+            for _ in range(len(net.buses)):
+                batch = stream.queue.get()
+                assert batch is not None
+                if any(type(sample) is not TransformStamped for sample in batch):
+                    bus.publish(batch)
+        net.settle()
+        passed_on = 2 * (len(net.buses) - 1)
+        assert [bus.statistics().samples for bus in net.buses] == [2 * len(net.buses) + passed_on] * len(net.buses)
+        assert all(latched(bus) == latched(net.buses[0]) for bus in net.buses)
+
+
+def test_what_is_changed_on_its_way_is_somebody_elses() -> None:
+    with Network(CHAIN) as net:
+        net.buses[0].publish(moving("map", "a", 1))
+        net.settle()
+        (sample,) = net.received(1, 0)[0]
+        net.buses[1].publish(sample.replace(child="b"))
+        net.settle()
+        assert net.received(0, 1) == net.received(3, 1) == [(moving("map", "b", 1),)]
+
+
+def test_links_of_one_bus_may_be_for_different_frames() -> None:
+    with Network([[0], [1]]) as net:
+        bus = net.add_bus()
+        net.domains[0].join(bus, frames={"a", "b"})
+        net.domains[1].join(bus, frames={"b", "c"})
+        for member in (0, 1):
+            net.buses[member].publish([static("map", name, float(member)) for name in "abc"])
+            net.settle()
+        assert sorted(net.received(2, 0)[0], key=str) == [static("map", name) for name in "ab"]
+        assert sorted(net.received(2, 1)[0], key=str) == [static("map", name, 1.0) for name in "bc"]
+        assert net.received(0, 1) == [(static("map", "b", 1.0),)]
+        assert net.received(1, 0) == [(static("map", "b"),)]
+
+
+# What is removed.
+
+
+@graphs
+@pytest.mark.parametrize("removes", [0, -1])
+def test_a_removed_frame_goes_everywhere_and_comes_back_with_newer_samples(graph: Graph, removes: int) -> None:
+    with Network(graph) as net:
+        for stamp in range(3):
+            net.buses[0].publish([static("map", "s", float(stamp)), moving("map", "a", stamp)])
+            net.settle()
+            assert [frames_of(bus) for bus in net.buses] == [{"s", "a"}] * len(net.buses)
+            net.buses[removes].remove_frame("s")
+            net.buses[removes].remove_frame("a")
+            net.settle()
+            assert [frames_of(bus) for bus in net.buses] == [set()] * len(net.buses)
+        assert [bus.statistics().samples for bus in net.buses] == [6] * len(net.buses)
+
+
+@graphs
+@pytest.mark.parametrize("removes", [0, -1])
+def test_nobody_keeps_a_removed_static_frame_for_late_joiners(graph: Graph, removes: int) -> None:
+    with Network(graph) as net:
+        net.buses[0].publish([static("map", "s"), static("map", "t")])
+        net.settle()
+        net.buses[removes].remove_frame("s")
+        net.settle()
+        for end in net.ends:
+            end.bury()
+            assert set(end.cache) <= {"t"}
+        for domain in net.domains:
+            late = net.add_bus()
+            domain.join(late)
+            net.settle()
+            assert set(latched(late)) == {"t"}
+
+
+def test_what_is_kept_for_late_joiners_is_what_was_published_last_by_whomever() -> None:
+    with Network(MESH) as net:
+        for member in (2, 0, 3):
+            newest = static("map", "s", float(member))
+            net.buses[member].publish(newest)
+            net.settle()
+            late = net.add_bus()
+            net.domains[0].join(late)
+            net.settle()
+            assert latched(late) == {"s": newest}
+        net.buses[1].publish(moving("map", "s", 1))
+        net.settle()
+        assert [end.cache for end in net.ends] == [{}] * len(net.ends)
+
+
+def test_the_second_bridge_does_not_keep_what_the_first_one_told_it_was_removed() -> None:
+    with Network(TWO_BRIDGES) as net:
+        source, first, second, _ = net.buses
+        source.publish(static("map", "s"))
+        net.settle()
+        source.remove_frame("s")
+        net.send(source)
+        inner, outer = net.domains
+        ends = {id(domain): {end.bus: end for end in domain.ends} for domain in net.domains}
+        for domain, sender, receiver in ((inner, source, first), (outer, first, second)):
+            wire = domain.wires[ends[id(domain)][sender], ends[id(domain)][receiver]]
+            while wire.packets:
+                wire.deliver()
+            net.send(receiver)
+        net.settle()
+        for end in net.ends:
+            end.bury()
+            assert end.cache == {}
+
+
+def test_a_copy_on_a_slower_way_does_not_bring_a_removed_frame_back() -> None:
+    with Network(RING) as net:
+        a, b, c = net.buses
+        ends = [end for end in net.domains[1].ends if end.bus is c]
+        slow = net.domains[1].wires[ends[0], next(end for end in net.domains[1].ends if end.bus is b)]
+        for stamp in range(3):
+            a.publish([moving("map", "a", stamp), static("map", "s", float(stamp))])
+            a.remove_frame("a")
+            a.remove_frame("s")
+        for _ in range(10):
+            for bus in net.buses:
+                net.send(bus)
+            for wire in net.wires:
+                while wire.packets and wire is not slow:
+                    wire.deliver()
+        assert b.statistics().samples == 6
+        assert len(slow.packets) > 1
+        net.settle()
+        assert [bus.statistics().samples for bus in net.buses] == [6, 6, 6]
+        assert [frames_of(bus) for bus in net.buses] == [set()] * 3
+
+
+def test_more_removals_at_once_than_are_remembered_do_not_go_round_a_ring_for_ever() -> None:
+    with Network(RING_WITH_A_TAIL) as net:
+        source = net.buses[3]
+        for number in range(12_000):
+            source.publish(moving("map", f"{number}", 1))
+            source.remove_frame(f"{number}")
+        net.settle()
+        assert [bus.statistics().samples for bus in net.buses] == [12_000] * 4
+        source.publish([moving("map", "0", 1), static("map", "s")])
+        net.settle()
+        assert [frames_of(bus) for bus in net.buses] == [{"0", "s"}] * 4
+
+
+def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> None:
+    with Network(RING) as net:
+        relays = {end.relay for end in net.ends}
+        for turn in range(75):
+            source = net.buses[turn % 3]
+            names = [f"{turn} {number}" for number in range(400)]
+            source.publish([(static if turn % 2 else moving)("map", name, stamp=1) for name in names])
+            net.settle()
+            for number, name in enumerate(names):
+                net.buses[number % 3].remove_frame(name)
+            net.settle()
+            for end in net.ends:
+                end.bury()
+        assert [bus.statistics().frames for bus in net.buses] == [0, 0, 0]
+        for relay in relays:
+            assert 1_000 < size_of(relay) <= 10_020, "what was removed last is remembered, and it is not without end"
+        for end in net.ends:
+            assert size_of(end.outbox) == 0
+            assert end.cache == {}
+            assert all(peer.frames == set() for peer in end.peers.forget_all())
+
+
+def test_what_a_subscriber_removes_on_hearing_of_a_removal_is_removed_everywhere() -> None:
+    with Network(MESH) as net:
+        a, b, *_ = net.buses
+        careful = Bus(SimulatedClock())
+        careful.subscribe(lambda _: None, lambda frame: careful.remove_frame("tool") if frame == "arm" else None)
+        net.buses.append(careful)
+        net.domains[0].join(careful)
+        a.publish([static("map", "arm"), static("arm", "tool")])
+        net.settle()
+        b.remove_frame("arm")
+        net.settle()
+        assert [frames_of(bus) for bus in net.buses] == [set()] * 5
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_what_a_subscriber_publishes_on_hearing_of_a_removal_stays(early: bool) -> None:
+    with Network(MESH) as net:
+        keeper = Bus(SimulatedClock())
+        net.buses.append(keeper)
+        again = static("map", "s", 2.0)
+        keep: Callable[[], object] = partial(keeper.subscribe, lambda _: None, lambda _: keeper.publish(again))
+        if early:
+            keep()
+        net.domains[0].join(keeper)
+        if not early:
+            keep()
+        keeper.publish(static("map", "s", 1.0))
+        net.settle()
+        net.buses[0].remove_frame("s")
+        net.settle()
+        assert [latched(bus) for bus in net.buses] == [{"s": again}] * 5
+
+
+def test_a_frame_that_a_bus_has_forgotten_with_its_clock_is_still_removed_behind_it() -> None:
+    clock = SimulatedClock(start=10)
+    with Network([[0], [1]]) as net:
+        bridge = Bus(clock)
+        net.buses.append(bridge)
+        for domain in net.domains:
+            domain.join(bridge)
+        net.buses[0].publish(moving("map", "a", 1))
+        net.settle()
+        clock.set(0)
+        net.buses[0].remove_frame("a")
+        net.settle()
+        assert [frames_of(bus) for bus in net.buses] == [set()] * 3
+
+
+# Who is lost.
+
+
+def test_a_peer_that_is_lost_has_the_frames_that_it_was_the_last_to_publish() -> None:
+    with Network(MESH) as net:
+        a, b, c, d = net.buses
+        a.publish([static("map", name) for name in "zyxwvu"])
+        net.settle()
+        b.publish(static("map", "y", 2.0))
+        d.publish(static("map", "x", 2.0))
+        net.settle()
+        c.remove_frame("w")
+        a.publish([moving("map", "v", 1), moving("map", "new", 1)])
+        net.settle()
+        d.publish(moving("map", "u", 1))
+        net.settle()
+        a.publish(moving("map", "u", 2))
+        net.settle()
+        lost = net.domains[0].ends[0]
+        net.domains[0].kill(lost)
+        net.settle()
+        assert [end.losses for end in net.ends] == [[(lost.id, ("new", "u", "v", "z"))]] * 3
+        assert {"u", "v", "x", "y", "z", "new"} == frames_of(b) == frames_of(c) == frames_of(d)
+
+
+def test_frames_of_a_lost_peer_leave_also_behind_another_domain_and_those_taken_over_stay() -> None:
+    with Network([[0, 1, 2], [1, 3], [3, 4]], drop_lost=True) as net:
+        a, _, restarted, _, far = net.buses
+        a.publish([static("map", name) for name in "xyz"])
+        far.publish(static("map", "mine"))
+        net.settle()
+        restarted.publish(static("map", "y", 2.0))
+        far.publish(static("map", "z", 2.0))
+        net.settle()
+        net.domains[0].kill(net.domains[0].ends[0])
+        net.settle()
+        expected = {"mine": static("map", "mine"), "y": static("map", "y", 2.0), "z": static("map", "z", 2.0)}
+        assert [latched(bus) for bus in net.buses[1:]] == [expected] * 4
+        assert frames_of(a) == {"mine", "x", "y", "z"}, "the dead one is not told"
+
+
+def test_without_drop_the_frames_of_a_lost_peer_stay_everywhere() -> None:
+    with Network(CHAIN) as net:
+        net.buses[0].publish([static("map", "s"), moving("map", "a", 1)])
+        net.settle()
+        net.domains[0].kill(net.domains[0].ends[0])
+        net.settle()
+        assert [frames_of(bus) for bus in net.buses] == [{"s", "a"}] * 4
+
+
+def test_the_loss_of_a_bridge_takes_nothing_from_those_who_publish_it() -> None:
+    with Network(TWO_BRIDGES, drop_lost=True) as net:
+        source, first, _, far = net.buses
+        inner, outer = net.domains
+        ends = {domain: {end.bus: end for end in domain.ends} for domain in net.domains}
+        source.publish(static("map", "s"))
+        net.send(source)
+        # It is the first bridge from which everybody hears of it first.
+        for domain, sender in ((inner, source), (outer, first)):
+            for end in domain.ends:
+                if end.bus is not sender and (sender is first or end.bus is first):
+                    wire = domain.wires[ends[domain][sender], end]
+                    while wire.packets:
+                        wire.deliver()
+            net.send(first)
+        net.settle()
+        for domain in net.domains:
+            domain.kill(ends[domain][first])
+        net.settle()
+        assert set(latched(source)) == {"s"}
+        source.publish(static("map", "s", 2.0))
+        net.settle()
+        assert latched(far) == {"s": static("map", "s", 2.0)}
+
+
+@pytest.mark.parametrize("graph", [PAIR, CHAIN, MESH, RING_WITH_A_TAIL], ids=["pair", "chain", "mesh", "tail"])
+@pytest.mark.parametrize("drop_lost", [True, False])
+def test_a_peer_that_comes_back_may_say_the_same_again(graph: Graph, drop_lost: bool) -> None:
+    with Network(graph, drop_lost) as net:
+        source = net.buses[-1 if graph is RING_WITH_A_TAIL else 0]
+        domain = net.domains[-1 if graph is RING_WITH_A_TAIL else 0]
+        end = next(end for end in domain.ends if end.bus is source)
+        source.publish([static("map", "s"), moving("map", "a", 1)])
+        net.settle()
+        others = [other for other in domain.ends if other is not end]
+        for times in range(1, 3):
+            for other in others:
+                domain.part(end, other)
+            net.settle()
+            for bus in net.buses:
+                if bus is not source:
+                    assert frames_of(bus) == (set() if drop_lost else {"s", "a"})
+            for other in others:
+                domain.meet(end, other)
+            net.settle()
+            assert [set(latched(bus)) for bus in net.buses] == [{"s"}] * len(net.buses)
+            source.publish(moving("map", "a", 1 + times))
+            net.settle()
+            assert [frames_of(bus) for bus in net.buses] == [{"s", "a"}] * len(net.buses)
+        assert net.published(net.buses.index(source)) == net.heard[net.buses.index(source)]
+
+
+def test_a_bridge_that_is_started_again_brings_back_what_is_behind_it() -> None:
+    with Network([[0, 1], [1, 2], [2, 3]], drop_lost=True) as net:
+        net.buses[0].publish(static("map", "s"))
+        net.settle()
+        for domain in net.domains[:2]:
+            domain.kill(next(end for end in domain.ends if end.bus is net.buses[1]))
+        net.settle()
+        assert [set(latched(bus)) for bus in net.buses] == [{"s"}, {"s"}, set(), set()]
+        bridge = net.add_bus()
+        for domain in net.domains[:2]:
+            domain.join(bridge, drop_lost=True)
+        net.settle()
+        assert [set(latched(bus)) for bus in net.buses] == [{"s"}] * 5
+
+
+def test_what_is_still_on_its_way_round_does_not_bring_back_what_was_lost() -> None:
+    with Network(RING, drop_lost=True) as net:
+        a, b, c = net.buses
+        a.publish([static("map", "s"), moving("map", "a", 1)])
+        net.send(a)
+        slow = next(wire for wire in net.domains[1].wires.values() if wire.sender.bus is c)
+        for wire in net.wires:
+            while wire.packets:
+                wire.deliver()
+        net.send(c)
+        assert len(slow.packets) == 2
+        for domain in (net.domains[0], net.domains[2]):
+            domain.kill(next(end for end in domain.ends if end.bus is a))
+        for wire in net.wires:
+            while wire.packets and wire is not slow:
+                wire.deliver()
+        net.settle()
+        assert [frames_of(bus) for bus in (b, c)] == [set(), set()]
+
+
+def test_who_removes_or_publishes_what_is_lost_on_hearing_of_it_disturbs_nobody() -> None:
+    with Network(PAIR, drop_lost=True) as net:
+        a, b = net.buses
+        heard: list[str] = []
+
+        def removed(frame: str) -> None:
+            heard.append(frame)
+            if frame == "arm":
+                b.remove_frame("tool")
+                b.publish(static("map", "wheel", 2.0))
+
+        b.subscribe(lambda _: None, removed)
+        a.publish([static("map", name) for name in ("arm", "tool", "wheel", "zoo")])
+        net.settle()
+        net.domains[0].kill(net.domains[0].ends[0])
+        net.settle()
+        assert heard == ["arm", "tool", "zoo"]
+        assert latched(b) == {"wheel": static("map", "wheel", 2.0)}
+        assert b.statistics().callbacks_failed == 0
+        assert net.domains[0].ends[0].losses[0][1] == ("arm", "tool", "wheel", "zoo")
+
+
+# The life of a relay.
+
+
+def test_a_bus_without_links_has_no_relay_and_can_go() -> None:
+    with Network(PAIR) as net:
+        a, b = net.buses
+        net.domains[0].ends[1].leave()
+        heard = len(net.heard[1])
+        assert b not in relay_module._relays
+        assert a in relay_module._relays
+        b.publish(static("map", "b"))
+        assert len(net.heard[1]) == heard + 1
+        assert net.domains[0].ends[1].outbox.flush() == []
+        net.domains[0].ends.pop()
+    gone = weakref.ref(b)
+    del b
+    net.buses.clear()
+    net.heard.clear()
+    net.domains.clear()
+    gc.collect()
+    assert gone() is None
+
+
+def test_a_relay_hears_nothing_any_more_when_the_last_link_has_left() -> None:
+    bus = Bus(SimulatedClock())
+    domain = Domain()
+    ends = [domain.join(bus), Domain().join(bus)]
+    relay = weakref.ref(ends[0].relay)
+    for end in ends:
+        end.leave()
+    del end
+    ends.clear()
+    domain.ends.clear()
+    gc.collect()
+    assert relay() is None
+
+
+def test_a_bus_whose_links_end_and_begin_again_is_told_nothing_of_its_own() -> None:
+    with Network(PAIR) as net:
+        net.buses[0].publish(static("map", "s"))
+        net.settle()
+        for end in list(net.ends):
+            end.leave()
+            net.domains[0].kill(end)
+        for bus in net.buses:
+            net.domains[0].join(bus)
+        net.settle()
+        assert net.heard[0] == [(static("map", "s"),)]
+        net.buses[0].remove_frame("s")
+        net.settle()
+        assert [latched(bus) for bus in net.buses] == [{}, {}]
+
+
+def test_a_bus_whose_links_end_and_begin_again_knows_its_own_samples() -> None:
+    with Network(RING) as net:
+        a = net.buses[0]
+        a.publish([static("map", "s"), moving("map", "a", 1)])
+        net.settle()
+        for domain in (net.domains[0], net.domains[2]):
+            end = next(end for end in domain.ends if end.bus is a)
+            end.leave()
+            domain.kill(end)
+        net.settle()
+        a.publish(moving("map", "a", 2))
+        for domain in (net.domains[0], net.domains[2]):
+            domain.join(a)
+        net.settle()
+        a.publish(moving("map", "a", 3))
+        net.settle()
+        assert [batch[0].stamp for batch in net.heard[0]] == [0, 2, 3]
+        for bus in net.buses[1:]:
+            assert set(latched(bus)) == {"s"}
+            assert frames_of(bus) == {"s", "a"}
+
+
+def test_a_closed_bus_is_not_joined() -> None:
+    bus = Bus(SimulatedClock())
+    bus.close()
+    with Network(PAIR) as net:
+        with pytest.raises(BusClosedError):
+            join(bus, net.domains[0].ends[0].outbox)
+        assert bus not in relay_module._relays
+
+
+# Models.
+
+
+def steps_of(*more: str) -> st.SearchStrategy[list[Step]]:
+    """Short and long lives of a network; `more` can happen than what always can."""
+    kinds = ("publish", "publish", "remove", "send", "send", "deliver", "deliver", "deliver", *more)
+    number = st.integers(0, 11)
+    step = st.tuples(st.sampled_from(kinds), number, number, st.lists(number, min_size=1, max_size=4))
+    return st.lists(step, max_size=10) | st.lists(step, min_size=30, max_size=80)
+
+
+class Model:
+    """Drives a network by numbers; each bus has three frames of its own, and one is anybody's."""
+
+    def __init__(self, net: Network) -> None:
+        self.net = net
+        self._stamp = 0
+
+    def do(self, step: str, who: int, where: int, numbers: list[int]) -> None:
+        net = self.net
+        bus = net.buses[who % len(net.buses)]
+        wires = net.wires
+        if step == "publish":
+            bus.publish([self._sample(who % len(net.buses), number) for number in numbers])
+        elif step == "remove":
+            if f"{who % len(net.buses)}.{where % 3}" in frames_of(bus):
+                bus.remove_frame(f"{who % len(net.buses)}.{where % 3}")
+        elif step == "takeover":
+            # Who is the last, everybody can only know if they do not all speak at once.
+            net.settle()
+            self._stamp += 1
+            bus.publish((static if where % 2 else moving)("map", "shared", stamp=self._stamp, x=float(self._stamp)))
+            net.settle()
+        elif step == "banish":
+            net.settle()
+            if frames := sorted(frames_of(bus)):
+                bus.remove_frame(frames[where % len(frames)])
+            net.settle()
+        elif step == "send":
+            net.send(bus)
+        elif step == "join":
+            net.domains[where % len(net.domains)].join(net.add_bus())
+        elif step in ("part", "meet"):
+            domain = net.domains[where % len(net.domains)]
+            one, other = domain.ends[who % len(domain.ends)], domain.ends[numbers[0] % len(domain.ends)]
+            if one is not other and ((one, other) in domain.wires) == (step == "part"):
+                (domain.part if step == "part" else domain.meet)(one, other)
+        elif wires:
+            wire = wires[where % len(wires)]
+            place = numbers[0] % len(wire.packets)
+            if step == "deliver":
+                wire.deliver()
+            elif step == "overtake":
+                wire.deliver(place)
+            elif step == "drop":
+                del wire.packets[place]
+            elif step == "repeat":
+                wire.packets.append(wire.packets[place])
+
+    def _sample(self, member: int, number: int) -> TransformStamped:
+        self._stamp += 1
+        kind = static if number % 4 == 3 else moving
+        parent, child = ("map", "odom")[number % 2], f"{member}.{number % 3}"
+        return kind(parent, child, stamp=self._stamp, x=float(self._stamp), authority=("", "slam")[number // 6])
+
+    def move_on(self) -> None:
+        """What had turned moving moves on, so that everybody hears of that at last."""
+        for member, bus in enumerate(self.net.buses):
+            for number in range(3):
+                if f"{member}.{number}" not in latched(bus):
+                    bus.publish(moving("map", f"{member}.{number}", 10**9))
+        self.net.settle()
+
+    def check_nothing_went_wrong(self) -> None:
+        for bus in self.net.buses:
+            assert bus.statistics().callbacks_failed == 0
+            assert bus.statistics().rejected == {}
+        for end in self.net.ends:
+            assert (end.refused, end.reports, end.peers.rejected) == ([], [], {})
+
+    def check_nothing_older_came(self, say_again: bool = False) -> None:
+        """Of each origin and frame, what is heard is ever newer."""
+        for heard in self.net.heard:
+            newest: dict[str, int] = {}
+            for batch in heard:
+                last = {sample.child: sample.stamp for sample in batch}
+                for child, stamp in last.items():
+                    known = newest.get(child, -1)
+                    assert stamp > known or (say_again and stamp == known)
+                newest |= last
+
+    def check_no_echo(self) -> None:
+        for member, heard in enumerate(self.net.heard):
+            for batch in heard:
+                own = [sample.child.startswith(f"{member}.") for sample in batch]
+                assert all(own) if type(batch[0]) is TransformStamped else not any(own)
+
+    def check_all_agree(self) -> None:
+        """On what is static, with those who publish it."""
+        for member, bus in enumerate(self.net.buses):
+            for other in self.net.buses:
+                theirs, own = (
+                    {child: sample for child, sample in known.items() if child.startswith(f"{member}.")}
+                    for known in (latched(other), latched(bus))
+                )
+                assert theirs == own
+
+
+@given(graph=st.sampled_from((MESH, CHAIN, RING, CIRCLE)), steps=steps_of("takeover", "banish"))
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_without_loss_everybody_hears_every_batch_once_whole_and_in_order(graph: Graph, steps: list[Step]) -> None:
+    with Network(graph) as net:
+        model = Model(net)
+        buffers = [Buffer(bus, keep=None) for bus in net.buses]
+        for step in steps:
+            model.do(*step)
+        net.settle()
+        model.check_nothing_went_wrong()
+        members = range(len(net.buses))
+        for member in members:
+            for origin in members:
+                if origin != member:
+                    assert net.received(member, origin) == net.published(origin)
+            assert len(net.heard[member]) == sum(len(net.published(origin)) for origin in members)
+        assert len({frozenset(latched(bus).values()) for bus in net.buses}) == 1
+        assert len({frozenset(frames_of(bus)) for bus in net.buses}) == 1
+        for child in frames_of(net.buses[0]):
+            assert len({buffer.tree.parent(child) for buffer in buffers}) == 1
+        assert sum(end.inbox.lost for end in net.ends) == 0
+        for end in net.ends:
+            end.bury()
+        late = net.add_bus()
+        net.domains[-1].join(late)
+        net.settle()
+        assert latched(late) == latched(net.buses[0])
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of("overtake", "overtake", "drop", "repeat", "join"),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_with_loss_nothing_older_comes_and_in_the_end_all_agree_on_what_is_static(
+    graph: Graph, steps: list[Step]
+) -> None:
+    with Network(graph) as net:
+        model = Model(net)
+        for step in steps:
+            model.do(*step)
+        net.settle()
+        net.recover()
+        model.check_nothing_went_wrong()
+        model.check_nothing_older_came()
+        model.check_no_echo()
+        model.move_on()
+        model.check_all_agree()
+
+
+def lose_and_find(graph: Graph, steps: list[Step], drop_lost: bool) -> None:
+    with Network(graph, drop_lost) as net:
+        model = Model(net)
+        for step in steps:
+            model.do(*step)
+        for domain in net.domains:
+            for one, other in combinations(domain.ends, 2):
+                if (one, other) not in domain.wires:
+                    domain.meet(one, other)
+        net.settle()
+        net.recover()
+        model.check_nothing_went_wrong()
+        model.check_nothing_older_came(say_again=True)
+        model.check_no_echo()
+        model.move_on()
+        model.check_all_agree()
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of("part", "part", "meet"),
+    drop_lost=st.booleans(),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_when_peers_are_lost_and_found_all_agree_in_the_end_whether_their_frames_leave_or_not(
+    graph: Graph, steps: list[Step], drop_lost: bool
+) -> None:
+    lose_and_find(graph, steps, drop_lost)
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of("part", "part", "meet", "overtake", "drop", "repeat", "join"),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_when_messages_are_lost_besides_all_agree_in_the_end(graph: Graph, steps: list[Step]) -> None:
+    lose_and_find(graph, steps, drop_lost=False)
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, CIRCLE, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of(),
+    more=steps_of(),
+    which=st.integers(0, 3),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_whatever_is_on_its_way_when_a_bus_dies_its_frames_leave_everywhere(
+    graph: Graph, steps: list[Step], more: list[Step], which: int
+) -> None:
+    with Network(graph, drop_lost=True) as net:
+        model = Model(net)
+        for step in steps:
+            model.do(*step)
+        dead = net.buses[which % len(net.buses)]
+        for domain in net.domains:
+            for end in [end for end in domain.ends if end.bus is dead]:
+                domain.kill(end)
+        for step in more:
+            model.do(*step)
+        net.settle()
+        model.check_nothing_went_wrong()
+        model.check_nothing_older_came()
+        alive = [bus for bus in net.buses if bus is not dead]
+        for bus in alive:
+            assert not any(frame.startswith(f"{net.buses.index(dead)}.") for frame in frames_of(bus))

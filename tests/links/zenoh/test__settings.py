@@ -1,0 +1,270 @@
+import json
+import math
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from support.processes import crowd, free_ports, new_domain, until
+from support.samples import moving, static
+
+from tfbus import Buffer, Bus
+from tfbus.links.zenoh import ZenohLink
+from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, settings
+
+LISTEN, CONNECT = "listen/endpoints", "connect/endpoints"
+LOOPBACK = "tcp/127.0.0.1:0"
+
+
+def read(
+    path: str,
+    listen: Addresses | None = None,
+    connect: Addresses | None = None,
+    config: dict[str, Any] | None = None,
+    lease: float = 2.0,
+) -> Any:
+    """What one of zenoh's settings is."""
+    return json.loads(settings(listen, connect, config, lease).get_json(path))
+
+
+def test_without_an_address_links_meet_on_the_loopback_only() -> None:
+    assert read(LISTEN) == [MEETING_POINT, LOOPBACK]
+    assert read(CONNECT) == [MEETING_POINT]
+    assert MEETING_POINT.startswith("tcp/127.0.0.1:")
+    assert read("scouting/multicast/enabled") is False
+    assert read("mode") == "peer"
+
+
+@pytest.mark.parametrize("addresses", ["tcp/192.168.1.5:7447", ["tcp/192.168.1.5:7447"], ("tcp/192.168.1.5:7447",)])
+def test_one_address_may_be_given_as_text_or_in_a_list(addresses: Addresses) -> None:
+    assert read(LISTEN, listen=addresses) == ["tcp/192.168.1.5:7447"]
+    assert read(CONNECT, connect=addresses) == ["tcp/192.168.1.5:7447"]
+
+
+def test_whoever_is_given_an_address_does_not_go_to_the_meeting_point() -> None:
+    assert read(CONNECT, listen="tcp/127.0.0.1:7000") == []
+    assert read(LISTEN, connect="tcp/127.0.0.1:7000") == [LOOPBACK]
+    config = {LISTEN: ["tcp/127.0.0.1:7000"]}
+    assert (read(LISTEN, config=config), read(CONNECT, config=config)) == (["tcp/127.0.0.1:7000"], [])
+    config = {CONNECT: ["tcp/127.0.0.1:7000"]}
+    assert (read(LISTEN, config=config), read(CONNECT, config=config)) == ([LOOPBACK], ["tcp/127.0.0.1:7000"])
+    assert read(CONNECT, config={"connect": {"endpoints": ["tcp/127.0.0.1:7000"]}}) == ["tcp/127.0.0.1:7000"]
+
+
+@pytest.mark.parametrize("address", ["tls/192.168.1.5:7447", "quic/192.168.1.5:7447"])
+def test_whoever_connects_with_a_certificate_opens_no_port_without_one(address: str) -> None:
+    assert read(LISTEN, connect=address) == []
+    assert read(LISTEN, connect=[address, "tcp/127.0.0.1:7000"]) == [LOOPBACK]
+    assert read(LISTEN, connect=address, listen="tcp/127.0.0.1:7000") == ["tcp/127.0.0.1:7000"]
+
+
+def test_how_to_connect_is_no_address() -> None:
+    config = {"connect/retry": {"period_max_ms": 5_000}, "listen/timeout_ms": 100}
+    assert read(LISTEN, config=config) == [MEETING_POINT, LOOPBACK]
+    assert read(CONNECT, config=config) == [MEETING_POINT]
+
+
+def test_only_who_listens_at_an_address_of_its_own_fails_if_it_cannot() -> None:
+    assert read("listen/exit_on_failure") is False
+    assert read("listen/exit_on_failure", connect="tcp/127.0.0.1:7000") is False
+    assert read("listen/exit_on_failure", listen="tcp/127.0.0.1:7000") is not False
+    assert read("listen/exit_on_failure", config={LISTEN: ["tcp/127.0.0.1:7000"]}) is not False
+
+
+def test_settings_of_zenoh_win_over_those_of_the_link() -> None:
+    config = {"scouting/multicast/enabled": True, "transport/link/tx/lease": 7_000, "mode": "client", LISTEN: []}
+    assert read("scouting/multicast/enabled", config=config) is True
+    assert read("transport/link/tx/lease", config=config) == 7_000
+    assert read("mode", config=config) == "client"
+    assert read(LISTEN, listen="tcp/127.0.0.1:7000", config=config) == []
+
+
+def test_the_lease_is_in_milliseconds() -> None:
+    assert read("transport/link/tx/lease", lease=1.5) == 1_500
+    assert read("transport/link/tx/lease", lease=1) == 1_000
+    assert read("transport/link/tx/lease", lease=1e-9) == 1
+
+
+@pytest.mark.parametrize("lease", [0.0, -1.0, math.nan, math.inf])
+def test_a_lease_is_a_time_that_passes(lease: float) -> None:
+    with pytest.raises(ValueError, match="lease"):
+        settings(None, None, None, lease)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "",
+        "garbage",
+        "127.0.0.1:7447",
+        "tcp/",
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:",
+        "tcp/127.0.0.1:65536",
+        "xyz/1.2.3.4:5",
+    ],
+)
+def test_what_can_be_no_address_is_named(address: str) -> None:
+    for listen, connect in ((address, None), (None, address), (None, ["tcp/127.0.0.1:7000", address])):
+        with pytest.raises(ValueError, match=f"not {address!r}"):
+            settings(listen, connect, None, 2.0)
+
+
+@pytest.mark.parametrize(
+    "address",
+    [
+        "tcp/[::1]:7447",
+        "tls/robot.local:0",
+        "udp/0.0.0.0:7447",
+        "quic/robot:1#iface=eth0",
+        "unixsock-stream//tmp/robot",
+    ],
+)
+def test_addresses_of_all_kinds_go_through(address: str) -> None:
+    assert read(LISTEN, listen=address) == [address]
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [("no/such/setting", 1), ("mode", "nonsense"), ("mode", math.nan), ("transport/link/tx/lease", "long"), ("", 1)],
+)
+def test_a_setting_that_zenoh_does_not_take_is_named_with_its_value(path: str, value: object) -> None:
+    with pytest.raises(ValueError, match="zenoh does not take") as caught:
+        settings(None, None, {path: value}, 2.0)
+    assert repr(path) in str(caught.value)
+    assert repr(value) in str(caught.value)
+    assert ".rs:" not in str(caught.value)
+
+
+def test_a_setting_that_is_not_json_is_named() -> None:
+    with pytest.raises(ValueError, match="'mode'"):
+        settings(None, None, {"mode": object()}, 2.0)
+
+
+def listening(pid: int, kind: str) -> set[str]:
+    """The local addresses, in hex, at which a process can be reached."""
+    own = {fd.readlink().name for fd in Path(f"/proc/{pid}/fd").iterdir() if fd.is_symlink()}
+    found = set()
+    for line in Path(f"/proc/{pid}/net/{kind}").read_text(encoding="ascii").splitlines()[1:]:
+        fields = line.split()
+        # State 0A is LISTEN; a socket of UDP is always open.
+        if f"socket:[{fields[9]}]" in own and (kind.startswith("udp") or fields[3] == "0A"):
+            found.add(fields[1].partition(":")[0])
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="needs /proc/net")
+def test_without_an_address_a_process_can_be_reached_over_the_loopback_only() -> None:
+    with crowd() as processes:
+        first, second = processes.add({"domain": (domain := new_domain())}), processes.add({"domain": domain})
+        first.ask("until", peers=1)
+        for process in (first, second):
+            # 127.0.0.1, in the byte order of the machine.
+            assert listening(process.pid, "tcp") == {"0100007F"}
+            assert listening(process.pid, "tcp6") == set()
+            assert listening(process.pid, "udp") | listening(process.pid, "udp6") == set()
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a certificate authority's own certificate, and those that it gave to a robot and to a guest."""
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        pytest.skip("needs the program openssl")
+    folder = tmp_path_factory.mktemp("certificates")
+    new = [openssl, "req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+
+    def call(*arguments: str) -> None:
+        subprocess.run(arguments, cwd=folder, check=True, capture_output=True, timeout=60)
+
+    call(*new, "-x509", "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=ca", "-days", "2")
+    for name in ("robot", "guest"):
+        (folder / f"{name}.ext").write_text(
+            "subjectAltName=IP:127.0.0.1\nbasicConstraints=CA:FALSE\n", encoding="ascii"
+        )
+        call(*new, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")
+        signed = ("-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial", "-extfile", f"{name}.ext", "-days", "2")
+        call(openssl, "x509", "-req", "-in", f"{name}.csr", *signed, "-out", f"{name}.pem")
+    return folder
+
+
+def tls(folder: Path, name: str) -> dict[str, Any]:
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate": str(folder / "ca.pem"),
+            "listen_certificate": str(folder / f"{name}.pem"),
+            "listen_private_key": str(folder / f"{name}.key"),
+            "connect_certificate": str(folder / f"{name}.pem"),
+            "connect_private_key": str(folder / f"{name}.key"),
+            "enable_mtls": True,
+        }
+    }
+
+
+@pytest.mark.anyio
+async def test_two_links_talk_over_tls(certificates: Path) -> None:
+    address = f"tls/127.0.0.1:{free_ports(1)[0]}"
+    domain = new_domain()
+    with Bus() as robot, Bus() as guest, Buffer(guest) as buffer:
+        robot.publish(static("map", "base", 1.0))
+        async with (
+            ZenohLink(robot, domain, listen=address, config=tls(certificates, "robot")),
+            ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")),
+        ):
+            with anyio.fail_after(30):
+                assert (await buffer.lookup("map", "base")).transform.translation[0] == 1.0
+
+
+@pytest.mark.anyio
+async def test_nobody_joins_over_tls_without_a_certificate(certificates: Path) -> None:
+    address = f"tls/127.0.0.1:{free_ports(1)[0]}"
+    domain = new_domain()
+    stranger = {"transport/link/tls/root_ca_certificate": str(certificates / "ca.pem")}
+    with Bus() as robot, Bus() as guest, Bus() as other:
+        async with (
+            ZenohLink(robot, domain, listen=address, config=tls(certificates, "robot")) as link,
+            ZenohLink(other, domain, listen=[], connect=address, config=stranger) as refused,
+            # It comes behind the other and gets in.
+            ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")) as welcome,
+        ):
+            await until(lambda: welcome.peers == (link.id,))
+            assert refused.peers == ()
+            assert link.peers == (welcome.id,)
+
+
+@pytest.mark.anyio
+async def test_access_control_lets_a_guest_listen_and_not_publish(certificates: Path) -> None:
+    address = f"tls/127.0.0.1:{free_ports(1)[0]}"
+    domain = new_domain()
+    read_only = {
+        "access_control": {
+            "enabled": True,
+            "default_permission": "allow",
+            "rules": [
+                {
+                    "id": "publishing",
+                    "messages": ["put", "delete", "reply"],
+                    "flows": ["ingress"],
+                    "permission": "deny",
+                    "key_exprs": ["tfbus/**"],
+                }
+            ],
+            "subjects": [{"id": "guests", "cert_common_names": ["guest"]}],
+            "policies": [{"rules": ["publishing"], "subjects": ["guests"]}],
+        }
+    }
+    with Bus() as robot, Bus() as guest, Buffer(robot) as own, Buffer(guest) as buffer:
+        guest.publish(static("map", "too early"))
+        async with ZenohLink(robot, domain, listen=address, config=tls(certificates, "robot") | read_only) as link:
+            async with ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")) as other:
+                await until(lambda: link.peers == (other.id,) and other.peers == (link.id,))
+                guest.publish([static("map", "a fake"), moving("map", "another", 1)])
+                robot.publish([static("map", "base", 1.0), moving("base", "arm", 1)])
+                with anyio.fail_after(30):
+                    await buffer.lookup("map", "arm")
+            # That the guest has gone comes behind all that it has sent.
+            await until(lambda: link.peers == ())
+            assert own.tree.frames() == ["arm", "base", "map"]
+            assert link.statistics().received_messages == 0

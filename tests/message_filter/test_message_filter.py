@@ -1,0 +1,1331 @@
+"""tf2's own tests of its message filter, and what an event loop adds: orders, bounds, time, errors and cancellation."""
+
+import asyncio
+import gc
+import logging
+import threading
+import weakref
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import anyio
+import pytest
+from anyio.streams.memory import MemoryObjectReceiveStream, MemoryObjectSendStream
+from support.asking import Asked, HandClock, driving, settle
+from support.samples import moving, static
+
+from tfbus import (
+    LATEST,
+    SECOND,
+    Buffer,
+    Bus,
+    BusClosedError,
+    ClockResetError,
+    DisconnectedError,
+    FutureExtrapolationError,
+    LookupTimeoutError,
+    MessageFilter,
+    PastExtrapolationError,
+    PointStamped,
+    SimulatedClock,
+    Transform,
+    TransformStamped,
+    UnknownFrameError,
+)
+from tfbus.errors import TransformError
+from tfbus.message_filter._dropped_messages import DropReason
+
+pytestmark = pytest.mark.anyio
+
+PATIENCE = 30.0
+"""Real seconds after which a test that hangs is given up."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A message; its frame is where it was taken."""
+
+    stamp: Any
+    frame: str = "laser"
+
+
+Pair = tuple[Scan, TransformStamped]
+Drop = tuple[Scan, DropReason, TransformError | None]
+Streams = tuple[MemoryObjectSendStream[Scan], MemoryObjectReceiveStream[Scan]]
+
+
+@pytest.fixture
+def clock() -> SimulatedClock:
+    return SimulatedClock()
+
+
+@pytest.fixture
+def bus(clock: SimulatedClock) -> Bus:
+    return Bus(clock)
+
+
+@pytest.fixture
+def buffer(bus: Bus) -> Buffer:
+    return Buffer(bus)
+
+
+@pytest.fixture
+def streams() -> Iterator[Streams]:
+    send, receive = anyio.create_memory_object_stream[Scan](1_000)
+    with send, receive:
+        yield send, receive
+
+
+class DroppedMessages:
+    """What `on_drop` was told."""
+
+    def __init__(self) -> None:
+        self.all: list[Drop] = []
+
+    def __call__(self, message: Scan, reason: DropReason, error: TransformError | None) -> None:
+        self.all.append((message, reason, error))
+
+    @property
+    def told(self) -> list[tuple[Scan, str]]:
+        return [(message, reason) for message, reason, _ in self.all]
+
+
+async def read(pairs: MessageFilter[Scan, Any], got: list[Any]) -> None:
+    async for pair in pairs:
+        got.append(pair)  # noqa: PERF401 - the test looks at them meanwhile
+
+
+def stamps(got: list[Any]) -> list[int]:
+    return [message.stamp for message, _ in got]
+
+
+def balanced(pairs: MessageFilter[Any, Any]) -> bool:
+    return pairs.arrived == pairs.delivered + sum(pairs.dropped.values()) + pairs.pending
+
+
+def put(send: MemoryObjectSendStream[Scan], *messages: Scan) -> None:
+    for message in messages:
+        send.send_nowait(message)
+
+
+# What tf2 tests of its own filter
+
+
+async def test_without_transforms_nothing_comes_out(buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    got: list[Pair] = []
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        tasks.start_soon(read, pairs, got)
+        put(send, Scan(5))
+        await settle()
+        assert (got, pairs.arrived, pairs.pending, dict(pairs.dropped)) == ([], 1, 1, {})
+        (waiting,) = buffer.pending()
+        assert (waiting.question.target, waiting.question.source, waiting.question.at) == ("map", "laser", 5)
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_message_in_the_target_frame_needs_no_transforms(buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    put(send, Scan(5, "map"))
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        message, found = await anext(pairs)
+    assert message == Scan(5, "map")
+    assert (found.parent, found.child, found.stamp, found.transform) == ("map", "map", 5, Transform.identity())
+
+
+async def test_a_message_whose_transform_is_there_comes_out(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    bus.publish([moving("map", "laser", 4, x=4.0), moving("map", "laser", 6, x=6.0)])
+    put(send, Scan(5))
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        message, found = await anext(pairs)
+    assert message == Scan(5)
+    assert (found.parent, found.child, found.stamp) == ("map", "laser", 5)
+    assert found.transform.translation == (5.0, 0.0, 0.0)
+
+
+async def test_a_message_comes_out_as_soon_as_its_transform_arrives(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    put(send, Scan(5))
+    got: list[Pair] = []
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        tasks.start_soon(read, pairs, got)
+        for stamp in (3, 4):
+            bus.publish(moving("map", "laser", stamp, x=float(stamp)))
+            await settle()
+            assert got == []
+        bus.publish(moving("map", "laser", 6, x=6.0))
+        await settle()
+        assert [(message, found.transform.translation[0]) for message, found in got] == [(Scan(5), 5.0)]
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_full_queue_drops_the_messages_that_came_first(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish(moving("map", "laser", 0))
+    async with MessageFilter(receive, buffer, "map", capacity=10, on_drop=drops) as pairs:
+        for stamp in range(1, 21):
+            put(send, Scan(stamp))
+            await settle()
+        assert drops.told == [(Scan(stamp), "queue full") for stamp in range(1, 11)]
+        assert pairs.dropped == {"queue full": 10}
+        for stamp, (_, _, error) in enumerate(drops.all, 1):
+            assert isinstance(error, FutureExtrapolationError)
+            assert (error.child, error.stamp, error.newest) == ("laser", stamp, 0)
+        bus.publish(moving("map", "laser", 20))
+        await settle()
+        assert stamps([await anext(pairs) for _ in range(10)]) == list(range(11, 21))
+        assert (pairs.arrived, pairs.delivered, pairs.pending) == (20, 10, 0)
+
+
+async def test_the_target_can_be_changed_while_messages_wait(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    got: list[Pair] = []
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        tasks.start_soon(read, pairs, got)
+        put(send, Scan(5))
+        bus.publish(moving("odom", "laser", 5, x=1.0))
+        await settle()
+        assert got == []
+        pairs.set_target("odom")
+        await settle()
+        put(send, Scan(5))
+        await settle()
+        assert [(found.parent, found.transform.translation[0]) for _, found in got] == [("odom", 1.0)] * 2
+        pairs.set_target("world")
+        put(send, Scan(5))
+        await settle()
+        assert [waiting.question.target for waiting in buffer.pending()] == ["world"]
+        tasks.cancel_scope.cancel()
+
+
+async def test_what_is_ready_keeps_its_transform_when_the_target_changes(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish([moving("map", "laser", 5), static("map", "odom")])
+    put(send, Scan(5))
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        await settle()
+        pairs.set_target("odom")
+        put(send, Scan(5))
+        await settle()
+        assert [(await anext(pairs))[1].parent for _ in range(2)] == ["map", "odom"]
+
+
+async def test_a_changed_target_that_is_the_frame_of_a_message_is_an_answer(buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        put(send, Scan(5))
+        await settle()
+        pairs.set_target("laser")
+        assert (await anext(pairs))[1].parent == "laser"
+
+
+async def test_of_several_targets_all_are_needed(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    got: list[tuple[Scan, tuple[TransformStamped, ...]]] = []
+    pairs = MessageFilter(receive, buffer, ["world", "odom", "laser"])
+    async with anyio.create_task_group() as tasks, pairs:
+        tasks.start_soon(read, pairs, got)
+        put(send, Scan(5))
+        bus.publish(moving("odom", "laser", 5, x=1.0))
+        await settle()
+        assert got == []
+        bus.publish(moving("world", "odom", 5, x=10.0))
+        await settle()
+        ((message, found),) = got
+        assert message == Scan(5)
+        assert [t.parent for t in found] == ["world", "odom", "laser"]
+        assert [t.transform.translation[0] for t in found] == [11.0, 1.0, 0.0]
+        pairs.set_target(["map"])
+        put(send, Scan(5))
+        bus.publish(static("world", "map", x=1.0))
+        await settle()
+        assert [t.transform.translation[0] for t in got[1][1]] == [10.0]
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_tolerance_needs_the_time_after_the_stamp_too(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    got: list[Pair] = []
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map", tolerance=0.2) as pairs:
+        tasks.start_soon(read, pairs, got)
+        put(send, Scan(SECOND))
+        for seconds in (1.0, 1.1, 1.2 - 1e-9):
+            bus.publish(driving("map", "laser", seconds))
+            await settle()
+            assert got == []
+        bus.publish(driving("map", "laser", 1.2))
+        await settle()
+        ((_, found),) = got
+        assert (found.stamp, found.transform.translation[0]) == (SECOND, 1.0)
+        # And a message is not delivered because of what comes after it alone.
+        put(send, Scan(SECOND - 1))
+        await settle()
+        assert pairs.dropped == {"too old": 1}
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_message_older_than_the_buffer_is_dropped_at_once(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish(driving("map", "laser", 100.0, authority="odometry"))
+    async with MessageFilter(receive, buffer, "map", on_drop=drops) as pairs:
+        put(send, Scan(99 * SECOND))
+        await settle()
+        ((message, reason, error),) = drops.all
+        assert (message, reason) == (Scan(99 * SECOND), "too old")
+        assert isinstance(error, PastExtrapolationError)
+        assert (error.child, error.authority) == ("laser", "odometry")
+        assert (pairs.pending, pairs.dropped) == (0, {"too old": 1})
+
+
+async def test_a_message_that_waits_while_its_time_leaves_the_buffer_is_dropped(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish(driving("map", "laser", 1.0))
+    async with MessageFilter(receive, buffer, "map", on_drop=drops) as pairs:
+        put(send, Scan(2 * SECOND))
+        await settle()
+        bus.publish(driving("map", "laser", 10_000.0))
+        await settle()
+        assert drops.told == [(Scan(2 * SECOND), "too old")]
+        assert (pairs.pending, buffer.pending()) == (0, ())
+
+
+@pytest.mark.parametrize("frame", ["", "/laser"])
+async def test_a_name_that_cannot_be_a_frames_is_dropped_at_once(frame: str, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    async with MessageFilter(receive, buffer, "map", on_drop=drops) as pairs:
+        put(send, Scan(5, frame))
+        await settle()
+        ((_, reason, error),) = drops.all
+        assert reason == "unknown frame"
+        assert isinstance(error, UnknownFrameError)
+        assert error.frame == frame
+        assert (pairs.arrived, pairs.pending) == (1, 0)
+
+
+async def test_transforms_from_a_thread_bring_every_message_out(streams: Streams) -> None:
+    send, receive = streams
+    bus = Bus()
+    buffer = Buffer(bus)
+    put(send, *(Scan(stamp) for stamp in range(30)))
+
+    def publish_all(publish: Callable[[TransformStamped], object]) -> None:
+        for stamp in range(30):
+            publish(moving("map", "laser", stamp, x=float(stamp)))
+
+    with anyio.fail_after(PATIENCE), bus.threadsafe() as publish:
+        async with MessageFilter(receive, buffer, "map", order="stamp") as pairs:
+            thread = threading.Thread(target=publish_all, args=(publish,))
+            thread.start()
+            got = [await anext(pairs) for _ in range(30)]
+            thread.join()
+    assert [(message.stamp, found.transform.translation[0]) for message, found in got] == [
+        (stamp, float(stamp)) for stamp in range(30)
+    ]
+
+
+async def test_a_callback_may_call_the_filter_and_the_bus(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    seen: list[int] = []
+
+    def drop(message: Scan, _reason: DropReason, _error: TransformError | None) -> None:
+        assert balanced(pairs)
+        seen.append(message.stamp)
+        pairs.set_target("odom")
+        bus.publish(moving("odom", "laser", message.stamp + 2))
+
+    async with MessageFilter(receive, buffer, "map", capacity=2, on_drop=drop) as pairs:
+        put(send, Scan(1), Scan(2), Scan(3))
+        await settle()
+        assert (seen, pairs.callbacks_failed) == ([1, 2], 0)
+        assert [(await anext(pairs))[1].parent] == ["odom"]
+        assert pairs.dropped == {"queue full": 1, "too old": 1}
+
+
+async def test_one_nanosecond_is_told_from_the_next_at_a_stamp_of_today(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    today = 1_000_000_000 * SECOND + 1
+    got: list[Pair] = []
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        tasks.start_soon(read, pairs, got)
+        put(send, Scan(today), Scan(today + 1))
+        bus.publish(moving("map", "laser", today))
+        await settle()
+        assert stamps(got) == [today]
+        bus.publish(moving("map", "laser", today + 1))
+        await settle()
+        assert stamps(got) == [today, today + 1]
+        tasks.cancel_scope.cancel()
+
+
+# Frames and stamps
+
+
+async def test_frame_and_stamp_may_come_from_callables(bus: Bus, buffer: Buffer) -> None:
+    bus.publish(moving("map", "laser", 5, x=2.0))
+
+    async def headers() -> AsyncIterator[dict[str, Any]]:
+        yield {"frame_id": "laser", "stamp": (0, 5)}
+
+    async with MessageFilter(
+        headers(),
+        buffer,
+        "map",
+        frame=lambda message: str(message["frame_id"]),
+        stamp=lambda message: int(message["stamp"][0]) * SECOND + int(message["stamp"][1]),
+    ) as pairs:
+        _, found = await anext(pairs)
+    assert (found.stamp, found.transform.translation[0]) == (5, 2.0)
+
+
+async def test_any_stamped_data_are_messages_and_latest_is_a_stamp(bus: Bus, buffer: Buffer) -> None:
+    bus.publish([moving("map", "laser", 5), moving("map", "laser", 7)])
+    point = PointStamped("laser", LATEST, (1.0, 0.0, 0.0))
+
+    async def points() -> AsyncIterator[PointStamped]:
+        yield point
+
+    async with MessageFilter(points(), buffer, "map", tolerance=5.0) as pairs:
+        message, found = await anext(pairs)
+    assert (message, found.stamp) == (point, 7)
+
+
+async def test_latest_in_the_target_frame_is_stamped_with_now(
+    clock: SimulatedClock, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    clock.set(77)
+    put(send, Scan(LATEST, "map"))
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        assert (await anext(pairs))[1].stamp == 77
+
+
+# Orders
+
+
+@pytest.mark.parametrize(
+    ("order", "expected"),
+    [("ready", [4, 2, 3, 1, 5]), ("stamp", [1, 2, 3, 4, 5]), ("arrival", [5, 3, 1, 4, 2])],
+)
+async def test_messages_come_out_in_the_order_that_was_asked_for(
+    order: Any, expected: list[int], bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    got: list[Pair] = []
+    frames = {5: "five", 3: "three", 1: "one", 4: "four", 2: "two"}
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map", order=order) as pairs:
+        put(send, *(Scan(stamp, frame) for stamp, frame in frames.items()))
+        await settle()
+        for stamp in (4, 2, 3, 1, 5):
+            bus.publish(moving("map", frames[stamp], stamp))
+            await settle()
+        tasks.start_soon(read, pairs, got)
+        await settle()
+        assert stamps(got) == expected
+        tasks.cancel_scope.cancel()
+
+
+async def test_messages_that_one_batch_makes_ready_come_out_as_they_came(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    order = [7, 3, 9, 1, 5, 8, 2]
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        put(send, *map(Scan, order))
+        bus.publish(moving("map", "laser", 0))
+        await settle()
+        bus.publish(moving("map", "laser", 10))
+        await settle()
+        assert stamps([await anext(pairs) for _ in order]) == order
+
+
+async def test_messages_that_corrected_samples_make_ready_come_out_in_that_order(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish([static("map", "base"), moving("odom", "one", 5), moving("odom", "two", 5)])
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        put(send, Scan(5, "one"), Scan(5, "two"))
+        await settle()
+        for frame in ("two", "one"):
+            bus.publish(moving("map", frame, 5))
+            await settle()
+        assert buffer.tree.inserted == 3
+        assert [(await anext(pairs))[0].frame for _ in range(2)] == ["two", "one"]
+
+
+@pytest.mark.parametrize("order", ["stamp", "arrival"])
+async def test_a_message_that_waits_holds_back_those_behind_it_until_it_is_dropped(
+    order: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    got: list[Pair] = []
+    bus.publish(moving("map", "laser", 2))
+    pairs = MessageFilter(receive, buffer, "map", timeout=1.0, order=order)
+    async with anyio.create_task_group() as tasks, pairs:
+        tasks.start_soon(read, pairs, got)
+        put(send, Scan(1, "nobody"), Scan(2))
+        await clock.advance(0.9)
+        assert got == []
+        await clock.advance(0.2)
+        assert stamps(got) == [2]
+        tasks.cancel_scope.cancel()
+
+
+async def test_by_stamp_a_late_older_message_still_comes_out(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    bus.publish([moving("map", "laser", 1), moving("map", "laser", 9)])
+    async with MessageFilter(receive, buffer, "map", order="stamp") as pairs:
+        put(send, Scan(8))
+        assert (await anext(pairs))[0] == Scan(8)
+        put(send, Scan(10), Scan(3))
+        assert (await anext(pairs))[0] == Scan(3)
+
+
+# Bounds
+
+
+async def test_drop_newest_refuses_what_arrives_at_a_full_queue(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish(moving("map", "laser", 0))
+    put(send, *map(Scan, range(1, 6)))
+    async with MessageFilter(receive, buffer, "map", capacity=2, overflow="drop_newest", on_drop=drops) as pairs:
+        await settle()
+        assert drops.told == [(Scan(stamp), "queue full") for stamp in (3, 4, 5)]
+        assert {type(error) for _, _, error in drops.all} == {FutureExtrapolationError}
+        bus.publish(moving("map", "laser", 9))
+        await settle()
+        assert stamps([await anext(pairs) for _ in range(2)]) == [1, 2]
+
+
+async def test_a_full_queue_of_what_nobody_reads_drops_without_an_error(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish([moving("map", "laser", 0), moving("map", "laser", 9)])
+    put(send, *map(Scan, range(1, 6)))
+    async with MessageFilter(receive, buffer, "map", capacity=2, on_drop=drops) as pairs:
+        await settle()
+        assert drops.all == [(Scan(stamp), "queue full", None) for stamp in (1, 2, 3)]
+        assert stamps([await anext(pairs) for _ in range(2)]) == [4, 5]
+
+
+async def test_blocking_leaves_in_the_source_what_there_is_no_room_for(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    put(send, *map(Scan, range(1, 8)))
+    bus.publish(moving("map", "laser", 0))
+    got: list[Pair] = []
+    pairs = MessageFilter(receive, buffer, "map", capacity=3, overflow="block")
+    async with anyio.create_task_group() as tasks, pairs:
+        await settle()
+        assert (pairs.arrived, receive.statistics().current_buffer_used) == (3, 4)
+        bus.publish(moving("map", "laser", 9))
+        await settle()
+        assert pairs.arrived == 3
+        await anext(pairs)
+        await settle()
+        assert pairs.arrived == 4
+        tasks.start_soon(read, pairs, got)
+        await settle()
+        assert stamps(got) == [2, 3, 4, 5, 6, 7]
+        assert dict(pairs.dropped) == {}
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_replay_that_never_waits_is_delivered_whole_when_it_blocks(bus: Bus, buffer: Buffer) -> None:
+    bus.publish([moving("map", "laser", 0), moving("map", "laser", 1_000)])
+
+    async def replay() -> AsyncIterator[Scan]:
+        for stamp in range(1_000):
+            yield Scan(stamp)
+
+    got: list[Pair] = []
+    async with MessageFilter(replay(), buffer, "map", capacity=5, overflow="block") as pairs:
+        await read(pairs, got)
+    assert stamps(got) == list(range(1_000))
+
+
+async def test_a_message_that_is_dropped_as_its_transform_comes_stays_dropped(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    put(send, Scan(5))
+    got: list[Pair] = []
+    async with MessageFilter(receive, buffer, "map", capacity=1) as pairs:
+        await settle()
+        put(send, Scan(6))
+        bus.publish([moving("map", "laser", 5), moving("map", "laser", 6)])
+        await settle()
+        send.close()
+        await read(pairs, got)
+        # Which of the two tasks runs first is the loop's affair.
+        assert stamps(got) == [6]
+        assert pairs.dropped == {"queue full": 1}
+
+
+async def test_what_is_dropped_on_arrival_takes_no_room(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    bus.publish(moving("map", "laser", 10))
+    put(send, Scan(11), Scan(5), Scan(5, ""))
+    async with MessageFilter(receive, buffer, "map", capacity=1) as pairs:
+        await settle()
+        assert (pairs.pending, pairs.dropped) == (1, {"too old": 1, "unknown frame": 1})
+
+
+# Time
+
+
+async def test_a_message_times_out_on_the_clock_of_the_bus(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish([moving("map", "laser", 1), static("moon", "rover")])
+    async with MessageFilter(receive, buffer, "map", timeout=2.0, on_drop=drops) as pairs:
+        put(send, Scan(5), Scan(5, "nobody"))
+        await clock.advance(1.0)
+        put(send, Scan(5, "rover"))
+        await clock.advance(0.9)
+        assert (drops.all, pairs.pending) == ([], 3)
+        await clock.advance(0.1)
+        assert Counter(drops.told) == {(Scan(5), "timed out"): 1, (Scan(5, "nobody"), "unknown frame"): 1}
+        await clock.advance(1.0)
+        assert pairs.dropped == {"timed out": 2, "unknown frame": 1}
+        causes = {message.frame: error.__cause__ for message, _, error in drops.all if error is not None}
+        assert {frame: type(cause) for frame, cause in causes.items()} == {
+            "laser": FutureExtrapolationError,
+            "nobody": UnknownFrameError,
+            "rover": DisconnectedError,
+        }
+        for _, _, error in drops.all:
+            assert isinstance(error, LookupTimeoutError)
+            assert (error.target, error.timeout) == ("map", 2.0)
+
+
+async def test_the_target_that_a_message_timed_out_for_is_named(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish(moving("odom", "laser", 5))
+    async with MessageFilter(receive, buffer, ["odom", "map"], timeout=1.0, on_drop=drops):
+        put(send, Scan(5))
+        await clock.advance(1.0)
+        ((_, _, error),) = drops.all
+        assert isinstance(error, LookupTimeoutError)
+        assert (error.target, error.source) == ("map", "laser")
+
+
+async def test_a_timeout_of_zero_drops_what_cannot_be_answered_on_arrival(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish(moving("map", "laser", 5))
+    put(send, Scan(6), Scan(5))
+    async with MessageFilter(receive, buffer, "map", timeout=0.0) as pairs:
+        assert (await anext(pairs))[0] == Scan(5)
+        await settle()
+        assert pairs.dropped == {"timed out": 1}
+
+
+async def test_with_a_timeout_of_zero_what_cannot_be_answered_takes_no_room(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish(moving("map", "laser", 5))
+    put(send, Scan(5), Scan(6), Scan(5, "nobody"))
+    async with MessageFilter(receive, buffer, "map", timeout=0.0, capacity=1) as pairs:
+        await settle()
+        assert pairs.dropped == {"timed out": 1, "unknown frame": 1}
+        assert (await anext(pairs))[0] == Scan(5)
+
+
+async def test_what_is_ready_does_not_time_out(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    put(send, Scan(5))
+    async with MessageFilter(receive, buffer, "map", timeout=1.0) as pairs:
+        await settle()
+        bus.publish(moving("map", "laser", 5))
+        await clock.advance(100.0)
+        assert (await anext(pairs))[0] == Scan(5)
+
+
+async def test_changing_the_target_does_not_give_a_message_more_time(
+    clock: SimulatedClock, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    put(send, Scan(5))
+    async with MessageFilter(receive, buffer, "map", timeout=2.0) as pairs:
+        await clock.advance(1.5)
+        pairs.set_target("odom")
+        await clock.advance(0.5)
+        assert pairs.pending == 0
+
+
+async def test_data_that_come_in_the_turn_in_which_the_time_is_up_count(streams: Streams) -> None:
+    send, receive = streams
+    clock = HandClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    put(send, Scan(5))
+    async with MessageFilter(receive, buffer, "map", timeout=1.0) as pairs:
+        await settle()
+        clock.scopes[0].cancel()
+        bus.publish(moving("map", "laser", 5))
+        assert (await anext(pairs))[0] == Scan(5)
+        assert dict(pairs.dropped) == {}
+
+
+async def test_a_jump_back_drops_what_waits_and_delivers_what_is_ready(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    await clock.advance(10.0)
+    bus.publish(driving("map", "laser", 10.0))
+    async with MessageFilter(receive, buffer, "map", on_drop=drops) as pairs:
+        put(send, Scan(10 * SECOND), Scan(11 * SECOND), Scan(11 * SECOND, "nobody"))
+        await settle()
+        clock.set(5 * SECOND)
+        assert pairs.dropped == {"clock reset": 2}
+        ((_, _, error), _) = drops.all
+        assert isinstance(error, ClockResetError)
+        assert (error.before, error.after) == (10 * SECOND, 5 * SECOND)
+        assert (await anext(pairs))[0] == Scan(10 * SECOND)
+        put(send, Scan(6 * SECOND))
+        await settle()
+        bus.publish(driving("map", "laser", 6.0))
+        assert (await anext(pairs))[0] == Scan(6 * SECOND)
+
+
+async def test_a_jump_forward_drops_nothing(clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    put(send, Scan(5))
+    async with MessageFilter(receive, buffer, "map") as pairs:
+        await settle()
+        clock.set(1_000 * SECOND)
+        bus.publish(moving("map", "laser", 5))
+        assert (await anext(pairs))[0] == Scan(5)
+
+
+# The callback
+
+
+async def test_a_callback_that_raises_disturbs_nobody_and_is_logged_once(
+    bus: Bus, buffer: Buffer, streams: Streams, caplog: pytest.LogCaptureFixture
+) -> None:
+    send, receive = streams
+
+    def clumsy(_message: Scan, _reason: DropReason, _error: TransformError | None) -> None:
+        raise ValueError("spilt the coffee")
+
+    bus.publish(moving("map", "laser", 10))
+    put(send, Scan(1), Scan(2), Scan(10))
+    async with MessageFilter(receive, buffer, "map", on_drop=clumsy) as pairs:
+        assert (await anext(pairs))[0] == Scan(10)
+        assert (pairs.dropped, pairs.callbacks_failed) == ({"too old": 2}, 2)
+    (record,) = caplog.records
+    assert (record.name, record.levelno) == ("tfbus", logging.WARNING)
+    assert "clumsy" in record.getMessage()
+
+
+# How it ends
+
+
+async def test_when_the_source_is_exhausted_what_waits_is_waited_for(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    got: list[Pair] = []
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        reading = Asked(tasks, partial(read, pairs, got))
+        put(send, Scan(5), Scan(6))
+        send.close()
+        await settle()
+        bus.publish(moving("map", "laser", 5))
+        await settle()
+        assert (stamps(got), reading.ended) == ([5], False)
+        bus.publish(moving("map", "laser", 6))
+        await settle()
+        assert (stamps(got), reading.answer) == ([5, 6], None)
+        with pytest.raises(StopAsyncIteration):
+            await anext(pairs)
+
+
+async def test_the_last_message_that_is_dropped_ends_the_iteration(
+    clock: SimulatedClock, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map", timeout=1.0) as pairs:
+        reading = Asked(tasks, pairs.__anext__)
+        put(send, Scan(5))
+        send.close()
+        await clock.advance(1.0)
+        assert isinstance(reading.error, StopAsyncIteration)
+
+
+@pytest.mark.parametrize("closed", ["bus", "buffer"])
+async def test_closing_ends_the_iteration_after_what_is_ready(
+    closed: str, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    got: list[Pair] = []
+    bus.publish(moving("map", "laser", 5))
+    async with MessageFilter(receive, buffer, "map", on_drop=drops) as pairs:
+        put(send, Scan(5), Scan(6))
+        await settle()
+        (bus if closed == "bus" else buffer).close()
+        put(send, Scan(5))
+        await read(pairs, got)
+        assert stamps(got) == [5]
+        assert drops.told == [(Scan(6), "closed")]
+        error = drops.all[0][2]
+        assert isinstance(error, BusClosedError)
+        assert isinstance(error.__cause__, FutureExtrapolationError)
+        assert receive.statistics().current_buffer_used == 1
+
+
+@pytest.mark.parametrize("closed", ["bus", "buffer"])
+@pytest.mark.parametrize("before", [True, False])
+async def test_closing_ends_the_iteration_when_nothing_waits(
+    before: bool, closed: str, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    close = (bus if closed == "bus" else buffer).close
+    if before:
+        close()
+        put(send, Scan(5, "map"))
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        reading = Asked(tasks, pairs.__anext__)
+        await settle()
+        if not before:
+            assert not reading.ended
+            close()
+            await settle()
+        assert isinstance(reading.error, StopAsyncIteration)
+        assert pairs.arrived == 0
+
+
+async def test_a_closed_bus_reads_nothing_of_a_source_that_never_waits(bus: Bus, buffer: Buffer) -> None:
+    async def replay() -> AsyncIterator[Scan]:
+        yield Scan(5, "map")
+
+    bus.close()
+    got: list[Pair] = []
+    async with MessageFilter(replay(), buffer, "map") as pairs:
+        await read(pairs, got)
+    assert (got, pairs.arrived) == ([], 0)
+
+
+async def test_a_filter_belongs_to_the_loop_of_its_bus(buffer: Buffer) -> None:
+    errors: list[Exception] = []
+
+    async def enter() -> None:
+        async with MessageFilter(Source(OSError()), buffer, "map"):
+            pass
+
+    def run() -> None:
+        try:
+            asyncio.run(enter())
+        except Exception as error:  # noqa: BLE001 - the test looks at it
+            errors.append(error)
+
+    async with MessageFilter(Source(StopAsyncIteration()), buffer, "map"):
+        thread = threading.Thread(target=run)
+        thread.start()
+        thread.join(PATIENCE)
+    assert [type(error) for error in errors] == [RuntimeError]
+
+
+async def test_leaving_drops_what_is_left_and_leaves_nothing_behind(
+    clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    drops = DroppedMessages()
+    bus.publish(moving("map", "laser", 5))
+    async with MessageFilter(receive, buffer, "map", timeout=9.0, on_drop=drops) as pairs:
+        put(send, Scan(5), Scan(6), Scan(6, "nobody"))
+        await settle()
+        assert len(buffer.pending()) == 2
+    assert buffer.pending() == ()
+    assert (pairs.arrived, pairs.pending, pairs.dropped) == (3, 0, {"closed": 3})
+    assert [type(error) for _, _, error in drops.all] == [type(None), FutureExtrapolationError, UnknownFrameError]
+    with pytest.raises(StopAsyncIteration):
+        await anext(pairs)
+    # Neither the clock nor the buffer nor the source has anything to do with it any more.
+    clock.set(-1)
+    bus.close()
+    send.send_nowait(Scan(7))
+    assert receive.receive_nowait() == Scan(7)
+    assert pairs.arrived == 3
+
+
+async def test_a_filter_that_was_left_is_held_by_nobody(buffer: Buffer, streams: Streams) -> None:
+    pairs = MessageFilter(streams[1], buffer, "map")
+    async with pairs:
+        await settle()
+    held = weakref.ref(pairs)
+    del pairs
+    gc.collect()
+    assert held() is None
+
+
+async def test_a_generator_is_closed_where_it_was_read(buffer: Buffer) -> None:
+    closed: list[anyio.TaskInfo] = []
+    read_in: list[anyio.TaskInfo] = []
+
+    async def endless() -> AsyncIterator[Scan]:
+        try:
+            while True:
+                read_in.append(anyio.get_current_task())
+                yield Scan(5)
+        finally:
+            closed.append(anyio.get_current_task())
+
+    for overflow in ("block", "drop_newest"):
+        async with MessageFilter(endless(), buffer, "map", capacity=1, overflow=overflow):
+            for _ in range(20):
+                await anyio.lowlevel.checkpoint()
+        assert [task.id for task in closed] == [read_in[-1].id]
+        closed.clear()
+
+
+# Errors
+
+
+class Source:
+    """Yields messages, then raises."""
+
+    def __init__(self, error: BaseException, *messages: Scan) -> None:
+        self._error = error
+        self._messages = list(messages)
+
+    def __aiter__(self) -> "Source":
+        return self
+
+    async def __anext__(self) -> Scan:
+        await anyio.lowlevel.checkpoint()
+        if self._messages:
+            return self._messages.pop(0)
+        raise self._error
+
+
+async def test_what_the_source_raises_comes_out_after_what_is_ready(bus: Bus, buffer: Buffer) -> None:
+    bus.publish(moving("map", "laser", 5))
+    error = OSError("unplugged")
+    got: list[Pair] = []
+    with pytest.raises(OSError, match="unplugged") as caught:
+        async with MessageFilter(Source(error, Scan(6), Scan(5)), buffer, "map") as pairs:
+            await settle()
+            await read(pairs, got)
+    assert caught.value is error
+    assert stamps(got) == [5]
+    assert (pairs.dropped, buffer.pending()) == ({"closed": 1}, ())
+
+
+async def test_whoever_catches_what_the_source_raises_may_read_on(bus: Bus, buffer: Buffer) -> None:
+    got: list[Pair] = []
+    async with MessageFilter(Source(OSError("unplugged"), Scan(5)), buffer, "map") as pairs:
+        with pytest.raises(OSError, match="unplugged"):
+            await anext(pairs)
+        bus.publish(moving("map", "laser", 5))
+        await read(pairs, got)
+    assert stamps(got) == [5]
+
+
+async def test_what_the_source_raises_is_not_lost_when_nobody_reads_on(buffer: Buffer) -> None:
+    with pytest.raises(OSError, match="unplugged"):
+        async with MessageFilter(Source(OSError("unplugged")), buffer, "map"):
+            await settle()
+
+
+async def test_an_error_of_the_body_comes_before_one_of_the_source(buffer: Buffer) -> None:
+    with pytest.raises(ZeroDivisionError):
+        async with MessageFilter(Source(OSError("unplugged")), buffer, "map"):
+            await settle()
+            _ = 1 / 0
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        (Scan(1.5), TypeError),
+        (Scan(None), TypeError),
+        (Scan(2**63), ValueError),
+        (Scan(5, None), TypeError),  # type: ignore[arg-type]
+        ("no header", AttributeError),
+    ],
+)
+async def test_a_message_without_a_frame_and_a_stamp_is_an_error_of_the_program(
+    message: Any, error: type[Exception], buffer: Buffer
+) -> None:
+    async def one() -> AsyncIterator[Any]:
+        yield message
+
+    with pytest.raises(error):
+        async with MessageFilter(one(), buffer, "map") as pairs:
+            await anext(pairs)
+    assert (pairs.arrived, balanced(pairs)) == (0, True)
+
+
+async def test_messages_without_a_stamp_of_their_own_have_no_order_by_stamp(buffer: Buffer) -> None:
+    async def one() -> AsyncIterator[Scan]:
+        yield Scan(LATEST)
+
+    with pytest.raises(TypeError, match="stamp"):
+        async with MessageFilter(one(), buffer, "map", order="stamp") as pairs:
+            await anext(pairs)
+    assert pairs.arrived == 0
+
+
+async def test_what_a_callable_raises_comes_out_as_it_is(buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    put(send, Scan(0))
+    with pytest.raises(ZeroDivisionError):
+        async with MessageFilter(receive, buffer, "map", stamp=lambda message: 1 // message.stamp) as pairs:
+            await anext(pairs)
+
+
+async def test_what_the_body_raises_comes_out_as_it_is(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    bus.publish(moving("map", "laser", 5))
+    put(send, Scan(5), Scan(6))
+    with pytest.raises(ZeroDivisionError):
+        async with MessageFilter(receive, buffer, "map") as pairs:
+            async for _ in pairs:
+                _ = 1 / 0
+    assert buffer.pending() == ()
+
+
+async def test_what_closing_a_generator_raises_is_not_lost(buffer: Buffer) -> None:
+    async def fragile() -> AsyncIterator[Scan]:
+        try:
+            yield Scan(5)
+            await anyio.sleep_forever()
+        finally:
+            raise OSError("torn")
+
+    with pytest.raises(OSError, match="torn"):
+        async with MessageFilter(fragile(), buffer, "map"):
+            await settle()
+
+
+class Alarm(BaseException):
+    """No `Exception`, like Ctrl-C, but no event loop knows it."""
+
+
+def ring(*_: object) -> str:
+    try:
+        raise KeyError("while this")
+    except KeyError:
+        raise Alarm from ValueError("because of that")
+
+
+async def ringing() -> AsyncIterator[Scan]:
+    yield Scan(5, "map")
+    ring()
+
+
+@pytest.mark.parametrize("where", ["source", "frame", "stamp", "on_drop", "on_drop of one that waits"])
+@pytest.mark.parametrize("reading", [True, False])
+async def test_what_is_no_exception_stops_the_body_and_comes_out_as_it_is(
+    where: str, reading: bool, clock: SimulatedClock, buffer: Buffer
+) -> None:
+    options: dict[str, dict[str, Any]] = {
+        "source": {},
+        "frame": {"frame": ring},
+        "stamp": {"stamp": ring},
+        "on_drop": {"on_drop": ring, "timeout": 0.0},
+        "on_drop of one that waits": {"on_drop": ring, "timeout": 1.0},
+    }
+    source = ringing() if where == "source" else Source(StopAsyncIteration(), Scan(5))
+    with anyio.fail_after(PATIENCE):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(clock.advance, 2.0)
+            with pytest.raises(Alarm) as caught:
+                async with MessageFilter(source, buffer, "map", **options[where]) as pairs:
+                    if reading:
+                        await anext(pairs)
+                    await anyio.sleep_forever()
+            await anyio.lowlevel.checkpoint()
+    assert repr(caught.value.__context__) == "KeyError('while this')"
+    assert repr(caught.value.__cause__) == "ValueError('because of that')"
+    assert (buffer.pending(), balanced(pairs)) == ((), True)
+
+
+async def test_a_group_that_the_source_raises_stays_one(buffer: Buffer) -> None:
+    alarm = Alarm()
+    with pytest.raises(BaseExceptionGroup, match="two or more") as caught:
+        async with MessageFilter(Source(BaseExceptionGroup("two or more", [alarm])), buffer, "map") as pairs:
+            await anext(pairs)
+    assert caught.value.exceptions == (alarm,)
+
+
+def test_an_interrupt_in_the_source_comes_out_of_the_loop_as_it_is(
+    run: Callable[[Callable[[], Any]], Any], buffer: Buffer
+) -> None:
+    seen: list[str] = []
+
+    async def main() -> None:
+        try:
+            async with MessageFilter(Source(KeyboardInterrupt()), buffer, "map") as pairs:
+                await anext(pairs)
+        except BaseException as error:
+            seen.append(type(error).__name__)
+            raise
+
+    with pytest.raises(KeyboardInterrupt):
+        run(main)
+    assert seen == ["KeyboardInterrupt"]
+
+
+# Cancellation
+
+
+async def test_a_cancelled_body_is_cancelled_and_leaves_nothing_behind(buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    put(send, Scan(5), Scan(6))
+    with anyio.CancelScope() as scope:
+        async with MessageFilter(receive, buffer, "map") as pairs:
+            await settle()
+            scope.cancel()
+            await anext(pairs)
+    assert scope.cancelled_caught
+    assert (buffer.pending(), pairs.dropped) == ((), {"closed": 2})
+
+
+async def test_a_reader_that_is_cancelled_loses_nothing(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        reading = Asked(tasks, pairs.__anext__)
+        await settle()
+        reading.cancel()
+        bus.publish(moving("map", "laser", 5))
+        put(send, Scan(5))
+        await settle()
+        assert reading.cancelled
+        with anyio.CancelScope() as scope:
+            scope.cancel()
+            await anext(pairs)
+        assert scope.cancelled_caught
+        assert (await anext(pairs))[0] == Scan(5)
+        assert (pairs.arrived, pairs.delivered) == (1, 1)
+
+
+async def test_a_second_reader_is_told_and_the_first_goes_on(buffer: Buffer, streams: Streams) -> None:
+    send, receive = streams
+    async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
+        first = Asked(tasks, pairs.__anext__)
+        await settle()
+        with pytest.raises(anyio.BusyResourceError):
+            await anext(pairs)
+        put(send, Scan(5, "map"))
+        await settle()
+        assert first.answer[0] == Scan(5, "map")
+
+
+async def test_a_filter_is_entered_once_and_read_inside(buffer: Buffer, streams: Streams) -> None:
+    pairs = MessageFilter(streams[1], buffer, "map")
+    with pytest.raises(RuntimeError, match="enter"):
+        await anext(pairs)
+    async with pairs:
+        pass
+    with pytest.raises(RuntimeError, match="once"):
+        await pairs.__aenter__()
+
+
+def test_a_filter_is_made_without_an_event_loop(buffer: Buffer) -> None:
+    assert MessageFilter(Source(OSError()), buffer, "map").arrived == 0
+
+
+async def no_callback(_message: Scan, _reason: DropReason, _error: TransformError | None) -> None:
+    """An async function cannot be called when a message is dropped."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        ({"target": ""}, UnknownFrameError),
+        ({"target": ["map", "/odom"]}, UnknownFrameError),
+        ({"target": []}, ValueError),
+        ({"target": 5}, TypeError),
+        ({"tolerance": -1.0}, ValueError),
+        ({"tolerance": "much"}, TypeError),
+        ({"timeout": -1.0}, ValueError),
+        ({"capacity": 0}, ValueError),
+        ({"capacity": 1.5}, TypeError),
+        ({"overflow": "conflate"}, ValueError),
+        ({"order": "random"}, ValueError),
+        ({"on_drop": no_callback}, TypeError),
+        ({"on_drop": "print"}, TypeError),
+        ({"frame": "laser"}, TypeError),
+        ({"stamp": 5}, TypeError),
+        ({"messages": [Scan(1)]}, TypeError),
+    ],
+)
+def test_an_argument_that_makes_no_sense_is_refused(
+    arguments: dict[str, Any], error: type[Exception], buffer: Buffer
+) -> None:
+    with pytest.raises(error):
+        MessageFilter(**{"messages": Source(OSError()), "buffer": buffer, "target": "map", **arguments})
+
+
+def test_a_queue_size_behind_the_target_as_in_tf2_is_refused(buffer: Buffer) -> None:
+    make: Any = MessageFilter
+    with pytest.raises(TypeError, match="positional"):
+        make(Source(OSError()), buffer, "map", 10)
+
+
+async def test_a_leading_slash_is_named_with_the_frame_that_was_meant(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish(static("map", "laser"))
+    pairs = MessageFilter(receive, buffer, "map", on_drop=(drops := DroppedMessages()))
+    for target in ("/map", ["/map"]):
+        with pytest.raises(UnknownFrameError, match=r"no leading slash, did you mean 'map'\?"):
+            MessageFilter(receive, buffer, target)
+    with pytest.raises(UnknownFrameError, match="did you mean 'map'"):
+        pairs.set_target("/map")
+    async with pairs:
+        put(send, Scan(5, "/laser"))
+        await settle()
+    ((_, _, error),) = drops.all
+    assert "no leading slash, did you mean 'laser'?" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("target", "changed", "error"),
+    [
+        ("map", ["map"], TypeError),
+        (["map"], "map", TypeError),
+        ("map", "/map", UnknownFrameError),
+        (["map"], [], ValueError),
+    ],
+)
+def test_a_changed_target_that_makes_no_sense_is_refused(
+    target: Any, changed: Any, error: type[Exception], buffer: Buffer
+) -> None:
+    pairs: MessageFilter[Scan, Any] = MessageFilter(Source(OSError()), buffer, target)
+    with pytest.raises(error):
+        pairs.set_target(changed)
+
+
+# Plain asyncio
+
+
+def test_a_filter_in_tasks_of_asyncio() -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+    queue: asyncio.Queue[Scan] = asyncio.Queue()
+
+    async def messages() -> AsyncIterator[Scan]:
+        while True:
+            yield await queue.get()
+
+    async def first() -> int:
+        async with MessageFilter(messages(), buffer, "map") as pairs:
+            async for message, _ in pairs:
+                return int(message.stamp)
+        return -1
+
+    async def main() -> None:
+        async with asyncio.TaskGroup() as tasks:
+            answers = [tasks.create_task(first()) for _ in range(2)]
+            await settle()
+            await queue.put(Scan(5))
+            await queue.put(Scan(6))
+            await settle()
+            bus.publish([moving("map", "laser", 5), moving("map", "laser", 6)])
+        assert sorted(answer.result() for answer in answers) == [5, 6]
+        assert buffer.pending() == ()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("around", ["timeout", "wait_for"])
+def test_a_timeout_of_asyncio_around_a_filter_is_a_timeout(around: str) -> None:
+    buffer = Buffer(Bus())
+    left: list[int] = []
+
+    async def endless() -> None:
+        send, receive = anyio.create_memory_object_stream[Scan](10)
+        with send, receive:
+            send.send_nowait(Scan(5))
+            try:
+                async with MessageFilter(receive, buffer, "map") as pairs:
+                    await read(pairs, [])
+            finally:
+                left.append(pairs.dropped["closed"])
+
+    async def main() -> None:
+        with pytest.raises(TimeoutError):
+            if around == "wait_for":
+                await asyncio.wait_for(endless(), 0.01)
+            else:
+                async with asyncio.timeout(0.01):
+                    await endless()
+        task = asyncio.current_task()
+        assert task is not None
+        assert task.cancelling() == 0
+        assert (left, buffer.pending()) == ([1], ())
+        assert asyncio.all_tasks() == {task}
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("where", ["waiting", "in the body", "with an answer"])
+def test_a_cancelled_task_of_asyncio_is_cancelled(where: str) -> None:
+    bus = Bus(SimulatedClock())
+    buffer = Buffer(bus)
+
+    async def reading() -> None:
+        async with MessageFilter(Source(StopAsyncIteration(), Scan(5)), buffer, "map") as pairs:
+            async for _ in pairs:
+                await asyncio.sleep(3_600.0)
+
+    async def main() -> None:
+        task = asyncio.create_task(reading())
+        await settle()
+        if where != "waiting":
+            bus.publish(moving("map", "laser", 5))
+        if where == "in the body":
+            await settle()
+        task.cancel("enough")
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert task.cancelled()
+        assert (buffer.pending(), asyncio.all_tasks()) == ((), {asyncio.current_task()})
+
+    asyncio.run(main())
+
+
+def test_a_source_that_is_cancelled_in_its_own_right_is_no_quiet_end() -> None:
+    buffer = Buffer(Bus(SimulatedClock()))
+
+    async def main() -> None:
+        async with MessageFilter(Source(asyncio.CancelledError()), buffer, "map") as pairs:
+            with pytest.raises(asyncio.CancelledError):
+                await anext(pairs)
+
+    asyncio.run(main())

@@ -1,0 +1,349 @@
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType
+from rosbags.typesys import Stores, get_typestore
+from support.recorded import batches_in, facts, messages_in, write_mcap
+from support.samples import moving, static
+
+from tfbus import RecordingError, TransformStamped
+from tfbus.recording import open_recording
+from tfbus.tf_message import encode
+
+COUNT = 40
+LINES = [
+    (10, "/tf_static", [static("base", "laser", 1.0)]),
+    *((100 + k, "/tf", [moving("odom", "base", k, float(k)), moving("base", "wheel", k)]) for k in range(COUNT)),
+]
+EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    return partial(write_mcap, tmp_path / "run.mcap")
+
+
+def damage(path: Path, part: bytes) -> None:
+    """Turn over a bit where some bytes first are."""
+    data = bytearray(path.read_bytes())
+    data[data.index(part)] ^= 1
+    path.write_bytes(data)
+
+
+def records_in(data: bytes | bytearray) -> Iterator[tuple[int, int]]:
+    """Where each record begins, and its opcode."""
+    at = 8
+    while at + 8 < len(data):
+        yield at, data[at]
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+
+
+@pytest.mark.parametrize("finish", [True, False])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"chunk_size": 1},
+        {"chunk_size": 1_000_000},
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.ZSTD},
+        {"use_chunking": False},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.CHUNK},
+        {"use_statistics": False},
+        {"repeat_channels": False},
+        {"repeat_schemas": False},
+        {"repeat_schemas": False, "repeat_channels": False, "use_statistics": False, "index_types": IndexType.NONE},
+        {"enable_crcs": False},
+        {"enable_data_crcs": True},
+    ],
+    ids=str,
+)
+def test_all_is_read_however_a_file_is_laid_out(write: Write, options: dict[str, Any], finish: bool) -> None:
+    path = write(LINES, finish=finish, **options)
+    assert batches_in(path) == EXPECTED
+    with open_recording(path) as recording:
+        assert (recording.start, recording.end, recording.finished) == (10, 99 + COUNT, finish)
+
+
+def test_the_index_tells_how_many_messages_of_transforms_there_are(write: Write) -> None:
+    with open_recording(write(LINES)) as recording:
+        assert facts(recording) == (10, 99 + COUNT, COUNT + 1, True)
+
+
+def test_without_an_index_nobody_knows_how_many_messages_there_are(write: Write) -> None:
+    with open_recording(write(LINES, finish=False)) as recording:
+        assert facts(recording) == (10, 99 + COUNT, None, False)
+
+
+def test_a_message_at_log_time_zero_counts(write: Write) -> None:
+    for finish in (True, False):
+        path = write([(0, "/tf", [moving("a", "b", 0)])], finish=finish)
+        with open_recording(path) as recording:
+            assert (recording.start, recording.end) == (0, 0)
+        assert [message.received for message in messages_in(path)] == [0]
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_a_message_whose_log_time_is_no_stamp_is_told_and_the_others_are_read(write: Write, finish: bool) -> None:
+    late = [(2**63 + 5, "/tf", [moving("a", "b", 6)]), (2**64 - 1, "/tf", [moving("a", "b", 7)])]
+    path = write([(5, "/tf", [moving("a", "b", 5)]), *late], finish=finish)
+    found = [
+        (message.received, len(message.batch), [str(each) for each in message.errors]) for message in messages_in(path)
+    ]
+    reasons = [f"no message of transforms (damaged): a message has the log time {time} ns" for time, _, _ in late]
+    assert found == [(5, 1, []), *((5, 0, [reason]) for reason in reasons)]
+
+
+def test_a_finished_file_without_messages_is_an_empty_recording(write: Write) -> None:
+    with open_recording(write([])) as recording:
+        assert facts(recording) == (None, None, 0, True)
+        assert list(recording.messages()) == []
+
+
+def test_what_is_on_other_topics_or_of_other_types_is_left_alone(write: Write) -> None:
+    other = [moving("x", "y", 0)]
+    lines = [
+        (5, "/camera", b"\xff" * 5_000),
+        *((6, topic, other) for topic in ("/robot1/tf", "/tf_old", "/tf/more", "//tf")),
+        (7, "tf", [moving("a", "b", 1)]),
+        (8, "tf_static", [static("b", "c")]),
+    ]
+    path = write(lines)
+    assert batches_in(path) == [(7, (moving("a", "b", 1),)), (8, (static("b", "c"),))]
+    with open_recording(path) as recording:
+        assert (recording.start, recording.count) == (5, 2)
+    assert batches_in(write(LINES, schema="sensor_msgs/msg/Image")) == []
+    assert batches_in(write(LINES, encoding="protobuf")) == []
+
+
+@given(
+    times=st.lists(st.integers(0, 30), max_size=40),
+    chunk_size=st.integers(1, 2_000),
+    ends=st.tuples(*[st.integers(0, 30)] * 2),
+)
+def test_messages_come_by_log_time_wherever_they_are_in_the_file(
+    tmp_path_factory: pytest.TempPathFactory, times: list[int], chunk_size: int, ends: tuple[int, int]
+) -> None:
+    lines = [(time, "/tf", [moving("a", "b", place)]) for place, time in enumerate(times)]
+    path = write_mcap(tmp_path_factory.mktemp("recording") / "run.mcap", lines, chunk_size=chunk_size)
+    by_time = sorted((time, place) for place, time in enumerate(times))
+    found = [(message.received, message.batch[0].stamp) for message in messages_in(path)]
+    assert found == by_time
+    since, until = ends
+    within = [(message.received, message.batch[0].stamp) for message in messages_in(path, since, until)]
+    assert within == [(time, place) for time, place in by_time if since <= time <= until]
+
+
+def test_of_a_part_only_the_chunks_are_read_that_it_needs(write: Write) -> None:
+    path = write(LINES)
+    # A chunk has ten messages or less: these are far from the first and the last one.
+    for stamp in (0, COUNT - 1):
+        damage(path, encode([moving("odom", "base", stamp, float(stamp)), moving("base", "wheel", stamp)]))
+    middle = messages_in(path, 115, 120)
+    # One for the static transform, which is in the first chunk.
+    assert [message.received for message in middle if message.batch] == [115, 116, 117, 118, 119, 120]
+    assert not any(message.errors for message in middle)
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_a_damaged_chunk_is_told_and_the_others_are_read(write: Write, finish: bool) -> None:
+    path = write(LINES, finish=finish)
+    damage(path, encode(EXPECTED[15][1]))
+    messages = messages_in(path)
+    (lost,) = [message for message in messages if message.errors]
+    assert [error.reason for error in lost.errors] == ["damaged"]
+    assert lost.batch == ()
+    read = [(message.received, message.batch) for message in messages if message.batch]
+    missing = [place for place, line in enumerate(EXPECTED) if line not in read]
+    assert 15 in missing
+    assert missing == list(range(missing[0], missing[-1] + 1))
+    assert len(missing) < 12
+    # It comes in the place of what is lost.
+    assert messages.index(lost) == missing[0]
+
+
+def test_of_a_range_that_begins_in_a_damaged_chunk_the_loss_is_told_at_its_beginning(write: Write) -> None:
+    path = write(LINES)
+    damage(path, encode(EXPECTED[15][1]))
+    lost = {
+        since: message.received
+        for since in range(100, 100 + COUNT)
+        for message in messages_in(path, since)
+        if message.errors
+    }
+    # The chunk has several messages, and it is told from whichever the range begins with.
+    assert sum(since == received for since, received in lost.items()) > 1
+    assert all(since <= received <= 114 for since, received in lost.items() if since <= 114)
+
+
+def test_a_chunk_without_transforms_is_not_even_looked_at(write: Write) -> None:
+    first, second = [moving("a", "b", 1)], [moving("a", "b", 3)]
+    path = write([(1, "/tf", first), (2, "/camera", b"picture" * 1_000), (3, "/tf", second)], chunk_size=1)
+    damage(path, b"picturepicture")
+    assert [received for received, _ in batches_in(path)] == [1, 3]
+
+
+def test_a_record_that_goes_on_behind_the_end_of_a_finished_file_is_told(write: Write) -> None:
+    path = write(LINES, use_statistics=False)
+    data = bytearray(path.read_bytes())
+    second = [place for place, opcode in records_in(data) if opcode == Opcode.CHUNK][1]
+    data[second + 1 : second + 9] = len(data).to_bytes(8, "little")
+    path.write_bytes(data)
+    *read, lost = messages_in(path)
+    assert [(message.received, message.batch) for message in read] == EXPECTED[: len(read)]
+    assert 0 < len(read) < len(EXPECTED)
+    assert [error.reason for error in lost.errors] == ["damaged"]
+
+
+def test_damage_in_the_index_costs_nothing_but_the_index(write: Write) -> None:
+    path = write(LINES)
+    data = path.read_bytes()
+    index = data.rindex(b"/tf_static")
+    for place in (index, len(data) - 30, len(data) - 20):
+        torn = bytearray(data)
+        torn[place] ^= 1
+        path.write_bytes(torn)
+        assert batches_in(path) == EXPECTED
+        with open_recording(path) as recording:
+            assert recording.count is None
+
+
+def test_an_index_that_points_behind_the_end_costs_only_that_chunk(write: Write) -> None:
+    path = write(LINES, enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    place = next(place for place, opcode in records_in(data) if opcode == Opcode.CHUNK_INDEX)
+    # Behind the two log times.
+    data[place + 25 : place + 33] = b"\xff" * 8
+    path.write_bytes(data)
+    lost, *read = messages_in(path)
+    assert [error.reason for error in lost.errors] == ["damaged"]
+    assert 0 < len(read) < len(EXPECTED)
+    assert [(message.received, message.batch) for message in read] == EXPECTED[-len(read) :]
+
+
+def test_where_the_records_make_no_sense_any_more_the_rest_is_lost_and_told(write: Write) -> None:
+    path = write(LINES, finish=False)
+    data = path.read_bytes()
+    nonsense = b"\x04" + (100).to_bytes(8, "little") + b"\xff" * 100
+    path.write_bytes(data + nonsense + data[8:])
+    *read, lost = messages_in(path)
+    assert [(message.received, message.batch) for message in read] == EXPECTED
+    assert [error.reason for error in lost.errors] == ["damaged"]
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+def test_a_file_that_is_cut_anywhere_gives_what_comes_before_the_cut(
+    write: Write, compression: CompressionType
+) -> None:
+    path = write(LINES[:10], compression=compression)
+    found, shortest = EXPECTED[:10], 10
+    for size in reversed(range(path.stat().st_size)):
+        os.truncate(path, size)
+        try:
+            found = batches_in(path)
+        except RecordingError as error:
+            assert error.reason == ("truncated" if size else "empty")
+            found = []
+        assert found == EXPECTED[: len(found)]
+        # What can be read of a shorter file can be read of a longer one.
+        assert len(found) <= shortest
+        shortest = len(found)
+    assert found == []
+
+
+@settings(max_examples=300)
+@given(data=st.data())
+def test_whatever_bytes_are_turned_over_nothing_but_what_was_recorded_comes_out(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    finish = data.draw(st.booleans())
+    whole = bytearray(
+        write_mcap(path, LINES, compression=data.draw(st.sampled_from(CompressionType)), finish=finish).read_bytes()
+    )
+    for place in data.draw(st.lists(st.integers(0, len(whole) - 1), min_size=1, max_size=3)):
+        whole[place] = data.draw(st.integers(0, 255))
+    path.write_bytes(whole)
+    try:
+        messages = messages_in(path)
+    except RecordingError:
+        return
+    read = [(message.received, message.batch) for message in messages if message.batch]
+    assert all(line in EXPECTED for line in read)
+
+
+def test_a_foreign_message_on_the_topic_is_counted_and_the_next_ones_are_read(write: Write) -> None:
+    path = write([(1, "/tf", b"\0\1\0\0nonsense"), (2, "/tf", b""), (3, "/tf", [moving("a", "b", 3)])])
+    first, second, third = messages_in(path)
+    assert [error.reason for error in first.errors] == ["truncated"]
+    assert [error.reason for error in second.errors] == ["truncated"]
+    assert third.batch == (moving("a", "b", 3),)
+
+
+def test_messages_of_ros_1_are_read_as_well_with_their_sender(write: Write) -> None:
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    sample = moving("odom", "base", 1_500_000_000, 2.5)
+    payload = bytes(types.cdr_to_ros1(encode([sample]), "tf2_msgs/msg/TFMessage"))
+    for schema in ("tf2_msgs/TFMessage", "tf/tfMessage"):
+        lines = [(1, "/tf", payload)]
+        path = write(lines, schema=schema, encoding="ros1", metadata={"callerid": "/odometry"})
+        assert batches_in(path) == [(1, (sample.replace(authority="odometry"),))]
+
+
+AUTHORITIES = "tfbus.authorities"
+THREE = [moving("a", name, 1) for name in "bcd"]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "authorities"),
+    [
+        ('[["odometry", 1]]', ["odometry"] * 3),
+        ('[["odometry", 3]]', ["odometry"] * 3),
+        ('[["odometry", 2], ["slam", 1]]', ["odometry", "odometry", "slam"]),
+        ('[["odometry", 1], ["", 1], ["slam", 1]]', ["odometry", "", "slam"]),
+        # Not of ours, or not for these: then nobody is said to have sent them.
+        ('[["odometry", 1], ["slam", 1]]', [""] * 3),
+        ("[]", [""] * 3),
+        ("nonsense", [""] * 3),
+        ("[" * 100_000, [""] * 3),
+        ("3", [""] * 3),
+        ('[["odometry", "x"]]', [""] * 3),
+        ('[["odometry", 3], ["slam", -1]]', [""] * 3),
+        ('[["odometry", 1000000000000]]', [""] * 3),
+    ],
+)
+def test_authorities_are_in_the_metadata_of_the_channel(write: Write, metadata: str, authorities: list[str]) -> None:
+    path = write([(1, "/tf", THREE), (2, "/tf_static", [static("x", "y")] * 3)], metadata={AUTHORITIES: metadata})
+    (_, moving_ones), (_, static_ones) = batches_in(path)
+    assert [sample.authority for sample in moving_ones] == authorities
+    assert [sample.authority for sample in static_ones] == authorities
+    assert all(sample.static for sample in static_ones)
+
+
+def test_the_official_reader_finds_the_same_messages(write: Write) -> None:
+    path = write(LINES)
+    with path.open("rb") as file:
+        official = [(message.log_time, message.data) for _, _, message in make_reader(file).iter_messages()]
+    ours: list[tuple[int, bytes]] = [(received, encode(batch)) for received, batch in batches_in(path)]
+    assert ours == official
+
+
+def test_half_read_messages_can_be_left_and_read_anew(write: Write) -> None:
+    with open_recording(write(LINES)) as recording:
+        first, second = recording.messages(), recording.messages()
+        assert next(first) == next(second)
+        for _ in range(5):
+            next(first)
+        rest: list[tuple[int, tuple[TransformStamped, ...]]] = [(its.received, its.batch) for its in second]
+        assert rest == EXPECTED[1:]

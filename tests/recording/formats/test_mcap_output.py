@@ -1,0 +1,235 @@
+from collections import Counter
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+from support.samples import moving, static
+from support.strategies import samples
+
+from tfbus import Transform, TransformStamped
+from tfbus.recording._write_queue import Entry
+from tfbus.recording.formats._channels import TYPE_HASH
+from tfbus.recording.formats.mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, McapOutput
+from tfbus.stamps import SECOND
+from tfbus.tf_message import decode
+
+
+def written(path: Path, *entries: Entry) -> McapOutput:
+    with closing(McapOutput(str(path), overwrite=True)) as output:
+        output.write(entries)
+        output.finish()
+    return output
+
+
+def readable(path: Path) -> int:
+    """How many messages the official reader finds in a file that may end anywhere."""
+    count = 0
+    with path.open("rb") as file:
+        try:
+            for record in StreamReader(file).records:
+                count += isinstance(record, Message)
+        except Exception:  # noqa: BLE001 - of any kind, and it says that the file ends
+            pass
+    return count
+
+
+def plain(sample: TransformStamped) -> TransformStamped:
+    """As ROS knows it."""
+    return TransformStamped(sample.parent, sample.child, sample.stamp, sample.transform)
+
+
+def test_the_schema_is_the_definition_that_ros_2_has() -> None:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    assert store.generate_msgdef(SCHEMA_NAME, ros_version=2)[0] == SCHEMA
+    assert store.hash_rihs01(SCHEMA_NAME) == TYPE_HASH
+
+
+def test_the_official_reader_finds_topics_times_and_transforms(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    turned = TransformStamped("map", "b", 12 * SECOND + 7, Transform((1.0, 2.0, 3.0), (0.0, 0.6, 0.0, 0.8)), "slam")
+    written(path, (5, (static("map", "c", x=3.0),)), (9, (moving("map", "a", 3, x=0.1), turned)))
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        found = [
+            (
+                *(schema.name, schema.encoding, channel.message_encoding, channel.topic),
+                *(message.log_time, message.publish_time, message.data),
+            )
+            for schema, channel, message in reader.iter_messages()
+            if schema is not None
+        ]
+    kind = ("tf2_msgs/msg/TFMessage", "ros2msg", "cdr")
+    assert [entry[:6] for entry in found] == [(*kind, "/tf_static", 5, 5), (*kind, "/tf", 9, 9)]
+    assert decode(found[0][6]).samples == [moving("map", "c", 0, x=3.0)]
+    assert decode(found[1][6]).samples == [moving("map", "a", 3, x=0.1), plain(turned)]
+
+
+def test_rosbags_finds_topics_types_counts_times_and_transforms(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    written(
+        path, (5, (static("map", "c", x=3.0),)), *((9 + k, (moving("map", "a", k, x=k / 7),)) for k in range(1_000))
+    )
+    with AnyReader([path]) as reader:
+        assert {(each.topic, each.msgtype, each.msgcount) for each in reader.connections} == {
+            ("/tf_static", "tf2_msgs/msg/TFMessage", 1),
+            ("/tf", "tf2_msgs/msg/TFMessage", 1_000),
+        }
+        messages: list[tuple[int, Any]] = [
+            (time, reader.deserialize(raw, each.msgtype)) for each, time, raw in reader.messages()
+        ]
+    assert [time for time, _ in messages] == [5, *range(9, 1_009)]
+    for number, (_, message) in enumerate(messages[1:]):
+        (transform,) = message.transforms
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", "a")
+        assert transform.header.stamp.nanosec == number
+        assert transform.transform.translation.x == number / 7
+
+
+def test_a_batch_of_both_kinds_is_a_message_on_each_topic(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    written(path, (5, (moving("map", "a", 1), static("a", "b"), moving("a", "c", 2), static("a", "d"))))
+    with Reader(path) as reader:
+        found = {each.topic: (time, decode(raw).samples) for each, time, raw in reader.messages()}
+    assert found == {
+        "/tf_static": (5, [moving("a", "b", 0), moving("a", "d", 0)]),
+        "/tf": (5, [moving("map", "a", 1), moving("a", "c", 2)]),
+    }
+
+
+def test_a_child_that_changes_its_kind_within_a_batch_has_the_last_one(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    written(path, (5, (moving("map", "a", 1), static("map", "b"), static("map", "a"), moving("map", "b", 2))))
+    with Reader(path) as reader:
+        assert [(each.topic, decode(raw).samples) for each, _, raw in reader.messages()] == [
+            ("/tf", [moving("map", "a", 1)]),
+            ("/tf_static", [moving("map", "b", 0), moving("map", "a", 0)]),
+            ("/tf", [moving("map", "b", 2)]),
+        ]
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(samples(at=st.integers(-(2**31) * SECOND, 2**31 * SECOND - 1)), min_size=1, max_size=5))
+def test_transforms_come_back_bit_for_bit(tmp_path: Path, batch: list[TransformStamped]) -> None:
+    path = tmp_path / "run.mcap"
+    output = written(path, (5, tuple(batch)))
+    found: dict[str, list[str]] = {"/tf": [], "/tf_static": []}
+    with Reader(path) as reader:
+        for each, _, raw in reader.messages():
+            found[each.topic] += map(repr, decode(raw).samples)
+    # The text tells negative zeros too.
+    assert found["/tf"] == [repr(plain(sample)) for sample in batch if not sample.static]
+    assert found["/tf_static"] == [repr(plain(sample)) for sample in batch if sample.static]
+    assert output.samples == len(batch)
+
+
+def test_what_a_message_cannot_hold_is_left_out_and_counted_by_reason(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    late, long = moving("map", "a", 2**31 * SECOND), moving("map", "a" * 2_000, 1)
+    output = written(path, (5, (late, moving("map", "b", 1), long)), (6, (late,)))
+    with Reader(path) as reader:
+        assert [(time, decode(raw).samples) for _, time, raw in reader.messages()] == [(5, [moving("map", "b", 1)])]
+    assert output.refused == Counter({"stamp": 2, "frame name": 1})
+    assert (output.samples, output.messages) == (1, 1)
+
+
+def test_an_instant_before_1970_is_recorded_as_1970(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    written(path, (-5, (moving("map", "a", -5),)))
+    with Reader(path) as reader:
+        assert [(time, decode(raw).samples) for _, time, raw in reader.messages()] == [(0, [moving("map", "a", -5)])]
+
+
+def authorities_in(path: Path) -> list[tuple[str | None, list[str]]]:
+    """For each message, what its channel tells of authorities, and the children in it."""
+    with path.open("rb") as file:
+        return [
+            (
+                channel.metadata.get("tfbus.authorities"),
+                [sample.child for sample in decode(message.data).samples if sample is not None],
+            )
+            for _, channel, message in make_reader(file).iter_messages(log_time_order=False)
+        ]
+
+
+def test_a_message_is_on_a_channel_that_tells_its_authorities(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    a, b, c = (moving("map", child, 1, authority=who) for child, who in (("a", "x"), ("b", "x"), ("c", "y")))
+    written(path, (1, (a,)), (2, (a, b)), (3, (a, b, c)), (4, (moving("map", "d", 1),)))
+    assert authorities_in(path) == [
+        ('[["x", 1]]', ["a"]),
+        ('[["x", 1]]', ["a", "b"]),
+        ('[["x", 2], ["y", 1]]', ["a", "b", "c"]),
+        (None, ["d"]),
+    ]
+
+
+def test_a_message_of_too_many_authorities_is_divided(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    crowd = tuple(moving("map", f"f{number}", 1, authority=f"a{number // 2}") for number in range(100))
+    output = written(path, (1, crowd))
+    assert authorities_in(path) == [
+        (f'[["a{number}", 1]]', [f"f{2 * number}", f"f{2 * number + 1}"]) for number in range(50)
+    ]
+    assert (output.samples, output.messages, output.unattributed) == (100, 50, 0)
+
+
+def test_with_a_thousand_authorities_the_rest_is_recorded_without_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    output = written(path, *((k, (moving("map", "a", k, authority=f"a{k}"),)) for k in range(1_010)))
+    told = [authorities for authorities, _ in authorities_in(path)]
+    assert told == [f'[["a{k}", 1]]' for k in range(1_000)] + [None] * 10
+    assert (output.samples, output.unattributed) == (1_010, 10)
+
+
+def test_what_counts_as_written_can_be_read_at_any_moment(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    seen = set()
+    with closing(McapOutput(str(path), overwrite=False)) as output:
+        for k in range(2_000):
+            output.write([(k, (moving("map", "a", k, authority=f"a{k // 100}"),))])
+            assert output.samples + output.buffered == k + 1
+            if output.samples not in seen:
+                seen.add(output.samples)
+                assert output.samples == output.messages == readable(path)
+        # A message of one transform has 100 to 200 bytes.
+        assert 2_000 * 100 / CHUNK_SIZE < len(seen) < 2_000 * 200 / CHUNK_SIZE + 2
+        assert output.samples < 2_000
+        output.write((), flush=True)
+        assert output.samples == readable(path) == 2_000
+
+
+def test_a_new_channel_that_ends_a_chunk_counts_nothing_too_early(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with closing(McapOutput(str(path), overwrite=False)) as output:
+        for k in range(400):
+            output.write([(k, (moving("map", "a", k, authority=f"a{k}"),))])
+            assert output.samples <= readable(path)
+
+
+def test_a_file_that_is_there_is_kept_unless_it_may_be_lost(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_text("precious")
+    with pytest.raises(FileExistsError):
+        McapOutput(str(path), overwrite=False)
+    assert path.read_text() == "precious"
+    written(path, (1, (moving("map", "a", 1),)))
+    assert readable(path) == 1
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, lambda path: path.symlink_to("/dev/full")], ids=["folder", "full disk"])
+def test_what_cannot_be_written_at_all_raises_at_once(tmp_path: Path, make: Callable[[Path], None]) -> None:
+    path = tmp_path / "run.mcap"
+    make(path)
+    with pytest.raises(OSError, match=r"directory|space"):
+        McapOutput(str(path), overwrite=True)

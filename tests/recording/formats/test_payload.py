@@ -1,0 +1,62 @@
+import struct
+
+import pytest
+import zstandard
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from support.samples import moving
+
+from tfbus.recording.formats.payload import samples_of
+from tfbus.recording.formats.storage import Channel
+from tfbus.tf_message import MalformedMessageError, encode
+
+CDR, ROS1 = Channel(False, ("odometry",)), Channel(False, ("odometry",), ros1=True)
+SAMPLES = [moving("odom", "base", 3, 1.5, "odometry"), moving("base", "wheel", 4, 2.5, "odometry")]
+PAYLOAD = encode(SAMPLES)
+BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msgs/msg/TFMessage"))
+
+
+@pytest.mark.parametrize(
+    ("channel", "payload"), [(CDR, PAYLOAD), (CDR, zstandard.compress(PAYLOAD)), (ROS1, BY_ROS_1)], ids=str
+)
+def test_the_samples_are_those_that_were_sent_in_whatever_they_are_wrapped(channel: Channel, payload: bytes) -> None:
+    found = samples_of(channel, payload)
+    assert (found.samples, found.errors) == (SAMPLES, [])
+
+
+def test_in_the_other_byte_order_every_transform_has_its_authority_too() -> None:
+    # One transform, between frames with names of three letters, stamped 1 s and 2 ns, at x = 1 m.
+    name = b"\0\0\0\4abc\0", b"\0\0\0\4xyz\0"
+    numbers = struct.pack(">7d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    one = struct.pack(">iI", 1, 2) + b"".join(name)
+    payload = b"\0\0\0\0" + struct.pack(">I", 2) + one + b"\0" * 4 + numbers + one + numbers
+    found = samples_of(CDR, payload)
+    assert found.samples == [moving("abc", "xyz", 1_000_000_002, 1.0, "odometry")] * 2
+
+
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+@given(payload=st.binary(max_size=300))
+def test_any_bytes_are_samples_or_malformed(channel: Channel, payload: bytes) -> None:
+    try:
+        samples_of(channel, payload)
+    except MalformedMessageError as error:
+        assert error.reason
+
+
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+@given(data=st.data())
+def test_a_message_that_is_cut_or_turned_over_is_samples_or_malformed(channel: Channel, data: st.DataObject) -> None:
+    payload = bytearray(PAYLOAD if channel is CDR else BY_ROS_1)
+    payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
+    end = data.draw(st.integers(0, len(payload)))
+    try:
+        samples_of(channel, bytes(payload[:end]))
+    except MalformedMessageError as error:
+        assert error.reason
+
+
+def test_what_only_looks_compressed_is_malformed() -> None:
+    with pytest.raises(MalformedMessageError) as raised:
+        samples_of(CDR, b"\x28\xb5\x2f\xfd" + b"\xff" * 30)
+    assert raised.value.reason == "encoding"

@@ -1,0 +1,151 @@
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in
+from support.samples import moving, static
+
+from tfbus import RecordingError, TransformStamped
+from tfbus.recording import open_recording
+from tfbus.tf_message import encode
+
+TF = "tf2_msgs/msg/TFMessage"
+LINES: list[tuple[int, str, list[TransformStamped]]] = [
+    (30, "/tf", [moving("odom", "base", 3)]),
+    (10, "/tf_static", [static("base", "laser", 1.0)]),
+    (20, "/tf", [moving("odom", "base", 2), moving("base", "wheel", 2)]),
+    (20, "/tf", [moving("odom", "base", 1)]),
+]
+IN_ORDER = [(received, tuple(samples)) for received, _, samples in sorted(LINES, key=lambda line: line[0])]
+
+
+def write(path: Path, *, oldest_schema: bool = False) -> sqlite3.Connection:
+    """A file with the tables of the oldest ROS 2, or of a newer one, as `ros2 bag record` makes them."""
+    file = sqlite3.connect(path)
+    # Nobody pulls the plug here.
+    file.execute("PRAGMA synchronous = OFF")
+    further = "" if oldest_schema else ", offered_qos_profiles TEXT NOT NULL DEFAULT ''"
+    file.execute(
+        f"CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT{further})"
+    )
+    file.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+    if not oldest_schema:
+        file.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+    topics = [("/camera", "sensor_msgs/msg/Image"), ("/tf", TF), ("/tf_static", TF), ("/tf", "std_msgs/msg/String")]
+    for number, (name, kind) in enumerate(topics, 1):
+        file.execute(
+            "INSERT INTO topics(id, name, type, serialization_format) VALUES (?, ?, ?, 'cdr')", (number, name, kind)
+        )
+    for received, topic, samples in LINES:
+        number = 3 if topic == "/tf_static" else 2
+        add(file, number, received, encode(samples))
+    add(file, 1, 5, b"a picture")
+    add(file, 4, 40, b"a string")
+    file.commit()
+    return file
+
+
+def add(file: sqlite3.Connection, topic: int, received: int, data: object) -> None:
+    file.execute("INSERT INTO messages(topic_id, timestamp, data) VALUES (?, ?, ?)", (topic, received, data))
+
+
+@pytest.mark.parametrize("oldest_schema", [True, False])
+def test_messages_come_by_log_time_from_old_files_and_new_ones(tmp_path: Path, oldest_schema: bool) -> None:
+    path = tmp_path / "run.db3"
+    write(path, oldest_schema=oldest_schema).close()
+    assert batches_in(path) == IN_ORDER
+    with open_recording(path) as recording:
+        assert facts(recording) == (5, 40, 4, True)
+
+
+def test_a_range_includes_both_ends_and_begins_with_what_was_static(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    write(path).close()
+    assert [message.received for message in messages_in(path, 20, 20)] == [20, 20, 20]
+    assert messages_in(path, 25)[0].batch == (static("base", "laser", 1.0),)
+    assert [message.received for message in messages_in(path, until=10)] == [10]
+
+
+def test_what_rosbags_writes_is_read(tmp_path: Path) -> None:
+    (path,) = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3")
+    assert len(messages_in(path)) == len(messages_in(SMALL))
+
+
+def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> None:
+    running, killed = tmp_path / "running.db3", tmp_path / "killed.db3"
+    with sqlite3.connect(running) as file:
+        file.execute("PRAGMA journal_mode = WAL")
+    writer = write(running)
+    # What is on the disk while it runs is what a killed one leaves.
+    for suffix in ("", "-wal"):
+        shutil.copy(f"{running}{suffix}", f"{killed}{suffix}")
+    writer.close()
+    assert Path(f"{killed}-wal").stat().st_size > 0
+    assert batches_in(killed) == IN_ORDER
+    with open_recording(killed) as recording:
+        assert not recording.finished
+
+
+def test_reading_leaves_nothing_beside_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with sqlite3.connect(path) as file:
+        file.execute("PRAGMA journal_mode = WAL")
+    write(path).close()
+    batches_in(path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_name_that_looks_like_a_part_of_an_address_is_only_a_name(tmp_path: Path) -> None:
+    path = tmp_path / "50% of?mode=rw#1.db3"
+    write(path).close()
+    assert batches_in(path) == IN_ORDER
+
+
+def test_a_message_that_is_no_message_is_counted(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        for data in (None, "text", 7, b"\0"):
+            add(file, 2, 50, data)
+    file.close()
+    assert [error.reason for message in messages_in(path) for error in message.errors] == ["truncated"] * 4
+
+
+def test_another_database_is_no_recording(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with sqlite3.connect(path) as file:
+        file.execute("CREATE TABLE people(name TEXT)")
+    file.close()
+    with pytest.raises(RecordingError, match="an SQLite file, but no recording of ROS 2") as raised:
+        open_recording(path)
+    assert raised.value.reason == "foreign"
+
+
+def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    write(path).close()
+    path.write_bytes(path.read_bytes().replace(b"tabletopicstopics", b"tabletopic\xfftopics"))
+    with pytest.raises(RecordingError, match="it cannot be read as a recording of ROS 2") as raised:
+        open_recording(path)
+    assert raised.value.reason == "damaged"
+
+
+def test_a_file_that_is_cut_is_refused_or_gives_what_is_left_and_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        for received in range(100, 2_000):
+            add(file, 2, received, encode([moving("odom", "base", received)]))
+    file.close()
+    data = path.read_bytes()
+    whole = batches_in(path)
+    for size in range(20, len(data), 4_096 + 17):
+        path.write_bytes(data[:size])
+        try:
+            messages = messages_in(path)
+        except RecordingError as error:
+            assert error.reason in ("damaged", "foreign")
+            continue
+        read = [(message.received, message.batch) for message in messages if message.batch]
+        assert read == whole or any(message.errors for message in messages)
+        assert set(read) <= set(whole)

@@ -1,0 +1,198 @@
+import logging
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin
+from support.recorded import SMALL, WRONG_IN_SMALL, answers, as_ros2, messages_in, real, write_mcap
+from support.samples import any_samples, moving, over, static, x_of
+
+from tfbus import (
+    LATEST,
+    Buffer,
+    Bus,
+    DisconnectedError,
+    ExtrapolationError,
+    RecordingError,
+    TransformLookupError,
+    TransformStamped,
+    TransformTree,
+    UnknownFrameError,
+)
+from tfbus.recording import load
+
+SECOND = 1_000_000_000
+TOLERANCE = 1e-9
+
+ERRORS: dict[str, type[TransformLookupError]] = {
+    "LookupException": UnknownFrameError,
+    "ConnectivityException": DisconnectedError,
+    "ExtrapolationException": ExtrapolationError,
+}
+
+
+def disagreement(tree: TransformTree, answer: dict[str, Any]) -> str:
+    """What the tree answers differently from tf2; empty if nothing."""
+    at = LATEST if answer["at"] is None else answer["at"]
+    try:
+        found = tree.lookup(answer["target"], answer["source"], at)
+    except TransformLookupError as error:
+        expected = ERRORS.get(answer.get("error", ""))
+        return "" if expected and isinstance(error, expected) else f"{answer}: {error}"
+    if "error" in answer:
+        return f"{answer}: {found}"
+    # tf2 gives all that is static the stamp 0; tests/golden/README.md says why tfbus does not.
+    stamp = answer["at"] or (0 if found.static else found.stamp)
+    away = math.dist(found.transform.translation, answer["translation"])
+    # Up to their sign. Unit quaternions are half as far apart as the rotations.
+    turned = 2 * min(
+        math.dist(found.transform.rotation, [sign * part for part in answer["rotation"]]) for sign in (1.0, -1.0)
+    )
+    same = stamp == answer["stamp"] and away <= TOLERANCE and turned <= TOLERANCE
+    return "" if same else f"{answer}: {found}, {away} m and {turned} rad away"
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3", "mcap", "folder of db3", "folder of mcap"])
+def test_a_recording_answers_what_tf2_did_in_every_format(tmp_path: Path, kind: str) -> None:
+    path = SMALL
+    if kind != "bag":
+        path = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.MCAP if "mcap" in kind else StoragePlugin.SQLITE3)
+        if "folder" not in kind:
+            (path,) = path.glob(f"*.{kind}")
+    problems: Counter[str] = Counter()
+    tree = load(path, problems=problems)
+    asked = answers()
+    assert len(asked) > 450
+    assert [line for answer in asked if (line := disagreement(tree, answer))] == []
+    assert problems == WRONG_IN_SMALL
+
+
+def test_the_kth_transform_of_a_turtle_is_its_kth_pose() -> None:
+    path = real("turtlesim.bag")
+    tree = load(path)
+    sent: dict[str, list[int]] = {"turtle1": [], "turtle2": []}
+    for message in messages_in(path):
+        for sample in message.batch:
+            if sample.child in sent:
+                sent[sample.child].append(sample.stamp)
+    with AnyReader([path]) as reader:
+        for turtle, stamps in sent.items():
+            topic = [connection for connection in reader.connections if connection.topic == f"/{turtle}/pose"]
+            poses: list[Any] = [reader.deserialize(raw, link.msgtype) for link, _, raw in reader.messages(topic)]
+            assert len(poses) == len(stamps) == 1344
+            assert sorted(set(stamps)) == stamps
+            for pose, stamp in zip(poses, stamps, strict=True):
+                found = tree.lookup("world", turtle, stamp).transform
+                assert found.translation == (pose.x, pose.y, 0.0)
+                half = pose.theta / 2
+                assert found.rotation == pytest.approx((0.0, 0.0, math.sin(half), math.cos(half)), abs=2e-16)
+    assert tree.lookup("turtle1", "carrot").static
+
+
+def test_the_pr2_has_all_its_frames() -> None:
+    problems: Counter[str] = Counter()
+    tree = load(real("pr2_tf.bag"), problems=problems)
+    edges = tree.edges()
+    assert len(edges) == 82
+    assert problems == {}
+    assert {edge.authority for edge in edges} == {"robot_state_publisher"}
+    tree.lookup("base_footprint", "l_gripper_tool_frame")
+
+
+def test_everything_is_kept_however_long_ago(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", over("a", "b", (0, 1_000_000 * SECOND), speed=1e-9))])
+    tree = load(path)
+    assert tree.keep is None
+    assert x_of(tree, "a", "b", 250_000 * SECOND) == pytest.approx(250_000.0)
+
+
+def test_a_part_has_what_was_recorded_in_it_and_what_was_static_before(tmp_path: Path) -> None:
+    lines = [
+        (0, "/tf_static", [static("b", "fixed", 5.0)]),
+        *((time, "/tf", [moving("a", "b", time + 1_000, float(time))]) for time in range(10, 60, 10)),
+    ]
+    tree = load(write_mcap(tmp_path / "run.mcap", lines), 20, 40)
+    (edge, fixed) = tree.edges()
+    assert (edge.child, edge.samples, edge.oldest, edge.newest) == ("b", 3, 1_020, 1_040)
+    assert fixed.static
+    assert x_of(tree, "a", "fixed", 1_030) == 35.0
+
+
+def test_a_loop_of_parents_is_left_out_and_the_rest_of_its_message_is_not(tmp_path: Path) -> None:
+    lines = [(1, "/tf", [moving("a", "b", 1)]), (2, "/tf", [moving("b", "a", 2), moving("a", "c", 2, 7.0)])]
+    problems: Counter[str] = Counter()
+    tree = load(write_mcap(tmp_path / "run.mcap", lines), problems=problems)
+    assert problems == {"cycle": 1}
+    assert tree.chain("c", "b") == ["c", "a", "b"]
+    assert tree.frames() == ["a", "b", "c"]
+    assert x_of(tree, "a", "c") == 7.0
+
+
+def test_one_message_may_turn_an_edge_round(tmp_path: Path) -> None:
+    lines = [
+        (1, "/tf", [moving("map", "a", 1), moving("a", "b", 1)]),
+        (2, "/tf", [moving("b", "a", 2), moving("map", "b", 2)]),
+    ]
+    problems: Counter[str] = Counter()
+    tree = load(write_mcap(tmp_path / "run.mcap", lines), problems=problems)
+    assert problems == {}
+    assert tree.chain("map", "a") == ["map", "b", "a"]
+
+
+@given(batches=st.lists(st.lists(any_samples("abcd", last=20), min_size=1, max_size=4), max_size=15))
+def test_what_is_in_the_tree_is_what_a_bus_would_have_taken(
+    tmp_path_factory: pytest.TempPathFactory, batches: list[list[TransformStamped]]
+) -> None:
+    # A message is of one kind.
+    parts = [[sample for sample in batch if sample.static == kind] for batch in batches for kind in (True, False)]
+    lines = [(time, "/tf_static" if part[0].static else "/tf", part) for time, part in enumerate(parts) if part]
+    problems: Counter[str] = Counter()
+    tree = load(write_mcap(tmp_path_factory.mktemp("recording") / "run.mcap", lines), problems=problems)
+    bus = Bus()
+    buffer = Buffer(bus, keep=None)
+    for _, _, part in lines:
+        bus.publish(part, invalid="drop")
+    assert problems == bus.statistics().rejected
+    assert tree.edges() == buffer.tree.edges()
+    assert tree.to_yaml() == buffer.tree.to_yaml()
+
+
+def test_without_a_counter_what_is_left_out_is_logged_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "tfbus"):
+        load(SMALL)
+    (record,) = caplog.records
+    assert record.getMessage().startswith(f"left out of {SMALL}: 3 x not finite, 2 x frame name, ")
+    caplog.clear()
+    load(SMALL, problems=Counter())
+    assert caplog.records == []
+
+
+def test_nothing_is_logged_where_nothing_is_wrong(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    load(write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])]))
+    assert caplog.records == []
+
+
+def test_a_counter_goes_on_counting() -> None:
+    problems = Counter({"cycle": 10})
+    load(SMALL, problems=problems)
+    assert problems["cycle"] == 11
+
+
+def test_what_is_no_recording_raises(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError):
+        load(tmp_path / "run.mcap")
+
+
+def test_a_lookup_in_a_loaded_tree_is_not_stale_after_the_shape_has_changed(tmp_path: Path) -> None:
+    lines = [(time, "/tf", [moving("a" if time < 5 else "z", "b", time, float(time))]) for time in range(10)]
+    tree = load(
+        write_mcap(tmp_path / "run.mcap", [(0, "/tf_static", [static("root", "a"), static("root", "z")]), *lines])
+    )
+    assert tree.parent("b", 3) == "a"
+    assert tree.parent("b", 7) == "z"
+    assert (tree.forest.changed, tree.forest.joined) == (set(), set())

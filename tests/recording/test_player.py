@@ -1,0 +1,677 @@
+import asyncio
+import math
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+
+import anyio
+import anyio.lowlevel
+import anyio.to_thread
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import StoragePlugin
+from support.asking import Asked, settle
+from support.recorded import SMALL, WRONG_IN_SMALL, as_ros2, batches_in, real, write_mcap
+from support.samples import moving, static
+from trio.testing import MockClock
+
+from tfbus import (
+    SECOND,
+    Buffer,
+    Bus,
+    BusClosedError,
+    ClockReset,
+    ClockResetError,
+    FrameRemoved,
+    RecordingError,
+    SimulatedClock,
+)
+from tfbus.geometry.stamped import Batch
+from tfbus.recording import Player, Recorder, load
+from tfbus.recording._write_queue import Entry
+from tfbus.recording.formats.mcap_output import McapOutput
+
+pytestmark = pytest.mark.anyio
+
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+
+PATIENCE = 60.0
+"""Real seconds after which a test that hangs is given up."""
+
+AS_FAST = math.inf
+START = 1_700_000_000 * SECOND
+
+
+def written(path: Path, *entries: Entry) -> Path:
+    """A recording with batches at log times."""
+    with closing(McapOutput(str(path), overwrite=True)) as output:
+        output.write(entries)
+        output.finish()
+    return path
+
+
+def drive(seconds: Iterable[float], authority: str = "odometry") -> list[Entry]:
+    """A child that is at t m at t s, recorded as it was sent."""
+    stamps = [START + round(time * SECOND) for time in seconds]
+    return [(stamp, (moving("map", "base", stamp, (stamp - START) / SECOND, authority),)) for stamp in stamps]
+
+
+def x_at(buffer: Buffer, seconds: float) -> float:
+    return buffer.lookup_nowait("map", "base", START + round(seconds * SECOND)).transform.translation[0]
+
+
+@contextmanager
+def reads_of(path: Path) -> Iterator[set[int]]:
+    """The threads that open a file."""
+    readers: set[int] = set()
+    listening = [True]
+
+    def hear(event: str, arguments: tuple[object, ...]) -> None:
+        if listening and event == "open" and arguments[0] in (path, str(path)):
+            readers.add(threading.get_ident())
+
+    # It cannot be taken away again.
+    sys.addaudithook(hear)
+    try:
+        yield readers
+    finally:
+        listening.clear()
+
+
+class Heard:
+    """The batches that come over a bus, with the clock's time."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.entries: list[Entry] = []
+        self._bus = bus
+        self._registration = bus.subscribe(self._hear)
+        self.arrived = anyio.Event()
+
+    def _hear(self, batch: Batch) -> None:
+        self.entries.append((self._bus.clock.now(), batch))
+        self.arrived.set()
+
+    @property
+    def batches(self) -> list[Batch]:
+        return [batch for _, batch in self.entries]
+
+    async def until(self, count: int) -> None:
+        with anyio.fail_after(PATIENCE):
+            while len(self.entries) < count:
+                self.arrived = anyio.Event()
+                await self.arrived.wait()
+
+
+async def test_everything_is_published_as_it_was_recorded(tmp_path: Path) -> None:
+    batches: list[Batch] = [
+        (static("map", "rig", authority="survey"),),
+        (moving("map", "base", 7, 1.0, "odometry"), moving("base", "arm", 9, 2.0, "arm")),
+        (moving("map", "base", 8, 1.5),),
+    ]
+    path = written(tmp_path / "run.mcap", *((START + k, batch) for k, batch in enumerate(batches)))
+    with Bus() as bus:
+        heard = Heard(bus)
+        player = Player(bus, path, rate=AS_FAST)
+        assert (player.start, player.end, player.position) == (None, None, None)
+        await player.play()
+    assert heard.batches == batches
+    assert (player.start, player.end, player.position) == (START, START + 2, START + 2)
+    assert (player.played, player.passes, player.bad) == (4, 1, {})
+
+
+async def test_a_simulated_clock_goes_from_message_to_message(tmp_path: Path) -> None:
+    times = (0.0, 0.1, 0.1, 0.25, 3_600.000_000_001, 3_600.5)
+    path = written(tmp_path / "run.mcap", *drive(times))
+    clock = SimulatedClock()
+    with Bus(clock) as bus:
+        heard = Heard(bus)
+        await Player(bus, path, rate=AS_FAST).play()
+    assert heard.entries == drive(times)
+    assert clock.now() == START + 3_600 * SECOND + SECOND // 2
+
+
+async def test_messages_out_of_order_do_not_turn_the_clock_back(tmp_path: Path) -> None:
+    lines = [(received, "/tf", [moving("map", "base", received)]) for received in (5, 3, 9)]
+    path = write_mcap(tmp_path / "run.mcap", lines, finish=False)
+    with Bus(SimulatedClock()) as bus:
+        heard = Heard(bus)
+        await Player(bus, path, rate=AS_FAST).play()
+        assert bus.statistics().clock_resets == 0
+    assert [now for now, _ in heard.entries] == [5, 5, 9]
+
+
+async def watch_positions(bus: Bus, buffer: Buffer, seen: list[float]) -> None:
+    """A timed task: twice as often as there are samples, it looks where the base is."""
+    async for _ in bus.clock.ticks(200.0):
+        found = await buffer.lookup("map", "base")
+        seen.append(found.transform.translation[0])
+
+
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_timed_tasks_see_the_same_in_each_of_twenty_runs(tmp_path: Path, backend: str) -> None:
+    # Many blocks, so that the thread has something to do meanwhile.
+    path = written(tmp_path / "run.mcap", *drive(k / 100 for k in range(600)))
+
+    async def observe() -> list[float]:
+        seen: list[float] = []
+        with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(watch_positions, bus, buffer, seen)
+                await Player(bus, path, rate=AS_FAST).play()
+                tasks.cancel_scope.cancel()
+        return seen
+
+    # The first look waits for the first sample. From then on there is one half way to a sample and one just before it.
+    runs = [anyio.run(observe, backend=backend) for _ in range(20)]
+    assert runs == [[0.0, *((look - 1) // 2 / 100 for look in range(1, 1_199))]] * 20
+
+
+async def test_a_lookup_of_what_comes_later_waits_in_simulated_time(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 1.0, 2.0, 3.0)))
+    with Bus(SimulatedClock(START)) as bus, Buffer(bus) as buffer:
+        async with anyio.create_task_group() as tasks:
+            there = Asked(tasks, partial(buffer.lookup, "map", "base", START + 3 * SECOND // 2, timeout=2.5))
+            late = Asked(tasks, partial(buffer.lookup, "map", "base", START + 5 * SECOND // 2, timeout=2.5))
+            await Player(bus, path, rate=AS_FAST).play()
+        assert there.answer.transform.translation[0] == 1.5
+        assert isinstance(late.error, TimeoutError)
+
+
+async def test_a_loop_is_a_jump_back_that_drops_what_moves(tmp_path: Path) -> None:
+    entries = drive((0.0, 1.0, 2.0))
+    path = written(tmp_path / "run.mcap", (START, (static("base", "rig", 5.0),)), *entries)
+    found: list[object] = []
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer, bus.events(stale_after=None) as events:
+
+        def ask(batch: Batch) -> None:
+            # Before the middle of each pass: what the end of the last one said must be gone, and the rig still there.
+            if batch == entries[0][1]:
+                found.append(buffer.can_transform("map", "rig", START))
+                found.append(buffer.can_transform("map", "base", START + 2 * SECOND))
+            if batch == entries[2][1]:
+                found.append(x_at(buffer, 1.5))
+                if player.passes == 2:
+                    scope.cancel()
+
+        bus.subscribe(ask)
+        player = Player(bus, path, rate=AS_FAST, loop=True)
+        with anyio.CancelScope() as scope, anyio.fail_after(PATIENCE):
+            await player.play()
+        resets = bus.statistics().clock_resets
+        bus.close()
+        told = [(event.before, event.stamp) async for event in events if isinstance(event, ClockReset)]
+    assert found == [True, False, 1.5] * 3
+    assert resets == 2
+    assert told == [(START + 2 * SECOND, START)] * 2
+
+
+async def test_who_waits_for_the_last_sample_is_done_with_it_before_the_clock_jumps(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 1.0)))
+    with Bus(SimulatedClock(START)) as bus, Buffer(bus) as buffer, anyio.fail_after(PATIENCE):
+
+        async def think_about_it() -> float:
+            await buffer.lookup("map", "base", START + SECOND)
+            for _ in range(200):
+                await anyio.lowlevel.checkpoint()
+            return x_at(buffer, 1.0)
+
+        async with anyio.create_task_group() as playing:
+            async with anyio.create_task_group() as asking:
+                last = Asked(asking, think_about_it)
+                never = Asked(asking, partial(buffer.lookup, "map", "base", START + 2 * SECOND))
+                await settle()
+                playing.start_soon(Player(bus, path, rate=AS_FAST, loop=True).play)
+            playing.cancel_scope.cancel()
+    assert last.answer == 1.0
+    assert isinstance(never.error, ClockResetError)
+
+
+async def test_on_a_clock_that_cannot_jump_a_loop_removes_what_moves(tmp_path: Path) -> None:
+    entries = drive((0.0, 100.0, 200.0))
+    path = written(tmp_path / "run.mcap", (START, (static("base", "rig", 5.0),)), *entries)
+    with Bus() as bus, Buffer(bus) as buffer, bus.events(stale_after=None) as events:
+        found: list[object] = []
+
+        def ask(batch: Batch) -> None:
+            # Nothing so old would be taken behind the end of the last pass.
+            if batch == entries[0][1]:
+                found.append(buffer.can_transform("map", "rig", START))
+                if player.passes == 2:
+                    scope.cancel()
+
+        bus.subscribe(ask)
+        player = Player(bus, path, rate=AS_FAST, loop=True)
+        with anyio.CancelScope() as scope, anyio.fail_after(PATIENCE):
+            await player.play()
+        expired = sum(buffer.expired for buffer in bus.statistics().buffers)
+        bus.close()
+        removed = [event.frame async for event in events if isinstance(event, FrameRemoved)]
+    assert found == [True] * 3
+    assert removed == ["base"] * 2
+    assert expired == 0
+
+
+async def test_a_frame_that_somebody_else_has_removed_meanwhile_is_no_error(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 1.0)))
+    with Bus() as bus:
+        player = Player(bus, path, rate=AS_FAST)
+        await player.play()
+        bus.remove_frame("base")
+        await player.play()
+    assert (player.played, player.passes) == (4, 2)
+
+
+async def test_a_range_begins_with_what_was_static_before(tmp_path: Path) -> None:
+    entries = drive(range(10))
+    path = written(
+        tmp_path / "run.mcap",
+        (START, (static("base", "rig", 1.0, authority="survey"), static("base", "mast"))),
+        *entries[:4],
+        (START + 3 * SECOND, (static("base", "rig", 2.0, authority="survey"),)),
+        *entries[4:],
+    )
+    since, until = START + 5 * SECOND, START + 7 * SECOND
+    for clock in (SimulatedClock(), None):
+        with Bus(clock) as bus:
+            heard = Heard(bus)
+            player = Player(bus, path, rate=AS_FAST, since=since, until=until)
+            await player.play()
+        samples = [sample for batch in heard.batches for sample in batch]
+        assert set(samples[:2]) == {static("base", "rig", 2.0, authority="survey"), static("base", "mast")}
+        assert samples[2:] == [sample for _, (sample,) in entries[5:8]]
+        assert (player.start, player.end, player.position) == (since, until, until)
+        if clock is not None:
+            assert {now for now, batch in heard.entries if batch[0].static} == {since}
+
+
+async def test_an_empty_range_ends_at_once_even_in_a_loop(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 1.0)))
+    with Bus(SimulatedClock()) as bus:
+        player = Player(bus, path, loop=True, since=START + 5 * SECOND)
+        with anyio.fail_after(PATIENCE):
+            await player.play()
+    assert (player.played, player.position) == (0, None)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+async def test_a_seek_interrupts_a_pause_of_an_hour(tmp_path: Path, simulated: bool) -> None:
+    entries = [(START, (static("base", "rig"),)), *drive((0.0, 3_600.0, 7_200.0))]
+    path = written(tmp_path / "run.mcap", *entries)
+    with Bus(SimulatedClock() if simulated else None) as bus, bus.events(stale_after=None) as events:
+        heard = Heard(bus)
+        player = Player(bus, path)
+        async with anyio.create_task_group() as tasks:
+            playing = Asked(tasks, player.play)
+            await heard.until(2)
+            player.seek(START + 3_600 * SECOND)
+            await heard.until(4)
+            assert not playing.ended
+            player.seek(START)
+            await heard.until(6)
+            player.seek(START + 7_200 * SECOND)
+            with anyio.fail_after(PATIENCE):
+                while not playing.ended:  # noqa: ASYNC110
+                    await anyio.sleep(0.001)
+        if simulated:
+            assert [now for now, _ in heard.entries] == [
+                START + hours * 3_600 * SECOND for hours in (0, 0, 1, 1, 0, 0, 2, 2)
+            ]
+        bus.close()
+        # Only of the one that goes back.
+        told = [type(event) async for event in events if isinstance(event, (ClockReset, FrameRemoved))]
+        assert told == [ClockReset if simulated else FrameRemoved]
+    rig, first, second, third = (batch for _, batch in entries)
+    assert heard.batches == [rig, first, rig, second, rig, first, rig, third]
+    assert player.passes == 1
+
+
+async def test_a_subscriber_may_seek(tmp_path: Path) -> None:
+    entries = drive(range(1_000))
+    path = written(tmp_path / "run.mcap", *entries)
+    with Bus(SimulatedClock()) as bus:
+        heard = Heard(bus)
+        player = Player(bus, path, rate=AS_FAST)
+        targets = iter((900, 100))
+
+        def jump(batch: Batch) -> None:
+            if batch[0].stamp in (START + 10 * SECOND, START + 950 * SECOND) and (to := next(targets, None)):
+                player.seek(START + to * SECOND)
+
+        bus.subscribe(jump)
+        await player.play()
+    expected = [*range(11), *range(900, 951), *range(100, 1_000)]
+    assert heard.entries == [entries[k] for k in expected]
+
+
+async def test_a_seek_before_it_plays_is_where_it_begins_once(tmp_path: Path) -> None:
+    entries = drive(range(5))
+    path = written(tmp_path / "run.mcap", *entries)
+    with Bus(SimulatedClock()) as bus:
+        heard = Heard(bus)
+        player = Player(bus, path, rate=AS_FAST)
+        player.seek(START + 3 * SECOND)
+        await player.play()
+        await player.play()
+    assert heard.entries == [*entries[3:], *entries]
+
+
+async def test_a_seek_behind_the_end_does_not_end_a_loop(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive(range(5)))
+    with Bus(SimulatedClock()) as bus:
+        heard = Heard(bus)
+        player = Player(bus, path, rate=AS_FAST, loop=True)
+        player.seek(START + 3_600 * SECOND)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(player.play)
+            await heard.until(10)
+            tasks.cancel_scope.cancel()
+    assert player.passes >= 2
+
+
+async def test_a_loop_ends_where_there_is_nothing_to_play(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive(range(5)))
+    with Bus(SimulatedClock()) as bus, anyio.fail_after(PATIENCE):
+        player = Player(bus, path, rate=AS_FAST, loop=True, since=START + 3_600 * SECOND)
+        player.seek(START + 7_200 * SECOND)
+        await player.play()
+    assert (player.played, player.passes) == (0, 2)
+
+
+async def test_as_fast_as_can_be_waits_for_nothing(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive(3_600.0 * k for k in range(1_000)))
+    with Bus() as bus, anyio.fail_after(PATIENCE):
+        player = Player(bus, path, rate=AS_FAST)
+        await player.play()
+    assert player.played == 1_000
+
+
+def in_virtual_time(function: Callable[[], Awaitable[None]]) -> None:
+    """Run with trio's own clock, which jumps to the next deadline whenever nothing runs."""
+    clock = MockClock(autojump_threshold=0)
+    anyio.run(function, backend="trio", backend_options={"clock": clock})
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0, 0.25])
+@pytest.mark.parametrize(
+    ("simulated", "times"),
+    [(True, (0.0, 0.5, 0.501, 9.0)), (False, (0.0, 0.5, 0.501, 86_400.0))],
+    ids=["simulated", "system"],
+)
+def test_each_message_comes_at_its_time(tmp_path: Path, rate: float, simulated: bool, times: tuple[float, ...]) -> None:
+    path = written(tmp_path / "run.mcap", *drive(times))
+
+    async def play() -> None:
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            bus.subscribe(lambda _: heard.append(anyio.current_time()))
+            await Player(bus, path, rate=rate).play()
+
+    heard: list[float] = []
+    in_virtual_time(play)
+    assert [time - heard[0] for time in heard] == pytest.approx([time / rate for time in times], abs=1e-6)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+async def test_the_highest_rates_are_as_fast_as_can_be(tmp_path: Path, simulated: bool) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
+    for rate in (1e12, 1e300):
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            player = Player(bus, path, rate=rate)
+            with anyio.fail_after(PATIENCE):
+                await player.play()
+            assert player.played == 3
+
+
+def test_at_the_lowest_rates_a_simulated_clock_still_goes_on(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 3e-9)))
+    heard: list[float] = []
+
+    async def play() -> None:
+        with Bus(SimulatedClock()) as bus:
+            bus.subscribe(lambda _: heard.append(anyio.current_time()))
+            await Player(bus, path, rate=1e-9).play()
+
+    in_virtual_time(play)
+    assert heard[1] - heard[0] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize("finish", [True, False])
+async def test_the_event_loop_does_not_read_the_file(tmp_path: Path, finish: bool) -> None:
+    lines = [(received, "/tf", batch) for received, batch in drive((0.0, 0.5))]
+    path = write_mcap(tmp_path / "run.mcap", lines, finish=finish)
+    with Bus(SimulatedClock()) as bus, reads_of(path) as readers:
+        await Player(bus, path, rate=AS_FAST).play()
+    assert readers
+    assert threading.get_ident() not in readers
+
+
+def test_at_a_rate_a_simulated_clock_does_not_stand_still_between_messages(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+    seen: list[float] = []
+
+    async def tick(bus: Bus) -> None:
+        async for number in bus.clock.ticks(50.0):
+            assert bus.clock.now() == START + number * SECOND // 50
+            seen.append(anyio.current_time())
+
+    async def play() -> None:
+        with Bus(SimulatedClock(START)) as bus:
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(tick, bus)
+                await Player(bus, path, rate=4.0).play()
+                tasks.cancel_scope.cancel()
+
+    in_virtual_time(play)
+    assert len(seen) == 501
+    # A step is 20 ms.
+    assert all(abs(number / 50.0 / 4.0 - (time - seen[0])) < 0.021 for number, time in enumerate(seen))
+
+
+def test_a_range_begins_at_its_beginning_though_the_first_message_comes_later(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+
+    async def play() -> None:
+        with Bus() as bus:
+            player = Player(bus, path, since=START + 4 * SECOND)
+            before = anyio.current_time()
+            await player.play()
+            assert anyio.current_time() - before == pytest.approx(6.0, abs=1e-6)
+
+    in_virtual_time(play)
+
+
+async def test_what_is_wrong_in_a_recording_is_counted_and_the_rest_is_played() -> None:
+    with Bus(SimulatedClock()) as bus:
+        player = Player(bus, SMALL, rate=AS_FAST)
+        await player.play()
+        statistics = bus.statistics()
+    # The loop of parents only the bus can see.
+    assert {**player.bad, **statistics.rejected} == WRONG_IN_SMALL
+    assert player.played == statistics.samples + WRONG_IN_SMALL["cycle"]
+
+
+async def test_of_a_damaged_file_that_was_cut_off_what_is_left_is_played(tmp_path: Path) -> None:
+    entries = drive(k / 100 for k in range(2_000))
+    path = written(tmp_path / "run.mcap", *entries)
+    data = bytearray(path.read_bytes()[:-10_000])
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+    with Bus(SimulatedClock()) as bus:
+        heard = Heard(bus)
+        player = Player(bus, path, rate=AS_FAST)
+        await player.play()
+    assert sum(player.bad.values()) == 1
+    assert heard.entries == [(now, (message,)) for now, (message,) in entries if (now, (message,)) in heard.entries]
+    assert entries[0] == heard.entries[0]
+    assert 500 < len(heard.entries) < 2_000
+
+
+@pytest.mark.parametrize("storage", [None, StoragePlugin.SQLITE3, StoragePlugin.MCAP], ids=["bag", "db3", "mcap"])
+async def test_recordings_of_all_formats_are_played(tmp_path: Path, storage: StoragePlugin | None) -> None:
+    bag = real("turtlesim.bag")
+    path = bag if storage is None else as_ros2(bag, tmp_path / "converted", storage)
+    tree = load(path)
+    with Bus(SimulatedClock()) as bus, Buffer(bus, keep=None) as buffer:
+        player = Player(bus, path, rate=AS_FAST)
+        await player.play()
+    assert player.played == sum(len(batch) for _, batch in batches_in(path))
+    stamps = [sample.stamp for _, batch in batches_in(path) for sample in batch if sample.child == "turtle2"]
+    question = ("turtle1", "turtle2", stamps[len(stamps) // 2])
+    assert buffer.lookup_nowait(*question) == tree.lookup(*question)
+
+
+async def test_what_is_played_can_be_recorded_again(tmp_path: Path) -> None:
+    entries = [(START, (static("base", "rig", authority="survey"),)), *drive(k / 50 for k in range(500))]
+    path, copy = written(tmp_path / "run.mcap", *entries), tmp_path / "copy.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, copy):
+            await Player(bus, path, rate=AS_FAST).play()
+    assert batches_in(copy) == batches_in(path)
+
+
+async def test_a_player_that_is_cancelled_can_play_again(tmp_path: Path) -> None:
+    entries = drive(range(2_000))
+    path = written(tmp_path / "run.mcap", *entries)
+    with Bus() as bus:
+        heard = Heard(bus)
+        player = Player(bus, path)
+        async with anyio.create_task_group() as tasks:
+            playing = Asked(tasks, player.play)
+            await heard.until(1)
+            playing.cancel()
+        assert playing.cancelled
+        player = Player(bus, path, rate=AS_FAST)
+        await player.play()
+    assert heard.batches == [batch for _, batch in [entries[0], *entries]]
+
+
+def test_under_plain_asyncio_it_can_be_cancelled_too(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 3_600.0)))
+
+    async def main() -> None:
+        with Bus() as bus:
+            heard = Heard(bus)
+            player = Player(bus, path)
+            for count in (1, 2):
+                task = asyncio.create_task(player.play())
+                await heard.until(count)
+                task.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await task
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.01):
+                    await player.play()
+
+    asyncio.run(main())
+
+
+async def test_only_one_task_plays(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 3_600.0)))
+    with Bus() as bus:
+        heard = Heard(bus)
+        player = Player(bus, path)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(player.play)
+            await heard.until(1)
+            with pytest.raises(RuntimeError, match="played already"):
+                await player.play()
+            tasks.cancel_scope.cancel()
+
+
+async def test_on_a_simulated_clock_nobody_else_may_keep_time(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive((0.0, 1.0)))
+    clock = SimulatedClock()
+    with Bus(clock) as bus:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, Player(bus, path).play)
+            with anyio.fail_after(PATIENCE):
+                while not asked.ended:
+                    await clock.advance(1.0)
+    assert isinstance(asked.error, RuntimeError)
+    assert "another task is advancing" in str(asked.error)
+
+
+async def test_on_a_bus_that_is_closed_it_ends_with_the_buss_error(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive(range(1_000)))
+    with Bus() as bus:
+        bus.subscribe(lambda _: bus.close())
+        player = Player(bus, path, rate=AS_FAST)
+        with pytest.raises(BusClosedError):
+            await player.play()
+    assert player.played == 1
+
+
+async def test_a_file_that_cannot_be_read_any_more_ends_it_with_the_disks_error(tmp_path: Path) -> None:
+    path = written(tmp_path / "run.mcap", *drive(range(10)))
+    with Bus(SimulatedClock()) as bus:
+        bus.subscribe(lambda _: path.unlink(missing_ok=True))
+        player = Player(bus, path, rate=AS_FAST, loop=True)
+        with pytest.raises(FileNotFoundError):
+            await player.play()
+    assert (player.played, player.passes) == (10, 1)
+
+
+@pytest.mark.parametrize(("content", "reason"), [(None, "missing"), ("", "empty"), ("no recording", "foreign")])
+async def test_what_is_no_recording_says_so(tmp_path: Path, content: str | None, reason: str) -> None:
+    path = tmp_path / "run.mcap"
+    if content is not None:
+        path.write_text(content)
+    with Bus() as bus:
+        player = Player(bus, path)
+        for _ in range(2):
+            with pytest.raises(RecordingError) as caught:
+                await player.play()
+            assert caught.value.reason == reason
+
+
+def test_arguments_are_checked_when_it_is_made(tmp_path: Path) -> None:
+    with Bus() as bus:
+        for rate in (0.0, -1.0, math.nan):
+            with pytest.raises(ValueError, match="greater than zero"):
+                Player(bus, tmp_path, rate=rate)
+        with pytest.raises(TypeError, match="must be a number"):
+            Player(bus, tmp_path, rate="2")  # type: ignore[arg-type]
+        with pytest.raises(TypeError, match="from_seconds"):
+            Player(bus, tmp_path, since=1.5)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="end before it begins"):
+            Player(bus, tmp_path, since=5, until=4)
+        with pytest.raises(TypeError, match="from_seconds"):
+            Player(bus, tmp_path).seek(1.5)  # type: ignore[arg-type]
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+@given(
+    st.lists(st.integers(0, 20), min_size=1, max_size=30).map(sorted),
+    st.dictionaries(st.integers(1, 40), st.integers(0, 22), max_size=6),
+)
+def test_whenever_it_is_made_to_seek_it_goes_on_from_there(
+    run: Run, tmp_path: Path, times: list[int], seeks: dict[int, int]
+) -> None:
+    """Against a model: a list, in which the n-th message that is heard makes it jump."""
+    entries = drive(times)
+    path = written(tmp_path / "run.mcap", *entries)
+    expected: list[Entry] = []
+    at = 0
+    while at < len(entries):
+        expected.append(entries[at])
+        at += 1
+        if len(expected) in seeks:
+            at = sum(time < seeks[len(expected)] for time in times)
+
+    async def play() -> None:
+        with Bus(SimulatedClock()) as bus:
+            heard = Heard(bus)
+            player = Player(bus, path, rate=AS_FAST)
+
+            def jump(_: Batch) -> None:
+                if len(heard.entries) in seeks:
+                    player.seek(START + seeks[len(heard.entries)] * SECOND)
+
+            bus.subscribe(jump)
+            await player.play()
+            assert heard.entries == expected
+
+    run(play)

@@ -1,0 +1,594 @@
+import asyncio
+import errno
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import closing
+from io import BytesIO
+from pathlib import Path
+
+import anyio
+import anyio.to_thread
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from support.asking import Asked, settle
+from support.samples import any_samples, moving, static
+
+from tfbus import (
+    SECOND,
+    Buffer,
+    Bus,
+    BusClosedError,
+    Event,
+    RecorderStatistics,
+    RecordingDropped,
+    RecordingFailed,
+    SimulatedClock,
+    Transform,
+    TransformBroadcaster,
+    TransformError,
+    TransformStamped,
+    TransformTree,
+)
+from tfbus.recording.load import load
+from tfbus.recording.recorder import Recorder
+from tfbus.recording.recording import open_recording
+
+pytestmark = pytest.mark.anyio
+
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+
+PATIENCE = 60.0
+"""Real seconds after which a test that hangs is given up."""
+
+
+def recorded(path: Path) -> list[tuple[int, tuple[TransformStamped, ...]]]:
+    """The times and batches in a file in which nothing is wrong."""
+    with open_recording(path) as recording:
+        messages = list(recording.messages())
+        assert recording.finished
+    assert all(not message.errors for message in messages)
+    return [(message.received, message.batch) for message in messages]
+
+
+def noise(count: int, child: str = "base") -> list[TransformStamped]:
+    """Samples that no compression makes smaller than about 50 bytes."""
+    numbers = random.Random(count)
+    return [
+        TransformStamped("map", child, stamp, Transform((numbers.random(), numbers.random(), numbers.random())))
+        for stamp in range(count)
+    ]
+
+
+def offered(statistics: RecorderStatistics) -> int:
+    queue = statistics.queue
+    return statistics.samples + sum(statistics.refused.values()) + queue.pending + queue.dropped + queue.conflated
+
+
+async def until(true: Callable[[], bool]) -> None:
+    """Wait for what a thread does: there is no event to wait for."""
+    with anyio.fail_after(PATIENCE):
+        while not true():  # noqa: ASYNC110
+            await anyio.sleep(0.001)
+
+
+class Pipe:
+    """A named pipe as the disk: nothing goes on when it is full, and it fails when nobody reads any more."""
+
+    def __init__(self, path: Path) -> None:
+        os.mkfifo(path)
+        self.path = path
+        self.data = b""
+        self._reading = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        self._thread = threading.Thread(target=self._drain)
+
+    def drain(self) -> None:
+        """Take what comes from now on, until the writer closes it."""
+        os.set_blocking(self._reading, True)
+        self._thread.start()
+
+    def _drain(self) -> None:
+        while piece := os.read(self._reading, 65_536):
+            self.data += piece
+
+    def break_off(self) -> None:
+        os.close(self._reading)
+        self._reading = -1
+
+    def close(self) -> None:
+        if self._thread.ident is not None:
+            self._thread.join(PATIENCE)
+        if self._reading >= 0:
+            self.break_off()
+
+    def messages(self) -> int:
+        self._thread.join(PATIENCE)
+        return sum(1 for _ in make_reader(BytesIO(self.data)).iter_messages())
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Iterator[Pipe]:
+    with closing(Pipe(tmp_path / "pipe.mcap")) as pipe:
+        yield pipe
+
+
+async def test_what_is_latched_comes_first_and_then_what_is_published(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    clock = SimulatedClock(7 * SECOND)
+    with Bus(clock) as bus:
+        bus.publish(
+            [static("map", "a", authority="survey"), moving("a", "b", 1), static("map", "c", authority="survey")]
+        )
+        async with Recorder(bus, path):
+            clock.set(8 * SECOND)
+            bus.publish(moving("a", "b", 2, authority="odometry"))
+            clock.set(9 * SECOND)
+            bus.publish([moving("a", "b", 3, authority="odometry"), static("b", "d", authority="survey")])
+        bus.publish(moving("a", "b", 4))
+    latched = (static("map", "a", authority="survey"), static("map", "c", authority="survey"))
+    assert recorded(path) == [
+        (7 * SECOND, latched),
+        (8 * SECOND, (moving("a", "b", 2, authority="odometry"),)),
+        (9 * SECOND, (static("b", "d", authority="survey"),)),
+        (9 * SECOND, (moving("a", "b", 3, authority="odometry"),)),
+    ]
+
+
+async def test_a_batch_is_recorded_under_the_simulated_time_of_its_publication(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    clock = SimulatedClock()
+    with Bus(clock) as bus:
+        broadcaster = TransformBroadcaster(bus, authority="odometry")
+
+        async def drive() -> None:
+            async for tick in clock.ticks(100.0):
+                broadcaster.send("map", "base", Transform((tick / 100, 0.0, 0.0)), at=7)
+
+        async with Recorder(bus, path), anyio.create_task_group() as tasks:
+            tasks.start_soon(drive)
+            await clock.advance(2.0)
+            tasks.cancel_scope.cancel()
+    assert [received for received, _ in recorded(path)] == [tick * SECOND // 100 for tick in range(201)]
+
+
+def answers(tree: TransformTree, stamps: range) -> list[str]:
+    """Everything that can be asked of a tree, to the last bit; where there is no answer, why."""
+    found = []
+    for target in sorted(tree.frames()):
+        for source in sorted(tree.frames()):
+            for stamp in stamps:
+                try:
+                    found.append(repr(tree.lookup(target, source, stamp)))
+                except TransformError as error:
+                    found.append(f"{target} {source} {stamp}: {error}")
+    return found
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+@given(st.lists(st.lists(any_samples("abcd", 5), min_size=1, max_size=4), max_size=12))
+def test_a_loaded_recording_gives_the_answers_that_the_buffer_gave(
+    run: Run, tmp_path: Path, batches: list[list[TransformStamped]]
+) -> None:
+    path = tmp_path / "run.mcap"
+
+    async def record() -> None:
+        with Bus(SimulatedClock()) as bus:
+            buffer = Buffer(bus, keep=None)
+            async with Recorder(bus, path, overwrite=True):
+                for batch in batches:
+                    # One by one, for a batch of both kinds is divided in the file, and then less can be judged at once.
+                    for sample in batch:
+                        bus.publish(sample, invalid="drop")
+            before.extend(answers(buffer.tree, range(7)))
+
+    before: list[str] = []
+    run(record)
+    assert answers(load(path), range(7)) == before
+
+
+async def test_two_recorders_of_one_bus_write_the_same(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, one), Recorder(bus, str(two)):
+            for sample in noise(3_000):
+                bus.publish(sample)
+    assert one.read_bytes() == two.read_bytes()
+    assert len(recorded(one)) == 3_000
+
+
+async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, path) as recorder:
+            for number in range(1, 4):
+                bus.publish(moving("map", "a", number))
+                await recorder.flush()
+                assert (recorder.statistics().samples, recorder.statistics().queue.pending) == (number, 0)
+                with open_recording(path) as recording:
+                    assert len(list(recording.messages())) == number
+                    assert not recording.finished
+        await recorder.flush()
+
+
+async def test_several_may_wait_for_a_flush(tmp_path: Path) -> None:
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
+            bus.publish(moving("map", "a", 1))
+            asked = [Asked(tasks, recorder.flush) for _ in range(3)]
+            await until(lambda: all(each.ended for each in asked))
+            assert recorder.statistics().samples == 1
+
+
+async def test_a_little_is_in_the_file_soon_without_being_asked_for(tmp_path: Path) -> None:
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
+            bus.publish(moving("map", "a", 1))
+            assert recorder.statistics().queue.pending == 1
+            await until(lambda: recorder.statistics().samples == 1)
+
+
+async def test_a_hundred_thousand_samples_flat_out_are_recorded_or_counted(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus, bus.events() as events:
+        bus.publish(static("map", "rig"))
+        async with Recorder(bus, path, capacity=20_000) as recorder:
+            for stamp in range(100_000):
+                # Nothing is awaited, so nothing can be written.
+                bus.publish((moving("map", "a", stamp),) if stamp % 10_000 else (static("map", f"s{stamp}"),))
+            statistics = recorder.statistics()
+            assert (statistics.samples, offered(statistics)) == (0, 100_001)
+            # The newest 20,000 batches, two of them static, and the nine static samples from before.
+            assert statistics.queue.pending == 20_009
+            assert recorder.bus is bus
+        statistics = recorder.statistics()
+        bus.close()
+        told = [event async for event in events if isinstance(event, RecordingDropped)]
+    assert statistics.queue.pending == 0
+    assert statistics.queue.dropped == 100_001 - 20_009
+    assert statistics.samples == 20_009 == sum(len(batch) for _, batch in recorded(path))
+    assert told == [RecordingDropped(0, str(path), 1)]
+    kept = [sample for _, batch in recorded(path) for sample in batch]
+    assert {sample.child for sample in kept if sample.static} == {"rig", *(f"s{k}0000" for k in range(1, 10)), "s0"}
+    assert [sample.stamp for sample in kept if not sample.static] == [
+        stamp for stamp in range(80_000, 100_000) if stamp % 10_000
+    ]
+
+
+async def test_each_time_that_the_disk_falls_behind_is_told_once(tmp_path: Path) -> None:
+    with Bus(SimulatedClock()) as bus, bus.events() as events:
+        async with Recorder(bus, tmp_path / "run.mcap", capacity=10) as recorder:
+            for _ in range(2):
+                for sample in noise(15):
+                    bus.publish(sample)
+                await recorder.flush()
+                await settle()
+        bus.close()
+        told = [event async for event in events if isinstance(event, RecordingDropped)]
+    assert [event.dropped for event in told] == [1, 6]
+    assert recorder.statistics().queue.dropped == 10
+
+
+async def test_a_disk_that_hangs_holds_up_nobody(pipe: Pipe) -> None:
+    with Bus(SimulatedClock()) as bus, bus.events() as events:
+        async with Recorder(bus, pipe.path, capacity=100, overwrite=True) as recorder:
+            for sample in noise(20_000):
+                bus.publish(sample)
+                if sample.stamp % 50 == 0:
+                    await settle()
+            await until(lambda: recorder.statistics().queue.dropped > 0)
+            assert offered(recorder.statistics()) == 20_000
+            assert recorder.error is None
+            pipe.drain()
+        statistics = recorder.statistics()
+        bus.close()
+        assert RecordingDropped in [type(event) async for event in events]
+    assert offered(statistics) == 20_000
+    assert statistics.samples == pipe.messages()
+
+
+async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_file(pipe: Pipe) -> None:
+    recorders = []
+
+    async def record(bus: Bus) -> None:
+        async with Recorder(bus, pipe.path, overwrite=True) as recorder:
+            recorders.append(recorder)
+            for sample in noise(20_000):
+                bus.publish(sample)
+            await until(lambda: recorder.statistics().samples > 0)
+            # Far from all, for nobody empties the pipe.
+            assert recorder.statistics().queue.pending > 10_000
+            tasks.cancel_scope.cancel()
+            pipe.drain()
+            await anyio.sleep_forever()
+
+    with Bus(SimulatedClock()) as bus:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(record, bus)
+        # It hears of nothing any more.
+        bus.publish(moving("map", "a", 1))
+    (recorder,) = recorders
+    assert offered(recorder.statistics()) == recorder.statistics().samples == 20_000
+    assert pipe.messages() == 20_000
+
+
+async def test_what_the_body_raises_leaves_as_it_is_with_a_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus, pytest.raises(LookupError, match="the body's own"):
+        async with Recorder(bus, path):
+            bus.publish(moving("map", "a", 1))
+            raise LookupError("the body's own")
+    assert len(recorded(path)) == 1
+
+
+async def test_a_disk_that_fails_is_an_event_and_the_body_goes_on(pipe: Pipe, caplog: pytest.LogCaptureFixture) -> None:
+    heard: list[Event] = []
+    with Bus(SimulatedClock(3 * SECOND)) as bus, bus.events() as events, anyio.fail_after(PATIENCE):
+        async with Recorder(bus, pipe.path, overwrite=True) as recorder:
+            pipe.break_off()
+            for sample in noise(100):
+                bus.publish(sample)
+            async for event in events:
+                if isinstance(event, RecordingFailed):
+                    heard.append(event)
+                    break
+            await recorder.flush()
+            bus.publish(moving("map", "base", 1_000))
+            await settle()
+        await recorder.flush()
+    assert isinstance(recorder.error, BrokenPipeError)
+    assert heard == [RecordingFailed(3 * SECOND, str(pipe.path), recorder.error)]
+    statistics = recorder.statistics()
+    assert (statistics.samples, statistics.queue.pending, statistics.queue.dropped) == (0, 0, 100)
+    assert ["has ended early" in record.message for record in caplog.records] == [True]
+
+
+async def test_a_disk_that_fails_at_the_end_is_told_too_and_nothing_is_raised(pipe: Pipe) -> None:
+    with Bus(SimulatedClock()) as bus, bus.events() as events:
+        async with Recorder(bus, pipe.path, overwrite=True) as recorder:
+            await recorder.flush()
+            pipe.break_off()
+        bus.close()
+        assert [type(event) async for event in events] == [RecordingFailed]
+    assert isinstance(recorder.error, BrokenPipeError)
+
+
+async def test_whoever_waits_for_a_flush_is_let_go_when_the_disk_fails(pipe: Pipe) -> None:
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, pipe.path, overwrite=True) as recorder:
+            pipe.break_off()
+            bus.publish(moving("map", "a", 1))
+            with anyio.fail_after(PATIENCE):
+                await recorder.flush()
+            assert isinstance(recorder.error, BrokenPipeError)
+
+
+FULL_DISK = """
+import json, resource, sys, anyio
+from tfbus import Bus, TransformBroadcaster, Transform
+from tfbus.recording.recorder import Recorder
+
+async def main():
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+    with Bus() as bus:
+        broadcaster = TransformBroadcaster(bus)
+        async with Recorder(bus, sys.argv[1]) as recorder:
+            stamp = 0
+            while recorder.error is None:
+                stamp += 1
+                broadcaster.send("map", "base", Transform((1 / stamp, 2 / stamp, 3 / stamp)), at=stamp)
+                await anyio.sleep(0)
+        queue = recorder.statistics().queue
+        print(json.dumps([recorder.error.errno, recorder.statistics().samples, queue.dropped, stamp]))
+
+anyio.run(main, backend=sys.argv[2])
+"""
+
+
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path: Path, backend: str) -> None:
+    path = tmp_path / "run.mcap"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, path, backend], capture_output=True, text=True, timeout=PATIENCE, check=True
+    )
+    code, samples, dropped, published = json.loads(done.stdout)
+    assert code == errno.EFBIG
+    assert samples > 0
+    assert samples + dropped == published
+    with open_recording(path) as recording:
+        stamps = [sample.stamp for message in recording.messages() for sample in message.batch]
+    # The chunk that did not fit may be whole, and only what belongs to it is missing.
+    assert samples <= len(stamps) < published
+    assert stamps == list(range(1, len(stamps) + 1))
+
+
+KILLED = """
+import sys, anyio
+from tfbus import Bus, TransformBroadcaster, Transform
+from tfbus.recording.recorder import Recorder
+
+async def main():
+    with Bus() as bus:
+        broadcaster = TransformBroadcaster(bus, authority="odometry")
+        async with Recorder(bus, sys.argv[1]) as recorder:
+            for stamp in range(1_000_000):
+                broadcaster.send("map", "base", Transform((1 / (stamp + 1), 0.0, 0.0)), at=stamp)
+                if stamp == 100 or stamp % 2_000 == 0:
+                    # Not to go on before the disk has it is not to ask for it: no flush.
+                    while recorder.statistics().samples <= stamp:
+                        await anyio.sleep(0.01)
+                    print(recorder.statistics().samples, flush=True)
+                elif stamp % 10 == 0:
+                    await anyio.sleep(0.001)
+
+anyio.run(main, backend=sys.argv[2])
+"""
+
+
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+@pytest.mark.parametrize("lines", [1, 3])
+def test_after_sigkill_everything_but_the_last_moment_can_be_read(tmp_path: Path, backend: str, lines: int) -> None:
+    path = tmp_path / "run.mcap"
+    command = [sys.executable, "-c", KILLED, str(path), backend]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        written = [int(process.stdout.readline()) for _ in range(lines)]
+        process.kill()
+        written += map(int, process.stdout.read().split())
+        assert process.wait(PATIENCE) == -9
+    with open_recording(path) as recording:
+        assert not recording.finished
+        samples = [sample for message in recording.messages() for sample in message.batch]
+    assert len(samples) >= written[-1] >= 1
+    assert samples == [
+        TransformStamped("map", "base", stamp, Transform((1 / (stamp + 1), 0.0, 0.0)), "odometry")
+        for stamp in range(len(samples))
+    ]
+
+
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, backend: str) -> None:
+    path = tmp_path / "run.mcap"
+    command = [sys.executable, "-c", KILLED, str(path), backend]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        written = int(process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=PATIENCE)
+    assert errors.splitlines()[-1] == "KeyboardInterrupt"
+    assert "ExceptionGroup" not in errors
+    assert [batch[0].stamp for _, batch in recorded(path)][:written] == list(range(written))
+
+
+async def test_a_file_that_is_there_already_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_text("precious")
+    with Bus(SimulatedClock()) as bus:
+        recorder = Recorder(bus, path)
+        with pytest.raises(FileExistsError):
+            await recorder.__aenter__()
+        bus.publish(moving("map", "a", 1))
+        assert offered(recorder.statistics()) == 0
+        assert path.read_text() == "precious"
+        async with Recorder(bus, path, overwrite=True):
+            bus.publish(moving("map", "a", 2))
+    assert len(recorded(path)) == 1
+
+
+async def test_a_recording_that_cannot_begin_raises(tmp_path: Path) -> None:
+    full = tmp_path / "full.mcap"
+    full.symlink_to("/dev/full")
+    with Bus(SimulatedClock()) as bus:
+        with pytest.raises(FileNotFoundError):
+            async with Recorder(bus, tmp_path / "nowhere" / "run.mcap"):
+                raise AssertionError("not reached")
+        with pytest.raises(OSError, match="No space"):
+            async with Recorder(bus, full, overwrite=True):
+                raise AssertionError("not reached")
+        bus.close()
+        with pytest.raises(BusClosedError):
+            async with Recorder(bus, tmp_path / "run.mcap"):
+                raise AssertionError("not reached")
+    assert not (tmp_path / "run.mcap").exists()
+
+
+async def test_one_that_is_cancelled_while_the_file_is_opened_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "pipe.mcap"
+    os.mkfifo(path)
+    with Bus(SimulatedClock()) as bus:
+        recorder = Recorder(bus, path, overwrite=True)
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, recorder.__aenter__)
+            await settle()
+            asked.cancel()
+            await settle()
+            # A pipe opens when there is a reader.
+            assert not asked.ended
+            data = await anyio.to_thread.run_sync(path.read_bytes)
+        assert asked.cancelled
+        bus.publish(moving("map", "a", 1))
+    assert offered(recorder.statistics()) == 0
+    assert list(make_reader(BytesIO(data)).iter_messages()) == []
+
+
+async def test_a_recorder_is_entered_once_and_flushed_after_that(tmp_path: Path) -> None:
+    with Bus(SimulatedClock()) as bus:
+        recorder = Recorder(bus, tmp_path / "run.mcap")
+        with pytest.raises(RuntimeError, match="enter the recorder first"):
+            await recorder.flush()
+        async with recorder:
+            with pytest.raises(RuntimeError, match="entered once"):
+                await recorder.__aenter__()
+        with pytest.raises(ValueError, match="capacity"):
+            Recorder(bus, tmp_path / "other.mcap", capacity=0)
+
+
+async def test_a_bus_that_is_closed_in_the_body_ends_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, path):
+            bus.publish(moving("map", "a", 1))
+            bus.close()
+    assert len(recorded(path)) == 1
+
+
+async def test_after_a_jump_back_of_the_clock_the_times_in_the_file_go_back_too(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    clock = SimulatedClock(9 * SECOND)
+    with Bus(clock) as bus:
+        async with Recorder(bus, path) as recorder:
+            bus.publish(moving("map", "a", 1))
+            clock.set(5 * SECOND)
+            bus.publish(moving("map", "a", 2))
+        assert recorder.statistics().samples == 2
+    with path.open("rb") as file:
+        times = [message.log_time for _, _, message in make_reader(file).iter_messages(log_time_order=False)]
+    assert times == [9 * SECOND, 5 * SECOND]
+
+
+def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+
+    async def record(bus: Bus, started: asyncio.Event) -> None:
+        async with Recorder(bus, path):
+            for sample in noise(5_000):
+                bus.publish(sample)
+            started.set()
+            await asyncio.sleep(PATIENCE)
+
+    async def main() -> None:
+        started = asyncio.Event()
+        with Bus(SimulatedClock()) as bus:
+            task = asyncio.create_task(record(bus, started))
+            await asyncio.wait_for(started.wait(), PATIENCE)
+            task.cancel()
+            # Once more, while it finishes the file.
+            asyncio.get_running_loop().call_soon(task.cancel)
+            with pytest.raises(asyncio.CancelledError):
+                await task
+
+    asyncio.run(main())
+    assert len(recorded(path)) == 5_000
+
+
+def test_under_plain_asyncio_one_that_is_cancelled_while_it_opens_leaves_nothing_behind(tmp_path: Path) -> None:
+    path = tmp_path / "pipe.mcap"
+    os.mkfifo(path)
+
+    async def main() -> bytes:
+        with Bus(SimulatedClock()) as bus:
+            task = asyncio.create_task(Recorder(bus, path, overwrite=True).__aenter__())
+            await asyncio.sleep(0.01)
+            task.cancel()
+            data = await asyncio.to_thread(path.read_bytes)
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            return data
+
+    assert list(make_reader(BytesIO(asyncio.run(main()))).iter_messages()) == []

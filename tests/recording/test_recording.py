@@ -1,0 +1,171 @@
+import gzip
+import math
+import os
+import socket
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+from support.recorded import SMALL, as_ros2, messages_in, write_mcap
+from support.samples import moving, static
+
+from tfbus import InvalidTransformError, RecordingError
+from tfbus.recording import open_recording
+from tfbus.tf_message import encode
+
+OPEN_FILES = Path("/proc/self/fd")
+
+SECOND = 1_000_000_000
+LINES = [
+    (10, "/tf_static", [static("base", "laser", 1.0), static("base", "camera", 1.0)]),
+    (20, "/tf", [moving("odom", "base", 20)]),
+    (30, "/tf_static", [static("base", "laser", 2.0)]),
+    (40, "/tf", [moving("odom", "base", 40)]),
+    (50, "/tf_static", [static("base", "laser", 3.0)]),
+]
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return write_mcap(tmp_path / "run.mcap", LINES)
+
+
+def test_what_a_file_is_tells_its_content_not_its_name(tmp_path: Path, recording: Path) -> None:
+    (sqlite,) = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3")
+    for source in (SMALL, recording, sqlite):
+        renamed = tmp_path / "measurement.bin"
+        renamed.write_bytes(source.read_bytes())
+        named, unnamed = (
+            [(message.received, message.batch) for message in messages_in(path)] for path in (source, renamed)
+        )
+        assert unnamed == named
+
+
+def test_every_way_to_write_a_path_is_good(recording: Path) -> None:
+    for path in (recording, str(recording), os.fspath(recording)):
+        with open_recording(path) as opened:
+            assert opened.path == recording
+            assert len(list(opened.messages())) == len(LINES)
+
+
+def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_before(recording: Path) -> None:
+    first, second, third, fourth = messages_in(recording, 35, 50)
+    assert [message.received for message in (first, second)] == [35, 35]
+    # In the order in which they came last.
+    assert (first.batch, second.batch) == ((static("base", "camera", 1.0),), (static("base", "laser", 2.0),))
+    assert (third.received, third.batch) == (40, (moving("odom", "base", 40),))
+    assert (fourth.received, fourth.batch) == (50, (static("base", "laser", 3.0),))
+
+
+def test_what_is_static_from_the_first_instant_of_a_range_is_not_from_before(recording: Path) -> None:
+    assert [message.received for message in messages_in(recording, 10)] == [10, 20, 30, 40, 50]
+    assert [message.received for message in messages_in(recording, 11)] == [11, 11, 20, 30, 40, 50]
+
+
+def test_a_range_behind_the_end_is_what_is_static_then(recording: Path) -> None:
+    batches = [message.batch for message in messages_in(recording, 10 * SECOND)]
+    assert batches == [(static("base", "camera", 1.0),), (static("base", "laser", 3.0),)]
+
+
+def test_an_empty_range_is_empty(recording: Path) -> None:
+    assert messages_in(recording, until=9) == []
+    assert messages_in(recording, since=5, until=3) == []
+
+
+def test_good_transforms_come_with_the_errors_of_the_bad_ones(tmp_path: Path) -> None:
+    payload = encode([moving("a", "b", 1), moving("a", "c", 1, 12_345.0), moving("a", "d", 1)])
+    nan = payload.replace(struct.pack("<d", 12_345.0), struct.pack("<d", math.nan))
+    (message,) = messages_in(write_mcap(tmp_path / "bad.mcap", [(7, "/tf", nan)]))
+    assert message.received == 7
+    assert message.batch == (moving("a", "b", 1), moving("a", "d", 1))
+    (error,) = message.errors
+    assert isinstance(error, InvalidTransformError)
+    assert (error.reason, error.child) == ("not finite", "c")
+
+
+def test_a_closed_recording_cannot_be_read(recording: Path) -> None:
+    with open_recording(recording) as opened:
+        pass
+    opened.close()
+    with pytest.raises(ValueError, match="is closed"):
+        opened.messages()
+    with pytest.raises(ValueError, match="is closed"):
+        _ = opened.start
+
+
+@pytest.mark.skipif(not OPEN_FILES.is_dir(), reason="this system does not show the open files of a process")
+def test_the_files_are_closed(recording: Path, tmp_path: Path) -> None:
+    folder = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3)
+    before = len(list(OPEN_FILES.iterdir()))
+    for path in (SMALL, recording, folder):
+        with open_recording(path) as opened:
+            next(opened.messages())
+    assert len(list(OPEN_FILES.iterdir())) == before
+
+
+TEXT = b"Dear diary,\ntoday I have driven a robot.\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "reason", "says"),
+    [
+        (b"", "empty", "the file is empty"),
+        (TEXT, "foreign", "it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)"),
+        (gzip.compress(TEXT * 100), "foreign", "it is no recording"),
+        (bytes(range(256)) * 100, "foreign", "it is no recording"),
+        (b"\0" * 10_000, "foreign", "it is no recording"),
+        (b"\x89MCAP0\r\n", "truncated", "ends before its first message"),
+        (b"\x89MCAP0\r\n" + TEXT * 100, "truncated", "ends before its first message"),
+        (b"\x89MC", "truncated", "the file ends after 3 bytes"),
+        (b"#ROSBAG V2.0\n", "damaged", "it cannot be read as a bag of ROS 1"),
+        (b"#ROSBAG V2.0\n" + TEXT * 100, "damaged", "it cannot be read as a bag of ROS 1"),
+        (b"#ROSBAG V1.2\n" + TEXT, "damaged", "it cannot be read as a bag of ROS 1"),
+        (b"#ROS", "truncated", "the file ends after 4 bytes"),
+        (b"SQLite format 3\0", "damaged", "it cannot be read as a recording of ROS 2"),
+        (b"SQLite format 3\0" + TEXT * 100, "damaged", "it cannot be read as a recording of ROS 2"),
+    ],
+    ids=lambda value: repr(value[:24]),
+)
+def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, content: bytes, reason: str, says: str) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError) as raised:
+        open_recording(path)
+    assert (raised.value.path, raised.value.reason) == (str(path), reason)
+    assert str(raised.value).startswith(f"recording {str(path)!r}: ")
+    assert says in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_what_is_not_there_is_missing(tmp_path: Path) -> None:
+    for path in (tmp_path / "run.mcap", tmp_path / "no folder" / "run.mcap"):
+        with pytest.raises(RecordingError, match="there is no such file") as raised:
+            open_recording(path)
+        assert raised.value.reason == "missing"
+
+
+def test_what_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+        with pytest.raises(RecordingError, match="it cannot be read: ") as raised:
+            open_recording(path)
+    assert raised.value.reason == "unreadable"
+
+
+@pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
+def test_without_its_extra_a_recording_says_which_it_is(package: str) -> None:
+    program = (
+        f"import sys; sys.modules[{package!r}] = None\n"
+        "from tfbus.recording import RecordingError, open_recording\n"
+        "try:\n"
+        f"    open_recording({str(SMALL)!r})\n"
+        "except RecordingError as error:\n"
+        "    print(error.reason, error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("missing extra ")
+    assert 'pip install "tfbus[bag]"' in done.stdout

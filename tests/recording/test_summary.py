@@ -1,0 +1,139 @@
+import dataclasses
+import pickle
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, real, write_mcap
+from support.samples import any_samples, moving, static
+
+from tfbus import TransformStamped
+from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
+
+SECOND = 1_000_000_000
+MS = 1_000_000
+
+
+def summary_of(path: Path) -> RecordingSummary:
+    with open_recording(path) as recording:
+        return summarise(recording)
+
+
+def frame_in(path: Path, samples: Sequence[TransformStamped]) -> FrameSummary:
+    """The summary of the only frame in a recording."""
+    lines = [(time, "/tf_static" if sample.static else "/tf", [sample]) for time, sample in enumerate(samples)]
+    (frame,) = summary_of(write_mcap(path / "run.mcap", lines)).frames
+    return frame
+
+
+def test_the_small_bag_has_what_its_script_sends() -> None:
+    summary = summary_of(SMALL)
+    frames = {frame.frame: frame for frame in summary.frames}
+    assert [*frames] == sorted(frames)
+    # From a second before the start to 2 ms after the last stamp of the odometry.
+    assert (summary.start, summary.end, summary.duration) == (99 * SECOND, 109_982 * MS, 10.982)
+    assert summary.roots == ("hen", "island", "map")
+    assert summary.problems == WRONG_IN_SMALL
+    assert summary.finished
+    # 10 Hz for 10 s.
+    assert frames["odom"] == FrameSummary("odom", ("map",), 0, 100, 100 * SECOND, 109_900 * MS, 10.0, 0.1, ("slam",))
+    # 50 Hz for 4 s, then from 5.5 s to 10 s, and one that came late.
+    base = frames["base_link"]
+    assert (base.moving, base.span, base.longest_gap) == (200 + 225 + 1, 9.98, 1.52)
+    assert base.rate == pytest.approx(425 / 9.98)
+    assert frames["box"].parents == ("table", "gripper")
+    assert frames["laser"] == FrameSummary("laser", ("base_link",), 1, 0, None, None, None, None, ("calibration",))
+    # Static ones, 10 + 20 + 20 + 5 Hz for 10 s, the base, the good ones beside bad ones, the first half of a loop.
+    assert summary.transforms == 5 + 100 + 200 + 200 + 50 + 426 + 10 + 1
+    assert summary.messages == len(messages_in(SMALL))
+
+
+def test_of_a_single_moving_sample_there_is_no_rate(tmp_path: Path) -> None:
+    frame = frame_in(tmp_path, [moving("a", "b", 7)])
+    assert (frame.oldest, frame.newest, frame.span, frame.rate, frame.longest_gap) == (7, 7, 0.0, None, None)
+    assert frame.kind == "moving"
+
+
+def test_samples_out_of_order_or_at_one_stamp_make_no_gap_and_no_rate(tmp_path: Path) -> None:
+    frame = frame_in(tmp_path, [moving("a", "b", stamp * SECOND) for stamp in (0, 3, 1, 2, 2, 2, 4)])
+    assert (frame.moving, frame.rate, frame.longest_gap, frame.span) == (7, 1.0, 1.0, 4.0)
+
+
+def test_a_frame_of_both_kinds_is_told_as_such(tmp_path: Path) -> None:
+    frame = frame_in(tmp_path, [static("a", "b"), moving("c", "b", 5), moving("a", "b", 6)])
+    assert (frame.kind, frame.static, frame.moving, frame.parents) == ("both", 1, 2, ("a", "c"))
+
+
+def test_an_empty_recording_has_an_empty_summary(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [])
+    assert summary_of(path) == RecordingSummary(path, True, None, None, 0, 0, (), (), {})
+    assert summary_of(path).duration is None
+
+
+def test_what_was_not_finished_or_is_damaged_is_told(tmp_path: Path) -> None:
+    lines = [(time, "/tf", [moving("a", "b", time, 0.5 + time)]) for time in range(100)]
+    path = write_mcap(tmp_path / "run.mcap", lines, finish=False)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    summary = summary_of(path)
+    assert not summary.finished
+    assert summary.problems == {"damaged": 1}
+    assert 50 < summary.transforms < 100
+
+
+@given(batches=st.lists(st.lists(any_samples("abcd", last=20), max_size=4), max_size=12))
+def test_what_closes_a_loop_is_left_out_as_it_is_in_a_loaded_tree(
+    tmp_path_factory: pytest.TempPathFactory, batches: list[list[TransformStamped]]
+) -> None:
+    lines = [
+        (time, "/tf_static" if kind else "/tf", chosen)
+        for time, samples in enumerate(batches)
+        for kind in (True, False)
+        if (chosen := [sample for sample in samples if sample.static == kind])
+    ]
+    path = write_mcap(tmp_path_factory.mktemp("recording") / "run.mcap", lines)
+    summary = summary_of(path)
+    problems: Counter[str] = Counter()
+    tree = load(path, problems=problems)
+    assert summary.problems == problems
+    sent = sum(len(samples) for _, _, samples in lines)
+    assert summary.transforms == sent - sum(problems.values()) == tree.inserted + tree.replaced
+    assert {frame.frame for frame in summary.frames} == {edge.child for edge in tree.edges()}
+    for frame, edge in zip(summary.frames, tree.edges(), strict=True):
+        assert edge.parent in frame.parents
+
+
+def test_messages_may_be_watched_on_their_way() -> None:
+    with open_recording(SMALL) as recording:
+        seen = []
+
+        def watched() -> Iterator[RecordedMessage]:
+            for message in recording.messages():
+                seen.append(message.received)
+                yield message
+
+        assert summarise(recording, watched()) == summary_of(SMALL)
+    assert len(seen) == len(messages_in(SMALL))
+
+
+def test_a_summary_is_frozen_data() -> None:
+    summary = summary_of(SMALL)
+    assert pickle.loads(pickle.dumps(summary)) == summary
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        summary.messages = 0  # type: ignore[misc]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        summary.frames[0].moving = 0  # type: ignore[misc]
+
+
+def test_the_summary_of_a_real_robot() -> None:
+    summary = summary_of(real("pr2_tf.bag"))
+    assert len(summary.frames) == 82
+    assert summary.roots == ("base_footprint",)
+    assert summary.problems == {}
+    # 153 messages on /tf, and one on /tf_static.
+    assert summary.messages == 154
+    assert {frame.moving for frame in summary.frames if frame.moving} == {153}

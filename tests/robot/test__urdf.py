@@ -1,0 +1,300 @@
+"""What a URDF says, and what it must not contain."""
+
+import math
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tfbus import InvalidRobotError, Joint, Mimic, Transform
+from tfbus.robot._urdf import DEPTH, read_urdf
+
+LINKS = '<link name="a"/><link name="b"/>'
+
+
+def robot(*parts: str) -> str:
+    return f'<?xml version="1.0"?>\n<robot name="r">{"".join(parts)}</robot>'
+
+
+def joint(inside: str = "", kind: str = "fixed", name: str = "j") -> str:
+    return f'<joint name="{name}" type="{kind}"><parent link="a"/><child link="b"/>{inside}</joint>'
+
+
+def only_joint(inside: str = "", kind: str = "fixed") -> Joint:
+    [found] = read_urdf(robot(LINKS, joint(inside, kind))).joints
+    return found
+
+
+def problem(source: Any) -> str:
+    with pytest.raises(InvalidRobotError) as caught:
+        read_urdf(source)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_names_links_and_joints_come_in_the_order_of_the_file() -> None:
+    found = read_urdf(robot('<link name="b"/>', joint(name="2"), '<link name="a"/>', joint(name="1")))
+    assert (found.name, found.links) == ("r", ("b", "a"))
+    assert [each.name for each in found.joints] == ["2", "1"]
+
+
+def test_everything_that_a_joint_says_is_read() -> None:
+    found = only_joint(
+        '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/><axis xyz="0 0 2"/><mimic joint="k" multiplier="-2"'
+        ' offset="0.5"/><limit lower="-1" upper="1e-1" effort="5" velocity="2"/><dynamics damping="1"/>'
+        '<calibration rising="0.1"/><safety_controller k_velocity="1"/>',
+        "revolute",
+    )
+    half = math.sqrt(0.5)
+    assert found.origin.is_close(Transform((1.0, 2.0, 3.0), (0.0, 0.0, half, half)))
+    assert (found.name, found.kind, found.parent, found.child) == ("j", "revolute", "a", "b")
+    assert (found.axis, found.lower, found.upper) == ((0.0, 0.0, 1.0), -1.0, 0.1)
+    assert found.mimic == Mimic("k", -2.0, 0.5)
+
+
+def test_what_a_joint_does_not_say_is_what_the_specification_says() -> None:
+    assert only_joint(kind="continuous") == Joint("j", "continuous", "a", "b", Transform(), (1.0, 0.0, 0.0))
+    assert only_joint('<mimic joint="k"/>', "continuous").mimic == Mimic("k", 1.0, 0.0)
+    assert only_joint('<mimic joint="k" multiplier="0"/>', "continuous").mimic == Mimic("k", 0.0, 0.0)
+    assert only_joint('<origin rpy="0 0 0"/>').origin == Transform()
+    assert only_joint('<origin xyz="1 2 3"/>').origin == Transform((1.0, 2.0, 3.0))
+    limited = only_joint('<limit effort="1" velocity="1" upper="2"/>', "prismatic")
+    assert (limited.lower, limited.upper) == (0.0, 2.0)
+
+
+@pytest.mark.parametrize("kind", ["continuous", "planar", "floating", "fixed"])
+def test_limits_count_only_where_the_specification_has_them(kind: str) -> None:
+    found = only_joint('<limit effort="1" velocity="1" lower="-1" upper="1"/>', kind)
+    assert (found.lower, found.upper) == (None, None)
+
+
+def test_a_revolute_joint_without_a_limit_has_none() -> None:
+    assert (only_joint(kind="revolute").lower, only_joint(kind="revolute").upper) == (None, None)
+
+
+def test_roll_pitch_and_yaw_are_about_fixed_axes() -> None:
+    found = only_joint('<origin rpy="0.1 -0.2 0.3"/>').origin
+    x, y, z = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    turns = [Transform.from_axis_angle(axis, angle) for axis, angle in ((z, 0.3), (y, -0.2), (x, 0.1))]
+    assert found.is_close(turns[0] @ turns[1] @ turns[2])
+
+
+@pytest.mark.parametrize("kind", ["fixed", "floating"])
+def test_the_zero_axis_that_exporters_write_for_joints_without_one_is_passed_over(kind: str) -> None:
+    assert only_joint('<axis xyz="0 0 0"/>', kind) == only_joint("", kind)
+
+
+def test_text_has_a_bracket_and_a_path_has_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = robot('<link name="küche"/>')
+    path = tmp_path / "robot.urdf"
+    path.write_text(text, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    assert read_urdf(text) == read_urdf(path) == read_urdf(str(path)) == read_urdf("robot.urdf")
+    assert read_urdf(text).links == ("küche",)
+    odd = tmp_path / "<robot>.urdf"
+    odd.write_text(text, encoding="utf-8")
+    assert read_urdf(odd) == read_urdf(text)
+
+
+def test_a_file_has_the_encoding_that_it_says(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(robot('<link name="küche"/>').replace("?>", ' encoding="latin-1"?>'), encoding="latin-1")
+    assert read_urdf(path).links == ("küche",)
+
+
+@pytest.mark.parametrize("name", ["missing.urdf", ""])
+def test_a_file_that_cannot_be_read_is_the_systems_error(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OSError, match=r"missing\.urdf|directory"):
+        read_urdf(name)
+
+
+PASSED_OVER = {
+    "a legacy transmission": '<transmission type="t" name="t"><actuator name="m"/><joint name="j"/></transmission>',
+    "gazebo": '<gazebo><plugin><link name="not one"/></plugin></gazebo><gazebo reference="a"/>',
+    "an extension": '<sensor name="s"><parent link="a"/></sensor><ros2_control name="x" type="system"/>',
+    "a call that xacro left": '<xacro:old_macro xmlns:xacro="http://ros.org/wiki/xacro" name="x"/>',
+    "a comment": '<!-- <link name="c"/> --><?editor state="x"?>',
+}
+
+
+@pytest.mark.parametrize("part", PASSED_OVER.values(), ids=PASSED_OVER)
+def test_what_is_neither_link_joint_nor_material_is_passed_over(part: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert read_urdf(robot(LINKS, part, joint())) == read_urdf(robot(LINKS, joint()))
+    assert capfd.readouterr() == ("", "")
+
+
+KNOWN_ELSEWHERE = [
+    '<collision><verbose value="x"/><geometry><box size="1 1 1"/></geometry><material name="m"/></collision>',
+    '<self_collision_checking/><visual><geometry><mesh filename="m" units="cm"/></geometry></visual>',
+    '<collision><geometry><capsule radius="1" length="2"/></geometry></collision>',
+    '<visual><geometry><sphere radius="1"/></geometry><material name="m" x="y"/></visual>',
+]
+
+
+@pytest.mark.parametrize("inside", KNOWN_ELSEWHERE)
+def test_what_the_parser_does_not_know_inside_a_link_is_passed_over_in_silence(
+    inside: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert read_urdf(robot(f'<link name="a" type="laser">{inside}</link>')).links == ("a",)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_what_the_parser_does_not_know_inside_a_joint_is_passed_over_in_silence(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert only_joint('<hint x="1"/><origin xyz="1 0 0" frame="a"/>') == only_joint('<origin xyz="1 0 0"/>')
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_namespace_for_all_elements_changes_nothing() -> None:
+    plain = robot(LINKS, joint('<origin xyz="1 0 0"/>'))
+    assert read_urdf(plain.replace("<robot", '<robot xmlns="http://example.org/robots"')) == read_urdf(plain)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ('<link name="a"/><link/>', "in <link> number 2: Required attribute not set in XML: name"),
+        ("<link/>", "in <link> number 1: Required attribute not set in XML: name"),
+        (joint(kind="ball"), 'in <joint name="j">: Invalid joint type: ball'),
+        (joint(kind="unknown"), "in <joint name=\"j\">: type 'unknown' is none of fixed"),
+        ('<joint name="j"/>', 'in <joint name="j">: Required attribute not set in XML: type'),
+        ('<joint type="fixed"/>', "in <joint> number 1: Required attribute not set in XML: name"),
+        ('<joint name="j" type="fixed"><child link="b"/></joint>', 'in <joint name="j">: Required element not'),
+        ('<joint name="j" type="fixed"><parent/></joint>', 'in <joint name="j">: <parent> has no link'),
+        (joint("<axis/>"), 'in <joint name="j">: <axis> has no xyz'),
+        (joint('<axis xyz="0 0 0"/>', "revolute"), 'in <joint name="j">: axis (0.0, 0.0, 0.0) has no direction'),
+        (joint('<axis xyz="0 x 0"/>', "revolute"), 'in <joint name="j">: '),
+        (joint('<origin xyz="1 2"/>'), 'in <joint name="j">: origin[@xyz]: Invalid vector length'),
+        (joint('<origin xyz="1 2 x"/>'), "in <joint name=\"j\">: origin[@xyz]: could not convert string to float: 'x'"),
+        (joint('<origin xyz="1 2 nan"/>'), 'in <joint name="j">: origin: translation [1.0, 2.0, nan] is not finite'),
+        (joint('<origin rpy="0 inf 0"/>'), 'in <joint name="j">: origin: rpy [0.0, inf, 0.0] is not finite'),
+        (joint("<origin/><origin/>"), 'in <joint name="j">: there is more than one <origin>'),
+        (joint('<limit lower="0"/>', "revolute"), 'in <joint name="j">: limit: Required attribute not set in XML: '),
+        (joint("<mimic/>"), 'in <joint name="j">: mimic: Required attribute not set in XML: joint'),
+        (joint('<mimic joint="k" offset="nan"/>'), 'in <joint name="j">: a limit or the mimic is NaN'),
+        ('<link name="a"><visual/></link>', 'in <link name="a">: visual[1]: Required element not set in XML: geometry'),
+        ('<link name="a"><visual><geometry/></visual></link>', 'in <link name="a">: '),
+        ('<link name="a"><inertial><mass/></inertial></link>', 'in <link name="a">: <mass> has no value'),
+        ('<link name="a"><inertial><mass value="x"/></inertial></link>', 'in <link name="a">: '),
+        ('<material name="m"/>', 'in <material name="m">: it has neither a color nor a texture'),
+        ('<material><color rgba="1 1 1 1"/></material>', "in <material> number 1: Required attribute not set in XML"),
+        ('<material name="m"><color rgba="1 1"/></material>', 'in <material name="m">: color'),
+    ],
+)
+def test_a_malformed_element_is_named(parts: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert problem(robot(parts)).startswith(message)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<robot", "it is not well-formed XML: unclosed token: line 1, column 0"),
+        ('<robot name="r"><link name="a"></robot>', "it is not well-formed XML: mismatched tag: line 1, column 33"),
+        ('<robot name="r"><x:link name="a"/></robot>', "it is not well-formed XML: unbound prefix"),
+        ('<robot name="r">\x00</robot>', "it is not well-formed XML: "),
+        ('<?xml version="1.0" encoding="none-such"?><robot/>', "in <robot>: Required attribute not set in XML: name"),
+        ("<robot/>\ud800", "it is not well-formed XML: "),
+        ("<sdf version='1.6'/>", "a URDF is a <robot>, but this is a <sdf>"),
+        ("<robot/>", "in <robot>: Required attribute not set in XML: name"),
+        ('<robot name="r" version="2.0"/>', 'in <robot name="r">: Invalid version; only 1.0 is supported'),
+    ],
+)
+def test_what_is_no_urdf_is_told_apart(text: str, message: str) -> None:
+    assert problem(text).startswith(message)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\x89PNG\r\n", b'<?xml version="1.0" encoding="none-such"?><robot/>', b"\xff\xfe<\x00", b"a: 1\n"]
+)
+def test_a_file_that_is_something_else_is_told_so(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_bytes(content)
+    assert problem(path).startswith("it is not well-formed XML: ")
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ('<xacro:include filename="arm.xacro"/>', "in <xacro:include>: this is still to be expanded: run xacro"),
+        ('<xacro:macro name="arm"/>', 'in <xacro:macro name="arm">: this is still to be expanded'),
+        ('<xacro:if value="1"/>', "in <xacro:if>: this is still to be expanded"),
+        (joint('<xacro:insert_block name="o"/>'), 'in <xacro:insert_block name="o">: this is still to be expanded'),
+        ('<link name="a"><xacro:inertia m="1"/></link>', "in <xacro:inertia>: this is still to be expanded"),
+        (joint('<origin xyz="0 0 ${h}"/>'), "in <joint name=\"j\">: '0 0 ${h}' is still to be expanded: run xacro"),
+        ('<link name="$(arg side)_arm"/>', "in <link name=\"$(arg side)_arm\">: '$(arg side)_arm' is still"),
+    ],
+)
+@pytest.mark.parametrize("namespace", ["http://www.ros.org/wiki/xacro", "http://ros.org/wiki/xacro"])
+def test_xacro_that_is_still_to_be_expanded_is_named(parts: str, message: str, namespace: str) -> None:
+    assert problem(robot(parts).replace("<robot", f'<robot xmlns:xacro="{namespace}"')).startswith(message)
+
+
+LAUGHS = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
+DOCTYPES = {
+    "a billion laughs": f'<!DOCTYPE robot [<!ENTITY l0 "ha">{LAUGHS}]><robot name="&l9;"/>',
+    "a file of the machine": '<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/hostname">]><robot name="&x;"/>',
+    "something from the net": '<!DOCTYPE robot SYSTEM "http://127.0.0.1:1/robot.dtd"><robot name="r"/>',
+    "a parameter entity": '<!DOCTYPE robot [<!ENTITY % x SYSTEM "file:///etc/hostname">%x;]><robot name="r"/>',
+    "nothing": '<!DOCTYPE robot><robot name="r"/>',
+}
+
+
+@pytest.mark.parametrize("text", DOCTYPES.values(), ids=DOCTYPES)
+def test_a_document_that_may_define_entities_is_not_read(text: str) -> None:
+    assert problem(text) == "it has a <!DOCTYPE>, which can define entities without end: URDF needs none"
+
+
+def test_ten_megabytes_of_nesting_end_at_the_hundredth_element() -> None:
+    assert problem("<robot>" * 1_500_000) == f"its elements are nested more than {DEPTH} deep"
+
+
+def test_elements_may_be_nested_as_deep_as_the_limit() -> None:
+    deep = DEPTH - 1
+    assert read_urdf(robot('<link name="a"/>', "<x>" * deep, "</x>" * deep)).links == ("a",)
+    assert "nested" in problem(robot("<x>" * DEPTH, "</x>" * DEPTH))
+
+
+def test_a_name_of_several_lines_makes_an_error_of_one() -> None:
+    assert problem(robot('<joint name="a&#10;b"/>')).startswith('in <joint name="a\\nb">: ')
+
+
+def test_an_error_about_an_element_pickles() -> None:
+    with pytest.raises(InvalidRobotError) as caught:
+        read_urdf(robot(joint('<origin xyz="1 2 x"/>')))
+    twin = pickle.loads(pickle.dumps(caught.value))
+    assert (str(twin), twin.element, twin.__cause__) == (str(caught.value), '<joint name="j">', None)
+
+
+def test_without_its_extra_reading_names_it() -> None:
+    hidden = (
+        "import sys; sys.modules['urdf_parser_py'] = None\n"
+        "import tfbus\n"
+        "try: tfbus.RobotModel.from_urdf('<robot/>')\n"
+        "except ImportError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=True)
+    assert done.stdout == 'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"\n'
+
+
+def test_what_it_reads_does_not_hang_on_pythons_asserts() -> None:
+    """The parser checks with ``assert``, which ``python -O`` leaves out."""
+    script = (
+        "import tfbus\n"
+        "for part in ('<axis xyz=\"1 0\"/>', '<origin xyz=\"1 0\"/>'):\n"
+        "    try: tfbus.RobotModel.from_urdf("
+        f"{robot(LINKS, joint('PART', 'revolute'))!r}.replace('PART', part))\n"
+        "    except tfbus.InvalidRobotError as error: print(error.element)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-O", "-c", script], capture_output=True, text=True, check=True, env=os.environ
+    )
+    assert done.stdout == '<joint name="j">\n' * 2

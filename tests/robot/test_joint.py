@@ -1,0 +1,228 @@
+"""Each kind of joint against its closed form, in homogeneous matrices and Rodrigues' formula."""
+
+import copy
+import math
+import pickle
+from dataclasses import FrozenInstanceError
+from decimal import Decimal
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.strategies import angles, transforms, unit_vectors, vectors
+
+from tfbus import InvalidRobotError, InvalidTransformError, Joint, Mimic, Transform
+from tfbus.geometry.rows import Vector
+from tfbus.robot.joint import KINDS
+
+Matrix = npt.NDArray[np.float64]
+
+ORIGIN = Transform((1.0, 2.0, 3.0), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))
+"""A quarter turn to the left, about z."""
+
+
+def joint(kind: Any, axis: Any = (0.0, 0.0, 1.0), origin: Transform = ORIGIN, **more: Any) -> Joint:
+    return Joint("elbow", kind, "upper_arm", "forearm", origin, axis, **more)
+
+
+def turn(axis: Vector, angle: float) -> Matrix:
+    """Rodrigues' formula, as a homogeneous matrix."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix = np.eye(4)
+    matrix[:3, :3] += math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    return matrix
+
+
+def shift(x: float, y: float, z: float) -> Matrix:
+    matrix = np.eye(4)
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def assert_close(actual: Transform, expected: Matrix) -> None:
+    np.testing.assert_allclose(actual.matrix(), expected, rtol=0.0, atol=1e-11)
+    assert math.fsum(part * part for part in actual.rotation) == pytest.approx(1.0, abs=2e-15)
+
+
+@given(transforms(10.0), unit_vectors(), angles(), st.sampled_from(("revolute", "continuous")))
+def test_a_turning_joint_turns_about_its_axis_in_the_childs_frame(
+    origin: Transform, axis: Vector, angle: float, kind: str
+) -> None:
+    assert_close(joint(kind, axis, origin).transform(angle), origin.matrix() @ turn(axis, angle))
+
+
+@given(transforms(10.0), unit_vectors(), st.floats(-10.0, 10.0))
+def test_a_prismatic_joint_slides_along_its_axis_and_does_not_turn(
+    origin: Transform, axis: Vector, length: float
+) -> None:
+    x, y, z = axis
+    moved = joint("prismatic", axis, origin).transform(length)
+    assert_close(moved, origin.matrix() @ shift(length * x, length * y, length * z))
+    assert moved.rotation == origin.rotation
+
+
+@given(transforms(10.0), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), angles())
+def test_a_planar_joint_about_z_is_x_y_and_yaw(origin: Transform, x: float, y: float, yaw: float) -> None:
+    expected = origin.matrix() @ shift(x, y, 0.0) @ turn((0.0, 0.0, 1.0), yaw)
+    assert_close(joint("planar", origin=origin).transform((x, y, yaw)), expected)
+
+
+@given(transforms(10.0), unit_vectors(), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), angles())
+def test_a_planar_joint_stays_in_its_plane_and_turns_about_the_normal(
+    origin: Transform, axis: Vector, x: float, y: float, angle: float
+) -> None:
+    there = np.linalg.inv(origin.matrix()) @ joint("planar", axis, origin).transform((x, y, angle)).matrix()
+    place = there[:3, 3]
+    assert abs(place @ np.array(axis)) <= 1e-10
+    assert np.linalg.norm(place) == pytest.approx(math.hypot(x, y), abs=1e-10)
+    np.testing.assert_allclose(there[:3, :3], turn(axis, angle)[:3, :3], atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("axis", "along_x", "along_y"),
+    [
+        ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+        ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+        ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+        ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
+        # Just beside -z, to the side of x: about an axis along y, so half a turn takes x to -x.
+        ((1e-9, 0.0, -1.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ],
+)
+def test_the_x_and_y_of_a_plane_come_with_z_on_the_shortest_way_to_the_axis(
+    axis: Vector, along_x: Vector, along_y: Vector
+) -> None:
+    flat = joint("planar", axis, Transform())
+    assert flat.transform((2.0, 0.0, 0.0)).translation == pytest.approx([2.0 * part for part in along_x], abs=1e-8)
+    assert flat.transform((0.0, 2.0, 0.0)).translation == pytest.approx([2.0 * part for part in along_y], abs=1e-8)
+
+
+@pytest.mark.parametrize("tilt", [1e-12, 1e-9, 1e-8, 1e-6, 1e-3])
+def test_a_plane_that_faces_down_but_for_a_little_is_as_exact_as_any(tilt: float) -> None:
+    axis = (math.sin(tilt), 0.0, -math.cos(tilt))
+    x, y, z = joint("planar", axis, Transform()).transform((1.0, 0.0, 0.0)).translation
+    assert (x, y, z) == pytest.approx((-math.cos(tilt), 0.0, -math.sin(tilt)), abs=1e-15)
+
+
+@given(transforms(10.0), transforms(10.0))
+def test_a_floating_joint_takes_seven_numbers_or_a_transform(origin: Transform, position: Transform) -> None:
+    floating = joint("floating", origin=origin)
+    assert_close(floating.transform(position), origin.matrix() @ position.matrix())
+    assert floating.transform((*position.translation, *position.rotation)) == floating.transform(position)
+
+
+@given(transforms())
+def test_a_fixed_joint_is_its_origin_whatever_the_position(origin: Transform) -> None:
+    assert joint("fixed", origin=origin).transform() == origin
+    assert joint("fixed", origin=origin).transform(math.nan) == origin
+
+
+@given(transforms(10.0), unit_vectors(), st.sampled_from(KINDS))
+def test_at_zero_every_joint_is_at_its_origin(origin: Transform, axis: Vector, kind: Any) -> None:
+    made = joint(kind, axis, origin)
+    assert_close(made.transform(made.zero), origin.matrix())
+
+
+@given(vectors(1.0).filter(lambda axis: math.hypot(*axis) > 0.1), st.sampled_from((1e-200, 1e-9, 3.0, 1e100)))
+def test_an_axis_of_any_length_is_made_one_long(axis: Vector, length: float) -> None:
+    made = joint("prismatic", [length * part for part in axis], Transform())
+    assert math.hypot(*made.axis) == pytest.approx(1.0, abs=1e-15)
+    assert made.transform(2.0).translation == pytest.approx([2.0 * part / math.hypot(*axis) for part in axis])
+
+
+def test_a_quarter_turn_of_an_elbow_is_known_by_hand() -> None:
+    bent = joint("revolute", (0.0, 1.0, 0.0)).transform(math.pi / 2)
+    # The forearm's x points down, and its y, by the quarter turn of the origin, backwards.
+    assert bent.apply((1.0, 0.0, 0.0)) == pytest.approx((1.0, 2.0, 2.0))
+    assert bent.apply((0.0, 1.0, 0.0)) == pytest.approx((0.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize("one", [1, np.float64(1.0), np.float32(1.0), np.int64(1), Fraction(2, 2)])
+def test_a_position_may_be_any_real_number(one: Any) -> None:
+    found = joint("revolute").row(one)
+    assert found == joint("revolute").row(1.0)
+    assert {type(part) for part in found} == {float}
+
+
+@pytest.mark.parametrize(
+    ("kind", "position", "reason"),
+    [
+        ("revolute", math.nan, "not finite"),
+        ("continuous", math.inf, "not finite"),
+        ("prismatic", -math.inf, "not finite"),
+        ("prismatic", 10**400, "not finite"),
+        ("planar", (0.0, math.nan, 0.0), "not finite"),
+        ("planar", (0.0, 0.0), "wrong length"),
+        ("floating", (0.0,) * 6, "wrong length"),
+        ("floating", (0.0,) * 8, "wrong length"),
+        ("floating", (0.0,) * 7, "zero quaternion"),
+        ("floating", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0), "not a unit quaternion"),
+        ("floating", (math.nan, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "not finite"),
+        ("floating", Transform((1.7e308, 1.7e308, 0.0)), "not finite"),
+        ("planar", (1.7e308, 1.7e308, 0.0), "not finite"),
+    ],
+)
+def test_a_position_that_is_none_is_refused_by_the_name_of_the_joint(kind: Any, position: Any, reason: str) -> None:
+    with pytest.raises(InvalidTransformError, match=r"^joint 'elbow': ") as caught:
+        joint(kind).transform(position)
+    assert (caught.value.reason, caught.value.parent, caught.value.child) == (reason, "upper_arm", "forearm")
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "fixed"])
+@pytest.mark.parametrize("position", ["1.0", None, Decimal(1), [object()] * 3, ["a"] * 7, object()])
+def test_a_position_of_a_useless_type_is_refused_by_the_name_of_the_joint(kind: Any, position: Any) -> None:
+    with pytest.raises((TypeError, InvalidTransformError), match=r"^joint 'elbow': position must be "):
+        joint(kind).transform(position)
+
+
+@pytest.mark.parametrize(
+    ("kind", "position"), [("planar", 1.0), ("floating", 1.0), ("floating", 1), ("revolute", (1,))]
+)
+def test_a_number_where_several_belong_is_a_type_error_and_the_other_way_round(kind: Any, position: Any) -> None:
+    with pytest.raises(TypeError, match=r"^joint 'elbow': position must be "):
+        joint(kind).transform(position)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"kind": "ball"}, "type 'ball' is none of fixed, revolute, continuous, prismatic, planar, floating"),
+        ({"axis": (0.0, 0.0, 0.0)}, "axis (0.0, 0.0, 0.0) has no direction"),
+        ({"axis": (0.0, math.nan, 1.0)}, "axis (0.0, nan, 1.0) is not finite"),
+        ({"axis": (0.0, 1.0)}, "axis must be 3 numbers, got shape (2,)"),
+        ({"lower": math.nan}, "a limit or the mimic is NaN"),
+        ({"upper": math.nan}, "a limit or the mimic is NaN"),
+        ({"mimic": Mimic("other", math.nan)}, "a limit or the mimic is NaN"),
+        ({"mimic": Mimic("other", 1.0, math.nan)}, "a limit or the mimic is NaN"),
+    ],
+)
+def test_a_joint_that_cannot_be_is_refused_by_its_name(change: dict[str, Any], problem: str) -> None:
+    with pytest.raises(InvalidRobotError) as caught:
+        joint(**{"kind": "revolute", **change})
+    assert str(caught.value) == f'in <joint name="elbow">: {problem}'
+    assert caught.value.element == '<joint name="elbow">'
+
+
+@pytest.mark.parametrize("kind", ["fixed", "floating"])
+def test_a_joint_without_an_axis_takes_no_notice_of_it(kind: Any) -> None:
+    assert joint(kind, (0.0, 0.0, 0.0)) == joint(kind, (0.0, 0.0, 1.0))
+
+
+def test_the_element_of_a_joint_is_one_line_whatever_its_name() -> None:
+    assert Joint("küche\x9b", "fixed", "a", "b").element == '<joint name="küche\\x9b">'
+    assert Joint('a "b"\nc', "fixed", "a", "b").element == '<joint name="a \\"b\\"\\nc">'
+
+
+def test_a_joint_is_a_value() -> None:
+    made = joint("revolute", lower=-1.0, upper=1.0, mimic=Mimic("shoulder", 2.0))
+    for twin in (copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
+        assert (twin, hash(twin)) == (made, hash(made))
+        assert twin.transform(0.3) == made.transform(0.3)
+    assert joint("revolute") != made
+    with pytest.raises(FrozenInstanceError):
+        made.name = "wrist"  # type: ignore[misc]

@@ -1,0 +1,110 @@
+"""Programs as a user runs them, each in a process of its own; a test waits for what they print."""
+
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import IO
+
+from support.processes import free_ports
+
+TFBUS = str(Path(sys.executable).with_name("tfbus"))
+PATIENCE = 30.0
+"""How long a test waits, in s, for what should come at once."""
+
+
+def free_address() -> str:
+    """An address on the loopback where nobody listens."""
+    return f"tcp/127.0.0.1:{free_ports(1)[0]}"
+
+
+class Lines:
+    """What comes out of a process."""
+
+    def __init__(self, file: IO[str]) -> None:
+        self._file = file
+        self._changed = threading.Condition()
+        self._lines: list[str] = []
+        self._read = 0
+        self._ended = False
+        self._reader = threading.Thread(target=self._follow)
+        self._reader.start()
+
+    @property
+    def text(self) -> str:
+        """All of it so far."""
+        with self._changed:
+            return "".join(self._lines)
+
+    def expect(self, pattern: str) -> str:
+        """The next line, behind those that were expected before, that has the pattern in it; waits for it."""
+        with self._changed:
+            while True:
+                while self._read < len(self._lines):
+                    self._read += 1
+                    if re.search(pattern, self._lines[self._read - 1]):
+                        return self._lines[self._read - 1].rstrip("\n")
+                came = not self._ended and self._changed.wait(PATIENCE)
+                assert came or self._read < len(self._lines), f"no {pattern!r} in {''.join(self._lines)!r}"
+
+    def skip(self) -> None:
+        """Expect only what comes from now on."""
+        with self._changed:
+            self._read = len(self._lines)
+
+    def join(self) -> None:
+        self._reader.join()
+
+    def _follow(self) -> None:
+        for line in self._file:
+            with self._changed:
+                self._lines.append(line)
+                self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+
+class Program:
+    """A process; it is killed at the end of the ``with``, unless it has ended."""
+
+    def __init__(self, *command: str | Path, environment: Mapping[str, str] | None = None) -> None:
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8", env=environment
+        )
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        self.output = Lines(self.process.stdout)
+        self.errors = Lines(self.process.stderr)
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """Send a signal and wait for the end; its status, and all output has come."""
+        self.process.send_signal(number)
+        return self.wait()
+
+    def wait(self) -> int:
+        """Wait for the end; its status, and all output has come."""
+        status = self.process.wait(PATIENCE)
+        self.output.join()
+        self.errors.join()
+        return status
+
+    def __enter__(self) -> "Program":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        with self.process:
+            self.process.kill()
+            self.output.join()
+            self.errors.join()
+
+
+def tfbus(*arguments: str) -> Program:
+    """The command."""
+    return Program(TFBUS, *arguments)

@@ -1,0 +1,319 @@
+"""A policy on one edge, against the rule written down in the plainest way, and on whole paths."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.samples import moving, static
+
+from tfbus import (
+    SECOND,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    GapError,
+    Hold,
+    PastExtrapolationError,
+    TransformTree,
+)
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tree._extrapolation import Place, place, place_many
+from tfbus.tree.history import FrameHistory, Samples
+from tfbus.tree.policy import Policy
+
+ROW = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def history(samples: Iterable[int] | dict[int, str], keep: int | None = None) -> FrameHistory:
+    """A history with samples at some stamps; of a dict, each with its parent."""
+    parents = samples if isinstance(samples, dict) else dict.fromkeys(samples, "world")
+    made = FrameHistory("robot", next(iter(parents.values()), "world"), False, keep)
+    for stamp, parent in parents.items():
+        made.insert(parent, stamp, ROW, "odometry")
+    return made
+
+
+def around(edge: FrameHistory, asked: list[int]) -> Samples:
+    """What is copied for some questions, by the first and the last."""
+    return edge.between(min(asked, default=0), max(asked, default=0))
+
+
+def rule(stamps: list[int], at: int, policy: Policy) -> Place | None:
+    """Read at the stamp where it is a sample, or between two that are near enough; else the nearest that may."""
+    if at in stamps:
+        return Place(at, 0, 0)
+    older = [stamp for stamp in stamps if stamp < at]
+    newer = [stamp for stamp in stamps if stamp > at]
+    if older and newer and (policy.max_gap is None or min(newer) - max(older) <= policy.max_gap):
+        return Place(at, 0, min(newer) - max(older))
+    allowed = [stamp for stamp in older if at - stamp <= max(policy.tolerance, policy.hold)]
+    allowed += [stamp for stamp in newer if stamp - at <= policy.tolerance]
+    if not allowed:
+        return None
+    nearest = min(allowed, key=lambda stamp: abs(at - stamp))
+    return Place(nearest, abs(at - nearest), 0)
+
+
+stamp_sets = st.sets(st.integers(-30, 30), max_size=8)
+policies = st.builds(Policy, st.integers(0, 12), st.none() | st.integers(0, 20), st.integers(0, 25))
+
+
+@given(stamp_sets, policies)
+def test_an_edge_is_read_where_the_rule_says(stamps: set[int], policy: Policy) -> None:
+    edge = history(sorted(stamps))
+    for at in range(-60, 61):
+        expected = rule(sorted(stamps), at, policy)
+        try:
+            found: Place | None = place(edge, at, policy)
+        except ExtrapolationError:
+            found = None
+        assert found == expected
+
+
+@given(stamp_sets, policies, st.lists(st.integers(-60, 60)), st.sampled_from((None, 20)))
+def test_many_stamps_are_placed_as_one_by_one(
+    stamps: set[int], policy: Policy, asked: list[int], keep: int | None
+) -> None:
+    edge = history(sorted(stamps), keep)
+    read_at, away, gap = place_many(around(edge, asked), np.array(asked, np.int64), policy)
+    for i, at in enumerate(asked):
+        try:
+            found = place(edge, at, policy)
+        except ExtrapolationError:
+            assert away[i] == -1
+        else:
+            assert (read_at[i], away[i], gap[i]) == found
+
+
+@given(st.dictionaries(st.integers(-30, 30), st.sampled_from(("odom", "map")), max_size=8), policies)
+def test_no_sample_with_another_parent_stands_in(parents: dict[int, str], policy: Policy) -> None:
+    edge = history(dict(sorted(parents.items())))
+    asked = np.arange(-60, 61)
+    read_at, away, _ = place_many(around(edge, asked.tolist()), asked, policy)
+    for i, at in enumerate(asked.tolist()):
+        try:
+            found = place(edge, at, policy)
+        except ExtrapolationError:
+            assert away[i] == -1
+            continue
+        assert (read_at[i], away[i]) == found[:2]
+        if found.stamp in parents:
+            assert parents[found.stamp] == edge.parent_at(at)
+
+
+def test_stamps_further_apart_than_a_signed_number_says_are_not_near() -> None:
+    edge = history([STAMP_MIN, STAMP_MAX])
+    policy = Policy(tolerance=5, max_gap=5)
+    with pytest.raises(GapError):
+        place(edge, 0, policy)
+    _, away, _ = place_many(edge.between(STAMP_MIN, STAMP_MAX), np.array([0, STAMP_MAX - 5, STAMP_MIN + 6]), policy)
+    assert away.tolist() == [-1, 5, -1]
+    for sample, at in ((STAMP_MIN, STAMP_MAX), (STAMP_MAX, STAMP_MIN)):
+        assert place_many(history([sample]).between(at, at), np.array([at]), policy)[1].tolist() == [-1]
+
+
+def test_of_many_stamps_a_gap_is_told_as_far_as_a_signed_number_says() -> None:
+    edge = history([STAMP_MIN, STAMP_MAX])
+    assert place(edge, 0, Policy()).gap == STAMP_MAX - STAMP_MIN
+    assert place_many(edge.between(0, 0), np.array([0]), Policy())[2].tolist() == [STAMP_MAX]
+
+
+@pytest.mark.parametrize(
+    ("at", "kind", "slack"),
+    [(4, PastExtrapolationError, 5), (10 - 6, PastExtrapolationError, 5), (41, FutureExtrapolationError, 20)],
+)
+def test_an_edge_that_nothing_stands_in_for_says_how_far_it_was_looked(
+    at: int, kind: type[ExtrapolationError], slack: int
+) -> None:
+    edge = history([10, 20])
+    with pytest.raises(kind) as caught:
+        place(edge, at, Policy(tolerance=5, hold=20))
+    assert (caught.value.stamp, caught.value.slack) == (at, slack)
+    assert (caught.value.oldest, caught.value.newest, caught.value.authority) == (10, 20, "odometry")
+
+
+def test_a_gap_is_refused_with_its_two_samples() -> None:
+    edge = history([0, SECOND, 4 * SECOND])
+    with pytest.raises(GapError) as caught:
+        place(edge, 2 * SECOND, Policy(max_gap=SECOND))
+    error = caught.value
+    assert (error.child, error.stamp, error.before, error.after) == ("robot", 2 * SECOND, SECOND, 4 * SECOND)
+    assert (error.oldest, error.newest, error.max_gap) == (0, 4 * SECOND, SECOND)
+    assert str(error) == (
+        "frame 'robot': asked for 2.000 s, between samples at 1.000 s and 4.000 s, which are 3 s apart (at most 1 s), "
+        "from 'odometry'"
+    )
+
+
+@pytest.mark.parametrize(("policy", "slack"), [((0, 0), 0), ((5, 0), 5), ((5, 8), 8), ((0, 8), 8), ((8, 5), 8)])
+def test_a_gap_that_nothing_stands_in_for_says_how_far_it_was_looked(policy: tuple[int, int], slack: int) -> None:
+    edge = history([0, 100])
+    with pytest.raises(GapError) as caught:
+        place(edge, 50, Policy(tolerance=policy[0], hold=policy[1], max_gap=20))
+    assert (caught.value.stamp, caught.value.slack) == (50, slack)
+
+
+# On whole paths: odom -> base moves 1 m/s with samples at 0, 1, 2 and 6 s; base -> arm is sampled at 0 and 4 s.
+
+
+@pytest.fixture
+def tree() -> TransformTree:
+    tree = TransformTree(keep=None)
+    tree.insert_many(moving("odom", "base", second * SECOND, float(second)) for second in (0, 1, 2, 6))
+    tree.insert_many(moving("base", "arm", second * SECOND, 10.0 * second) for second in (0, 4))
+    tree.insert(static("arm", "tool", 0.5))
+    return tree
+
+
+def seconds(value: float) -> int:
+    return round(value * SECOND)
+
+
+@pytest.mark.parametrize(
+    ("at", "policy", "x", "extrapolated_by", "gap"),
+    [
+        (1.5, {"max_gap": 4.0}, 1.5 + 15.0 + 0.5, 0.0, 4.0),
+        (3.0, {"max_gap": 4.0}, 3.0 + 30.0 + 0.5, 0.0, 4.0),
+        (3.0, {"max_gap": 3.9, "tolerance": 1.0}, 2.0 + 40.0 + 0.5, 1.0, 0.0),
+        (4.5, {"tolerance": 0.5}, 4.5 + 40.0 + 0.5, 0.5, 4.0),
+        (5.0, {"extrapolate": Hold(1.0)}, 5.0 + 40.0 + 0.5, 1.0, 4.0),
+        (6.5, {"extrapolate": Hold(2.5)}, 6.0 + 40.0 + 0.5, 2.5, 0.0),
+        (-0.25, {"tolerance": 0.25}, 0.0 + 0.0 + 0.5, 0.25, 0.0),
+        (2.0, {"tolerance": 9.0, "extrapolate": Hold(9.0)}, 2.0 + 20.0 + 0.5, 0.0, 4.0),
+    ],
+)
+def test_the_answer_says_what_was_done(
+    tree: TransformTree, at: float, policy: dict[str, Any], x: float, extrapolated_by: float, gap: float
+) -> None:
+    for target, source, sign in (("odom", "tool", 1.0), ("tool", "odom", -1.0)):
+        found = tree.lookup(target, source, seconds(at), **policy)
+        assert found.transform.translation == pytest.approx((sign * x, 0.0, 0.0))
+        assert (found.parent, found.child, found.stamp) == (target, source, seconds(at))
+        assert (found.extrapolated_by, found.gap) == (seconds(extrapolated_by), seconds(gap))
+        assert ("extrapolated by" in str(found)) == (extrapolated_by > 0.0)
+
+
+def test_without_a_policy_nothing_is_said_to_have_been_done(tree: TransformTree) -> None:
+    found = tree.lookup("odom", "tool", seconds(3.0))
+    assert (found.extrapolated_by, found.gap) == (0, None)
+    assert found == tree.lookup("odom", "tool", seconds(3.0), tolerance=0.1)
+
+
+@pytest.mark.parametrize(
+    ("at", "policy", "kind", "child"),
+    [
+        (4.6, {"tolerance": 0.5}, FutureExtrapolationError, "arm"),
+        (6.5, {"extrapolate": Hold(2.4)}, FutureExtrapolationError, "arm"),
+        (-0.1, {"extrapolate": Hold(9.0)}, PastExtrapolationError, "arm"),
+        (3.0, {"max_gap": 3.9}, GapError, "arm"),
+        (5.0, {"max_gap": 3.9}, GapError, "base"),
+    ],
+)
+def test_the_error_names_the_edge_that_decides(
+    tree: TransformTree, at: float, policy: dict[str, Any], kind: type[ExtrapolationError], child: str
+) -> None:
+    with pytest.raises(kind) as caught:
+        tree.lookup("odom", "tool", seconds(at), **policy)
+    assert caught.value.child == child
+    assert not tree.can_transform("odom", "tool", seconds(at), **policy)
+
+
+def test_static_paths_need_no_policy(tree: TransformTree) -> None:
+    found = tree.lookup("arm", "tool", seconds(99.0), tolerance=0.1)
+    assert (found.static, found.extrapolated_by, found.gap) == (True, 0, 0)
+
+
+def test_latest_waits_until_it_is_out_of_the_gap_of_another_edge(tree: TransformTree) -> None:
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree.lookup("odom", "tool", max_gap=3.9)
+    assert (caught.value.child, caught.value.stamp) == ("arm", seconds(6.0))
+    assert isinstance(caught.value.__cause__, GapError)
+    assert tree.lookup("odom", "tool").stamp == seconds(4.0)
+
+
+@pytest.mark.parametrize(
+    ("policy", "stamp", "x", "extrapolated_by"),
+    [
+        ({}, 4.0, 4.0 + 40.0, 0.0),
+        ({"extrapolate": Hold(1.5)}, 5.5, 5.5 + 40.0, 1.5),
+        ({"tolerance": 0.5}, 4.0, 4.0 + 40.0, 0.0),
+        ({"extrapolate": Hold(9.0)}, 6.0, 6.0 + 40.0, 2.0),
+    ],
+)
+def test_latest_goes_as_far_as_the_lagging_edge_may_be_held_but_not_beyond_the_newest(
+    tree: TransformTree, policy: dict[str, Any], stamp: float, x: float, extrapolated_by: float
+) -> None:
+    found = tree.lookup("odom", "arm", **policy)
+    assert found.stamp == seconds(stamp)
+    assert found.transform.translation[0] == pytest.approx(x)
+    assert found.extrapolated_by == seconds(extrapolated_by)
+
+
+def test_time_travel_tells_the_worse_of_both_legs(tree: TransformTree) -> None:
+    found = tree.lookup("base", "base", seconds(6.5), source_at=seconds(1.5), fixed="odom", extrapolate=Hold(1.0))
+    assert found.transform.translation == pytest.approx((1.5 - 6.0, 0.0, 0.0))
+    assert (found.extrapolated_by, found.gap) == (seconds(0.5), seconds(1.0))
+
+
+# Many stamps.
+
+keywords = st.fixed_dictionaries(
+    {
+        "tolerance": st.sampled_from((0.0, 0.3, 1.0)),
+        "max_gap": st.sampled_from((None, 0.9, 2.0, 3.9)),
+        "extrapolate": st.none() | st.builds(Hold, st.sampled_from((0.2, 2.0))),
+    }
+)
+tenths = st.integers(-20, 90).map(lambda tenth: tenth * SECOND // 10)
+
+
+@given(keywords, st.lists(tenths, max_size=60), st.sampled_from((("odom", "tool"), ("tool", "odom"), ("base", "arm"))))
+def test_many_answers_are_those_of_one_by_one(
+    policy: dict[str, Any], asked: list[int], frames: tuple[str, str]
+) -> None:
+    tree = TransformTree(keep=None)
+    tree.insert_many(moving("odom", "base", second * SECOND, float(second)) for second in (0, 1, 2, 6))
+    tree.insert_many(
+        moving("odom" if second < 3 else "base", "arm", second * SECOND, second) for second in (0, 2, 4, 5)
+    )
+    tree.insert(static("arm", "tool", 0.5))
+    found = tree.lookup_many(*frames, asked, out_of_range="nan", **policy)
+    faults = []
+    for i, at in enumerate(asked):
+        try:
+            one = tree.lookup(*frames, at, **policy)
+        except ExtrapolationError as error:
+            faults.append((i, error))
+            assert not found.valid[i]
+            assert found.extrapolated_by[i] == 0
+            continue
+        assert found[i].is_close(one.transform)
+        assert found.extrapolated_by[i] == one.extrapolated_by
+        assert (found.gap is None) == (one.gap is None)
+        assert found.gap is None or found.gap[i] == one.gap
+    if faults:
+        i, expected = faults[0]
+        with pytest.raises(type(expected)) as caught:
+            tree.lookup_many(*frames, asked, **policy)
+        assert caught.value.index == i
+        assert str(caught.value) == f"stamps[{i}]: {expected}"
+    else:
+        tree.lookup_many(*frames, asked, **policy)
+
+
+def test_many_in_time_travel_tell_the_worse_of_both_legs(tree: TransformTree) -> None:
+    found = tree.lookup_many(
+        "base", "base", [seconds(6.5)] * 2, source_at=[seconds(1.5), seconds(6.25)], fixed="odom", extrapolate=Hold(1.0)
+    )
+    assert found.translations[:, 0] == pytest.approx([1.5 - 6.0, 0.0])
+    assert found.extrapolated_by.tolist() == [seconds(0.5), seconds(0.5)]
+    assert found.gap is not None
+    assert found.gap.tolist() == [seconds(1.0), 0]
+    assert found[1:].extrapolated_by.tolist() == [seconds(0.5)]
+
+
+def test_many_without_a_policy_say_nothing(tree: TransformTree) -> None:
+    found = tree.lookup_many("odom", "tool", [seconds(3.0)])
+    assert (found.extrapolated_by.tolist(), found.gap) == ([0], None)

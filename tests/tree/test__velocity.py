@@ -1,0 +1,616 @@
+"""Closed forms rest on what is exact under the interpolation: straight lines, and steady turns about a fixed axis."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.samples import moving, static
+from support.strategies import TODAY, angles, rotations, stamps, transforms, unit_vectors
+
+from tfbus import (
+    LATEST,
+    SECOND,
+    DisconnectedError,
+    FutureExtrapolationError,
+    Latest,
+    PastExtrapolationError,
+    Transform,
+    TransformStamped,
+    TransformTree,
+    TwistStamped,
+    UnknownFrameError,
+    do_transform,
+)
+from tfbus.geometry.rows import Quaternion, Vector, rotate
+
+STILL = (0.0, 0.0, 0.0)
+Z = (0.0, 0.0, 1.0)
+QUARTER = SECOND // 4
+
+
+def tree_of(*samples: TransformStamped) -> TransformTree:
+    tree = TransformTree(keep=None)
+    tree.insert_many(samples)
+    return tree
+
+
+def trajectory(
+    parent: str, child: str, pose: Callable[[float], Transform], last: float = 4.0
+) -> list[TransformStamped]:
+    """Samples every quarter of a second, from 0 s to the last."""
+    times = range(0, int(last * SECOND) + 1, QUARTER)
+    return [TransformStamped(parent, child, stamp, pose(stamp / SECOND)) for stamp in times]
+
+
+def placed(
+    parent: str, child: str, translation: Vector, rotation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+) -> TransformStamped:
+    return TransformStamped(parent, child, 0, Transform(translation, rotation), static=True)
+
+
+def turning(rate: float, axis: Vector = Z) -> Callable[[float], Transform]:
+    """A steady turn, in rad/s: slerp between its samples is exact."""
+    return lambda time: Transform.from_axis_angle(axis, rate * time)
+
+
+def near(vector: Vector, tolerance: float = 1e-9) -> object:
+    return pytest.approx(vector, rel=0, abs=tolerance)
+
+
+def plus(*vectors: Vector) -> Vector:
+    x, y, z = (math.fsum(parts) for parts in zip(*vectors, strict=True))
+    return x, y, z
+
+
+def times(factor: float, vector: Vector) -> Vector:
+    return factor * vector[0], factor * vector[1], factor * vector[2]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def check_twist(twist: TwistStamped, linear: Vector, angular: Vector, tolerance: float = 1e-9) -> None:
+    assert twist.linear == near(linear, tolerance)
+    assert twist.angular == near(angular, tolerance)
+
+
+# Closed forms
+
+INSTANTS = [0.0, 0.1, 0.25, 1.0, 1.625, 3.999, 4.0]
+
+
+@pytest.mark.parametrize("time", INSTANTS)
+def test_a_body_carried_round_the_unit_circle_has_the_velocity_of_the_textbook(time: float) -> None:
+    tree = tree_of(*trajectory("map", "arm", turning(1.0)), placed("arm", "body", (1.0, 0.0, 0.0)))
+    twist = tree.twist("body", "map", round(time * SECOND))
+    check_twist(twist, (-math.sin(time), math.cos(time), 0.0), Z)
+    assert (twist.frame, twist.stamp) == ("map", round(time * SECOND))
+
+
+def test_between_samples_of_a_circle_the_origin_moves_along_the_chord() -> None:
+    """The chord's direction is the tangent's at its middle; its length is the arc's times sinc of half its angle."""
+    tree = tree_of(*trajectory("map", "body", lambda time: Transform((math.cos(time), math.sin(time), 0.0))))
+    speed = math.sin(0.125) / 0.125
+    for time in (1.01, 1.125, 1.24, 1.25):
+        linear = -speed * math.sin(1.125), speed * math.cos(1.125), 0.0
+        check_twist(tree.twist("body", "map", round(time * SECOND)), linear, STILL)
+
+
+def test_dense_samples_of_a_circle_give_the_velocity_of_the_circle() -> None:
+    step = SECOND // 1_000
+    poses = ((n * step, n / 1_000) for n in range(2_001))
+    tree = tree_of(
+        *(TransformStamped("map", "body", at, Transform((math.cos(t), math.sin(t), 0.0))) for at, t in poses)
+    )
+    for time in (0.0, 0.5, 0.5004, 1.0003, 1.9999, 2.0):
+        # A chord of 1 ms is half a ms off in direction at its ends.
+        twist = tree.twist("body", "map", round(time * SECOND))
+        check_twist(twist, (-math.sin(time), math.cos(time), 0.0), STILL, tolerance=0.5001e-3)
+
+
+@pytest.mark.parametrize(
+    ("frame", "axes", "linear"),
+    [
+        ("body", "map", (-math.sin(1.0), math.cos(1.0), 0.0)),
+        ("body", "body", (0.0, 1.0, 0.0)),
+        ("ahead", "map", (-2.0 * math.sin(1.0), 2.0 * math.cos(1.0), 0.0)),
+    ],
+)
+def test_where_lookup_velocity_of_tf2_is_wrong_the_exact_values_come_out(frame: str, axes: str, linear: Vector) -> None:
+    tree = tree_of(
+        *trajectory("map", "arm", turning(1.0)),
+        placed("arm", "body", (1.0, 0.0, 0.0)),
+        placed("body", "ahead", (1.0, 0.0, 0.0)),
+    )
+    check_twist(tree.twist(frame, "map", SECOND, expressed_in=axes), linear, Z)
+
+
+@pytest.mark.parametrize("time", INSTANTS)
+def test_a_rotating_observer_sees_what_stands_still_go_round_the_other_way(time: float) -> None:
+    rate, radius = 0.7, 3.0
+    tree = tree_of(*trajectory("map", "observer", turning(rate)), placed("map", "post", (radius, 0.0, 0.0)))
+    angle, speed = rate * time, rate * radius
+    at = round(time * SECOND)
+    check_twist(
+        tree.twist("post", "observer", at), (-speed * math.sin(angle), -speed * math.cos(angle), 0.0), (0.0, 0.0, -rate)
+    )
+    check_twist(tree.twist("post", "observer", at, expressed_in="map"), (0.0, -speed, 0.0), (0.0, 0.0, -rate))
+
+
+def test_an_observer_that_turns_with_the_body_sees_it_stand_still() -> None:
+    tree = tree_of(
+        *trajectory("map", "table", turning(2.0, (1.0, 2.0, 3.0))),
+        placed("table", "cup", (1.0, 0.0, 0.5)),
+        placed("table", "plate", (-1.0, 0.3, 0.5), (0.0, 0.6, 0.0, 0.8)),
+    )
+    check_twist(tree.twist("cup", "plate", SECOND // 3), STILL, STILL)
+    check_twist(tree.twist("cup", "plate", SECOND // 3, expressed_in="map"), STILL, STILL)
+
+
+def test_two_rates_about_one_axis_add_up_and_the_inner_one_carries_no_origin() -> None:
+    tree = tree_of(
+        *trajectory("map", "boom", turning(0.5)),
+        placed("boom", "tip", (2.0, 0.0, 0.0)),
+        *trajectory("tip", "wheel", turning(3.0)),
+    )
+    at = 3 * SECOND // 2
+    linear = (-math.sin(0.75), math.cos(0.75), 0.0)
+    check_twist(tree.twist("wheel", "map", at), linear, (0.0, 0.0, 3.5))
+    check_twist(tree.twist("wheel", "tip", at), STILL, (0.0, 0.0, 3.0))
+
+
+def test_a_walk_on_a_turntable_has_the_walk_and_the_turn_in_it() -> None:
+    """In the rotating axes v = (walk, rate * radius, 0), as for any polar coordinates."""
+    rate, walk = 0.8, 0.5
+    tree = tree_of(
+        *trajectory("map", "table", turning(rate)),
+        *trajectory("table", "walker", lambda time: Transform((1.0 + walk * time, 0.0, 0.0))),
+    )
+    at, radius = 2 * SECOND + 1_000, 1.0 + walk * 2.000001
+    check_twist(tree.twist("walker", "map", at, expressed_in="table"), (walk, rate * radius, 0.0), (0.0, 0.0, rate))
+
+
+@given(
+    rotations(),
+    unit_vectors(),
+    angles().filter(lambda angle: abs(angle) < math.pi - 1e-9),
+    st.booleans(),
+    st.floats(0.01, 0.99),
+)
+def test_a_turn_has_one_rate_in_the_parent_whatever_the_signs_of_its_quaternions(
+    start: Quaternion, axis: Vector, angle: float, flipped: bool, fraction: float
+) -> None:
+    first = Transform(rotation=start)
+    x, y, z, w = (Transform.from_axis_angle(axis, angle) @ first).rotation
+    second = Transform(rotation=(-x, -y, -z, -w) if flipped else (x, y, z, w))
+    tree = tree_of(TransformStamped("map", "body", 0, first), TransformStamped("map", "body", SECOND, second))
+    check_twist(tree.twist("body", "map", round(fraction * SECOND)), STILL, times(angle, axis), tolerance=1e-12)
+
+
+@given(rotations(), unit_vectors())
+def test_a_half_turn_goes_the_way_that_the_lookup_goes(start: Quaternion, axis: Vector) -> None:
+    first = Transform(rotation=start)
+    second = Transform.from_axis_angle(axis, math.pi) @ first
+    tree = tree_of(TransformStamped("map", "body", 0, first), TransformStamped("map", "body", SECOND, second))
+    _, angular = difference(tree, "body", "map", SECOND // 2)
+    check_twist(tree.twist("body", "map", SECOND // 2), STILL, angular, tolerance=1e-6)
+
+
+# What tf1 and tf2 test
+
+
+@pytest.mark.parametrize("speed", [1.0, 3.0, 0.3])
+@pytest.mark.parametrize("at", [QUARTER // 3, SECOND, 4 * SECOND, LATEST])
+def test_a_steady_straight_motion_has_its_speed_at_every_instant(speed: float, at: int | Latest) -> None:
+    tree = tree_of(*trajectory("map", "body", lambda time: Transform((speed * time, 0.0, 0.0))))
+    check_twist(tree.twist("body", "map", at), (speed, 0.0, 0.0), STILL)
+
+
+SIDES: list[tuple[float, Vector]] = [
+    (0.5, (1.0, 0.0, 0.0)),
+    (1.5, (0.0, 1.0, 0.0)),
+    (2.5, (-1.0, 0.0, 0.0)),
+    (3.5, (0.0, -1.0, 0.0)),
+    (4.5, (0.0, 0.0, 1.0)),
+    (5.5, (0.0, 0.0, -1.0)),
+]
+TURNS: list[tuple[float, Vector]] = [
+    (0.5, (1.0, 0.0, 0.0)),
+    (1.5, (-1.0, 0.0, 0.0)),
+    (2.5, (0.0, 1.0, 0.0)),
+    (3.5, (0.0, -1.0, 0.0)),
+    (4.5, (0.0, 0.0, 1.0)),
+    (5.5, (0.0, 0.0, -1.0)),
+]
+
+
+def stepping(velocities: list[tuple[float, Vector]], pose: Callable[[Vector], Transform]) -> list[TransformStamped]:
+    """Ten steps of 0.1 in each second, by one velocity after the other."""
+    there = STILL
+    samples = [TransformStamped("foo", "bar", 0, pose(there))]
+    for n in range(60):
+        there = plus(there, times(0.1, velocities[n // 10][1]))
+        samples.append(TransformStamped("foo", "bar", (n + 1) * SECOND // 10, pose(there)))
+    return samples
+
+
+@pytest.mark.parametrize(("time", "velocity"), SIDES)
+@pytest.mark.parametrize("observer", ["foo", "stationary_offset_child", "stationary_offset_parent"])
+def test_a_straight_motion_looks_the_same_from_three_frames_that_stand_still(
+    time: float, velocity: Vector, observer: str
+) -> None:
+    tree = tree_of(
+        *stepping(SIDES, Transform),
+        placed("foo", "stationary_offset_child", (1.0, 0.0, 0.0)),
+        placed("stationary_offset_parent", "foo", (0.0, 0.0, 1.0)),
+    )
+    check_twist(tree.twist("bar", observer, round(time * SECOND)), velocity, STILL)
+
+
+@pytest.mark.parametrize(("time", "velocity"), TURNS)
+def test_a_turn_alone_moves_no_origin_but_that_of_an_offset_child(time: float, velocity: Vector) -> None:
+    tree = tree_of(
+        *stepping(TURNS, lambda rpy: Transform.from_xyz_rpy(STILL, rpy)),
+        placed("bar", "stationary_offset_child", (1.0, 0.0, 0.0)),
+        placed("stationary_offset_parent", "foo", (0.0, 0.0, 1.0)),
+    )
+    at = round(time * SECOND)
+    for observer in ("foo", "stationary_offset_parent"):
+        check_twist(tree.twist("bar", observer, at), STILL, velocity)
+    arm = Transform.from_axis_angle([abs(part) for part in velocity], 0.5).apply((1.0, 0.0, 0.0))
+    check_twist(tree.twist("stationary_offset_child", "foo", at), cross(velocity, arm), velocity)
+
+
+# Against differences
+
+
+def difference(tree: TransformTree, frame: str, reference: str, at: int, step: int = 2_000) -> tuple[Vector, Vector]:
+    """What central differences of the lookup give for the linear and angular velocity, along the reference's axes."""
+    after = tree.lookup(reference, frame, at + step).transform
+    before = tree.lookup(reference, frame, at - step).transform
+    rate = SECOND / (2 * step)
+    axis, angle = (after @ before.inverse()).as_axis_angle()
+    return times(rate, plus(after.translation, times(-1.0, before.translation))), times(rate * angle, axis)
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> tuple[TransformTree, int, list[str]]:
+    """Two legs of up to three edges below one root, an instant away from all samples, and the frames.
+
+    Samples are at least 1 s apart, and at most 2 m from their parent: over 2 us the third derivative counts for less
+    than 1e-7.
+    """
+    at = draw(st.sampled_from([0, TODAY]))
+    tree = TransformTree(keep=None)
+    frames = ["root"]
+    for leg, least in (("a", 1), ("b", 0)):
+        parent = "root"
+        for n in range(draw(st.integers(least, 3))):
+            child = f"{leg}{n}"
+            if draw(st.booleans()):
+                tree.insert(TransformStamped(parent, child, 0, draw(transforms(2.0)), static=True))
+            else:
+                share = draw(st.integers(1, 9))
+                length = draw(st.integers(1, 5)) * SECOND
+                first = at - share * length // 10
+                for k in range(-draw(st.integers(0, 1)), 2 + draw(st.integers(0, 1))):
+                    tree.insert(TransformStamped(parent, child, first + k * length, draw(transforms(2.0))))
+            frames.append(child)
+            parent = child
+    return tree, at, frames
+
+
+@given(trees(), st.data())
+def test_twist_is_the_limit_of_differences(drawn: tuple[TransformTree, int, list[str]], data: st.DataObject) -> None:
+    tree, at, frames = drawn
+    frame, reference, axes = (data.draw(st.sampled_from(frames)) for _ in range(3))
+    linear, angular = difference(tree, frame, reference, at)
+    turn = tree.lookup(axes, reference, at).transform.rotation
+    twist = tree.twist(frame, reference, at, expressed_in=axes)
+    check_twist(twist, rotate(turn, *linear), rotate(turn, *angular), tolerance=1e-6)
+    assert (twist.frame, twist.stamp) == (axes, at)
+
+
+@given(trees(), st.data())
+def test_what_b_sees_of_a_is_what_a_sees_of_b_reversed_about_the_lever_arm(
+    drawn: tuple[TransformTree, int, list[str]], data: st.DataObject
+) -> None:
+    tree, at, frames = drawn
+    a, b, axes = (data.draw(st.sampled_from(frames)) for _ in range(3))
+    there, back = tree.twist(a, b, at, expressed_in=axes), tree.twist(b, a, at, expressed_in=axes)
+    arm = rotate(tree.lookup(axes, b, at).transform.rotation, *tree.lookup(b, a, at).transform.translation)
+    linear = plus(times(-1.0, there.linear), cross(there.angular, arm))
+    check_twist(back, linear, times(-1.0, there.angular))
+
+
+@given(trees(), st.data(), transforms(2.0))
+def test_the_body_twist_carried_to_another_frame_of_the_body_is_that_frames_own(
+    drawn: tuple[TransformTree, int, list[str]], data: st.DataObject, mount: Transform
+) -> None:
+    tree, at, frames = drawn
+    body, reference = (data.draw(st.sampled_from(frames)) for _ in range(2))
+    tree.insert(TransformStamped(body, "sensor", 0, mount, static=True))
+    carried = do_transform(tree.twist(body, reference, at, expressed_in=body), tree.lookup("sensor", body, at))
+    own = tree.twist("sensor", reference, at, expressed_in="sensor")
+    assert (carried.frame, carried.stamp) == (own.frame, own.stamp)
+    check_twist(carried, own.linear, own.angular)
+
+
+@given(trees(), st.data())
+def test_the_axes_turn_the_numbers_and_leave_the_motion_as_it_is(
+    drawn: tuple[TransformTree, int, list[str]], data: st.DataObject
+) -> None:
+    tree, at, frames = drawn
+    frame, reference, axes = (data.draw(st.sampled_from(frames)) for _ in range(3))
+    plain = tree.twist(frame, reference, at)
+    turn = tree.lookup(axes, reference, at).transform.rotation
+    assert plain == tree.twist(frame, reference, at, expressed_in=reference)
+    other = tree.twist(frame, reference, at, expressed_in=axes)
+    check_twist(other, rotate(turn, *plain.linear), rotate(turn, *plain.angular))
+
+
+@given(trees(), st.data())
+def test_a_frame_does_not_move_seen_from_itself(
+    drawn: tuple[TransformTree, int, list[str]], data: st.DataObject
+) -> None:
+    tree, at, frames = drawn
+    frame, axes = (data.draw(st.sampled_from(frames)) for _ in range(2))
+    check_twist(tree.twist(frame, frame, at, expressed_in=axes), STILL, STILL)
+
+
+# At samples
+
+
+def on_a_line(*points: tuple[int, float], parent: str = "map") -> list[TransformStamped]:
+    """Samples of ``body`` at some seconds and x."""
+    return [moving(parent, "body", seconds * SECOND, x) for seconds, x in points]
+
+
+def speed(tree: TransformTree, at: int | Latest) -> float:
+    """Of ``body`` on its line, seen from ``map``."""
+    twist = tree.twist("body", "map", at)
+    assert twist.angular == STILL
+    assert twist.linear[1:] == (0.0, 0.0)
+    return twist.linear[0]
+
+
+def test_at_a_sample_the_derivative_is_the_one_from_before() -> None:
+    tree = tree_of(*on_a_line((0, 0.0), (1, 1.0), (2, 3.0), (3, 6.0)))
+    assert [speed(tree, second * SECOND) for second in (1, 2, 3)] == [1.0, 2.0, 3.0]
+    assert [speed(tree, second * SECOND + 1) for second in (0, 1, 2)] == [1.0, 2.0, 3.0]
+    assert speed(tree, LATEST) == 3.0
+
+
+def test_at_the_first_sample_it_is_the_one_from_after() -> None:
+    tree = tree_of(*on_a_line((0, 0.0), (1, 1.0), (2, 3.0)))
+    assert speed(tree, 0) == 1.0
+
+
+@pytest.mark.parametrize("newest", [41, 42, 45])
+def test_what_has_left_the_window_is_not_differentiated(newest: int) -> None:
+    tree = TransformTree(keep=40.0)
+    tree.insert_many(on_a_line(*((second, float(second**2)) for second in range(newest + 1))))
+    oldest = newest - 40
+    assert speed(tree, oldest * SECOND) == 2 * oldest + 1
+    assert speed(tree, (oldest + 1) * SECOND) == 2 * oldest + 1
+    with pytest.raises(PastExtrapolationError):
+        tree.twist("body", "map", oldest * SECOND - 1)
+
+
+def test_samples_one_nanosecond_apart_have_a_velocity() -> None:
+    tree = tree_of(moving("map", "body", TODAY, 0.0), moving("map", "body", TODAY + 1, 1e-9))
+    assert speed(tree, TODAY) == speed(tree, TODAY + 1) == pytest.approx(1.0, rel=1e-15)
+
+
+@given(st.sets(stamps(), min_size=2, max_size=2))
+def test_a_segment_of_any_length_has_a_velocity(ends: set[int]) -> None:
+    low, high = sorted(ends)
+    tree = tree_of(moving("map", "body", low, 0.0), moving("map", "body", high, (high - low) / SECOND))
+    for at in (low, (low + high) // 2, high):
+        assert speed(tree, at) == pytest.approx(1.0, rel=1e-12)
+
+
+@pytest.mark.parametrize("at", [5 * SECOND, LATEST])
+def test_a_lone_sample_says_where_a_frame_is_but_not_where_it_goes(at: int | Latest) -> None:
+    tree = tree_of(moving("map", "body", 5 * SECOND, 1.0, authority="odometry"))
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree.twist("body", "map", at)
+    error = caught.value
+    assert (error.child, error.stamp) == ("body", 5 * SECOND + 1)
+    assert (error.oldest, error.newest) == (5 * SECOND, 5 * SECOND)
+    assert error.authority == "odometry"
+    tree.insert(moving("map", "body", 6 * SECOND, 3.0))
+    assert speed(tree, 5 * SECOND) == speed(tree, LATEST) == 2.0
+
+
+# Across a change of parent
+
+
+def reparented() -> TransformTree:
+    """On ``left`` until 1 s at 1 m/s, from 3 s on ``right`` at 2 m/s."""
+    return tree_of(
+        static("map", "left", 10.0),
+        static("map", "right", 20.0),
+        *on_a_line((0, 0.0), (1, 1.0), parent="left"),
+        *on_a_line((3, 0.0), (4, 2.0), parent="right"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("time", "expected"),
+    [(0.0, 1.0), (0.5, 1.0), (1.0, 1.0), (1.000000001, 0.0), (2.999999999, 0.0), (3.0, 2.0), (3.5, 2.0), (4.0, 2.0)],
+)
+def test_across_a_change_of_parent_a_frame_stands_still_and_the_new_parent_begins_from_after(
+    time: float, expected: float
+) -> None:
+    assert speed(reparented(), round(time * SECOND)) == expected
+
+
+def test_while_it_is_held_a_frame_goes_with_its_old_parent() -> None:
+    tree = tree_of(
+        *trajectory("map", "crane", turning(0.5)),
+        moving("crane", "box", 0, 1.0),
+        moving("crane", "box", SECOND, 2.0),
+        moving("map", "box", 3 * SECOND, 0.0),
+    )
+    check_twist(tree.twist("box", "map", 2 * SECOND, expressed_in="crane"), (0.0, 1.0, 0.0), (0.0, 0.0, 0.5))
+    check_twist(tree.twist("box", "crane", 2 * SECOND), STILL, STILL)
+
+
+def test_a_single_sample_between_two_parents_begins_to_be_held() -> None:
+    tree = tree_of(
+        static("map", "left", 10.0),
+        *on_a_line((0, 0.0), parent="left"),
+        *on_a_line((1, 5.0)),
+        *on_a_line((2, 0.0), (3, 4.0), parent="left"),
+    )
+    assert [speed(tree, second * SECOND) for second in (0, 1, 2, 3)] == [0.0, 0.0, 4.0, 4.0]
+
+
+@pytest.mark.parametrize("at", [3 * SECOND, LATEST])
+def test_the_first_sample_of_a_new_parent_waits_for_the_second(at: int | Latest) -> None:
+    tree = tree_of(*on_a_line((0, 0.0), (1, 1.0)), static("map", "lift"), *on_a_line((3, 0.0), parent="lift"))
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree.twist("body", "map", at)
+    assert (caught.value.child, caught.value.newest) == ("body", 3 * SECOND)
+
+
+# Stamps
+
+
+@pytest.mark.parametrize("at", [-SECOND, 0, 7, TODAY])
+def test_what_is_static_stands_still_at_any_stamp(at: int) -> None:
+    tree = tree_of(static("map", "base", 1.0, stamp=5), static("base", "lidar", 2.0, stamp=9))
+    assert tree.twist("lidar", "map", at) == TwistStamped("map", at, STILL, STILL)
+
+
+@pytest.mark.parametrize(
+    ("frame", "reference"), [("lidar", "base"), ("base", "lidar"), ("lidar", "lidar"), ("base", "base"), ("map", "map")]
+)
+def test_what_is_static_has_the_stamp_that_lookup_gives_it(frame: str, reference: str) -> None:
+    tree = tree_of(*on_a_line((0, 0.0), (8, 1.0)), static("body", "base", stamp=5), static("base", "lidar", stamp=7))
+    tree.insert_many([moving("body", "arm", 0), moving("body", "arm", 3)])
+    assert tree.twist(frame, reference).stamp == tree.lookup(reference, frame).stamp
+
+
+def test_seen_from_a_moving_frame_what_is_fixed_to_it_has_the_stamp_of_the_fixture() -> None:
+    tree = tree_of(*on_a_line((0, 0.0), (8, 1.0)), static("body", "lidar", stamp=5))
+    assert tree.twist("lidar", "body") == TwistStamped("body", 5, STILL, STILL)
+
+
+def slow_and_fast() -> TransformTree:
+    """``fast`` is known from 0 s to 8 s, ``slow`` from 0 s to 3 s; ``post`` stands still."""
+    return tree_of(
+        *trajectory("map", "fast", lambda time: Transform((time, 0.0, 0.0)), last=8.0),
+        *trajectory("map", "slow", turning(0.5), last=3.0),
+        static("map", "post", stamp=5),
+    )
+
+
+@pytest.mark.parametrize(
+    ("frame", "reference", "axes", "seconds"),
+    [
+        ("fast", "map", None, 8),
+        ("fast", "map", "post", 8),
+        ("fast", "map", "fast", 8),
+        ("fast", "map", "slow", 3),
+        ("slow", "map", "fast", 3),
+        ("fast", "slow", "post", 3),
+        ("post", "map", "fast", 8),
+        ("post", "post", "slow", 3),
+    ],
+)
+def test_latest_is_the_newest_stamp_that_all_three_frames_can_answer(
+    frame: str, reference: str, axes: str | None, seconds: int
+) -> None:
+    tree = slow_and_fast()
+    twist = tree.twist(frame, reference, expressed_in=axes)
+    assert twist.stamp == seconds * SECOND
+    assert twist == tree.twist(frame, reference, twist.stamp, expressed_in=axes)
+
+
+@pytest.mark.parametrize("last", [2.0, 4.0, 6.0])
+def test_the_axes_count_as_they_are_at_the_stamp(last: float) -> None:
+    tree = tree_of(
+        *trajectory("map", "axes", turning(0.5), last),
+        *trajectory("map", "body", lambda time: Transform((time, 0.0, 0.0))),
+    )
+    angle = 0.5 * min(last, 4.0)
+    check_twist(tree.twist("body", "map", expressed_in="axes"), (math.cos(angle), -math.sin(angle), 0.0), STILL)
+
+
+def test_late_samples_change_the_velocity_on_both_sides() -> None:
+    tree = tree_of(*on_a_line((0, 0.0), (2, 2.0)))
+    tree.insert(moving("map", "body", SECOND, 3.0))
+    assert (speed(tree, QUARTER), speed(tree, 7 * QUARTER)) == (3.0, -1.0)
+
+
+# Errors
+
+
+def lines_of_two_trees() -> TransformTree:
+    return tree_of(*on_a_line((1, 0.0), (2, 1.0)), static("map", "post"), moving("other", "elsewhere", SECOND))
+
+
+@pytest.mark.parametrize(
+    ("frames", "unknown"),
+    [(("bodi", "map", "post"), "bodi"), (("body", "mop", "post"), "mop"), (("body", "map", "pots"), "pots")],
+)
+@pytest.mark.parametrize("at", [SECOND, LATEST])
+def test_unknown_frames_are_named_wherever_they_stand(
+    frames: tuple[str, str, str], unknown: str, at: int | Latest
+) -> None:
+    frame, reference, axes = frames
+    with pytest.raises(UnknownFrameError) as caught:
+        lines_of_two_trees().twist(frame, reference, at, expressed_in=axes)
+    assert caught.value.frame == unknown
+
+
+@pytest.mark.parametrize(
+    ("frame", "reference", "axes"),
+    [("body", "elsewhere", "map"), ("elsewhere", "map", "map"), ("body", "map", "elsewhere")],
+)
+@pytest.mark.parametrize("at", [SECOND, LATEST])
+def test_frames_of_another_tree_are_disconnected(frame: str, reference: str, axes: str, at: int | Latest) -> None:
+    with pytest.raises(DisconnectedError):
+        lines_of_two_trees().twist(frame, reference, at, expressed_in=axes)
+
+
+@pytest.mark.parametrize(
+    ("frame", "reference", "axes"), [("body", "map", "map"), ("map", "body", "map"), ("post", "map", "body")]
+)
+def test_outside_the_window_the_errors_are_those_of_lookup(frame: str, reference: str, axes: str) -> None:
+    tree = lines_of_two_trees()
+    for at, error in ((SECOND - 1, PastExtrapolationError), (2 * SECOND + 1, FutureExtrapolationError)):
+        with pytest.raises(error) as caught:
+            tree.twist(frame, reference, at, expressed_in=axes)
+        assert (caught.value.child, caught.value.stamp) == ("body", at)
+
+
+def gap(axes_first: bool) -> TransformTree:
+    """One of two frames has stopped before the other began."""
+    early, late = ("axes", "body") if axes_first else ("body", "axes")
+    first = [moving("map", early, second * SECOND) for second in (0, 1)]
+    return tree_of(*first, *(moving("map", late, second * SECOND) for second in (5, 6)))
+
+
+@pytest.mark.parametrize("axes_first", [True, False])
+def test_latest_without_a_common_stamp_waits_for_the_frame_that_lags(axes_first: bool) -> None:
+    with pytest.raises(FutureExtrapolationError) as caught:
+        gap(axes_first).twist("body", "map", expressed_in="axes")
+    assert (caught.value.child, caught.value.stamp) == ("axes" if axes_first else "body", 5 * SECOND)
+
+
+@pytest.mark.parametrize("at", [1.5, True, "now", None])
+def test_a_stamp_is_an_integer_or_latest(at: object) -> None:
+    with pytest.raises(TypeError, match="a stamp is an int of nanoseconds"):
+        lines_of_two_trees().twist("body", "map", at)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("frame", "reference", "axes"), [(1, "map", None), ("body", None, None), ("body", "map", 2)])
+def test_a_frame_is_named_by_a_string(frame: str, reference: str, axes: str | None) -> None:
+    with pytest.raises(TypeError, match="a frame name must be a str"):
+        lines_of_two_trees().twist(frame, reference, expressed_in=axes)

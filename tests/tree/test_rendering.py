@@ -1,0 +1,237 @@
+import json
+import re
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.strategies import TODAY, frame_names
+
+from tfbus import SECOND, Edge, Transform, TransformStamped, TransformTree
+from tfbus.tree.rendering import describe, to_dot, to_yaml
+
+MOVING = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
+STATIC = Edge("base_link", "lidar", True, 1, None, None, "")
+SINGLE = Edge("base_link", "arm", False, 1, 3 * SECOND, 3 * SECOND, "driver")
+EMPTY = Edge("base_link", "tool", False, 0, None, None, "")
+EDGES = [SINGLE, MOVING, STATIC, EMPTY]
+
+
+def edge(parent: str, child: str) -> Edge:
+    return replace(STATIC, parent=parent, child=child)
+
+
+def labels(picture: str) -> list[str]:
+    """The frames of a picture without facts, in the order of their lines."""
+    return [re.sub(r"^[│├└─ ]*", "", line).removesuffix("  static").rstrip() for line in picture.split("\n")]
+
+
+# Text
+
+
+def test_the_picture_has_a_line_for_each_frame_with_its_facts() -> None:
+    assert describe(EDGES).split("\n") == [
+        "map",
+        "└── base_link  50.0 Hz  age 0 ns  span 2 s  from 'odometry'",
+        "    ├── arm    one sample  age 1 s  span 0 ns  from 'driver'",
+        "    ├── lidar  static",
+        "    └── tool   no samples",
+    ]
+
+
+def test_ages_are_counted_from_now_if_it_is_given() -> None:
+    assert "age 500 ms" in describe([MOVING], now=4_500_000_000)
+    assert "age 0 ns" in describe([MOVING])
+
+
+def test_a_branch_that_goes_on_is_marked_beside_what_hangs_below_it() -> None:
+    picture = describe([edge("map", "a"), edge("a", "b"), edge("map", "c")])
+    assert picture.split("\n") == ["map", "├── a      static", "│   └── b  static", "└── c      static"]
+
+
+def test_several_trees_are_drawn_one_after_the_other() -> None:
+    assert labels(describe([edge("odom", "base"), edge("map", "anchor")])) == ["map", "anchor", "odom", "base"]
+
+
+def test_an_empty_tree_has_a_picture_too() -> None:
+    tree = TransformTree()
+    assert tree.describe() == "(no frames)"
+    assert tree.to_yaml() == "{}\n"
+    assert tree.to_dot() == "digraph tf {\n}\n"
+
+
+def test_a_loop_is_drawn_once_and_named() -> None:
+    assert labels(describe([edge("b", "a"), edge("a", "b"), edge("map", "c")])) == ["map", "c", "a (in a loop)", "b"]
+
+
+def test_what_hangs_below_a_loop_is_drawn_there_and_is_not_in_the_loop() -> None:
+    picture = describe([edge("c", "b"), edge("b", "c"), edge("c", "a"), edge("a", "tool")])
+    assert labels(picture) == ["c (in a loop)", "b", "a", "tool"]
+
+
+def test_a_frame_on_itself_is_a_loop() -> None:
+    assert labels(describe([edge("a", "a")])) == ["a (in a loop)"]
+
+
+@given(st.dictionaries(st.sampled_from("abcdefgh"), st.sampled_from("abcdefgh"), max_size=8))
+def test_every_frame_of_any_graph_is_drawn_once_whatever_loops_there_are(parents: dict[str, str]) -> None:
+    picture = describe([edge(parent, child) for child, parent in sorted(parents.items())])
+    drawn = [label.removesuffix(" (in a loop)") for label in labels(picture)]
+    assert sorted(drawn) == sorted({*parents, *parents.values()} or {"(no frames)"})
+
+
+@given(st.dictionaries(st.sampled_from("abcdefgh"), st.sampled_from("abcdefgh"), max_size=8))
+def test_only_a_frame_that_comes_back_to_itself_is_called_in_a_loop(parents: dict[str, str]) -> None:
+    picture = describe([edge(parent, child) for child, parent in sorted(parents.items())])
+    named = {label.removesuffix(" (in a loop)") for label in labels(picture) if label.endswith(" (in a loop)")}
+    for frame in named:
+        above = parents[frame]
+        for _ in parents:
+            if above != frame:
+                above = parents[above]
+        assert above == frame
+
+
+def test_a_chain_of_two_thousand_frames_is_drawn_without_recursion() -> None:
+    picture = describe([edge(f"{depth:05}", f"{depth + 1:05}") for depth in range(2_000)])
+    assert picture.count("\n") == 2_000
+
+
+# Graphviz
+
+
+def test_graphviz_gets_an_arrow_for_each_edge_with_rate_and_sender() -> None:
+    assert to_dot(EDGES).split("\n") == [
+        "digraph tf {",
+        '    "base_link" -> "arm" [label="one sample\\ndriver"];',
+        '    "map" -> "base_link" [label="50.0 Hz\\nodometry"];',
+        '    "base_link" -> "lidar" [label="static", style=dashed];',
+        '    "base_link" -> "tool" [label="no samples"];',
+        "}",
+        "",
+    ]
+
+
+@pytest.mark.parametrize("name", ["küche", "腕", "🦾", "base link"])
+def test_graphviz_gets_names_of_every_alphabet_as_they_are(name: str) -> None:
+    assert f'    "{name}" -> "lidar" [' in to_dot([edge(name, "lidar")])
+
+
+@given(frame_names(), frame_names(), frame_names())
+def test_no_name_breaks_out_of_its_quotes_in_graphviz(parent: str, child: str, authority: str) -> None:
+    text = to_dot([replace(STATIC, parent=parent, child=child, authority=authority)])
+    quoted = r'"(?:[^"\\\n]|\\.)*"'
+    assert re.fullmatch(
+        rf"digraph tf {{\n    {quoted} -> {quoted} \[label={quoted}, style=dashed\];\n}}\n", text, re.DOTALL
+    )
+
+
+def test_graphviz_gets_a_loop_too() -> None:
+    assert to_dot([edge("b", "a"), edge("a", "b")]).count("->") == 2
+
+
+# YAML
+
+
+def parsed(text: str) -> dict[str, dict[str, Any]]:
+    """The YAML of frames: blocks of one level, whose keys and values are those of JSON."""
+    frames: dict[str, dict[str, Any]] = {}
+    frame = ""
+    for line in text.removesuffix("\n").split("\n"):
+        if line.startswith("  "):
+            key, _, value = line.strip().partition(": ")
+            frames[frame][key] = json.loads(value)
+        else:
+            assert line.endswith(":")
+            frame = json.loads(line[:-1])
+            frames[frame] = {}
+    return frames
+
+
+def test_yaml_has_the_keys_of_tf2_and_stamps_in_seconds() -> None:
+    assert parsed(to_yaml(EDGES)) == {
+        "arm": {
+            "parent": "base_link",
+            "broadcaster": "driver",
+            "static": False,
+            "rate": None,
+            "most_recent_transform": 3.0,
+            "oldest_transform": 3.0,
+            "buffer_length": 0.0,
+        },
+        "base_link": {
+            "parent": "map",
+            "broadcaster": "odometry",
+            "static": False,
+            "rate": 50.0,
+            "most_recent_transform": 4.0,
+            "oldest_transform": 2.0,
+            "buffer_length": 2.0,
+        },
+        "lidar": {
+            "parent": "base_link",
+            "broadcaster": "",
+            "static": True,
+            "rate": None,
+            "most_recent_transform": None,
+            "oldest_transform": None,
+            "buffer_length": None,
+        },
+        "tool": {
+            "parent": "base_link",
+            "broadcaster": "",
+            "static": False,
+            "rate": None,
+            "most_recent_transform": None,
+            "oldest_transform": None,
+            "buffer_length": None,
+        },
+    }
+
+
+def test_yaml_keeps_every_nanosecond_of_todays_stamps() -> None:
+    text = to_yaml([replace(MOVING, oldest=TODAY + 1, newest=TODAY + 2 * SECOND + 4)])
+    seconds = TODAY // SECOND
+    assert f"  oldest_transform: {seconds}.000000001\n" in text
+    assert f"  most_recent_transform: {seconds + 2}.000000004\n" in text
+    assert "  buffer_length: 2.000000003\n" in text
+
+
+def test_yaml_writes_no_number_that_a_yaml_1_1_parser_takes_for_a_string() -> None:
+    text = to_yaml([replace(MOVING, samples=2, oldest=0, newest=10_000)])
+    assert "  buffer_length: 0.00001\n" in text
+    assert "  most_recent_transform: 0.00001\n" in text
+
+
+@given(frame_names(), frame_names(), frame_names())
+def test_yaml_gives_back_every_name(parent: str, child: str, authority: str) -> None:
+    text = to_yaml([replace(STATIC, parent=parent, child=child, authority=authority)])
+    facts = parsed(text)[child]
+    assert (facts["parent"], facts["broadcaster"]) == (parent, authority)
+
+
+def test_yaml_escapes_no_character_in_halves() -> None:
+    assert '"🦾":\n' in to_yaml([edge("map", "🦾")])
+
+
+# The tree
+
+
+def test_a_tree_draws_its_own_edges() -> None:
+    tree = TransformTree()
+    for tenth in range(11):
+        tree.insert(TransformStamped("map", "base_link", tenth * SECOND // 10, Transform(), "odometry"))
+    tree.insert(TransformStamped("base_link", "lidar", 0, Transform(), static=True))
+    assert tree.describe(now=SECOND * 3 // 2).split("\n") == [
+        "map",
+        "└── base_link  10.0 Hz  age 500 ms  span 1 s  from 'odometry'",
+        "    └── lidar  static",
+    ]
+    assert tree.to_dot().count("->") == 2
+    assert set(parsed(tree.to_yaml())) == {"base_link", "lidar"}
+
+
+def test_a_slow_edge_does_not_look_like_a_dead_one() -> None:
+    slow = Edge("map", "dock", static=False, samples=2, oldest=0, newest=50 * SECOND, authority="")
+    assert "0.02 Hz" in describe([slow])

@@ -1,0 +1,586 @@
+import gc
+import math
+import sys
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import pairwise, product
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.samples import any_samples, moving, over, static, tree_of, x_of
+from support.strategies import TODAY
+from support.threads import threads_that
+
+from tfbus import (
+    LATEST,
+    SECOND,
+    DisconnectedError,
+    Edge,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    InvalidTransformError,
+    Latest,
+    Outcome,
+    PastExtrapolationError,
+    Transform,
+    TransformLookupError,
+    TransformStamped,
+    TransformTree,
+    UnknownFrameError,
+)
+
+# Insertion and the window
+
+
+def test_exactly_the_length_of_the_window_can_be_asked_back() -> None:
+    for keep in range(1, 100):
+        tree = TransformTree(float(keep))
+        for second in range(101):
+            tree.insert(moving("a", "b", second * SECOND, float(second)))
+        edge = (100 - keep) * SECOND
+        assert x_of(tree, "a", "b", edge) == 100.0 - keep
+        with pytest.raises(PastExtrapolationError) as caught:
+            tree.lookup("a", "b", edge - 1)
+        assert caught.value.oldest == edge
+
+
+def test_each_edge_has_its_own_window() -> None:
+    tree = tree_of(*over("a", "b", [0, 5]), *over("b", "c", [0, 1_000]), keep=10e-9)
+    assert tree.lookup("a", "b", 0).stamp == 0
+    assert not tree.can_transform("b", "c", 0)
+
+
+def test_outcomes_are_given_and_counted() -> None:
+    tree = TransformTree(keep=10e-9)
+    batch = [moving("a", "b", stamp) for stamp in (100, 90, 89, 90, 101, 90)]
+    expected = [
+        Outcome.INSERTED,
+        Outcome.INSERTED,
+        Outcome.EXPIRED,
+        Outcome.REPLACED,
+        Outcome.INSERTED,
+        Outcome.EXPIRED,
+    ]
+    assert tree.insert_many(batch) == expected
+    assert (tree.inserted, tree.replaced, tree.expired) == (3, 1, 2)
+    assert tree.insert(static("a", "c")) is Outcome.INSERTED
+    assert tree.insert(static("a", "c")) is Outcome.REPLACED
+
+
+def test_an_expired_sample_makes_no_frame_known() -> None:
+    tree = tree_of(moving("a", "b", 100), keep=10e-9)
+    assert tree.insert(moving("ghost", "b", 50)) is Outcome.EXPIRED
+    assert tree.frames() == ["a", "b"]
+
+
+def test_a_parent_is_forgotten_with_the_last_sample_that_names_it() -> None:
+    tree = tree_of(moving("old", "b", 0), moving("new", "b", 10), keep=10e-9)
+    assert tree.frames() == ["b", "new", "old"]
+    tree.insert(moving("new", "b", 11))
+    assert tree.frames() == ["b", "new"]
+    with pytest.raises(UnknownFrameError):
+        tree.lookup("old", "b", 11)
+
+
+def test_a_parent_that_only_a_late_sample_named_is_forgotten_as_soon_as_that_expires() -> None:
+    tree = tree_of(moving("new", "b", 100), moving("old", "b", 90), keep=10e-9)
+    assert "old" in tree
+    tree.insert(moving("new", "b", 101))
+    assert "old" not in tree
+
+
+@pytest.mark.parametrize("stamp", [0, 10, 20])
+def test_the_last_of_two_samples_at_one_stamp_wins(stamp: int) -> None:
+    tree = tree_of(*over("a", "b", [0, 10, 20]))
+    tree.lookup("a", "b", stamp)
+    assert tree.insert(moving("a", "b", stamp, 500.0)) is Outcome.REPLACED
+    assert x_of(tree, "a", "b", stamp) == 500.0
+
+
+def test_late_data_change_the_answer_between_their_neighbours() -> None:
+    tree = tree_of(*over("a", "b", [0, 20]))
+    assert x_of(tree, "a", "b", 10) == 10.0
+    tree.insert(moving("a", "b", 10, -7.0))
+    assert x_of(tree, "a", "b", 10) == -7.0
+    assert x_of(tree, "a", "b", 15) == pytest.approx(6.5)
+
+
+def test_late_data_lengthen_the_past_of_a_path_that_was_asked_before() -> None:
+    tree = tree_of(*over("a", "b", [50, 60]))
+    with pytest.raises(PastExtrapolationError):
+        tree.lookup("a", "b", 45)
+    tree.insert(moving("a", "b", 40, 40.0))
+    assert x_of(tree, "a", "b", 45) == 45.0
+
+
+@pytest.mark.parametrize("keep", [None, math.inf])
+def test_without_a_window_nothing_expires(keep: float | None) -> None:
+    tree = tree_of(moving("a", "b", 10**18), keep=keep)
+    assert tree.insert(moving("a", "b", 0)) is Outcome.INSERTED
+    assert tree.lookup("a", "b", 0).stamp == 0
+
+
+@pytest.mark.parametrize(("keep", "error"), [(-1.0, ValueError), (math.nan, ValueError), ("10", TypeError)])
+def test_a_window_must_be_a_duration(keep: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match="keep"):
+        TransformTree(keep)
+
+
+@pytest.mark.parametrize("sample", [None, "a", {"parent": "a"}, Transform()])
+def test_only_samples_are_inserted_and_a_batch_with_anything_else_is_not(sample: Any) -> None:
+    tree = TransformTree()
+    with pytest.raises(TypeError, match="TransformStamped"):
+        tree.insert(sample)
+    with pytest.raises(TypeError, match="TransformStamped"):
+        tree.insert_many([moving("a", "b", 0), sample])
+    assert tree.frames() == []
+
+
+# Loops
+
+
+def test_an_edge_that_closes_a_loop_is_refused_and_nothing_is_stored() -> None:
+    tree = tree_of(moving("a", "b", 0), moving("b", "c", 0))
+    edges, frames = tree.edges(), tree.frames()
+    with pytest.raises(InvalidTransformError) as caught:
+        tree.insert_many([moving("x", "y", 1), moving("c", "a", 1, authority="culprit"), moving("a", "b", 1)])
+    error = caught.value
+    assert (error.reason, error.parent, error.child, error.authority) == ("cycle", "c", "a", "culprit")
+    assert error.loop == ("a", "c", "b", "a")
+    assert (tree.edges(), tree.frames(), tree.inserted) == (edges, frames, 2)
+
+
+def test_one_batch_may_turn_an_edge_round() -> None:
+    tree = tree_of(moving("map", "base", 0, 5.0))
+    tree.insert_many([moving("base", "map", 10, -7.0), moving("world", "base", 10, 100.0)])
+    assert tree.chain("world", "map") == ["world", "base", "map"]
+    assert x_of(tree, "world", "map", 10) == 93.0
+    assert x_of(tree, "base", "map", 10) == -7.0
+    assert x_of(tree, "map", "base", 0) == 5.0, "the past stays as it was"
+
+
+def test_a_loop_that_late_data_form_in_the_past_is_an_error_there_and_only_there() -> None:
+    tree = tree_of(*over("map", "a", [10, 20]), *over("a", "b", [10, 20]))
+    tree.insert(moving("b", "a", 5))
+    tree.insert(moving("a", "b", 5))
+    with pytest.raises(DisconnectedError) as caught:
+        tree.lookup("map", "b", 5)
+    assert sorted(set(caught.value.loop)) == ["a", "b"]
+    assert caught.value.loop[0] == caught.value.loop[-1]
+    assert caught.value.stamp == 5
+    assert x_of(tree, "map", "b", 15) == 30.0
+    assert x_of(tree, "map", "b") == 40.0
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.sampled_from("bcd"), st.sampled_from("abcd"), st.integers(0, 9)), max_size=30))
+def test_no_order_of_parents_over_time_makes_a_lookup_hang(history: list[tuple[str, str, int]]) -> None:
+    tree = tree_of(moving("a", "b", 10), moving("b", "c", 10), moving("c", "d", 10))
+    for child, parent, stamp in history:
+        if child != parent:
+            tree.insert(moving(parent, child, stamp))
+    for target, source, at in product("abcd", "abcd", range(11)):
+        try:
+            found = tree.lookup(target, source, at)
+        except (DisconnectedError, ExtrapolationError):
+            continue
+        assert found.stamp == at
+    assert tree.chain("a", "d") == ["a", "b", "c", "d"]
+
+
+# Static
+
+
+def test_a_new_static_parent_moves_all_below_and_cuts_the_old_link() -> None:
+    tree = tree_of(static("a", "b", 1.0), static("b", "c", 2.0), static("a", "d", 10.0))
+    assert x_of(tree, "a", "c") == 3.0
+    tree.insert(static("d", "b", 5.0))
+    assert x_of(tree, "a", "c", 0) == 17.0
+    assert tree.chain("a", "c") == ["a", "d", "b", "c"]
+    tree.insert(static("elsewhere", "b"))
+    with pytest.raises(DisconnectedError):
+        tree.lookup("a", "c")
+
+
+def test_static_data_drop_the_moving_history_of_a_frame() -> None:
+    tree = tree_of(*over("a", "b", [0, 10]))
+    assert not tree.can_transform("a", "b", 99)
+    tree.insert(static("a", "b", 7.0))
+    assert x_of(tree, "a", "b", 99) == 7.0
+    assert x_of(tree, "a", "b", 5) == 7.0
+
+
+def test_moving_data_drop_the_static_value_of_a_frame() -> None:
+    tree = tree_of(static("a", "b", 7.0, stamp=100))
+    assert x_of(tree, "a", "b", 50) == 7.0
+    tree.insert(moving("a", "b", 10, 1.0))
+    assert x_of(tree, "a", "b", 10) == 1.0
+    with pytest.raises(FutureExtrapolationError):
+        tree.lookup("a", "b", 50)
+
+
+def test_after_a_clear_a_frame_may_become_static() -> None:
+    tree = tree_of(*over("a", "b", [0, 10]))
+    tree.clear()
+    tree.insert(static("a", "b", 2.0))
+    assert [x_of(tree, "a", "b", at) for at in (0, 5, 10**15)] == [2.0, 2.0, 2.0]
+
+
+# Names
+
+
+def test_an_empty_tree_knows_nothing() -> None:
+    tree = TransformTree()
+    assert (tree.frames(), tree.edges()) == ([], [])
+    with pytest.raises(UnknownFrameError):
+        tree.lookup("a", "a")
+
+
+def test_each_frame_has_the_parent_that_its_samples_name() -> None:
+    tree = tree_of(*over("a", "b", [10, 20]), static("b", "c"), moving("b", "d", 5))
+    assert [tree.parent(frame) for frame in "abcd"] == [None, "a", "b", "b"]
+    assert tree.parent("a", 12_345) is None
+    assert tree.parent("c", 12_345) == "b"
+    with pytest.raises(PastExtrapolationError):
+        tree.parent("b", 9)
+    with pytest.raises(FutureExtrapolationError):
+        tree.parent("d", 6)
+    with pytest.raises(UnknownFrameError):
+        tree.parent("nobody")
+
+
+def test_frames_are_those_that_any_sample_names_sorted() -> None:
+    tree = tree_of(moving("world", "base", 0), static("base", "camera"))
+    assert tree.frames() == ["base", "camera", "world"]
+    assert "world" in tree
+    assert "moon" not in tree
+
+
+def test_edges_tell_what_there_is_of_each_frame_sorted_by_name() -> None:
+    tree = tree_of(
+        *over("map", "base", range(0, SECOND + 1, SECOND // 10)), static("base", "arm", authority="urdf"), keep=0.5
+    )
+    assert tree.edges() == [
+        Edge("base", "arm", static=True, samples=1, oldest=None, newest=None, authority="urdf"),
+        Edge("map", "base", static=False, samples=6, oldest=SECOND // 2, newest=SECOND, authority=""),
+    ]
+    assert tree.edges()[1].rate == 10.0
+
+
+# Clearing, removing, copying
+
+
+def test_clear_drops_what_moves_and_keeps_what_is_static_and_all_names() -> None:
+    tree = tree_of(*over("map", "base", [0, 10]), static("base", "camera", 1.0))
+    tree.clear()
+    assert tree.frames() == ["base", "camera", "map"]
+    assert x_of(tree, "base", "camera", 5) == 1.0
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree.lookup("map", "camera", 5)
+    error = caught.value
+    assert (error.child, error.stamp, error.oldest, error.newest) == ("base", 5, None, None)
+
+
+def test_after_a_clear_time_may_start_again() -> None:
+    tree = tree_of(moving("map", "base", 100 * SECOND))
+    tree.clear()
+    assert tree.insert(moving("map", "base", 1, 4.0)) is Outcome.INSERTED
+    assert x_of(tree, "map", "base", 1) == 4.0
+
+
+@pytest.mark.parametrize("commit", [False, True])
+@pytest.mark.parametrize("known", [False, True])
+def test_after_a_clear_an_edge_may_come_back_the_other_way_round(commit: bool, known: bool) -> None:
+    tree = tree_of(moving("map", "base", 0, 5.0))
+    if known:
+        tree.insert(moving("world", "map", 0))
+    tree.clear()
+    turned = moving("base", "map", 1, -2.0)
+    if commit:
+        tree.commit((turned,))
+    else:
+        tree.insert(turned)
+    assert x_of(tree, "base", "map") == -2.0
+    assert x_of(tree, "map", "base", 1) == 2.0
+    assert tree.parent("base") is None
+
+
+def test_a_removed_frame_leaves_its_parent_and_those_below_it_become_a_tree_of_their_own() -> None:
+    tree = tree_of(static("map", "a"), *over("a", "b", [0, 10]), static("b", "c", 1.0), static("c", "d", 2.0))
+    assert tree.can_transform("map", "d")
+    tree.remove_frame("b")
+    with pytest.raises(DisconnectedError) as caught:
+        tree.lookup("map", "d")
+    assert caught.value.roots == ("map", "b")
+    assert x_of(tree, "b", "d", 5) == 3.0
+
+
+def test_a_removed_leaf_is_unknown_with_the_parent_that_only_it_named() -> None:
+    tree = tree_of(moving("a", "b", 0), moving("b", "c", 0))
+    tree.remove_frame("b")
+    assert tree.frames() == ["b", "c"]
+    tree.remove_frame("c")
+    assert tree.frames() == []
+    with pytest.raises(UnknownFrameError):
+        tree.remove_frame("c")
+
+
+def test_a_root_stays_known_as_long_as_a_frame_hangs_on_it() -> None:
+    tree = tree_of(moving("a", "b", 0))
+    tree.remove_frame("a")
+    assert tree.frames() == ["a", "b"]
+    assert tree.lookup("a", "b", 0).stamp == 0
+
+
+def test_a_removed_frame_may_come_back_elsewhere_and_earlier() -> None:
+    tree = tree_of(moving("a", "b", 100 * SECOND), static("b", "c", 1.0))
+    tree.remove_frame("b")
+    tree.insert(moving("z", "b", 1, 3.0))
+    assert x_of(tree, "z", "c", 1) == 4.0
+
+
+def test_a_copy_answers_the_same_and_is_independent_of_the_original() -> None:
+    tree = tree_of(*over("a", "b", [0, 10]), *over("z", "b", [20, 30]), static("b", "c", 1.0, stamp=4), keep=25e-9)
+    twin = tree.copy()
+    edges, frames = tree.edges(), tree.frames()
+    assert (twin.keep, twin.edges(), twin.frames()) == (25e-9, edges, frames)
+    assert x_of(twin, "a", "c", 10) == 11.0
+
+    tree.insert_many([moving("a", "b", 500), static("b", "c", 9.0), moving("new", "z", 0)])
+    tree.remove_frame("c")
+    assert (twin.edges(), twin.frames()) == (edges, frames)
+    assert x_of(twin, "z", "c", 25) == 26.0
+
+    before = tree.edges()
+    twin.clear()
+    twin.insert(moving("c", "q", 5))
+    assert tree.edges() == before
+    assert "q" not in tree
+
+
+# Depth
+
+
+@pytest.fixture(scope="module")
+def deep() -> TransformTree:
+    """A chain of 5,000 edges, each 1 m, moving and static ones in turn."""
+    tree = TransformTree()
+    for depth in reversed(range(5_000)):
+        make = static if depth % 2 else moving
+        tree.insert(make(f"frame {depth}", f"frame {depth + 1}", stamp=7, x=1.0))
+    return tree
+
+
+def test_a_chain_of_any_length_is_climbed_without_recursion(deep: TransformTree) -> None:
+    assert sys.getrecursionlimit() < 5_000
+    for at in (LATEST, 7):
+        assert x_of(deep, "frame 0", "frame 5000", at) == 5_000.0
+        assert x_of(deep, "frame 5000", "frame 0", at) == -5_000.0
+    assert len(deep.chain("frame 5000", "frame 0")) == 5_001
+    assert deep.describe().count("\n") == 5_000
+
+
+def test_a_loop_of_any_length_is_found_and_named_in_full(deep: TransformTree) -> None:
+    with pytest.raises(InvalidTransformError) as caught:
+        deep.insert(moving("frame 5000", "frame 0", 7))
+    assert caught.value.loop == ("frame 0", *(f"frame {depth}" for depth in reversed(range(5_001))))
+
+
+def test_the_roots_of_deep_trees_are_found(deep: TransformTree) -> None:
+    tree = deep.copy()
+    tree.insert(moving("island", "palm", 7))
+    with pytest.raises(DisconnectedError) as caught:
+        tree.lookup("palm", "frame 5000", 7)
+    assert caught.value.roots == ("island", "frame 0")
+
+
+# What is remembered between lookups
+
+NAMES = "abcd"
+SAMPLES = any_samples(NAMES, last=20)
+KEEPS = st.sampled_from([None, 0.0, 8e-9])
+
+
+def everything(tree: TransformTree) -> list[object]:
+    """The answer, or the error with its facts, to every question at some stamps."""
+    stamps: tuple[int | Latest, ...] = (LATEST, 3, 10, 17)
+    return [outcome(partial(tree.lookup, target, source, at)) for target, source, at in product(NAMES, NAMES, stamps)]
+
+
+def outcome(question: Callable[[], TransformStamped]) -> object:
+    try:
+        return question()
+    except TransformLookupError as error:
+        return type(error), str(error)
+
+
+@settings(deadline=None)
+@given(st.lists(SAMPLES, max_size=12), KEEPS)
+def test_no_lookup_ever_changes_what_a_later_one_answers(given: list[TransformStamped], keep: float | None) -> None:
+    asked = TransformTree(keep)
+    accepted: list[TransformStamped] = []
+    for sample in given:
+        try:
+            asked.insert(sample)
+        except InvalidTransformError:
+            continue
+        accepted.append(sample)
+        fresh = TransformTree(keep)
+        for earlier in accepted:
+            fresh.insert(earlier)
+        assert everything(asked) == everything(fresh)
+
+
+@settings(deadline=None)
+@given(st.lists(st.lists(SAMPLES, min_size=1, max_size=3), max_size=8), KEEPS)
+def test_a_batch_that_was_judged_before_is_stored_as_any_other(
+    batches: list[list[TransformStamped]], keep: float | None
+) -> None:
+    judged, committed = TransformTree(keep), TransformTree(keep)
+    for batch in batches:
+        try:
+            judged.insert_many(batch)
+        except InvalidTransformError:
+            continue
+        committed.commit(tuple(batch))
+        assert committed.edges() == judged.edges()
+        assert committed.frames() == judged.frames()
+        assert everything(committed) == everything(judged)
+    assert (committed.inserted, committed.replaced, committed.expired) == (
+        judged.inserted,
+        judged.replaced,
+        judged.expired,
+    )
+
+
+@settings(deadline=None)
+@given(st.permutations(range(10)), st.lists(st.sampled_from("pq"), min_size=10, max_size=10))
+def test_any_order_of_insertion_gives_the_same_answers(order: list[int], parents: list[str]) -> None:
+    fixed = (static("root", "p", 100.0), static("root", "q", 200.0))
+    data = [moving(parents[stamp], "b", stamp, float(stamp**2)) for stamp in range(10)]
+    in_order, shuffled = tree_of(*fixed, *data), tree_of(*fixed, *(data[at] for at in order))
+    for at in (LATEST, *range(-1, 11)):
+        for target in ("root", "p", "q"):
+            ask = [partial(tree.lookup, target, "b", at) for tree in (in_order, shuffled)]
+            assert outcome(ask[0]) == outcome(ask[1])
+
+
+# Memory
+
+
+@contextmanager
+def no_growth(limit: int) -> Iterator[None]:
+    """Fails if more than `limit` bytes are allocated in the block and not given back."""
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        yield
+        gc.collect()
+        after, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < limit
+
+
+@pytest.mark.parametrize("insert", [TransformTree.insert_many, TransformTree.commit])
+@pytest.mark.parametrize("order", [1, -1], ids=["in order", "backwards"])
+def test_a_sample_takes_at_most_100_bytes(insert: Callable[[TransformTree, Any], object], order: int) -> None:
+    edges = [(f"frame {depth}", f"frame {depth + 1}") for depth in range(5)]
+    stamps = range(TODAY, TODAY + 10 * SECOND, SECOND // 100)[::order]
+    tree = TransformTree(keep=None)
+    with no_growth(100 * len(stamps) * len(edges)):
+        for stamp in stamps:
+            # Another string for each, as from a wire.
+            authority = bytes.decode(b"odometry")
+            insert(tree, tuple(moving(parent, child, stamp, stamp / 3, authority) for parent, child in edges))
+    assert {edge.samples for edge in tree.edges()} == {1_000}
+
+
+def test_memory_is_flat_while_samples_come_and_go() -> None:
+    tree = TransformTree(keep=1e-6)
+
+    def go_on(first: int, last: int) -> None:
+        for stamp in range(first, last):
+            tree.commit((moving("a", "b", stamp), moving("b", "c", stamp)))
+            if stamp % 100 == 0:
+                tree.lookup("a", "c")
+
+    go_on(0, 2_000)
+    with no_growth(200_000):
+        go_on(2_000, 40_000)
+    assert [edge.samples for edge in tree.edges()] == [1_001, 1_001]
+
+
+def test_memory_is_flat_while_frames_of_ever_new_names_come_and_go() -> None:
+    tree = tree_of(static("map", "base"))
+
+    def churn(first: int, last: int) -> None:
+        for number in range(first, last):
+            frame, parent = f"object {number}", f"support {number}"
+            tree.insert_many([moving("base", parent, number), moving(parent, frame, number)])
+            tree.lookup("map", frame)
+            with pytest.raises(UnknownFrameError):
+                tree.lookup("map", f"misspelt {number}")
+            tree.remove_frame(frame)
+            tree.remove_frame(parent)
+
+    churn(0, 100)
+    with no_growth(50_000):
+        churn(100, 3_000)
+    assert tree.frames() == ["base", "map"]
+
+
+def test_memory_is_flat_while_a_frame_gets_ever_new_parents() -> None:
+    tree = TransformTree(keep=100e-9)
+    for number in range(3_000):
+        tree.insert(moving(f"parent {number}", "b", number))
+        assert len(tree.frames()) <= 102
+
+
+# Threads
+
+
+@pytest.mark.parametrize("insert", [TransformTree.insert_many, TransformTree.commit])
+def test_other_threads_see_all_of_a_batch_or_nothing(insert: Callable[[TransformTree, Any], object]) -> None:
+    # Only the newest samples are kept, so half a batch would be an extrapolation.
+    tree = tree_of(moving("body", "left", 0), moving("body", "right", 0), keep=0.0)
+
+    def read() -> None:
+        first, second = tree.lookup("left", "right"), tree.lookup("right", "left")
+        assert first.transform == second.transform == Transform.identity()
+        assert first.stamp <= second.stamp
+
+    with threads_that(read):
+        for stamp in range(1, 3_000):
+            insert(tree, (moving("body", "left", stamp, float(stamp)), moving("body", "right", stamp, float(stamp))))
+
+
+def test_other_threads_may_look_at_the_whole_tree_while_frames_come_and_go() -> None:
+    tree = tree_of(static("map", "base"))
+
+    def read() -> None:
+        assert tree.parent("base") == "map"
+        assert Edge("map", "base", True, 1, None, None, "") in tree.copy().edges()
+        assert {"base", "map"} <= set(tree.frames())
+        assert all("base" in picture for picture in (tree.describe(), tree.to_dot(), tree.to_yaml()))
+
+    with threads_that(read):
+        for number in range(500):
+            frames = [f"frame {number} {below}" for below in range(5)]
+            tree.insert_many([moving(parent, child, number) for parent, child in pairwise(["map", *frames])])
+            for frame in frames:
+                tree.remove_frame(frame)
+
+
+def test_a_tree_adopts_what_another_holds_instead_of_its_own_as_far_back_as_it_keeps_it() -> None:
+    other = tree_of(*over("map", "a", range(0, 101, 10)), static("a", "b"), keep=None)
+    tree = tree_of(moving("old", "c", 5), keep=30e-9)
+    tree.adopt(other)
+    assert [(edge.child, edge.oldest, edge.newest) for edge in tree.edges()] == [("a", 70, 100), ("b", None, None)]
+    assert (tree.frames(), tree.inserted, other.edges()[0].samples) == (["a", "b", "map"], 1, 11)
+    tree.adopt(tree)
+    assert x_of(tree, "map", "b", 75) == 75.0

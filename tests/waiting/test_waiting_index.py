@@ -1,0 +1,249 @@
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from tfbus import (
+    LATEST,
+    DisconnectedError,
+    FutureExtrapolationError,
+    Latest,
+    PastExtrapolationError,
+    Question,
+    TransformLookupError,
+    UnknownFrameError,
+)
+from tfbus.waiting.waiting_index import Waiter, WaitingIndex, blocking_frames
+
+
+def waiter(wake: Callable[[], object] = list) -> Waiter:
+    return Waiter(Question("map", "tool", LATEST), since=0, wake=wake)
+
+
+def short_of(child: str, stamp: int | Latest) -> FutureExtrapolationError:
+    return FutureExtrapolationError(child=child, stamp=stamp, oldest=None, newest=None)
+
+
+def unknown(frame: str) -> UnknownFrameError:
+    return UnknownFrameError(frame=frame)
+
+
+def apart(target_root: str, source_root: str) -> DisconnectedError:
+    return DisconnectedError(target="t", source="s", roots=(target_root, source_root))
+
+
+def parked(index: WaitingIndex, error: TransformLookupError) -> Waiter:
+    made = waiter()
+    index.park(made, error)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("error", "frames"),
+    [(short_of("tool", 5), ("tool",)), (unknown("tool"), ("tool",)), (apart("map", "odom"), ("map", "odom"))],
+)
+def test_what_blocks_a_lookup_names_the_frames_that_can_help(
+    error: TransformLookupError, frames: tuple[str, ...]
+) -> None:
+    assert blocking_frames(error) == frames
+
+
+def test_what_waiting_cannot_help_is_not_parked() -> None:
+    index = WaitingIndex()
+    with pytest.raises(TypeError, match="waiting cannot help"):
+        index.park(waiter(), PastExtrapolationError(child="tool", stamp=1, oldest=2, newest=3))
+    assert len(index) == 0
+    assert index.take_all() == []
+
+
+def test_an_edge_takes_whoever_needs_no_more_than_its_newest_stamp_in_order_of_stamp() -> None:
+    index = WaitingIndex()
+    late, early, exact, first = (parked(index, short_of("tool", stamp)) for stamp in (11, 5, 10, 1))
+    assert index.take("tool", 0) == []
+    assert index.take("tool", 10) == [first, early, exact]
+    assert index.take("tool", 10) == []
+    assert index.take("tool", 11) == [late]
+
+
+def test_who_needs_the_same_stamp_is_taken_in_order_of_arrival() -> None:
+    index = WaitingIndex()
+    waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
+    assert index.take("tool", 7) == waiters
+
+
+def test_who_needs_any_sample_of_an_edge_is_taken_by_the_first_whatever_its_stamp() -> None:
+    index = WaitingIndex()
+    anyone = parked(index, short_of("tool", LATEST))
+    assert index.take("tool", None) == []
+    assert index.take("tool", -(2**63)) == [anyone]
+
+
+def test_another_edge_takes_nobody() -> None:
+    index = WaitingIndex()
+    parked(index, short_of("tool", 1))
+    parked(index, unknown("camera"))
+    assert index.take("base", 100) == []
+    assert len(index) == 2
+
+
+def test_an_unknown_frame_takes_its_waiters_once_somebody_names_it() -> None:
+    index = WaitingIndex()
+    waiting = parked(index, unknown("camera"))
+    assert index.take("camera", None) == [waiting]
+    assert len(index) == 0
+
+
+@pytest.mark.parametrize(("first", "second"), [("map", "odom"), ("odom", "map")])
+def test_either_root_takes_who_waits_for_two_trees_to_join_and_only_once(first: str, second: str) -> None:
+    index = WaitingIndex()
+    waiting = parked(index, apart("map", "odom"))
+    assert index.take(first, 3) == [waiting]
+    assert index.take(second, 3) == []
+    assert not index.blocked
+
+
+def test_who_waits_under_two_roots_leaves_the_other_waiters_there() -> None:
+    index = WaitingIndex()
+    joined = parked(index, apart("map", "odom"))
+    other = parked(index, apart("odom", "robot"))
+    stamped = parked(index, short_of("odom", 50))
+    assert index.take("map", 1) == [joined]
+    assert index.take("odom", 50) == [other, stamped]
+
+
+def test_a_removed_waiter_is_never_taken_and_removing_it_again_does_nothing() -> None:
+    index = WaitingIndex()
+    errors = (short_of("tool", 5), short_of("tool", LATEST), unknown("camera"), apart("map", "odom"))
+    waiters = [parked(index, error) for error in errors]
+    stays = parked(index, short_of("tool", 5))
+    for gone in (*waiters, *waiters):
+        index.remove(gone)
+    assert len(index) == 1
+    assert set(index.blocked) == {"tool"}
+    assert index.take_all() == [stays]
+
+
+def test_removing_one_of_many_with_the_same_stamp_removes_that_one() -> None:
+    index = WaitingIndex()
+    waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
+    index.remove(waiters[2])
+    assert index.take("tool", 7) == waiters[:2] + waiters[3:]
+
+
+def test_take_all_takes_everybody_in_order_of_arrival_and_leaves_nothing() -> None:
+    index = WaitingIndex()
+    errors = (unknown("camera"), short_of("tool", 9), apart("map", "odom"), short_of("tool", 1))
+    waiters = [parked(index, error) for error in errors]
+    assert index.take_all() == waiters
+    assert (len(index), index.blocked, index.pending(), index.take_all()) == (0, {}, (), [])
+
+
+def test_a_taken_waiter_can_park_again_under_another_cause() -> None:
+    index = WaitingIndex()
+    waiting = parked(index, unknown("camera"))
+    index.take("camera", None)
+    index.park(waiting, short_of("camera", 20))
+    assert index.take("camera", 19) == []
+    assert index.take("camera", 20) == [waiting]
+
+
+def test_pending_tells_each_question_with_what_blocks_it() -> None:
+    index = WaitingIndex()
+    question = Question("map", "camera", 5)
+    error = unknown("camera")
+    index.park(Waiter(question, since=12, wake=list), error)
+    [pending] = index.pending()
+    assert (pending.question, pending.since, pending.blocked_by) == (question, 12, error)
+    assert str(pending) == "'camera' in 'map': frame 'camera' is not known"
+
+
+def test_nobody_is_woken_by_the_index_itself() -> None:
+    woken: list[str] = []
+    index = WaitingIndex()
+    for name in ("first", "second"):
+        index.park(waiter(partial(woken.append, name)), unknown("camera"))
+    taken = index.take("camera", None)
+    assert woken == []
+    for waiting in taken:
+        waiting.wake()
+    assert woken == ["first", "second"]
+
+
+FRAMES = st.sampled_from("abc")
+STAMPS = st.integers(-3, 3)
+ERRORS = st.one_of(
+    st.builds(short_of, FRAMES, STAMPS | st.just(LATEST)),
+    st.builds(unknown, FRAMES),
+    st.permutations("abc").map(lambda names: apart(names[0], names[1])),
+)
+
+
+class IndexMachine(RuleBasedStateMachine):
+    """The index against one list that is searched from end to end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.index = WaitingIndex()
+        self.model: list[tuple[Waiter, TransformLookupError]] = []
+        self.gone: list[Waiter] = []
+
+    @rule(error=ERRORS)
+    def park(self, error: TransformLookupError) -> None:
+        self.model.append((parked(self.index, error), error))
+
+    @precondition(lambda self: self.gone)
+    @rule(error=ERRORS, data=st.data())
+    def park_again(self, error: TransformLookupError, data: st.DataObject) -> None:
+        again = data.draw(st.sampled_from(self.gone))
+        self.gone.remove(again)
+        self.index.park(again, error)
+        self.model.append((again, error))
+
+    @precondition(lambda self: self.model or self.gone)
+    @rule(data=st.data())
+    def remove(self, data: st.DataObject) -> None:
+        removed = data.draw(st.sampled_from([*(waiting for waiting, _ in self.model), *self.gone]))
+        self.index.remove(removed)
+        self.leave([removed])
+
+    @rule(frame=FRAMES, newest=STAMPS | st.none())
+    def take(self, frame: str, newest: int | None) -> None:
+        for_any: list[Waiter] = []
+        by_stamp: list[tuple[int | float, Waiter]] = []
+        for waiting, error in self.model:
+            if frame not in blocking_frames(error):
+                continue
+            if not isinstance(error, FutureExtrapolationError):
+                for_any.append(waiting)
+                continue
+            needed = float("-inf") if isinstance(error.stamp, Latest) else error.stamp
+            if newest is not None and needed <= newest:
+                by_stamp.append((needed, waiting))
+        expected = for_any + [waiting for _, waiting in sorted(by_stamp, key=lambda place: place[0])]
+        assert self.index.take(frame, newest) == expected
+        self.leave(expected)
+
+    @rule()
+    def take_all(self) -> None:
+        expected = [waiting for waiting, _ in self.model]
+        assert self.index.take_all() == expected
+        self.leave(expected)
+
+    def leave(self, waiters: list[Waiter]) -> None:
+        for waiting in waiters:
+            if waiting not in self.gone:
+                self.gone.append(waiting)
+        self.model = [place for place in self.model if place[0] not in waiters]
+
+    @invariant()
+    def nothing_else_is_parked(self) -> None:
+        assert len(self.index) == len(self.model)
+        assert [pending.blocked_by for pending in self.index.pending()] == [error for _, error in self.model]
+        assert set(self.index.blocked) == {name for _, error in self.model for name in blocking_frames(error)}
+
+
+TestIndexAgainstAList = IndexMachine.TestCase
+TestIndexAgainstAList.settings = settings(deadline=None, max_examples=100, stateful_step_count=40)

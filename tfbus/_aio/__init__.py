@@ -1,0 +1,1 @@
+"""What anyio lacks: small tools for tasks, streams and threads."""

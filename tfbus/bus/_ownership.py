@@ -1,0 +1,129 @@
+"""Who may publish which child: by reservation, and by having been the first where the policy says so."""
+
+from collections.abc import Mapping
+from typing import Literal, Protocol, get_args
+
+from tfbus.errors import InvalidTransformError
+from tfbus.frames import check_frame
+from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.registration import Registration
+
+OnConflict = Literal["last", "reject"]
+
+
+class Published(Protocol):
+    """What is known of a child that somebody has published."""
+
+    @property
+    def authority(self) -> str: ...
+
+
+class Ownership:
+    """The rights of authorities; false while everybody may publish everything.
+
+    Parameters
+    ----------
+    on_conflict : {"last", "reject"}
+        Whether a second authority may publish a child, or only the first, until it is forgotten by `forget`.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+
+    def __init__(self, on_conflict: OnConflict) -> None:
+        if on_conflict not in get_args(OnConflict):
+            raise ValueError(f"on_conflict must be 'last' or 'reject', not {on_conflict!r}")
+        self._first_keeps = on_conflict == "reject"
+        self._reserved: dict[str, tuple[str, int]] = {}
+        self._first: dict[str, str] = {}
+
+    def __bool__(self) -> bool:
+        return self._first_keeps or bool(self._reserved)
+
+    def remembers(self, frame: str) -> bool:
+        """Whether a frame is kept for its first authority although nothing else is known of it."""
+        return frame in self._first
+
+    def remember(self, known: Mapping[str, Published]) -> None:
+        """Keep children for those who published them, if that is the policy, while nothing else is known of them.
+
+        It is one name a child that was published and not removed, as many as are known if the clock is never reset.
+        """
+        if self._first_keeps:
+            self._first.update((child, published.authority) for child, published in known.items())
+
+    def forget(self, frame: str) -> None:
+        """Let a frame that was removed be anybody's; a reservation stays."""
+        self._first.pop(frame, None)
+
+    def reserved_for(self, frame: str) -> str | None:
+        """The authority that has reserved a frame, if any."""
+        authority, _ = self._reserved.get(frame, (None, 0))
+        return authority
+
+    def reserve(self, frame: str, authority: str) -> Registration:
+        """Let only this authority publish a frame; if it has reserved it already, until both are closed.
+
+        Raises
+        ------
+        InvalidTransformError
+            If the name cannot be that of a frame, or another authority has reserved it (``reason="reserved"``).
+        TypeError
+            If `authority` is not a string.
+        """
+        check_frame(frame)
+        if not isinstance(authority, str):
+            raise TypeError(f"authority must be a str, not {authority!r}")
+        owner, times = self._reserved.get(frame, (authority, 0))
+        if owner != authority:
+            raise InvalidTransformError(
+                f"frame {frame!r} is reserved for {owner!r} and cannot be reserved for {authority!r}",
+                reason="reserved",
+                child=frame,
+                authority=authority,
+                owner=owner,
+            )
+        self._reserved[frame] = (authority, times + 1)
+        return Registration(lambda: self._release(frame))
+
+    def split(self, batch: Batch, known: Mapping[str, Published]) -> tuple[Batch, list[InvalidTransformError]]:
+        """The samples of a batch whose authorities may publish them, and the errors of the others, in order."""
+        allowed: list[TransformStamped] = []
+        refused: list[InvalidTransformError] = []
+        new: dict[str, str] = {}
+        for sample in batch:
+            _, child, _, _, authority, _ = sample._fields
+            owner = self.reserved_for(child)
+            reason = "authority" if owner is None else "reserved"
+            if owner is None and self._first_keeps:
+                if child in known:
+                    owner = known[child].authority
+                else:
+                    owner = self._first.get(child)
+                    owner = new.setdefault(child, authority) if owner is None else owner
+            if owner is None or owner == authority:
+                allowed.append(sample)
+            else:
+                refused.append(_refusal(sample, owner, reason))
+        return tuple(allowed), refused
+
+    def _release(self, frame: str) -> None:
+        authority, times = self._reserved[frame]
+        if times > 1:
+            self._reserved[frame] = (authority, times - 1)
+        else:
+            del self._reserved[frame]
+
+
+def _refusal(sample: TransformStamped, owner: str, reason: str) -> InvalidTransformError:
+    why = f"is reserved for {owner!r}" if reason == "reserved" else f"comes from {owner!r}, who was first"
+    return InvalidTransformError(
+        f"frame {sample.child!r} {why}: no sample of it is taken from {sample.authority!r}",
+        reason=reason,
+        parent=sample.parent,
+        child=sample.child,
+        authority=sample.authority,
+        owner=owner,
+    )

@@ -1,0 +1,139 @@
+"""Callbacks that are called with each batch."""
+
+from collections import deque
+from collections.abc import Callable
+from inspect import iscoroutinefunction
+from itertools import count
+from typing import TypeVar
+
+from tfbus._log import OnceLogger
+from tfbus.bus._announcer import Announcer
+from tfbus.events import SubscriberFailed
+from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.registration import Registration
+
+BatchCallback = Callable[[Batch], object]
+FrameCallback = Callable[[str], object]
+GivenT = TypeVar("GivenT")
+
+_QUEUED_BATCHES = 1_000
+
+
+class Subscribers:
+    """Calls subscribers one batch after the other, and keeps them from harming each other or the publisher.
+
+    A batch that a subscriber publishes waits until everybody has had the current one, so all see the same order. If one
+    removes a frame or turns the clock back, those behind it get the current batch without what is gone.
+
+    Attributes
+    ----------
+    callbacks : dict of int to callable
+    failures : int
+        Exceptions that subscribers raised.
+    """
+
+    def __init__(self, log: OnceLogger, news: Announcer) -> None:
+        self._log = log
+        self._announcer = news
+        self.callbacks: dict[int, BatchCallback] = {}
+        self._removal_callbacks: dict[int, FrameCallback] = {}
+        self._keys = count()
+        self._backlog: deque[Batch] = deque()
+        self._current: Batch = ()
+        self._calling: Callable[..., object] | None = None
+        self._queued = 0
+        self.failures = 0
+
+    def add(self, callback: BatchCallback, latched: Batch, removed: FrameCallback | None = None) -> Registration:
+        """Register a callback, and call it with what is latched if that is anything."""
+        for function in (callback, removed):
+            if function is not None and not callable(function):
+                raise TypeError(f"a subscriber must be callable, not {function!r}")
+            if iscoroutinefunction(function):
+                raise TypeError(f"a subscriber must not be async, as {function!r} is: read a bus.stream() instead")
+        key = next(self._keys)
+        self.callbacks[key] = callback
+        if removed is not None:
+            self._removal_callbacks[key] = removed
+        if latched:
+            outer, self._calling = self._calling, callback
+            try:
+                self._call(key, callback, latched)
+            finally:
+                self._calling = outer
+            if outer is None:
+                self._deliver_backlog()
+        return Registration(lambda: self._remove(key))
+
+    def check_backlog(self) -> None:
+        """Raise `RuntimeError` if callbacks publish without end."""
+        if self._queued >= _QUEUED_BATCHES:
+            raise RuntimeError(
+                f"the subscriber {_name(self._calling)} publishes without end: {self._queued} batches are queued "
+                "behind the one that it was called with"
+            )
+
+    def deliver(self, batch: Batch) -> None:
+        """Call everybody with a batch, now or, inside a callback, after the batches before it."""
+        self._backlog.append(batch)
+        if self._calling is not None:
+            self._queued += 1
+            return
+        self._deliver_backlog()
+
+    def discard_moving(self) -> None:
+        """Deliver no moving sample of what was published so far to anybody any more: the clock has jumped back."""
+        self._keep_only(lambda sample: sample.static)
+
+    def forget(self, child: str) -> None:
+        """Deliver no sample of a removed frame to anybody any more."""
+        self._keep_only(lambda sample: sample.child != child)
+
+    def tell_removed(self, child: str) -> None:
+        """Tell those who want to know that a frame was removed; what one of them publishes comes behind that."""
+        outer = self._calling
+        try:
+            for key, removed in tuple(self._removal_callbacks.items()):
+                if key in self._removal_callbacks:
+                    self._calling = removed
+                    self._call(key, removed, child)
+        finally:
+            self._calling = outer
+        if outer is None:
+            self._deliver_backlog()
+
+    def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
+        self._current = tuple(filter(wanted, self._current))
+        batches = (tuple(filter(wanted, batch)) for batch in self._backlog)
+        self._backlog = deque(batch for batch in batches if batch)
+
+    def _deliver_backlog(self) -> None:
+        try:
+            while self._backlog:
+                self._current = self._backlog.popleft()
+                for key in tuple(self.callbacks):
+                    # A callback may have ended another, or removed what the batch is about.
+                    if self._current and key in self.callbacks:
+                        self._calling = self.callbacks[key]
+                        self._call(key, self._calling, self._current)
+        finally:
+            self._current = ()
+            self._calling = None
+            self._queued = 0
+
+    def _remove(self, key: int) -> None:
+        self.callbacks.pop(key, None)
+        self._removal_callbacks.pop(key, None)
+
+    def _call(self, key: int, callback: Callable[[GivenT], object], given: GivenT) -> None:
+        try:
+            callback(given)
+        except Exception as error:  # noqa: BLE001 - a subscriber is somebody else's code
+            self.failures += 1
+            self._log.warning(("subscriber", key), "the subscriber %s raised", _name(callback), exc_info=error)
+            if self._announcer:
+                self._announcer.tell(SubscriberFailed(self._announcer.now(), _name(callback), error))
+
+
+def _name(callback: Callable[..., object] | None) -> str:
+    return getattr(callback, "__qualname__", None) or repr(callback)

@@ -1,0 +1,204 @@
+"""Who hangs on whom by the newest samples, and whether a batch may change it.
+
+The newest edges must form a forest, judged after the whole batch: one batch may turn an edge round. The bus keeps a
+`Topology` and asks it before anything is committed, so that the sender hears of a bad edge; a tree that is used alone
+has its own histories judged by `admit`.
+"""
+
+from collections import Counter
+from copy import copy
+from typing import Literal
+
+from tfbus._log import OnceLogger
+from tfbus.bus._announcer import Announcer
+from tfbus.bus._ownership import Ownership
+from tfbus.errors import InvalidTransformError
+from tfbus.events import AuthorityConflict, FrameAdded, FrameRemoved, KindChanged, Reparented, SampleRejected
+from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.registration import Registration
+from tfbus.tree.cycles import NewestEdge, admit
+
+
+class _Newest:
+    """The newest that a topology knows of one child.
+
+    `plain` is the authority whose moving samples under the same parent need no judgement; None while there is none.
+    """
+
+    __slots__ = ("authority", "newest", "parent", "plain", "static")
+
+    def __init__(self, parent: str, static: bool, authority: str) -> None:
+        self.parent = parent
+        self.static = static
+        self.newest: int | None = None
+        self.authority = authority
+        self.plain: str | None = None
+
+
+class Topology:
+    """Each child's newest parent, kind and authority, and the static samples that late joiners need.
+
+    Parameters
+    ----------
+    log : OnceLogger
+    ownership : Ownership
+        Who may publish what.
+    news : Announcer
+        Is told what changes, and what is refused.
+
+    Attributes
+    ----------
+    latched : dict of str to TransformStamped
+        The static sample of each static child.
+    rejected : Counter
+        Samples that were refused, by reason.
+    reparented, kind_changes, conflicts : int
+        Samples that gave a child another newest parent, or another kind, or came from another authority than before.
+    """
+
+    def __init__(self, log: OnceLogger, ownership: Ownership, news: Announcer) -> None:
+        self._log = log
+        self._ownership = ownership
+        self._announcer = news
+        self._newest: dict[str, _Newest] = {}
+        self.latched: dict[str, TransformStamped] = {}
+        self.rejected: Counter[str] = Counter()
+        self.reparented = 0
+        self.kind_changes = 0
+        self.conflicts = 0
+
+    def __len__(self) -> int:
+        return len(self._newest)
+
+    def __contains__(self, child: object) -> bool:
+        return child in self._newest or (isinstance(child, str) and self._ownership.remembers(child))
+
+    def names(self) -> set[str]:
+        """Every frame that an edge names."""
+        return {*self._newest, *(known.parent for known in self._newest.values())}
+
+    def newest(self, child: str) -> NewestEdge | None:
+        """The newest that is known of a child, if anything is."""
+        return self._newest.get(child)
+
+    def known(self) -> list[FrameAdded]:
+        """Every child, as if it were new."""
+        now = self._announcer.now()
+        return [
+            FrameAdded(now, child, known.parent, known.authority, known.static) for child, known in self._newest.items()
+        ]
+
+    def take(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
+        """Judge a batch, note what may be committed of it, and give that back.
+
+        Raises
+        ------
+        InvalidTransformError
+            If `invalid` is ``"raise"`` and a sample closes a loop, or its authority may not publish the child; then
+            nothing was noted.
+        """
+        newest = self._newest
+        for sample in batch:
+            parent, child, _, _, authority, static = sample._fields
+            known = newest.get(child)
+            if known is None or known.parent != parent or known.plain != authority or static:
+                return self._judge(batch, invalid)
+        # Nearly always: more of the same, of which only the stamps are news.
+        for sample in batch:
+            fields = sample._fields
+            known = newest[fields[1]]
+            if known.newest is None or fields[2] > known.newest:
+                known.newest = fields[2]
+        return batch
+
+    def reserve(self, child: str, authority: str) -> Registration:
+        """Let only one authority publish a child; see `Ownership.reserve`."""
+        registration = self._ownership.reserve(child, authority)
+        known = self._newest.get(child)
+        if known is not None and known.authority != authority:
+            known.plain = None
+        return registration
+
+    def remove(self, child: str) -> None:
+        """Forget a child, and who was the first to publish it."""
+        self.latched.pop(child, None)
+        self._ownership.forget(child)
+        if self._newest.pop(child, None) is not None and self._announcer:
+            self._announcer.tell(FrameRemoved(self._announcer.now(), child))
+
+    def clear_moving(self) -> None:
+        """Forget every child that is not static, but not for whom it is kept."""
+        self._ownership.remember({child: known for child, known in self._newest.items() if not known.static})
+        self._newest = {child: known for child, known in self._newest.items() if known.static}
+
+    def reject(self, reason: str, error: Exception) -> None:
+        """Count a sample that was refused, and tell of it."""
+        self.rejected[reason] += 1
+        if not self._announcer:
+            return
+        child = parent = authority = None
+        if isinstance(error, InvalidTransformError):
+            child, parent, authority = error.child, error.parent, error.authority
+        # A copy has no traceback that would keep the sender's variables.
+        self._announcer.tell(SampleRejected(self._announcer.now(), reason, child, parent, authority, copy(error)))
+
+    def _judge(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
+        refused: list[InvalidTransformError] = []
+        if self._ownership:
+            batch, refused = self._ownership.split(batch, self._newest)
+        accepted, looped = admit(self._newest, batch)
+        refused += looped
+        for error in refused:
+            self.reject(error.reason, error)
+        if refused and invalid == "raise":
+            raise refused[0]
+        for error in refused:
+            self._log.warning((error.reason, error.child, error.authority), "dropped a sample: %s", error)
+        for sample in accepted:
+            self._note(sample)
+        return accepted
+
+    def _note(self, sample: TransformStamped) -> None:
+        parent, child, stamp, _, authority, static = sample._fields
+        news = self._announcer
+        known = self._newest.get(child)
+        if known is None:
+            known = self._newest[child] = _Newest(parent, static, authority)
+            if news:
+                news.tell(FrameAdded(news.now(), child, parent, authority, static))
+        if known.authority != authority:
+            if self._ownership.reserved_for(child) is None:
+                self._conflict(child, authority, known.authority)
+            known.authority = authority
+        if known.static != static:
+            self.kind_changes += 1
+            kind = "static" if static else "moving"
+            self._log.warning(("kind", child, authority), "frame %r is now %s, from %r", child, kind, authority)
+            known.static = static
+            if news:
+                news.tell(KindChanged(news.now(), child, static, authority))
+        if static or known.newest is None or stamp >= known.newest:
+            known.newest = None if static else stamp
+            if known.parent != parent:
+                self._reparent(child, parent, known.parent, authority)
+                known.parent = parent
+        known.plain = None if static else authority
+        if static:
+            self.latched[child] = sample
+        else:
+            self.latched.pop(child, None)
+
+    def _conflict(self, child: str, authority: str, other: str) -> None:
+        self.conflicts += 1
+        first, second = sorted((other, authority))
+        key = ("authority", child, first, second)
+        self._log.warning(key, "frame %r comes from two authorities, %r and %r", child, first, second)
+        if self._announcer:
+            self._announcer.tell(AuthorityConflict(self._announcer.now(), child, authority, other))
+
+    def _reparent(self, child: str, parent: str, old_parent: str, authority: str) -> None:
+        self.reparented += 1
+        key = ("parent", child, authority)
+        self._log.info(key, "frame %r moves from %r to %r, says %r", child, old_parent, parent, authority)
+        if self._announcer:
+            self._announcer.tell(Reparented(self._announcer.now(), child, parent, old_parent, authority))

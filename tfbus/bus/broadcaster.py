@@ -1,0 +1,138 @@
+"""Sending transforms under one name."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+
+from tfbus.bus.bus import Bus
+from tfbus.errors import BusClosedError, UnknownFrameError
+from tfbus.frames import as_prefix
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
+
+
+class TransformBroadcaster:
+    """Publishes samples that carry its authority.
+
+    Parameters
+    ----------
+    bus : Bus
+    authority : str
+        Who says so: shown in errors and tools.
+    prefix : str, optional
+        What the bus has before the names of this broadcaster's frames, such as ``"robot1/"``, so that several robots
+        with the same frames can share a bus. The names that the methods take are without it.
+    shared : iterable of str
+        Names that get no prefix, because they are the same for everybody, such as ``{"map"}``.
+
+    Raises
+    ------
+    ValueError
+        If the prefix, or a shared name, is empty or starts with a slash, or a shared name starts with the prefix.
+    TypeError
+        If an argument is of another type, or there are shared names but no prefix.
+    """
+
+    def __init__(self, bus: Bus, authority: str = "", *, prefix: str | None = None, shared: Iterable[str] = ()) -> None:
+        if not isinstance(authority, str):
+            raise TypeError(f"authority must be a str, not {authority!r}")
+        self.bus = bus
+        self.authority = authority
+        self._prefix = as_prefix(prefix, shared)
+
+    def send(self, parent: str, child: str, transform: Transform, at: int | None = None) -> None:
+        """Publish where `child` is, seen from `parent`.
+
+        Parameters
+        ----------
+        parent, child : str
+        transform : Transform
+            Maps `child` coordinates into `parent`.
+        at : int, optional
+            ns; by default the clock's now.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a name or the stamp is bad, or the edge would close a loop of parents. Nothing is stored.
+        BusClosedError, TypeError
+        """
+        if self._prefix is not None:
+            parent, child = self._on_bus(parent), self._on_bus(child)
+        self.bus.publish(TransformStamped(parent, child, self._stamp(at), transform, self.authority))
+
+    def send_all(self, samples: Iterable[TransformStamped | tuple[str, str, Transform]], at: int | None = None) -> None:
+        """Publish several at once; they are seen all or not at all.
+
+        Parameters
+        ----------
+        samples : iterable of (parent, child, transform) or TransformStamped
+            The former are stamped with `at`; the latter keep their stamp and get this authority.
+        at : int, optional
+            ns; by default the clock's now, one for all.
+
+        Raises
+        ------
+        InvalidTransformError
+            If one of them is bad. Nothing is stored.
+        BusClosedError, TypeError
+        """
+        stamp = self._stamp(at)
+        self.bus.publish([self._sample(sample, stamp) for sample in samples])
+
+    def send_static(self, parent: str, child: str, transform: Transform) -> None:
+        """Publish a transform that holds at every stamp. Whoever joins later gets it too; sending it again replaces it.
+
+        Raises
+        ------
+        InvalidTransformError, BusClosedError, TypeError
+            As `send`.
+        """
+        parent, child = self._on_bus(parent), self._on_bus(child)
+        self.bus.publish(TransformStamped(parent, child, self.bus.clock.now(), transform, self.authority, static=True))
+
+    @contextmanager
+    def owning(self, *frames: str) -> Iterator[None]:
+        """Have frames for as long as a ``with`` lasts: nobody else may publish them, and at its end they are removed.
+
+        They are removed whoever published them: also what another authority, or this one, had sent before the ``with``
+        began. Nothing happens to a frame that was never published, and nothing at all once the bus is closed.
+
+        Raises
+        ------
+        InvalidTransformError
+            If another authority has reserved one of them; then none is reserved.
+        TypeError
+            If no frame is given.
+        BusClosedError
+        """
+        if not frames:
+            raise TypeError("owning needs at least one frame")
+        names = [self._on_bus(frame) for frame in frames]
+        with ExitStack() as reservations:
+            for name in names:
+                reservations.enter_context(self.bus.reserve(name, self.authority))
+            try:
+                yield
+            finally:
+                for name in names:
+                    with suppress(UnknownFrameError, BusClosedError):
+                        self.bus.remove_frame(name)
+
+    def _on_bus(self, name: str) -> str:
+        """The name that the bus has for a frame."""
+        return name if self._prefix is None else self._prefix.on_bus(name)
+
+    def _stamp(self, at: int | None) -> int:
+        return self.bus.clock.now() if at is None else at
+
+    def _sample(self, sample: TransformStamped | tuple[str, str, Transform], stamp: int) -> TransformStamped:
+        if isinstance(sample, TransformStamped):
+            parent, child = self._on_bus(sample.parent), self._on_bus(sample.child)
+            return sample.replace(parent=parent, child=child, authority=self.authority)
+        try:
+            if isinstance(sample, str):
+                raise TypeError
+            parent, child, transform = sample
+        except (TypeError, ValueError):
+            raise TypeError(f"expected (parent, child, transform) or a TransformStamped, not {sample!r}") from None
+        return TransformStamped(self._on_bus(parent), self._on_bus(child), stamp, transform, self.authority)

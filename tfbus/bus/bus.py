@@ -1,0 +1,376 @@
+"""The bus: who publishes reaches every buffer, stream and subscriber.
+
+`Bus.publish` is a plain function that does its work at once: it judges a batch by the newest parents that it knows of,
+has every buffer insert it and wake its waiters, then calls the subscribers. The bus owns no task and no loop, so
+nothing can be lost between "sent" and "buffered".
+"""
+
+import logging
+from collections.abc import Iterable
+from threading import get_ident
+from types import TracebackType
+from typing import Literal
+
+from tfbus._log import OnceLogger
+from tfbus.bus._announcer import Announcer
+from tfbus.bus._owner_thread import OwnerThread
+from tfbus.bus._ownership import OnConflict, Ownership
+from tfbus.bus._subscribers import BatchCallback, FrameCallback, Subscribers
+from tfbus.bus._topology import Topology
+from tfbus.bus.event_stream import EventStream
+from tfbus.bus.sample_queue import Overflow
+from tfbus.bus.stream import Stream
+from tfbus.bus.thread_publisher import ThreadPublisher
+from tfbus.clock import Clock, SystemClock
+from tfbus.errors import BusClosedError, UnknownFrameError
+from tfbus.events import ClockReset, Event
+from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
+from tfbus.registration import Registration
+from tfbus.statistics import BusStatistics
+from tfbus.waiting.live_tree import LiveTree
+
+
+class Bus:
+    """Broadcasts stamped transforms inside one process.
+
+    Parameters
+    ----------
+    clock : Clock, optional
+        Where stamps, timeouts and timed tasks take their time from; by default a `SystemClock`.
+    on_conflict : {"last", "reject"}
+        What happens to samples of a child that another authority has published before: they are taken and reported,
+        or refused until the frame is removed, across jumps of the clock. No authority, ``""``, is one like any other.
+
+    Raises
+    ------
+    ValueError
+        If `on_conflict` is none of them.
+
+    Notes
+    -----
+    A bus may be made before an event loop runs. It belongs to the thread that made it, until an event loop in another
+    thread uses it first; a loop has a claim on it once it has awaited a lookup, read a stream or entered `threadsafe`.
+    Other threads publish through `threadsafe`.
+    """
+
+    def __init__(self, clock: Clock | None = None, on_conflict: OnConflict = "last") -> None:
+        self.clock: Clock = SystemClock() if clock is None else clock
+        self._owner = OwnerThread()
+        self._closed = False
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._events: list[EventStream] = []
+        self._announcer = Announcer(self.clock.now, self._events)
+        self._topology = Topology(self._log, Ownership(on_conflict), self._announcer)
+        self._subscribers = Subscribers(self._log, self._announcer)
+        self._feeds: dict[LiveTree, int] = {}
+        self._streams: list[Stream] = []
+        self._threads: list[ThreadPublisher] = []
+        self._samples = 0
+        self._resets = 0
+        self._jumps = self.clock.on_jump(self._clock_jumped)
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._closed
+
+    def publish(
+        self, samples: TransformStamped | Iterable[TransformStamped], invalid: Literal["raise", "drop"] = "raise"
+    ) -> None:
+        """Send one sample, or a batch that is seen all or not at all.
+
+        When this returns, every buffer has the samples and the lookups that waited for them have been woken.
+
+        Parameters
+        ----------
+        samples : TransformStamped or iterable of them
+        invalid : {"raise", "drop"}
+            What to do with a sample that would close a loop of parents, or whose authority may not publish the child:
+            refuse the whole batch, or leave that sample out and count it. ``"drop"`` is for those who pass on what
+            others have sent.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a sample would close a loop of parents, its child is reserved for another authority, or comes from
+            another one with ``on_conflict="reject"``. Nothing is stored.
+        TypeError
+            If something in it is not a `TransformStamped`.
+        BusClosedError
+            If the bus is closed.
+        RuntimeError
+            If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
+        """
+        if get_ident() != self._owner.thread:
+            self.check_thread()
+        if self._closed:
+            raise BusClosedError
+        if invalid != "raise" and invalid != "drop":
+            raise ValueError(f"invalid must be 'raise' or 'drop', not {invalid!r}")
+        if type(samples) is TransformStamped:
+            batch: Batch = (samples,)
+        elif invalid == "raise":
+            batch = as_batch(samples)
+        else:
+            batch = self._well_typed(samples)
+        callbacks = self._subscribers.callbacks
+        if callbacks:
+            self._subscribers.check_backlog()
+        batch = self._topology.take(batch, invalid)
+        if not batch:
+            return
+        self._samples += len(batch)
+        for feed in self._feeds:
+            feed.receive(batch)
+        for stream in self._streams:
+            stream.put(batch)
+        if self._events:
+            for events in self._events:
+                events.arrived(batch)
+        if callbacks:
+            self._subscribers.deliver(batch)
+
+    def check_thread(self) -> None:
+        """Raise `RuntimeError` unless the caller may use the bus directly.
+
+        The first event loop to use a bus that another thread has made takes it over.
+        """
+        self._owner.check()
+
+    def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
+        """Call `callback` with each batch, a tuple of samples, until the registration is closed.
+
+        It is called inside `publish`, so it should be quick; if it publishes, those batches are delivered behind the
+        current one. If it raises an `Exception`, that is logged once and counted, and nobody else notices. What is
+        latched, it is given at once.
+
+        `removed` is called with each frame that `remove_frame` takes away, between the batches before and after it.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        self._check_usable()
+        return self._subscribers.add(callback, tuple(self._topology.latched.values()), removed)
+
+    def stream(self, capacity: int = 1_000, overflow: Overflow = "conflate") -> Stream:
+        """The batches as an async iterator: ``with bus.stream() as batches: async for batch in batches``.
+
+        Parameters
+        ----------
+        capacity : int
+            How many moving samples may wait for the reader; with ``"conflate"`` that is a number of children.
+        overflow : {"conflate", "drop_oldest"}
+            Keep the newest sample a child, or the newest whole batches. Static samples are never dropped.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        self._check_usable()
+        stream = Stream(capacity, overflow, self.check_thread, self._detach_stream)
+        latched = tuple(self._topology.latched.values())
+        if latched:
+            stream.put(latched)
+        self._streams.append(stream)
+        return stream
+
+    def events(self, capacity: int = 1_000, stale_after: float | None = 1.0) -> EventStream:
+        """What happens besides samples: ``with bus.events() as events: async for event in events``.
+
+        It begins with a `FrameAdded` for each frame that has a parent by now. Each failure of a subscriber is an event;
+        what is rejected is told once for each frame, authority and reason. Of two authorities that argue about a frame,
+        each pair is told once, and each parent and kind that one of them claims. That lasts until the frame is removed,
+        or the clock jumps back; the counters count every time.
+
+        Parameters
+        ----------
+        capacity : int
+            How many events may wait for the reader; then the oldest are dropped and counted. What was there at the
+            beginning, and who is stale or live, is never dropped.
+        stale_after : float or None
+            A moving frame is stale when its newest stamp is more than this many s behind the clock, and live again when
+            it is not; None for no such events. It is worked out while somebody reads, without a timer of its own.
+
+        Raises
+        ------
+        ValueError
+            If `capacity` is less than one, or `stale_after` negative.
+        BusClosedError
+        """
+        self._check_usable()
+        events = EventStream(capacity, stale_after, self._topology, self.clock, self.check_thread, self._detach_events)
+        self._events.append(events)
+        return events
+
+    def announce(self, event: Event) -> None:
+        """Tell whoever reads `events` of something that the bus cannot know: for links, recorders and players."""
+        self.check_thread()
+        self._announcer.tell(event)
+
+    def reserve(self, frame: str, authority: str) -> Registration:
+        """Let only `authority` publish a frame, whatever `on_conflict` says, until the registration is closed.
+
+        What another authority has published of it stays; from now on it is refused, with ``reason="reserved"``. One
+        authority may reserve a frame several times.
+
+        Raises
+        ------
+        InvalidTransformError
+            If another authority has reserved it, or the name cannot be that of a frame.
+        BusClosedError
+        """
+        self._check_usable()
+        return self._topology.reserve(frame, authority)
+
+    def threadsafe(self, capacity: int = 10_000) -> ThreadPublisher:
+        """A way in for other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
+
+        ``publish(samples)`` may then be called from any thread. The bus publishes what has gathered with
+        ``invalid="drop"``; when more than `capacity` moving samples wait, the oldest batches are dropped and counted.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        self._check_usable()
+        return ThreadPublisher(capacity, self._attach_publisher, self._publish_from_thread, self._threads.remove)
+
+    def attach(self, feed: LiveTree) -> None:
+        """Have a buffer's feed receive what is latched now and all that is published from now on."""
+        self._check_usable()
+        latched = tuple(self._topology.latched.values())
+        self._feeds[feed] = self._samples - len(latched)
+        if latched:
+            feed.receive(latched)
+
+    def detach(self, feed: LiveTree) -> None:
+        """Take a feed off the bus, if it is on it."""
+        if feed.anyone_waits:
+            self.check_thread()
+        self._feeds.pop(feed, None)
+
+    def remove_frame(self, frame: str) -> None:
+        """Make a frame disappear: from every buffer, from what streams still hold, and for whoever joins later.
+
+        Frames below it stay, as a tree of their own.
+
+        Raises
+        ------
+        UnknownFrameError
+            If neither the bus nor a buffer knows it.
+        """
+        self._check_usable()
+        if frame not in self._topology and not any(frame in feed.tree for feed in self._feeds):
+            names = self._topology.names()
+            if frame not in names:
+                raise UnknownFrameError(frame=frame, known=tuple(names))
+        self._topology.remove(frame)
+        self._subscribers.forget(frame)
+        for publisher in self._threads:
+            publisher.forget(frame)
+        for stream in self._streams:
+            stream.queue.forget(frame)
+        for feed in self._feeds:
+            feed.remove_frame(frame)
+        self._subscribers.tell_removed(frame)
+
+    def statistics(self) -> BusStatistics:
+        """All counters, as they are now."""
+        return BusStatistics(
+            samples=self._samples,
+            rejected=dict(self._topology.rejected),
+            reparented=self._topology.reparented,
+            kind_changes=self._topology.kind_changes,
+            authority_conflicts=self._topology.conflicts,
+            clock_resets=self._resets,
+            callbacks_failed=self._subscribers.failures,
+            frames=len(self._topology),
+            buffers=tuple(feed.statistics(self._samples - before) for feed, before in self._feeds.items()),
+            queues=(
+                *(stream.queue.statistics("stream") for stream in self._streams),
+                *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
+                *(events.queue.statistics() for events in self._events),
+            ),
+        )
+
+    def close(self) -> None:
+        """End every stream and every waiting lookup; buffers go on answering what they can.
+
+        A second call does nothing.
+        """
+        if self._closed:
+            return
+        readers: list[Stream | EventStream] = [*self._streams, *self._events]
+        if any(reader.waiting for reader in readers) or any(feed.anyone_waits for feed in self._feeds):
+            self.check_thread()
+        self._closed = True
+        self._jumps.close()
+        for publisher in self._threads:
+            publisher.end()
+            publisher.discard()
+        for reader in readers:
+            reader.end()
+        feeds = tuple(self._feeds)
+        for feed in feeds:
+            feed.end("the bus is closed")
+        # Only now, when everybody has been woken, somebody else's code.
+        for feed in feeds:
+            feed.tell_the_end()
+
+    def __enter__(self) -> "Bus":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _check_usable(self) -> None:
+        self.check_thread()
+        if self._closed:
+            raise BusClosedError
+
+    def _attach_publisher(self, publisher: ThreadPublisher) -> None:
+        self._check_usable()
+        self._threads.append(publisher)
+
+    def _detach_stream(self, stream: Stream) -> None:
+        if stream in self._streams:
+            self._streams.remove(stream)
+
+    def _detach_events(self, events: EventStream) -> None:
+        if events in self._events:
+            self._events.remove(events)
+
+    def _well_typed(self, samples: object) -> Batch:
+        """The samples of a batch; whatever else is in it is counted."""
+        things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
+        batch = tuple(thing for thing in things if isinstance(thing, TransformStamped))
+        if len(batch) < len(things):
+            for thing in things:
+                if not isinstance(thing, TransformStamped):
+                    self._topology.reject("not a sample", TypeError(f"expected a TransformStamped, not {thing!r}"))
+        return batch
+
+    def _publish_from_thread(self, batch: Batch) -> None:
+        if not self._closed:
+            self.publish(batch, invalid="drop")
+
+    def _clock_jumped(self, before: int, after: int) -> None:
+        if after >= before:
+            for events in self._events:
+                events.wake()
+            return
+        self.check_thread()
+        self._resets += 1
+        self._log.warning(("clock", before, after), "the clock jumped back: moving samples are dropped")
+        self._topology.clear_moving()
+        self._announcer.tell(ClockReset(after, before))
+        self._subscribers.discard_moving()
+        for publisher in self._threads:
+            publisher.discard()
+        for stream in self._streams:
+            stream.queue.discard_moving()
+        for feed in self._feeds:
+            feed.reset(before, after)

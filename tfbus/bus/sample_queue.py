@@ -1,0 +1,140 @@
+"""A bounded queue of batches between a publisher that never waits and a reader that may be slow."""
+
+from collections import deque
+from collections.abc import Callable
+from typing import Literal
+
+from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.statistics import QueueStatistics
+
+Overflow = Literal["conflate", "drop_oldest"]
+
+
+def check_capacity(capacity: object, name: str = "capacity") -> None:
+    """Raise `TypeError` or `ValueError` unless something can hold that many; `name` is for the error."""
+    if isinstance(capacity, bool) or not isinstance(capacity, int):
+        raise TypeError(f"{name} must be an int, not {capacity!r}")
+    if capacity < 1:
+        raise ValueError(f"{name} must be at least 1, got {capacity}")
+
+
+class SampleQueue:
+    """Batches in the order they came, or the newest sample of each child.
+
+    Static samples are never dropped: they do not count towards the capacity, and the newest one of each child stays.
+
+    Parameters
+    ----------
+    capacity : int
+        How many moving samples may be pending; at least one. With ``"conflate"`` that is a number of children.
+    overflow : {"conflate", "drop_oldest"}
+        ``"conflate"`` keeps the newest sample a child and, when there are too many children, drops the one that
+        has waited longest. ``"drop_oldest"`` drops the oldest whole batches, also when more than `capacity` batches
+        are pending (all static, they would never fill the queue); the newest batch always stays.
+
+    Attributes
+    ----------
+    dropped : int
+        Moving samples lost to the capacity, or discarded with their frame or their time.
+    conflated : int
+        Moving samples that gave way to another one of the same child; only with ``"conflate"``.
+    """
+
+    def __init__(self, capacity: int, overflow: Overflow) -> None:
+        check_capacity(capacity)
+        if overflow not in ("conflate", "drop_oldest"):
+            raise ValueError(f"overflow must be 'conflate' or 'drop_oldest', not {overflow!r}")
+        self.capacity = capacity
+        self.overflow: Overflow = overflow
+        self.dropped = 0
+        self.conflated = 0
+        self._newest: dict[str, TransformStamped] = {}
+        self._batches: deque[Batch] = deque()
+        self._moving = 0
+
+    def __len__(self) -> int:
+        return len(self._newest) + sum(map(len, self._batches))
+
+    def put(self, batch: Batch) -> None:
+        """Add a batch, dropping what does not fit."""
+        if self.overflow == "conflate":
+            for sample in batch:
+                self._conflate(sample)
+            if self._moving > self.capacity:
+                self._drop_children()
+        else:
+            self._batches.append(batch)
+            self._moving += sum(not sample.static for sample in batch)
+            while max(self._moving, len(self._batches)) > self.capacity and len(self._batches) > 1:
+                self._drop_batch()
+
+    def get(self) -> Batch | None:
+        """The next batch; with ``"conflate"``, all that is pending as one. None when there is nothing."""
+        if self._newest:
+            batch = tuple(self._newest.values())
+            self._newest.clear()
+        elif self._batches:
+            batch = self._batches.popleft()
+        else:
+            return None
+        self._moving -= sum(not sample.static for sample in batch)
+        return batch
+
+    def forget(self, child: str) -> None:
+        """Take out every sample of a frame that has been removed; moving ones count as dropped."""
+        pending = self._newest.pop(child, None)
+        if pending is not None and not pending.static:
+            self._moving -= 1
+            self.dropped += 1
+        if any(sample.child == child for batch in self._batches for sample in batch):
+            before = self._moving
+            self._keep_only(lambda sample: sample.child != child)
+            self.dropped += before - self._moving
+
+    def discard_moving(self) -> None:
+        """Take out every moving sample, as when the clock jumps back; they count as dropped."""
+        self.dropped += self._moving
+        self._keep_only(lambda sample: sample.static)
+
+    def statistics(self, kind: str) -> QueueStatistics:
+        """The queue's counters; `kind` says what it is for."""
+        return QueueStatistics(kind, self.overflow, self.capacity, len(self), self.dropped, self.conflated)
+
+    def _conflate(self, sample: TransformStamped) -> None:
+        pending = self._newest.get(sample.child)
+        if pending is not None:
+            self.conflated += not pending.static
+            # The last kind wins; of moving samples, the newest stamp.
+            if not (sample.static or pending.static) and sample.stamp < pending.stamp:
+                return
+            del self._newest[sample.child]
+            self._moving -= not pending.static
+        self._newest[sample.child] = sample
+        self._moving += not sample.static
+
+    def _drop_children(self) -> None:
+        for child in [child for child, sample in self._newest.items() if not sample.static]:
+            if self._moving <= self.capacity:
+                return
+            del self._newest[child]
+            self._moving -= 1
+            self.dropped += 1
+
+    def _drop_batch(self) -> None:
+        batch = self._batches.popleft()
+        lost = 0
+        for sample in batch:
+            if sample.static:
+                self._newest.pop(sample.child, None)
+                self._newest[sample.child] = sample
+            else:
+                lost += 1
+        self._moving -= lost
+        self.dropped += lost
+
+    def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
+        self._newest = {child: sample for child, sample in self._newest.items() if wanted(sample)}
+        kept = (tuple(filter(wanted, batch)) for batch in self._batches)
+        self._batches = deque(batch for batch in kept if batch)
+        self._moving = sum(not sample.static for sample in self._newest.values())
+        self._moving += sum(not sample.static for batch in self._batches for sample in batch)

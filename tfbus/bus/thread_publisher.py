@@ -1,0 +1,114 @@
+"""Publishing from other threads."""
+
+import threading
+from collections.abc import Callable, Iterable
+from types import TracebackType
+
+from tfbus._aio.loop_waker import LoopWaker
+from tfbus.bus.sample_queue import SampleQueue
+from tfbus.errors import BusClosedError
+from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
+
+
+class ThreadPublisher:
+    """What `Bus.threadsafe` gives: inside its ``with``, a function that any thread may call.
+
+    Samples are queued here and published on the event loop, with one wake-up of the loop for all that has gathered.
+
+    Parameters
+    ----------
+    capacity : int
+        How many moving samples may be pending; beyond that the oldest batches are dropped and counted.
+    attach : callable
+        Called on the loop when the ``with`` begins; raises if the bus is not for this loop.
+    deliver : callable
+        Publishes one batch; called on the loop.
+    detach : callable
+        Called on the loop when the ``with`` ends.
+    """
+
+    def __init__(
+        self,
+        capacity: int,
+        attach: Callable[["ThreadPublisher"], object],
+        deliver: Callable[[Batch], object],
+        detach: Callable[["ThreadPublisher"], object],
+    ) -> None:
+        self.queue = SampleQueue(capacity, "drop_oldest")
+        self._attach = attach
+        self._lock = threading.Lock()
+        self._deliver = deliver
+        self._detach = detach
+        self._bell = LoopWaker(self._drain)
+        self._ended = False
+
+    def __enter__(self) -> "ThreadPublisher":
+        self._bell.connect()
+        try:
+            self._attach(self)
+        except BaseException:
+            self.end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.end()
+        self._drain()
+        self._detach(self)
+
+    def __call__(self, samples: TransformStamped | Iterable[TransformStamped]) -> None:
+        """Hand over one sample or a batch; the order within a thread is kept.
+
+        Raises
+        ------
+        TypeError
+            If something in it is not a `TransformStamped`.
+        BusClosedError
+            If the ``with`` has ended, or the bus or the event loop is closed.
+        RuntimeError
+            If the ``with`` has not begun.
+
+        Notes
+        -----
+        What only the bus can judge, such as a loop of parents, is dropped and counted there.
+        """
+        batch = as_batch(samples)
+        if not self._bell.connected:
+            raise RuntimeError("enter the `with` of bus.threadsafe() on the event loop first")
+        with self._lock:
+            if self._ended:
+                raise BusClosedError("the bus takes no more samples from this thread: its `with` has ended")
+            self.queue.put(batch)
+        try:
+            self._bell.ring()
+        except RuntimeError as error:
+            self.end()
+            raise BusClosedError("the event loop of the bus has ended") from error
+
+    def end(self) -> None:
+        """Take no more samples."""
+        with self._lock:
+            self._ended = True
+
+    def discard(self) -> None:
+        """Drop what was queued before the clock jumped back; static samples stay."""
+        with self._lock:
+            self.queue.discard_moving()
+
+    def forget(self, child: str) -> None:
+        """Drop what is queued of a removed frame."""
+        with self._lock:
+            self.queue.forget(child)
+
+    def _drain(self) -> None:
+        with self._lock:
+            pending = len(self.queue)
+        # One by one: what is delivered may make the clock jump, and that discards the rest.
+        for _ in range(pending):
+            with self._lock:
+                batch = self.queue.get()
+            if batch is None:
+                return
+            self._deliver(batch)

@@ -1,0 +1,1 @@
+"""The subcommands of ``tfbus``, one module each."""

@@ -1,0 +1,11 @@
+"""Rigid transforms, samples that carry frames and a stamp, and arrays of transforms.
+
+`rows` has the arithmetic on plain tuples and `transform` the value that users hold; `stamped` adds two frames, a stamp
+and an authority.
+"""
+
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform_array import TransformArray
+
+__all__ = ["Transform", "TransformArray", "TransformStamped"]

@@ -1,0 +1,209 @@
+"""One sample: where a frame was, seen from its parent, at an instant."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from tfbus.errors import InvalidTransformError
+from tfbus.frames import check_frame
+from tfbus.geometry.rows import Row
+from tfbus.geometry.transform import Transform, from_row
+from tfbus.stamps import as_stamp, format_duration, format_stamp
+
+Fields = tuple[str, str, int, Row, str, bool]
+
+
+class TransformStamped:
+    """A transform with its two frames and its stamp: what is published, and what a lookup answers. Immutable.
+
+    Parameters
+    ----------
+    parent, child : str
+        The transform maps `child` coordinates into `parent`. In an answer they are target and source.
+    stamp : int
+        Nanoseconds.
+    transform : Transform
+    authority : str
+        Who says so; shown in errors and tools.
+    static : bool
+        Whether it holds at every stamp. An answer is static when its whole path is.
+
+    Raises
+    ------
+    InvalidTransformError
+        If a name is empty or starts with ``/``, child equals parent, or the stamp does not fit 64 bits.
+    TypeError
+        If an argument has the wrong type; a float stamp is the usual one.
+    """
+
+    # One slot, because the hot paths read all six fields at once.
+    __slots__ = ("_fields",)
+    _fields: Fields
+
+    def __init__(
+        self,
+        parent: str,
+        child: str,
+        stamp: int,
+        transform: Transform,
+        authority: str = "",
+        static: bool = False,
+    ) -> None:
+        for name in (parent, child):
+            check_frame(name, parent, child, authority)
+        if parent == child:
+            raise InvalidTransformError(
+                f"frame {child!r} cannot be its own parent",
+                reason="self transform",
+                parent=parent,
+                child=child,
+                authority=authority,
+            )
+        if not isinstance(transform, Transform):
+            raise TypeError(f"transform must be a Transform, not {transform!r}")
+        if not isinstance(authority, str):
+            raise TypeError(f"authority must be a str, not {authority!r}")
+        try:
+            stamp = as_stamp(stamp)
+        except ValueError as error:
+            raise InvalidTransformError(
+                str(error), reason="stamp", parent=parent, child=child, authority=authority
+            ) from None
+        self._fields = parent, child, stamp, transform._row, authority, bool(static)
+
+    @property
+    def parent(self) -> str:
+        """The frame that the transform maps into; the target, in an answer."""
+        return self._fields[0]
+
+    @property
+    def child(self) -> str:
+        """The frame that the transform maps from; the source, in an answer."""
+        return self._fields[1]
+
+    @property
+    def stamp(self) -> int:
+        """Nanoseconds; never `LATEST`."""
+        return self._fields[2]
+
+    @property
+    def transform(self) -> Transform:
+        """Maps `child` coordinates into `parent`."""
+        return from_row(self._fields[3])
+
+    @property
+    def authority(self) -> str:
+        """Who said so; empty in an answer."""
+        return self._fields[4]
+
+    @property
+    def static(self) -> bool:
+        """Whether it holds at every stamp."""
+        return self._fields[5]
+
+    @property
+    def extrapolated_by(self) -> int:
+        """How far an answer is from a sample that stood in for its stamp, in ns; never more than the policy allows."""
+        return 0
+
+    @property
+    def gap(self) -> int | None:
+        """How far two samples are apart that an answer was interpolated between, in ns; None without a policy."""
+        return None
+
+    def replace(self, **changes: Any) -> "TransformStamped":
+        """A copy with some fields changed, checked again."""
+        parent, child, stamp, row, authority, static = self._fields
+        fields = {
+            "parent": parent,
+            "child": child,
+            "stamp": stamp,
+            "transform": from_row(row),
+            "authority": authority,
+            "static": static,
+        }
+        return TransformStamped(**{**fields, **changes})
+
+    def __eq__(self, other: object) -> bool:
+        return self._fields == other._fields if isinstance(other, TransformStamped) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._fields)
+
+    def __repr__(self) -> str:
+        parent, child, stamp, row, authority, static = self._fields
+        extra = (f", authority={authority!r}" if authority else "") + (", static=True" if static else "")
+        return f"TransformStamped({parent!r}, {child!r}, {stamp}, {from_row(row)}{extra})"
+
+    def __str__(self) -> str:
+        when = "static" if self.static else f"at {format_stamp(self.stamp)}"
+        return f"{self.parent} <- {self.child} {when}: {self.transform}"
+
+
+class QualifiedTransform(TransformStamped):
+    """The answer of a lookup that was given a policy: it says what was done."""
+
+    __slots__ = ("_done",)
+    _done: tuple[int, int]
+
+    @property
+    def extrapolated_by(self) -> int:
+        """How far the stamp is from the sample that stood in for it, in ns, on the edge where that is furthest."""
+        return self._done[0]
+
+    @property
+    def gap(self) -> int:
+        """How far two samples are apart that were interpolated between, in ns, on the edge where that is furthest."""
+        return self._done[1]
+
+    def __str__(self) -> str:
+        held = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
+        return super().__str__() + held
+
+
+def answer_of(target: str, source: str, stamp: int, row: Row, static: bool) -> TransformStamped:
+    """A lookup's answer, of parts that are known to be good; nothing is checked."""
+    sample = TransformStamped.__new__(TransformStamped)
+    sample._fields = target, source, stamp, row, "", static
+    return sample
+
+
+def qualified_answer(
+    target: str, source: str, stamp: int, row: Row, static: bool, extrapolated_by: int, gap: int
+) -> QualifiedTransform:
+    """As `answer_of`, with what a policy did."""
+    sample = QualifiedTransform.__new__(QualifiedTransform)
+    sample._fields = target, source, stamp, row, "", static
+    sample._done = extrapolated_by, gap
+    return sample
+
+
+def renamed(answer: TransformStamped, target: str, source: str) -> TransformStamped:
+    """An answer under other names of its two frames."""
+    twin = type(answer).__new__(type(answer))
+    twin._fields = target, source, *answer._fields[2:]
+    if isinstance(answer, QualifiedTransform) and isinstance(twin, QualifiedTransform):
+        twin._done = answer._done
+    return twin
+
+
+Batch = tuple[TransformStamped, ...]
+"""Samples that belong together: they are seen all or not at all."""
+
+
+def as_batch(samples: TransformStamped | Iterable[TransformStamped]) -> Batch:
+    """One sample or an iterable of them, as a tuple.
+
+    Raises
+    ------
+    TypeError
+        If something in it is not a `TransformStamped`. The message names it.
+    """
+    if isinstance(samples, TransformStamped):
+        return (samples,)
+    if isinstance(samples, (str, bytes)) or not isinstance(samples, Iterable):
+        raise TypeError(f"expected a TransformStamped or an iterable of them, not {samples!r}")
+    batch = tuple(samples)
+    for sample in batch:
+        if not isinstance(sample, TransformStamped):
+            raise TypeError(f"expected a TransformStamped, not {sample!r}")
+    return batch

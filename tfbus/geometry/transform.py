@@ -1,0 +1,266 @@
+"""Rigid transforms.
+
+A `Transform` maps points of one frame into another: ``p_target = target_from_source.apply(p_source)``, and equal
+neighbours cancel in ``map_from_base @ base_from_lidar``. Quaternions are ``(x, y, z, w)``; transforms3d, which does the
+conversions, has ``w`` first, so every crossing says ``wxyz``.
+
+Inside, a transform is one tuple of seven floats, a row; `tfbus.geometry.rows` has the arithmetic.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, overload
+
+import numpy as np
+import numpy.typing as npt
+from transforms3d import euler, quaternions
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.rows import (
+    IDENTITY,
+    NORM_TOLERANCE,
+    ROUNDING,
+    Numbers,
+    Quaternion,
+    Row,
+    Vector,
+    as_floats,
+    as_rotation,
+    as_vector,
+    compose,
+    interpolate,
+    invert,
+    rotate,
+)
+
+
+class Transform:
+    """A rotation followed by a translation; immutable and hashable.
+
+    Parameters
+    ----------
+    translation : sequence of 3 floats
+        In m.
+    rotation : sequence of 4 floats
+        Unit quaternion (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given.
+
+    Raises
+    ------
+    InvalidTransformError
+        If a number is not finite, a length is wrong, or the norm is further off.
+
+    Examples
+    --------
+    >>> base_from_laser = Transform((0.1, 0.0, 0.2))
+    >>> base_from_laser.apply((1.0, 0.2, 0.0))
+    (1.1, 0.2, 0.2)
+    """
+
+    __slots__ = ("_row",)
+    _row: Row
+
+    def __init__(
+        self,
+        translation: Numbers = (0.0, 0.0, 0.0),
+        rotation: Numbers = (0.0, 0.0, 0.0, 1.0),
+    ) -> None:
+        self._row = (*as_vector(translation, "translation"), *as_rotation(rotation, "rotation"))
+
+    @classmethod
+    def identity(cls) -> "Transform":
+        """The transform that changes nothing."""
+        return from_row(IDENTITY)
+
+    @classmethod
+    def from_wxyz(cls, translation: Numbers, wxyz: Numbers) -> "Transform":
+        """From a translation in m and a unit quaternion in transforms3d's order, (w, x, y, z)."""
+        w, x, y, z = as_floats(wxyz, 4, "rotation")
+        return cls(translation, (x, y, z, w))
+
+    @classmethod
+    def from_matrix(cls, matrix: npt.ArrayLike) -> "Transform":
+        """From a homogeneous matrix of shape (4, 4).
+
+        The rotation part is projected on the nearest rotation (Bar-Itzhack 2000, as done by transforms3d) when it is
+        within 1 % of one.
+
+        Raises
+        ------
+        InvalidTransformError
+            If the shape is not (4, 4), a number is not finite, the last row is not (0, 0, 0, 1), or the rotation part
+            is not a rotation.
+        """
+        m = np.asarray(matrix, dtype=np.float64)
+        if m.shape != (4, 4):
+            raise InvalidTransformError(f"matrix must have shape (4, 4), got {m.shape}", reason="wrong length")
+        if not np.isfinite(m).all():
+            raise InvalidTransformError(f"matrix {m.tolist()} is not finite", reason="not finite")
+        r = m[:3, :3]
+        if np.abs(m[3] - (0.0, 0.0, 0.0, 1.0)).max() > NORM_TOLERANCE:
+            raise InvalidTransformError(f"matrix is not rigid: its last row is {m[3]}", reason="not a rotation")
+        if np.abs(r @ r.T - np.eye(3)).max() > 2 * NORM_TOLERANCE or np.linalg.det(r) < 0:
+            raise InvalidTransformError(
+                f"matrix is not rigid: no rotation is near {r.tolist()}", reason="not a rotation"
+            )
+        return cls.from_wxyz(m[:3, 3], quaternions.mat2quat(r))
+
+    @classmethod
+    def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers) -> "Transform":
+        """From a translation in m and roll, pitch, yaw in rad about the fixed axes x, y, z, as in URDF."""
+        roll, pitch, yaw = as_floats(rpy, 3, "rpy")
+        return cls.from_wxyz(xyz, euler.euler2quat(roll, pitch, yaw, "sxyz"))
+
+    @classmethod
+    def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> "Transform":
+        """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m."""
+        x, y, z = as_floats(axis, 3, "axis")
+        length = math.hypot(x, y, z)
+        if length == 0.0:
+            raise InvalidTransformError(f"axis {(x, y, z)} has no direction", reason="zero axis")
+        if not math.isfinite(angle):
+            raise InvalidTransformError(f"angle {angle!r} is not finite", reason="not finite")
+        return cls.from_wxyz(translation, quaternions.axangle2quat((x / length, y / length, z / length), angle, True))
+
+    @property
+    def translation(self) -> Vector:
+        """(x, y, z) in m."""
+        return self._row[:3]
+
+    @property
+    def rotation(self) -> Quaternion:
+        """Unit quaternion (x, y, z, w)."""
+        return self._row[3:]
+
+    def as_wxyz(self) -> Quaternion:
+        """The rotation in transforms3d's order, (w, x, y, z)."""
+        return self._row[6], *self._row[3:6]
+
+    def as_rpy(self) -> Vector:
+        """Roll, pitch, yaw in rad about the fixed axes x, y, z; at a pitch of 90 degrees yaw is 0.
+
+        Sum and difference of roll and yaw are read straight from the quaternion (Bernardes and Viollet, "Quaternion to
+        Euler angles conversion", PLoS ONE 17(11), 2022): on the way over a matrix, which transforms3d takes, rounding
+        costs up to half a rad within 1e-8 rad of that pitch.
+        """
+        x, y, z, w = self.rotation
+        low, high = math.hypot(x + z, w - y), math.hypot(x - z, w + y)
+        half_sum, half_difference = math.atan2(x + z, w - y), math.atan2(x - z, w + y)
+        if low <= ROUNDING:
+            half_sum = half_difference
+        elif high <= ROUNDING:
+            half_difference = half_sum
+        roll = math.remainder(half_sum + half_difference, math.tau)
+        yaw = math.remainder(half_sum - half_difference, math.tau)
+        return roll, math.pi / 2.0 - 2.0 * math.atan2(low, high), yaw
+
+    def as_axis_angle(self) -> tuple[Vector, float]:
+        """Unit axis and angle in rad, from 0 to pi; the axis of no rotation is (1, 0, 0).
+
+        The angle is taken from ``atan2``: ``acos``, which transforms3d uses, loses half the digits near the identity.
+        """
+        x, y, z, w = self.rotation
+        sine = math.hypot(x, y, z)
+        if sine == 0.0:
+            return (1.0, 0.0, 0.0), 0.0
+        length = math.copysign(sine, w)
+        return (x / length, y / length, z / length), 2.0 * math.atan2(sine, abs(w))
+
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """A new homogeneous matrix of shape (4, 4)."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = quaternions.quat2mat(self.as_wxyz())
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    def inverse(self) -> "Transform":
+        """The transform that undoes this one."""
+        return from_row(invert(self._row))
+
+    def __matmul__(self, other: "Transform") -> "Transform":
+        if not isinstance(other, Transform):
+            return NotImplemented
+        return from_row(compose(self._row, other._row))
+
+    @overload
+    def apply(self, points: npt.NDArray[Any]) -> npt.NDArray[Any]: ...
+    @overload
+    def apply(self, points: Sequence[float]) -> Vector: ...
+    def apply(self, points: Sequence[float] | npt.NDArray[Any]) -> Vector | npt.NDArray[Any]:
+        """Points of the source frame, in the target frame.
+
+        Parameters
+        ----------
+        points : sequence of 3 floats, or array of shape (..., 3)
+            In m. Arrays of float32 stay float32; integers become float64. What is not finite stays so, or NaN.
+
+        Returns
+        -------
+        tuple of 3 floats, or a new array of the same shape
+
+        Raises
+        ------
+        ValueError
+            If the shape does not end in 3. The message has the shape.
+        """
+        if not isinstance(points, np.ndarray):
+            if len(points) != 3:
+                raise ValueError(f"a point is three numbers, got shape ({len(points)},); points go in an array")
+            x, y, z = points
+            tx, ty, tz = self._row[:3]
+            try:
+                rx, ry, rz = rotate(self.rotation, x, y, z)
+            except TypeError:
+                raise ValueError(f"a point is three numbers, not {points!r}; points go in an array") from None
+            return float(tx + rx), float(ty + ry), float(tz + rz)
+        if points.ndim == 0 or points.shape[-1] != 3:
+            raise ValueError(f"points must have shape (..., 3), got {points.shape}")
+        dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(np.float64)
+        rotation = quaternions.quat2mat(self.as_wxyz()).T.astype(dtype)
+        with np.errstate(invalid="ignore"):
+            moved: npt.NDArray[Any] = points @ rotation
+            moved += np.asarray(self.translation, dtype)
+        return moved
+
+    def interpolate(self, other: "Transform", fraction: float) -> "Transform":
+        """The transform a `fraction` of the way to `other`: translation linear, rotation along the shorter arc.
+
+        Raises
+        ------
+        ValueError
+            If `fraction` is not from 0 to 1: nothing here extrapolates by itself.
+        """
+        if not 0.0 <= fraction <= 1.0:
+            raise ValueError(f"fraction must be from 0 to 1, got {fraction!r}")
+        return from_row(interpolate(self._row, other._row, float(fraction)))
+
+    def is_close(
+        self, other: "Transform", *, translation_tolerance: float = 1e-9, rotation_tolerance: float = 1e-9
+    ) -> bool:
+        """Whether the two move any point to nearly the same place: rotations are compared up to sign.
+
+        Parameters
+        ----------
+        translation_tolerance : float
+            Greatest distance in m.
+        rotation_tolerance : float
+            Greatest angle between the rotations in rad.
+        """
+        if math.dist(self.translation, other.translation) > translation_tolerance:
+            return False
+        return (self.inverse() @ other).as_axis_angle()[1] <= rotation_tolerance
+
+    def __eq__(self, other: object) -> bool:
+        return self._row == other._row if isinstance(other, Transform) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self._row)
+
+    def __repr__(self) -> str:
+        return f"Transform(translation={self.translation}, rotation={self.rotation})"
+
+
+def from_row(row: Row) -> Transform:
+    """The transform of a row that is known to be good; nothing is checked."""
+    transform = Transform.__new__(Transform)
+    transform._row = row
+    return transform

@@ -1,0 +1,225 @@
+"""Many transforms at once.
+
+Inside are seven columns, ``tx, ty, tz, qx, qy, qz, qw``, each an array over the transforms. The kernels of
+`tfbus.geometry` take columns as they take the seven floats of a row, so there is one source of each formula.
+"""
+
+from collections.abc import Iterator
+from typing import Any, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.read_only import locked
+from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Columns, Row, compose, invert, rotate
+from tfbus.geometry.transform import Transform, from_row
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+
+
+class TransformArray:
+    """A sequence of transforms in arrays, such as one frame's at many stamps. Immutable.
+
+    Parameters
+    ----------
+    translations : array of shape (n, 3)
+        In m.
+    rotations : array of shape (n, 4)
+        Unit quaternions (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given. NaN throughout,
+        in a translation and its rotation, means that there is no transform.
+
+    Raises
+    ------
+    InvalidTransformError
+        If the shapes are wrong, or a row is not finite, or too far from a unit quaternion.
+
+    Examples
+    --------
+    >>> steps = TransformArray([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], [[0.0, 0.0, 0.0, 1.0]] * 2)
+    >>> steps[1]
+    Transform(translation=(1.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0, 1.0))
+    >>> steps.apply([[0.0, 2.0, 0.0], [0.0, 3.0, 0.0]])
+    array([[0., 2., 0.],
+           [1., 3., 0.]])
+    """
+
+    __array_ufunc__ = None
+    __slots__ = ("_columns", "_done")
+    _columns: Floats
+    _done: Integers | None
+
+    def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike) -> None:
+        moves = np.asarray(translations, np.float64)
+        turns = np.asarray(rotations, np.float64)
+        if moves.ndim != 2 or moves.shape[1] != 3 or turns.shape != (len(moves), 4):
+            raise InvalidTransformError(
+                f"translations and rotations must have shapes (n, 3) and (n, 4), got {moves.shape} and {turns.shape}",
+                reason="wrong length",
+            )
+        with np.errstate(over="ignore"):
+            squares = np.square(turns).sum(axis=1)
+        norms = np.sqrt(squares)
+        missing = np.isnan(moves).all(axis=1) & np.isnan(turns).all(axis=1)
+        wrong = ~(missing | (np.isfinite(moves).all(axis=1) & (np.abs(norms - 1.0) <= NORM_TOLERANCE)))
+        if wrong.any():
+            i = int(wrong.argmax())
+            raise InvalidTransformError(
+                f"transform {i} is not rigid: translation {moves[i]}, rotation {turns[i]}",
+                reason="not a unit quaternion",
+            )
+        norms[np.abs(squares - 1.0) <= ROUNDING] = 1.0
+        self._columns = locked(np.vstack((moves.T, turns.T / norms)))
+        self._done = None
+
+    @property
+    def translations(self) -> Floats:
+        """(x, y, z) of each in m: a read-only array of shape (n, 3), a view of columns and so not C-contiguous."""
+        return self._columns[:3].T
+
+    @property
+    def rotations(self) -> Floats:
+        """The unit quaternion (x, y, z, w) of each: a read-only array of shape (n, 4), a view as `translations`."""
+        return self._columns[3:].T
+
+    @property
+    def valid(self) -> npt.NDArray[np.bool_]:
+        """Whether each is a transform, not NaN: a new array of shape (n,)."""
+        return np.asarray(np.isfinite(self._columns).all(axis=0))
+
+    @property
+    def extrapolated_by(self) -> Integers:
+        """As `TransformStamped.extrapolated_by`, of each: a read-only array of shape (n,) in ns."""
+        return locked(np.zeros(len(self), np.int64)) if self._done is None else self._done[0]
+
+    @property
+    def gap(self) -> Integers | None:
+        """As `TransformStamped.gap`, of each: a read-only array of shape (n,) in ns; None without a policy.
+
+        A gap of more than 2^63 - 1 ns is told as that.
+        """
+        return None if self._done is None else self._done[1]
+
+    def matrices(self) -> Floats:
+        """New homogeneous matrices of shape (n, 4, 4)."""
+        matrices = np.zeros((len(self), 4, 4))
+        rotation = (*self._columns[3:],)
+        for axis, unit in enumerate(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))):
+            matrices[:, :3, axis] = np.transpose(rotate(rotation, *unit))
+        matrices[:, :3, 3] = self.translations
+        matrices[:, 3, 3] = 1.0
+        return matrices
+
+    def apply(self, points: npt.ArrayLike) -> npt.NDArray[Any]:
+        """Each point by its own transform.
+
+        Parameters
+        ----------
+        points : array of shape (n, 3)
+            In m. float32 stays float32; integers become float64.
+
+        Returns
+        -------
+        array of shape (n, 3)
+
+        Raises
+        ------
+        ValueError
+            If the shape is another. The message has the shape.
+        """
+        array = np.asarray(points)
+        if array.shape != (len(self), 3):
+            raise ValueError(f"points must have shape ({len(self)}, 3), one for each transform, got {array.shape}")
+        dtype = array.dtype if np.issubdtype(array.dtype, np.floating) else np.dtype(np.float64)
+        moved = np.empty(array.shape, dtype)
+        with np.errstate(invalid="ignore"):
+            moved.T[:] = move((*self._columns,), *array.T.astype(np.float64))
+        return moved
+
+    def inverse(self) -> "TransformArray":
+        """The transforms that undo these; what a policy did is not carried over."""
+        return from_columns(np.stack(invert((*self._columns,))))
+
+    def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
+        """Each composed with one of `other`, or all with the same; what a policy did is not carried over."""
+        columns = _columns_of(other, len(self))
+        return NotImplemented if columns is None else from_columns(np.stack(compose((*self._columns,), columns)))
+
+    def __rmatmul__(self, other: Transform) -> "TransformArray":
+        columns = _columns_of(other, len(self))
+        return NotImplemented if columns is None else from_columns(np.stack(compose(columns, (*self._columns,))))
+
+    def __len__(self) -> int:
+        return len(self._columns[0])
+
+    @overload
+    def __getitem__(self, index: int | np.integer[Any]) -> Transform: ...
+    @overload
+    def __getitem__(self, index: slice | list[int] | list[bool] | npt.NDArray[Any]) -> "TransformArray": ...
+    def __getitem__(self, index: Any) -> "Transform | TransformArray":
+        """One transform, or those of a slice, or of a mask or indices in a list or an array.
+
+        Raises
+        ------
+        IndexError
+            If there is none at the index, or it is anything else, such as a tuple.
+        InvalidTransformError
+            If the one that is asked for is NaN.
+        """
+        try:
+            columns = None if isinstance(index, tuple) else self._columns[:, index]
+        except IndexError:
+            columns = None
+        if columns is None or columns.ndim > 2:
+            raise IndexError(
+                f"index {index!r} does not fit {len(self)} transforms: give an int, a slice, or a mask or indices in a "
+                "list or an array"
+            )
+        if columns.ndim == 2:
+            return from_columns(columns, None if self._done is None else self._done[:, index])
+        x, y, z, qx, qy, qz, qw = columns.tolist()
+        if x != x:
+            raise InvalidTransformError(f"transform {index} is NaN: it has no value", reason="not finite")
+        return from_row((x, y, z, qx, qy, qz, qw))
+
+    def __iter__(self) -> Iterator[Transform]:
+        return (self[i] for i in range(len(self)))
+
+    def __repr__(self) -> str:
+        return f"<TransformArray of {len(self)}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return from_columns, (self._columns, self._done)
+
+
+def from_rows(rows: list[Row]) -> TransformArray:
+    """The transforms of rows that are known to be good."""
+    return from_columns(np.array(rows).T if rows else np.empty((7, 0)))
+
+
+def from_columns(columns: Floats, done: Integers | None = None) -> TransformArray:
+    """The transforms of an array of shape (7, n) that is known to be good, with what a policy did, of shape (2, n).
+
+    The arrays belong to the transforms from now on.
+    """
+    transforms = TransformArray.__new__(TransformArray)
+    transforms._columns = locked(columns)
+    transforms._done = None if done is None else locked(done)
+    return transforms
+
+
+def move(columns: Columns, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
+    """Points, given and returned by coordinate, each moved by its own transform."""
+    x, y, z = rotate(columns[3:], x, y, z)
+    return columns[0] + x, columns[1] + y, columns[2] + z
+
+
+def _columns_of(other: object, count: int) -> Columns | None:
+    if isinstance(other, Transform):
+        return other._row
+    if not isinstance(other, TransformArray):
+        return None
+    if len(other) != count:
+        raise ValueError(f"{count} and {len(other)} transforms cannot be combined one by one")
+    return (*other._columns,)

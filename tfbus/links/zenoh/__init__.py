@@ -1,0 +1,5 @@
+"""Links over zenoh: peer to peer, or through a router."""
+
+from tfbus.links.zenoh.zenoh_link import ZenohLink
+
+__all__ = ["ZenohLink"]

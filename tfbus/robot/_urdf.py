@@ -1,0 +1,229 @@
+"""Reading URDF, the description of a robot as links and joints.
+
+urdf-parser-py knows what the elements mean, but complains on standard error of whatever it does not know, and stops at
+the legacy transmissions of real robots. So it gets only what it knows, element by element; the tree of the elements is
+built here, and safely: files come from anywhere.
+"""
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree as ET
+from xml.etree.ElementTree import Element
+
+from tfbus.errors import InvalidRobotError, InvalidTransformError
+from tfbus.geometry.transform import Transform
+from tfbus.robot.joint import Joint, Mimic, element
+
+DEPTH = 100
+"""How deep elements may be nested; in URDF it is less than ten."""
+
+READ = ("link", "joint", "material")
+KNOWN = {
+    "robot": "name version",
+    "link": "name, inertial visual collision",
+    "joint": "name type, origin axis parent child limit dynamics safety_controller calibration mimic",
+    "material": "name, color texture",
+    "inertial": ", origin mass inertia",
+    "visual": "name, origin geometry material",
+    "collision": "name, origin geometry",
+    "geometry": ", box cylinder sphere mesh",
+    "origin": "xyz rpy",
+    "axis": "xyz",
+    "parent": "link",
+    "child": "link",
+    "limit": "effort lower upper velocity",
+    "dynamics": "damping friction",
+    "safety_controller": "k_velocity k_position soft_lower_limit soft_upper_limit",
+    "calibration": "rising falling",
+    "mimic": "joint multiplier offset",
+    "mass": "value",
+    "inertia": "ixx ixy ixz iyy iyz izz",
+    "box": "size",
+    "cylinder": "radius length",
+    "sphere": "radius",
+    "mesh": "filename scale",
+    "color": "rgba",
+    "texture": "filename",
+}
+"""The attributes of each element, and after a comma the elements in it, that urdf-parser-py reads."""
+
+REPEATED = {"visual", "collision"}
+NEEDED = {"parent": "link", "child": "link", "axis": "xyz", "mass": "value"}
+"""Attributes whose absence urdf-parser-py does not notice."""
+
+XACRO = {"arg", "attribute", "call", "element", "if", "include", "insert_block", "macro", "property", "unless"}
+
+
+class Urdf(NamedTuple):
+    """What a URDF says of links and joints, in the order of the file."""
+
+    name: str
+    links: tuple[str, ...]
+    joints: tuple[Joint, ...]
+
+
+def read_urdf(source: str | os.PathLike[str]) -> Urdf:
+    """The links and joints of a URDF.
+
+    Parameters
+    ----------
+    source : str or path
+        The text itself, if it is a string with a ``<`` in it; else where the file is.
+
+    Raises
+    ------
+    InvalidRobotError
+        If it is not XML, not URDF, or an element is malformed. The message names the element.
+    OSError
+        If the file cannot be read.
+    ImportError
+        If urdf-parser-py is not installed.
+    """
+    try:
+        from urdf_parser_py import urdf
+    except ImportError as error:
+        raise ImportError('to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"') from error
+    text = source if isinstance(source, str) and "<" in source else Path(source).read_bytes()
+    robot = _parsed(text)
+    if robot.tag != "robot":
+        raise InvalidRobotError(f"a URDF is a <robot>, but this is a <{robot.tag}>")
+    _check_expanded(robot)
+    name = _understood(urdf, robot, element("robot", robot.get("name"))).name
+    links, joints = [], []
+    for part, place in _parts(robot):
+        if part.tag == "material" and part.find("color") is None and part.find("texture") is None:
+            raise InvalidRobotError("it has neither a color nor a texture", element=place)
+        found = _understood(urdf, part, place)
+        if part.tag == "link":
+            links.append(found.name)
+        elif part.tag == "joint":
+            joints.append(_joint(found, place))
+    return Urdf(name, tuple(links), tuple(joints))
+
+
+def _parsed(text: str | bytes) -> Element:
+    """The root of a document; the namespace that an unprefixed name may have is taken off."""
+    parser = ET.XMLParser(target=_Builder())
+    try:
+        parser.feed(text)
+        root: Element = parser.close()
+    except InvalidRobotError:
+        raise
+    except (ET.ParseError, LookupError, ValueError) as error:
+        raise InvalidRobotError(f"it is not well-formed XML: {error}") from None
+    namespace = root.tag[: root.tag.rfind("}") + 1]
+    for node in root.iter():
+        node.tag = node.tag.removeprefix(namespace)
+    return root
+
+
+class _Builder(ET.TreeBuilder):
+    """Builds the tree, but not one that is there to do harm."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = 0
+
+    def start(self, tag: Any, attrs: Any, /) -> Element:
+        self._depth += 1
+        if self._depth > DEPTH:
+            raise InvalidRobotError(f"its elements are nested more than {DEPTH} deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> Element:
+        self._depth -= 1
+        return super().end(tag)
+
+    def doctype(self, *_: object) -> None:
+        raise InvalidRobotError("it has a <!DOCTYPE>, which can define entities without end: URDF needs none")
+
+
+def _check_expanded(robot: Element) -> None:
+    """Raise `InvalidRobotError` for what xacro has yet to work on.
+
+    Calls of macros that xacro did not know stay in some real files as elements of the robot: those do no harm.
+    """
+    for part in robot:
+        read = part.tag in READ
+        for node in part.iter() if read else (part,):
+            namespace, _, tag = node.tag.rpartition("}")
+            if "xacro" in namespace and (read or tag in XACRO):
+                raise InvalidRobotError(
+                    "this is still to be expanded: run xacro on the file first",
+                    element=element(f"xacro:{tag}", node.get("name")),
+                )
+            for value in node.attrib.values() if read else ():
+                if "${" in value or "$(" in value:
+                    raise InvalidRobotError(
+                        f"{value!r} is still to be expanded: run xacro on the file first",
+                        element=element(part.tag, part.get("name")),
+                    )
+
+
+def _parts(robot: Element) -> Iterator[tuple[Element, str]]:
+    """The elements of a robot that are read, and how errors call each; without a name they are counted."""
+    seen: Counter[str] = Counter()
+    for part in robot:
+        if part.tag in READ:
+            seen[part.tag] += 1
+            name = part.get("name")
+            yield part, element(part.tag, name) + (f" number {seen[part.tag]}" if name is None else "")
+
+
+def _understood(parser: Any, part: Element, place: str) -> Any:
+    """What urdf-parser-py makes of one element."""
+    known = _known(part, place)
+    path = parser.xmlr.Path(part.tag)
+    try:
+        return getattr(parser, part.tag.capitalize()).from_xml(known, path)
+    except Exception as error:  # noqa: BLE001 - it raises plain ones
+        # Its own errors tell where they were, but on several lines.
+        where = str(getattr(error, "path", path)).removeprefix(str(path)).strip("/")
+        text = " ".join(str(getattr(error, "e", error)).split()) or type(error).__name__
+        raise InvalidRobotError(f"{where}: {text}" if where else text, element=place) from None
+
+
+def _known(node: Element, place: str) -> Element:
+    """A copy of an element with those parts alone that urdf-parser-py knows; of all others it would complain."""
+    attributes, _, inside = (names.split() for names in KNOWN[node.tag].partition(","))
+    if NEEDED.get(node.tag, "") not in ("", *node.attrib):
+        raise InvalidRobotError(f"<{node.tag}> has no {NEEDED[node.tag]}", element=place)
+    copy = Element(node.tag, {name: value for name, value in node.attrib.items() if name in attributes})
+    for child in node:
+        shape = child.find("geometry/*")
+        # Other programs know other shapes, such as capsules; how a link looks is not for us to judge.
+        if child.tag not in inside or (shape is not None and shape.tag not in KNOWN):
+            continue
+        if child.tag not in REPEATED and copy.find(child.tag) is not None:
+            raise InvalidRobotError(f"there is more than one <{child.tag}>", element=place)
+        copy.append(_known(child, place))
+    return copy
+
+
+def _joint(found: Any, place: str) -> Joint:
+    """A joint of urdf-parser-py as one of ours."""
+    origin = Transform()
+    if found.origin is not None:
+        try:
+            origin = Transform.from_xyz_rpy(found.origin.xyz, found.origin.rpy)
+        except InvalidTransformError as error:
+            raise InvalidRobotError(f"origin: {error}", element=place) from None
+    mimic = None
+    if found.mimic is not None:
+        multiplier, offset = found.mimic.multiplier, found.mimic.offset
+        mimic = Mimic(found.mimic.joint, 1.0 if multiplier is None else multiplier, 0.0 if offset is None else offset)
+    limited = found.limit is not None and found.type in ("revolute", "prismatic")
+    return Joint(
+        name=found.name,
+        kind=found.type,
+        parent=found.parent,
+        child=found.child,
+        origin=origin,
+        axis=(1.0, 0.0, 0.0) if found.axis is None else tuple(found.axis),
+        lower=found.limit.lower if limited else None,
+        upper=found.limit.upper if limited else None,
+        mimic=mimic,
+    )

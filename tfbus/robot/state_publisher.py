@@ -1,0 +1,107 @@
+"""Publishing a robot: its fixed joints once, and the moving ones with each message of their positions."""
+
+import logging
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus._log import OnceLogger
+from tfbus.bus.bus import Bus
+from tfbus.frames import as_prefix
+from tfbus.robot.joint import Position
+from tfbus.robot.model import RobotModel
+from tfbus.statistics import RobotStatistics
+
+
+class RobotStatePublisher:
+    """Turns positions of joints into transforms on a bus.
+
+    Making one sends the fixed joints, as statics: the bus latches them, so whoever joins later gets them too.
+
+    Parameters
+    ----------
+    bus : Bus
+    model : RobotModel
+    prefix : str
+        What the bus has before the names of this robot's frames, such as ``"robot1/"``, so that several robots with
+        the same frames can share a bus. The names of joints are without it.
+    authority : str
+        Who says so: shown in errors and tools.
+
+    Raises
+    ------
+    InvalidTransformError
+        If the bus refuses a fixed joint, because it would close a loop of parents or belongs to another authority.
+    ValueError
+        If the prefix starts with a slash.
+    BusClosedError, TypeError
+    """
+
+    def __init__(self, bus: Bus, model: RobotModel, prefix: str = "", authority: str = "robot_state_publisher") -> None:
+        as_prefix(prefix or None, ())
+        self.bus = bus
+        self.model = model
+        self.prefix = prefix
+        self.authority = authority
+        self._messages = 0
+        self._unknown = 0
+        self._violations: Counter[str] = Counter()
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        bus.publish(model.fixed_transforms(bus.clock.now(), authority, prefix))
+
+    def publish(self, positions: Mapping[str, Position], stamp: int | None = None) -> None:
+        """Send where the moving joints are, as one batch.
+
+        Joints that are not in `positions`, and mimic none that is, are left out: they stay where they were last. Names
+        that the robot does not have, and positions beyond the limits, are counted and logged once; nothing is clamped.
+
+        Parameters
+        ----------
+        positions : mapping of str to float, sequence of floats, or Transform
+            By name of joint, as `Joint.transform` takes them.
+        stamp : int, optional
+            When the joints were there, in ns; by default the clock's now.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a position is not finite, has a wrong length or holds no unit quaternion, the stamp is bad, or the bus
+            refuses a frame. Nothing is sent.
+        BusClosedError, TypeError
+        """
+        stamp = self.bus.clock.now() if stamp is None else stamp
+        self.bus.publish(self.model.moving_transforms(positions, stamp, self.authority, self.prefix))
+        self._messages += 1
+        for name in self.model.unknown_joints(positions):
+            self._unknown += 1
+            self._log.warning(("unknown", name), "robot %r has no joint %r", self.model.name, name)
+        for violation in self.model.violations(positions):
+            self._violations[violation.joint] += 1
+            self._log.warning(("limits", violation.joint), "robot %r, %s", self.model.name, violation)
+
+    def publish_state(
+        self, names: Sequence[str], positions: Sequence[float] | npt.NDArray[np.floating], stamp: int | None = None
+    ) -> None:
+        """As `publish`, with names and positions side by side, as ROS has them in a ``JointState``.
+
+        Raises
+        ------
+        ValueError
+            If there are not as many positions as names, or a name is there twice.
+        InvalidTransformError, BusClosedError, TypeError
+            As `publish`.
+        """
+        if len(names) != len(positions):
+            raise ValueError(f"there are {len(names)} names of joints, but {len(positions)} positions")
+        values = positions.tolist() if isinstance(positions, np.ndarray) else positions
+        paired = dict(zip(names, values, strict=True))
+        if len(paired) < len(names):
+            twice = sorted(name for name, count in Counter(names).items() if count > 1)
+            raise ValueError(f"a joint has one position, but there are several of {', '.join(map(repr, twice))}")
+        self.publish(paired, stamp)
+
+    def statistics(self) -> RobotStatistics:
+        """All counters, as they are now."""
+        return RobotStatistics(self._messages, self._unknown, dict(self._violations))

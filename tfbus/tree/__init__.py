@@ -1,0 +1,12 @@
+"""All frames and their history: a tree answers where one frame was, seen from another, or raises.
+
+No clock, no event loop, no input or output, and nothing of a bus: this room can be used alone, offline.
+"""
+
+from tfbus.tree.explanation import ExplainedEdge, Explanation
+from tfbus.tree.history import Edge, Outcome
+from tfbus.tree.policy import Hold
+from tfbus.tree.question import Question
+from tfbus.tree.tree import TransformTree
+
+__all__ = ["Edge", "ExplainedEdge", "Explanation", "Hold", "Outcome", "Question", "TransformTree"]

@@ -1,0 +1,67 @@
+"""One edge's interpolation at many stamps.
+
+The edge is prepared once: for each sample the rates towards the next one, so that a stamp costs one search, one sine
+and one cosine. Where there are fewer stamps than samples, only the samples that are asked for are prepared.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.geometry.rows import Columns
+from tfbus.stamps import Stamps
+from tfbus.tree.history import Samples
+
+Floats = npt.NDArray[np.float64]
+
+_STRAIGHT = 1e-9
+"""In place of an angle that rounds to zero: its own cosine is one to the last digit, so the arc is a straight line."""
+
+
+class Segments:
+    """One edge's interpolation at given stamps, prepared.
+
+    A segment goes from one sample to the next: ``t(s) = t0 + s v`` and ``q(s) = q0 cos(s w) + p sin(s w)``, with s the
+    ns since its first sample, and p the unit quaternion a right angle away from q0 on the shorter arc to the next
+    rotation. That is slerp with its two sines resolved (Shoemake 1985, section 3.3). The last sample has a segment of
+    its own, which stays where it is, and so has one that is followed by another parent.
+    """
+
+    def __init__(self, samples: Samples, stamps: Stamps) -> None:
+        its_stamps = np.frombuffer(samples.stamps, np.int64)
+        rows = np.frombuffer(samples.records, np.float64).reshape(-1, 8)[:, 1:]
+        self._segments: npt.NDArray[np.intp] | None = its_stamps.searchsorted(stamps, "right") - 1
+        self._elapsed = _nanoseconds(its_stamps[self._segments], stamps)
+        first = np.arange(len(its_stamps))
+        if len(stamps) < len(its_stamps):
+            first, self._segments = self._segments, None
+        last = np.minimum(first + 1, len(its_stamps) - 1)
+        if samples.parents is not None:
+            parents = np.array(samples.parents, object)
+            last = np.where(parents[first] == parents[last], last, first)
+        a, b = rows[first].T, rows[last].T
+        duration = _nanoseconds(its_stamps[first], its_stamps[last])
+        duration[first == last] = np.inf
+        dot = (a[3:] * b[3:]).sum(axis=0)
+        cosine = np.minimum(np.abs(dot), 1.0)
+        angle = np.maximum(np.arccos(cosine), _STRAIGHT)
+        sine = np.sin(angle)
+        self._table = np.empty((15, len(first)))
+        self._table[:7] = a
+        self._table[7:10] = (b[:3] - a[:3]) / duration
+        self._table[10:14] = (np.where(dot < 0.0, -b[3:], b[3:]) - cosine * a[3:]) / sine
+        self._table[14] = angle / duration
+
+    def at(self, part: slice) -> Columns:
+        """The transforms at some of the stamps."""
+        segments = self._segments
+        table = self._table[:, part] if segments is None else self._table.take(segments[part], axis=1)
+        elapsed = self._elapsed[part]
+        angle = elapsed * table[14]
+        moved = table[:3] + elapsed * table[7:10]
+        turned = table[3:7] * np.cos(angle) + table[10:14] * np.sin(angle)
+        return (*moved, *turned)
+
+
+def _nanoseconds(begin: Stamps, end: Stamps) -> Floats:
+    """From one stamp to a later one, however far they are apart."""
+    return (end - begin).view(np.uint64).astype(np.float64)

@@ -1,0 +1,137 @@
+"""How fast a frame moves: the analytic derivative of what the lookup interpolates.
+
+Between two samples the origin moves on a straight line at a constant velocity, and slerp turns at a constant angular
+velocity about an axis that stands still in the parent. At a sample the derivative is the one from before; at the first
+sample of a window, or of a new parent, it is the one from after.
+"""
+
+import math
+from bisect import bisect_left
+from typing import NamedTuple
+
+from tfbus.errors import PastExtrapolationError
+from tfbus.geometry.rows import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
+from tfbus.stamps import LATEST, SECOND
+from tfbus.tree._lookup import At, resolve
+from tfbus.tree._python_kernel import Step, climb
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import RECORD, RECORD_SIZE, FrameHistory
+from tfbus.tree.path import Path
+
+STILL: Vector = (0.0, 0.0, 0.0)
+
+
+class Motion(NamedTuple):
+    """Where a frame is and how it moves, seen from another; everything along that one's axes."""
+
+    row: Row
+    linear: Vector
+    """Velocity of the frame's origin in m/s."""
+    angular: Vector
+    """Angular velocity in rad/s."""
+
+
+def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tuple[int, Vector, Vector]:
+    """The stamp, and a frame's linear and angular velocity seen from `reference`, along the axes of a third frame.
+
+    The errors are those of `TransformTree.twist`. The caller holds the lock.
+    """
+    stamp = _common_stamp(forest, frame, reference, axes) if at is LATEST else at
+    # For its errors: of several edges without an answer, it names the one that decides.
+    resolve(forest, reference, frame, stamp, None)
+    turn = resolve(forest, axes, reference, stamp, None)[1][3:]
+    linear, angular = _motion(forest.find_path(reference, frame, stamp), stamp)
+    return stamp, rotate(turn, *linear), rotate(turn, *angular)
+
+
+def _common_stamp(forest: Forest, frame: str, reference: str, axes: str) -> int:
+    """The newest stamp at which both the frame and the axes are known; that of static samples if nothing moves."""
+    stamp, _, static = resolve(forest, reference, frame, LATEST, None)
+    other, _, still = resolve(forest, axes, reference, LATEST, None)
+    if still or static or stamp == other:
+        return stamp if still else other
+    (lagging_end, ahead_end), common = ((frame, axes), stamp) if stamp < other else ((axes, frame), other)
+    try:
+        resolve(forest, reference, ahead_end, common, None)
+    except PastExtrapolationError as error:
+        # As for one path, the edge that lags has to come as far as the others still reach back.
+        lagging = forest.find_path(reference, lagging_end, LATEST).newest_common()[1]
+        raise lagging.missing(common if error.oldest is None else error.oldest) from error
+    return common
+
+
+def _motion(path: Path, at: int) -> tuple[Vector, Vector]:
+    """The linear and angular velocity of a path's source, seen from its target.
+
+    Both ends are seen from the common ancestor first. Then the target's own motion is taken off, as in Craig,
+    "Introduction to Robotics", 3rd edition, section 5.3, and what is left is told along the target's axes.
+    """
+    above, below = _climb(path.up, at), _climb(path.down, at)
+    arm = _difference(above.row[:3], below.row[:3])
+    linear = _difference(_difference(above.linear, below.linear), _cross(below.angular, arm))
+    angular = _difference(above.angular, below.angular)
+    turn = invert(below.row)[3:]
+    return rotate(turn, *linear), rotate(turn, *angular)
+
+
+def _climb(steps: tuple[Step, ...], at: int) -> Motion:
+    """The motion of the first step's child, seen from the last step's parent."""
+    row, linear, angular = Motion(IDENTITY, STILL, STILL)
+    for step in steps:
+        here = _edge_motion(step, at) if isinstance(step, FrameHistory) else Motion(step, STILL, STILL)
+        turn = here.row[3:]
+        arm = rotate(turn, *row[:3])
+        linear = _sum(_sum(here.linear, _cross(here.angular, arm)), rotate(turn, *linear))
+        angular = _sum(here.angular, rotate(turn, *angular))
+        row = compose(here.row, row)
+    return Motion(row, linear, angular)
+
+
+def _edge_motion(edge: FrameHistory, at: int) -> Motion:
+    row = climb((edge,), at)
+    i = bisect_left(edge.stamps, at)
+    if edge.stamps[i] == at and not _joined(edge, i):
+        i += 1
+        if i == len(edge.stamps):
+            # A lone sample says where the frame is, but not where it is going.
+            raise edge.missing(at + 1)
+    if not _joined(edge, i):
+        return Motion(row, STILL, STILL)
+    stamp, ax, ay, az, *before = RECORD.unpack_from(edge.records, (i - 1) * RECORD_SIZE)
+    until, bx, by, bz, *after = RECORD.unpack_from(edge.records, i * RECORD_SIZE)
+    rate = SECOND / (until - stamp)
+    linear = (bx - ax) * rate, (by - ay) * rate, (bz - az) * rate
+    return Motion(row, linear, _turn_rate(tuple(before), tuple(after), rate))
+
+
+def _joined(edge: FrameHistory, i: int) -> bool:
+    """Whether there is a segment from the sample before to this one: both in the window, with the same parent."""
+    if not edge.start < i < len(edge.stamps):
+        return False
+    return edge.parents is None or edge.origins[i - 1][0] == edge.origins[i][0]
+
+
+def _turn_rate(before: Quaternion, after: Quaternion, rate: float) -> Vector:
+    """The constant angular velocity that turns one rotation into the next along the shorter arc, in the parent."""
+    x, y, z, _ = compose((0.0, 0.0, 0.0, *after), invert((0.0, 0.0, 0.0, *before)))[3:]
+    sine = math.hypot(x, y, z)
+    if sine == 0.0:
+        return STILL
+    # Added up as the lookup does it, for where this is all rounding it decides which way a half turn goes.
+    ai, aj, ak, aw = before
+    bi, bj, bk, bw = after
+    dot = ai * bi + aj * bj + ak * bk + aw * bw
+    scale = 2.0 * math.atan2(sine, abs(dot)) / sine * (-rate if dot < 0.0 else rate)
+    return x * scale, y * scale, z * scale
+
+
+def _sum(a: Vector, b: Vector) -> Vector:
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+def _difference(a: Vector, b: Vector) -> Vector:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -1,0 +1,117 @@
+"""Loops of parents.
+
+The newest edges of all frames must form a forest. A batch is judged as a whole, so one batch may turn an edge round.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.stamped import Batch, TransformStamped
+
+_SHOWN = 10
+
+
+class NewestEdge(Protocol):
+    """The newest that is known of one child."""
+
+    @property
+    def parent(self) -> str: ...
+
+    @property
+    def static(self) -> bool: ...
+
+    @property
+    def newest(self) -> int | None: ...
+
+    @property
+    def authority(self) -> str: ...
+
+
+def admit(
+    edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]
+) -> tuple[Batch, list[InvalidTransformError]]:
+    """Split a batch into the samples that leave a forest and the errors of those that do not.
+
+    Of the samples that close a loop, the last one in the batch is refused, and so on until no loop is left.
+
+    Parameters
+    ----------
+    edges : mapping of child to its newest edge
+        A child that is neither static nor has a newest stamp counts as having no parent.
+    batch : sequence of TransformStamped
+    """
+    accepted: Sequence[TransformStamped] = batch
+    refused: list[InvalidTransformError] = []
+    while loops := _find_loops(edges, changes := _changed_parents(edges, accepted)):
+        loop_of = {frame: loop for loop in loops for frame in loop}
+        kept: list[TransformStamped] = []
+        for sample in reversed(accepted):
+            loop = loop_of.get(sample.child)
+            if loop is not None and changes.get(sample.child) == sample.parent:
+                refused.append(_cycle(edges, sample, loop))
+                for frame in loop:
+                    del loop_of[frame]
+            else:
+                kept.append(sample)
+        accepted = kept[::-1]
+    return tuple(accepted), refused
+
+
+def _cycle(edges: Mapping[str, NewestEdge], sample: TransformStamped, loop: tuple[str, ...]) -> InvalidTransformError:
+    start = loop.index(sample.child)
+    circle = (*loop[start:], *loop[: start + 1])
+    shown = (
+        circle if len(circle) <= _SHOWN else (*circle[: _SHOWN - 2], f"({len(circle) - _SHOWN + 1} more)", circle[-1])
+    )
+    others = sorted({edges[frame].authority for frame in loop if frame in edges and frame != sample.child} - {""})
+    return InvalidTransformError(
+        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {' -> '.join(shown)}"
+        + (f", with edges from {' and '.join(map(repr, others))}" if others else ""),
+        reason="cycle",
+        parent=sample.parent,
+        child=sample.child,
+        authority=sample.authority,
+        loop=circle,
+    )
+
+
+def _parent(edge: NewestEdge | None) -> str | None:
+    return None if edge is None or (edge.newest is None and not edge.static) else edge.parent
+
+
+def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
+    """The children whose newest parent is another one after the batch, with that parent."""
+    parents: dict[str, str] = {}
+    stamps: dict[str, int | None] = {}
+    for sample in batch:
+        parent, child, stamp, _, _, static = sample._fields
+        if child not in stamps:
+            edge = edges.get(child)
+            stamps[child] = None if edge is None else edge.newest
+        newest = stamps[child]
+        # The last kind wins; of moving samples, the newest stamp.
+        if static or newest is None or stamp >= newest:
+            parents[child] = parent
+            stamps[child] = None if static else stamp
+    return {child: parent for child, parent in parents.items() if parent != _parent(edges.get(child))}
+
+
+def _find_loops(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> list[tuple[str, ...]]:
+    """The loops that run through a changed child, each from a frame over its parents; they share no frame."""
+    loops: list[tuple[str, ...]] = []
+    judged: set[str] = set()
+    for child in changes:
+        walk: dict[str, None] = {}
+        here: str | None = child
+        while here is not None and here not in judged and here not in walk:
+            walk[here] = None
+            here = changes[here] if here in changes else _parent(edges.get(here))
+        if here in walk:
+            frames = list(walk)
+            circle = tuple(frames[frames.index(here) :])
+            # There may be others that are none of this batch's.
+            if not changes.keys().isdisjoint(circle):
+                loops.append(circle)
+        judged.update(walk)
+    return loops

@@ -1,0 +1,271 @@
+"""Why a lookup has the answer that it has, or none: what each edge on the path can tell of the instant.
+
+The caller of `explain` holds the lock; making text of an `Explanation` needs none.
+"""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import pairwise
+
+from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus.stamps import LATEST, Latest, format_duration, format_stamp, to_seconds
+from tfbus.tree._extrapolation import Leniency
+from tfbus.tree._extrapolation import place as place_of
+from tfbus.tree._lookup import At, resolve
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.path import Path
+from tfbus.tree.policy import Policy
+from tfbus.tree.rendering import format_rate
+
+
+@dataclass(frozen=True, slots=True)
+class ExplainedEdge:
+    """What one edge tells of the instant that was asked for.
+
+    Attributes
+    ----------
+    parent, child : str
+    static : bool
+    before, after : int or None
+        The stamps of the samples round the instant, in ns: the same twice if one has it, None where there is none.
+    fraction : float or None
+        How much of `after` is in the answer, 0 to 1: 0 where a sample has the instant, or where the parent changes at
+        `after`. None if the edge is static or does not answer.
+    extrapolated_by : int
+        How far a sample is away that stands in for the instant, in ns.
+    newest : int or None
+        The stamp of the newest sample, in ns; None if the edge is static or has none.
+    age : float or None
+        How old the newest sample was at the `now` of the explanation, in s.
+    rate : float or None
+        Mean samples a second over the window; None for fewer than two.
+    authority : str
+        Who sent the newest sample; may be empty.
+    error : ExtrapolationError or None
+        Why this edge blocks the answer.
+    """
+
+    parent: str
+    child: str
+    static: bool
+    before: int | None = None
+    after: int | None = None
+    fraction: float | None = None
+    extrapolated_by: int = 0
+    newest: int | None = None
+    age: float | None = None
+    rate: float | None = None
+    authority: str = ""
+    error: ExtrapolationError | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """How a lookup comes to its answer, or what keeps it from one. As a string, a text of several lines.
+
+    Attributes
+    ----------
+    target, source : str
+    at : int or LATEST
+        What was asked; ns.
+    stamp : int or None
+        The stamp of the answer, in ns; None if there is none.
+    now : int or None
+        The instant that ages are counted from, in ns.
+    chain : tuple of str
+        The frames from target to source; empty where there is no path.
+    half_chains : tuple of tuple of str
+        Where the two frames are in different trees: the frames from target up to its root, and those from source. If
+        they hang in a loop, the frame where it closes comes twice. Else empty.
+    edges : tuple of ExplainedEdge
+        One for each two neighbours in the chain, in its order; or in those of target's half chain, then source's.
+    errors : tuple of TransformLookupError
+        All that blocks the answer. The one that a lookup raises is among them.
+    """
+
+    target: str
+    source: str
+    at: At
+    stamp: int | None = None
+    now: int | None = None
+    chain: tuple[str, ...] = ()
+    half_chains: tuple[tuple[str, ...], ...] = ()
+    edges: tuple[ExplainedEdge, ...] = ()
+    errors: tuple[TransformLookupError, ...] = ()
+
+    @property
+    def answerable(self) -> bool:
+        """Whether a lookup had an answer."""
+        return not self.errors
+
+    def __str__(self) -> str:
+        when = ", latest" if isinstance(self.at, Latest) else f" at {format_stamp(self.at)}"
+        if not self.answerable:
+            when += ": no answer"
+        elif isinstance(self.at, Latest) and self.stamp is not None:
+            when += f": {format_stamp(self.stamp)}"
+        lines = [f"{self.source!r} in {self.target!r}{when}"]
+        rows = _aligned([_cells(edge, self) for edge in self.edges])
+        if self.half_chains:
+            up = len(self.half_chains[0]) - 1
+            for half, of_it in zip(self.half_chains, (rows[:up], rows[up:]), strict=True):
+                lines += [f"  {half[0]!r} is a root" if len(half) == 1 else f"  up from {half[0]!r} to {half[-1]!r}"]
+                lines += [f"  {row}" for row in of_it]
+        else:
+            lines += rows
+        for error in self.errors:
+            lines.append(f"! {error}")
+            if isinstance(error.__cause__, TransformLookupError):
+                lines.append(f"  because {error.__cause__}")
+        return "\n".join(lines)
+
+
+def _cells(edge: ExplainedEdge, whole: Explanation) -> list[str]:
+    """What is told of an edge, a column each."""
+    below = not whole.half_chains and whole.chain.index(edge.parent) < whole.chain.index(edge.child)
+    age = ""
+    if edge.newest is not None and whole.now is not None:
+        age = f"age {format_duration(whole.now - edge.newest)}"
+    return [
+        "!" if edge.error is not None else " ",
+        f"{edge.parent} <- {edge.child}" if below else f"{edge.child} -> {edge.parent}",
+        format_rate(edge.static, edge.newest, edge.rate),
+        age,
+        _samples(edge),
+        f"from {edge.authority!r}" if edge.authority else "",
+    ]
+
+
+def _samples(edge: ExplainedEdge) -> str:
+    before, after = ("" if stamp is None else format_stamp(stamp) for stamp in (edge.before, edge.after))
+    samples = before if before == after else f"{before} .. {after}".strip()
+    if edge.extrapolated_by:
+        return f"{samples}, {format_duration(edge.extrapolated_by)} off"
+    return f"{samples}, {edge.fraction:.1%}" if edge.fraction is not None and before != after else samples
+
+
+def _aligned(rows: list[list[str]]) -> list[str]:
+    """Rows of cells, each column as wide as its widest."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    gaps = [1, *(2 if width else 0 for width in widths[1:])]
+    return [
+        "".join(f"{cell:<{width}}{' ' * gap}" for cell, width, gap in zip(row, widths, gaps, strict=True)).rstrip()
+        for row in rows
+    ]
+
+
+def explain(
+    forest: Forest, target: str, source: str, at: At, not_before: int | None, policy: Policy | None, now: int | None
+) -> Explanation:
+    """What a lookup with these arguments goes by. The parameters are those of `TreeReader.explain`."""
+    stamp: int | None = None
+    raised: TransformLookupError | None = None
+    try:
+        stamp, _, _ = resolve(forest, target, source, at, not_before, None if policy is None else Leniency(policy))
+    except TransformLookupError as error:
+        raised = error
+    if isinstance(raised, UnknownFrameError):
+        return Explanation(target, source, at, None, now, errors=_unknown(forest, target, source))
+    if now is None:
+        newest = [edge.newest for edge in forest.frames.values()]
+        now = max((reached for reached in newest if reached is not None), default=None)
+    if isinstance(raised, DisconnectedError):
+        halves = tuple(_up_to_root(forest, frame, raised.stamp) for frame in (target, source))
+        links = [link for half in halves for link in pairwise(half)]
+        edges = tuple(_explained(forest.frames[child], parent, raised.stamp, now, policy) for child, parent in links)
+        return Explanation(target, source, at, None, now, half_chains=halves, edges=edges, errors=(raised,))
+    path = forest.find_path(target, source, at if stamp is None else stamp)
+    chain, top = path.frames, path.frames.index(path.root)
+    links = [*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:]))]
+    instant = stamp
+    if isinstance(raised, ExtrapolationError):
+        instant = _reached(path) if isinstance(at, Latest) else at
+    found = []
+    for child, parent in links:
+        edge = forest.frames[child]
+        blocked = _block(edge, at, raised, policy) if isinstance(raised, ExtrapolationError) else None
+        found.append(_explained(edge, parent, instant, now, policy, blocked))
+    errors = tuple(edge.error for edge in found if edge.error is not None)
+    return Explanation(target, source, at, stamp, now, chain, (), tuple(found), errors)
+
+
+def _unknown(forest: Forest, *frames: str) -> tuple[UnknownFrameError, ...]:
+    errors = []
+    for frame in dict.fromkeys(frames):
+        try:
+            forest.check_known(frame)
+        except UnknownFrameError as error:
+            errors.append(error)
+    return tuple(errors)
+
+
+def _up_to_root(forest: Forest, frame: str, instant: int | None) -> tuple[str, ...]:
+    """A frame, its parent and so on, up to a frame without one or to one that comes again."""
+    walk = {frame: None}
+    here = frame
+    while (edge := forest.frames.get(here)) is not None:
+        here = edge.parent if instant is None else edge.parent_at(instant)
+        if here in walk:
+            return (*walk, here)
+        walk[here] = None
+    return tuple(walk)
+
+
+def _reached(path: Path) -> int | None:
+    """The newest stamp that all moving edges have reached; None if one has no samples."""
+    return path.newest_common()[0] if all(edge.stamps for edge in path.moving) else None
+
+
+def _explained(
+    edge: FrameHistory,
+    parent: str,
+    instant: int | None,
+    now: int | None,
+    policy: Policy | None,
+    error: ExtrapolationError | None = None,
+) -> ExplainedEdge:
+    if edge.static:
+        return ExplainedEdge(parent, edge.child, True, authority=edge.authority)
+    facts = edge.edge()
+    age = None if facts.newest is None or now is None else to_seconds(now - facts.newest)
+    before = after = fraction = None
+    away = 0
+    if instant is not None:
+        before, after = edge.around(instant)
+        with suppress(ExtrapolationError):
+            place = place_of(edge, instant, policy or Policy())
+            away = place.extrapolated_by
+            fraction = _fraction(edge, place.stamp, before, after)
+    return ExplainedEdge(
+        parent, edge.child, False, before, after, fraction, away, facts.newest, age, facts.rate, facts.authority, error
+    )
+
+
+def _fraction(edge: FrameHistory, stamp: int, before: int | None, after: int | None) -> float:
+    """How much of `after` is in what the edge tells of a stamp that it covers."""
+    if before is None or after is None or stamp == before:
+        return 0.0 if stamp == before else 1.0
+    if stamp < after and edge.parent_at(before) != edge.parent_at(after):
+        return 0.0
+    return (stamp - before) / (after - before)
+
+
+def _block(edge: FrameHistory, at: At, raised: ExtrapolationError, policy: Policy | None) -> ExtrapolationError | None:
+    """Why an edge blocks an answer, if it does; `raised` is what the lookup says."""
+    if edge.child == raised.child:
+        return raised
+    if edge.static:
+        return None
+    if not isinstance(at, Latest):
+        try:
+            place_of(edge, at, policy or Policy())
+        except ExtrapolationError as error:
+            return error
+        return None
+    # `LATEST` waits until those that lag have come as far as the others reach back.
+    if isinstance(raised.stamp, Latest):
+        return None if edge.stamps else edge.missing(LATEST)
+    if edge.stamps and edge.stamps[-1] >= raised.stamp - raised.slack:
+        return None
+    return edge.missing(raised.stamp, raised.slack)

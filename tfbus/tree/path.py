@@ -1,0 +1,164 @@
+"""The way between two frames, and the arithmetic along it.
+
+A path climbs from the source to the lowest common ancestor and from the target to the same frame, so no edge above that
+can fail or slow a lookup. Runs of static edges are folded into one row. `climb` is the kernel of every scalar lookup:
+one loop over Python floats, because a function call or a small array for each edge would cost more than its arithmetic.
+Its formulas are those of `tfbus.geometry`.
+"""
+
+from collections.abc import Mapping
+
+from tfbus.errors import DisconnectedError, ExtrapolationError, PastExtrapolationError
+from tfbus.geometry.rows import Row, compose, invert
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN
+from tfbus.tree._python_kernel import Step, climb
+from tfbus.tree.history import FrameHistory
+
+
+class Path:
+    """How to get from `source` to `target`, with the parents that hold at one instant.
+
+    Attributes
+    ----------
+    up, down : tuple of steps
+        From source, and from target, to the common ancestor: moving edges, and the rows that static ones amount to.
+    frames : tuple of str
+        From target to source, the common ancestor once.
+    root : str
+        The common ancestor.
+    moving : tuple of FrameHistory
+        The edges that are not static.
+    lasting : bool
+        Whether it is the path at every stamp, because no frame on it changes parent inside its window.
+    """
+
+    __slots__ = ("_static", "down", "frames", "lasting", "moving", "root", "up")
+
+    def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
+        edges = ups + downs
+        self.up = _fold(ups)
+        self.down = _fold(downs)
+        self.root = root
+        self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
+        self.moving = tuple(edge for edge in edges if not edge.static)
+        self.lasting = all(edge.parents is None for edge in edges)
+        self._static = tuple(edge for edge in edges if edge.static)
+
+    @property
+    def static_stamp(self) -> int:
+        """The newest stamp among the static samples, in ns; sending one again may change it, but not the path."""
+        return max((edge.static_stamp or 0 for edge in self._static), default=0)
+
+    def row(self, at: int) -> Row:
+        """Source in target at a stamp.
+
+        Raises
+        ------
+        ExtrapolationError
+            If an edge does not cover it.
+        """
+        if not self.down:
+            return climb(self.up, at)
+        return compose(invert(climb(self.down, at)), climb(self.up, at))
+
+    def rows(self, stamps: list[int]) -> list[Row]:
+        """As `row`, at some stamps."""
+        if not self.down:
+            return [climb(self.up, at) for at in stamps]
+        return [self.row(at) for at in stamps]
+
+    def newest_common(self) -> tuple[int, FrameHistory]:
+        """The newest stamp that every moving edge has reached, and the edge that has come no further.
+
+        Raises
+        ------
+        FutureExtrapolationError
+            If an edge has no samples.
+        """
+        lagging = self.moving[0]
+        common = STAMP_MAX
+        for edge in self.moving:
+            if not edge.stamps:
+                raise edge.missing(LATEST)
+            if edge.stamps[-1] < common:
+                lagging, common = edge, edge.stamps[-1]
+        return common, lagging
+
+    def blocker(self, at: int) -> ExtrapolationError:
+        """The edge that decides among those that do not cover a stamp: one past for good, or the last to come."""
+        missing = [edge.missing(at) for edge in self.moving if not edge.covers(at)]
+        for error in missing:
+            if isinstance(error, PastExtrapolationError):
+                return error
+        return min(missing, key=lambda error: STAMP_MIN if error.newest is None else error.newest)
+
+
+def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
+    steps: list[Step] = []
+    for edge in edges:
+        if not edge.static:
+            steps.append(edge)
+        elif steps and isinstance(steps[-1], tuple):
+            steps[-1] = compose(edge.row, steps[-1])
+        else:
+            steps.append(edge.row)
+    return tuple(steps)
+
+
+def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: int | None) -> Path:
+    """The path that holds at a stamp, or with each frame's newest parent.
+
+    Both ends climb in turn, so the search stops at most one side's length beyond the common ancestor.
+
+    Parameters
+    ----------
+    frames : mapping of child to its history
+    target, source : str
+    at : int or None
+        ns; None for the newest parents.
+
+    Raises
+    ------
+    DisconnectedError
+        If they do not meet, or a side comes back to where it was: out-of-order samples can form a loop in the past.
+    """
+    up, down = _Climber(frames, source, at), _Climber(frames, target, at)
+    while True:
+        for meeting in (up.here, down.here):
+            if meeting in up.seen and meeting in down.seen:
+                return Path(up.edges[: up.seen[meeting]], down.edges[: down.seen[meeting]], meeting)
+        if up.ended and down.ended:
+            raise DisconnectedError(
+                target=target, source=source, roots=(down.here, up.here), stamp=at, loop=up.loop or down.loop
+            )
+        up.climb()
+        down.climb()
+
+
+class _Climber:
+    """One end of a path on its way to the root."""
+
+    __slots__ = ("_at", "_frames", "edges", "ended", "here", "loop", "seen")
+
+    def __init__(self, frames: Mapping[str, FrameHistory], frame: str, at: int | None) -> None:
+        self._frames = frames
+        self._at = at
+        self.here = frame
+        self.edges: list[FrameHistory] = []
+        self.seen = {frame: 0}
+        self.ended = False
+        self.loop: tuple[str, ...] = ()
+
+    def climb(self) -> None:
+        """Go one edge up, unless this is the root."""
+        edge = self._frames.get(self.here)
+        if edge is None or self.ended:
+            self.ended = True
+            return
+        self.here = edge.parent if self._at is None else edge.parent_at(self._at)
+        self.edges.append(edge)
+        if self.here in self.seen:
+            self.loop = (*[edge.child for edge in self.edges[self.seen[self.here] :]], self.here)
+            self.ended = True
+        else:
+            self.seen[self.here] = len(self.edges)

@@ -1,0 +1,140 @@
+"""Pictures of a tree: text for people, Graphviz, and tf2's YAML."""
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from tfbus.stamps import format_duration, format_stamp
+from tfbus.tree.history import Edge
+
+_NOT_IN_YAML = re.compile(r"[\x7f-\xa0\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
+
+
+def describe(edges: Sequence[Edge], now: int | None = None) -> str:
+    """The edges as an indented tree, one frame a line, with rate, age, span and authority.
+
+    Parameters
+    ----------
+    edges : sequence of Edge
+    now : int, optional
+        The stamp that ages are counted from, in ns; by default the newest among the edges.
+    """
+    if not edges:
+        return "(no frames)"
+    if now is None:
+        now = max((edge.newest for edge in edges if edge.newest is not None), default=0)
+    lines = [(f"{branch.guides}{branch.frame}", branch.edge) for branch in branches(edges)]
+    width = max(len(label) for label, _ in lines) + 2
+    return "\n".join(
+        label if edge is None else f"{label:<{width}}{'  '.join(facts(edge, now).values())}" for label, edge in lines
+    )
+
+
+def facts(edge: Edge, now: int) -> dict[str, str]:
+    """What is known of an edge, for people: rate, age, span and authority, as far as it has them."""
+    known = {"rate": _rate(edge)}
+    if edge.oldest is not None and edge.newest is not None:
+        known["age"] = f"age {format_duration(now - edge.newest)}"
+        known["span"] = f"span {format_duration(edge.newest - edge.oldest)}"
+    if edge.authority:
+        known["authority"] = f"from {edge.authority!r}"
+    return known
+
+
+def _rate(edge: Edge) -> str:
+    return format_rate(edge.static, edge.newest, edge.rate)
+
+
+def format_rate(static: bool, newest: int | None, rate: float | None) -> str:
+    """How often samples come, for people: ``static``, ``10.0 Hz``, ``one sample``."""
+    if static:
+        return "static"
+    if newest is None:
+        return "no samples"
+    if rate is None:
+        return "one sample"
+    return f"{rate:.1f} Hz" if rate >= 1.0 else f"{rate:.2g} Hz"
+
+
+class Branch(NamedTuple):
+    """One line of a picture: the frame, what is drawn before it, and its edge unless it is a root."""
+
+    guides: str
+    frame: str
+    edge: Edge | None
+
+
+def branches(edges: Sequence[Edge]) -> Iterator[Branch]:
+    """All frames as they are drawn, roots first; a loop is opened at one of its frames."""
+    below: dict[str, list[Edge]] = {}
+    for edge in edges:
+        below.setdefault(edge.parent, []).append(edge)
+    above = {edge.child: edge.parent for edge in edges}
+    drawn: set[str] = set()
+    for frame in [*sorted(parent for parent in below if parent not in above), *sorted(above)]:
+        if frame in drawn:
+            continue
+        # What no root leads to hangs in a loop, or below one: up to the first frame that comes again.
+        root = frame
+        climbed: set[str] = set()
+        while root in above and root not in climbed:
+            climbed.add(root)
+            root = above[root]
+        drawn.add(root)
+        yield Branch("", f"{root} (in a loop)" if root in above else root, None)
+        stack = _stacked(below.get(root, []), "")
+        while stack:
+            edge, guides, indent = stack.pop()
+            if edge.child in drawn:
+                continue
+            drawn.add(edge.child)
+            yield Branch(guides, edge.child, edge)
+            stack.extend(_stacked(below.get(edge.child, []), indent))
+
+
+def _stacked(edges: list[Edge], indent: str) -> list[tuple[Edge, str, str]]:
+    rows = [(edge, f"{indent}├── ", f"{indent}│   ") for edge in edges[:-1]]
+    rows += [(edge, f"{indent}└── ", f"{indent}    ") for edge in edges[-1:]]
+    return rows[::-1]
+
+
+def to_dot(edges: Sequence[Edge]) -> str:
+    """The edges in Graphviz's language; static ones are dashed."""
+    lines = ["digraph tf {"]
+    for edge in edges:
+        label = _rate(edge) + (f"\n{edge.authority}" if edge.authority else "")
+        style = ", style=dashed" if edge.static else ""
+        lines.append(f"    {_quoted(edge.parent)} -> {_quoted(edge.child)} [label={_quoted(label)}{style}];")
+    return "\n".join([*lines, "}", ""])
+
+
+def to_yaml(edges: Sequence[Edge]) -> str:
+    """The edges as YAML with the keys of tf2's ``all_frames_as_yaml``; stamps and lengths in s, null where static."""
+    if not edges:
+        return "{}\n"
+    lines = []
+    for edge in edges:
+        length = None if edge.oldest is None or edge.newest is None else edge.newest - edge.oldest
+        facts = {
+            "parent": _quoted(edge.parent),
+            "broadcaster": _quoted(edge.authority),
+            "static": json.dumps(edge.static),
+            "rate": json.dumps(edge.rate),
+            "most_recent_transform": _seconds(edge.newest),
+            "oldest_transform": _seconds(edge.oldest),
+            "buffer_length": _seconds(length),
+        }
+        lines.append(f"{_quoted(edge.child)}:")
+        lines += [f"  {key}: {value}" for key, value in facts.items()]
+    return "\n".join([*lines, ""])
+
+
+def _seconds(stamp: int | None) -> str:
+    """Exact, and never with an exponent, which YAML 1.1 takes for a string."""
+    return "null" if stamp is None else format_stamp(stamp).removesuffix(" s")
+
+
+def _quoted(text: str) -> str:
+    """In double quotes as YAML and Graphviz read them; Graphviz knows no ``\\u``, so letters of any alphabet stay."""
+    return _NOT_IN_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(text, ensure_ascii=False))
