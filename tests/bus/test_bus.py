@@ -401,15 +401,15 @@ def test_a_misspelt_policy_for_conflicts_is_refused() -> None:
 async def test_what_is_announced_reaches_everybody_who_reads_events() -> None:
     bus = Bus(SimulatedClock(start=5))
     joined, lost = PeerJoined(5, "tf", "other"), PeerLost(6, "tf", "other", ("slam",), ("odom",))
-    bus.announce(joined)
+    bus._announce(joined)
     with bus.events() as first, bus.events() as second:
         for event in (joined, lost):
-            bus.announce(event)
+            bus._announce(event)
         for events in (first, second):
             assert [await anext(events), await anext(events)] == [joined, lost]
-    bus.announce(joined)
+    bus._announce(joined)
     bus.close()
-    bus.announce(joined)
+    bus._announce(joined)
 
 
 async def test_who_waits_for_events_is_woken_by_what_is_announced() -> None:
@@ -419,7 +419,7 @@ async def test_who_waits_for_events_is_woken_by_what_is_announced() -> None:
         async with anyio.create_task_group() as tasks:
             asked = Asked(tasks, events.__anext__)
             await settle()
-            bus.announce(joined)
+            bus._announce(joined)
             await settle()
             assert asked.answer == joined
 
@@ -427,9 +427,9 @@ async def test_who_waits_for_events_is_woken_by_what_is_announced() -> None:
 async def test_nothing_is_announced_from_another_thread() -> None:
     bus = Bus(SimulatedClock())
     with bus.events() as events:
-        bus.check_thread()
+        bus._check_thread()
         with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
-            await anyio.to_thread.run_sync(bus.announce, PeerJoined(0, "tf", "other"))
+            await anyio.to_thread.run_sync(bus._announce, PeerJoined(0, "tf", "other"))
         assert len(events.queue) == 0
 
 
@@ -677,7 +677,7 @@ async def test_nothing_but_threadsafe_may_touch_a_bus_in_use_from_another_thread
     clock = SimulatedClock(start=10)
     with Bus(clock) as bus, Buffer(bus) as buffer:
         bus.publish(moving("map", "base", 0))
-        bus.check_thread()
+        bus._check_thread()
         for touch in (
             partial(Buffer, bus),
             partial(bus.subscribe, print),

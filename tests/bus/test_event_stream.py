@@ -411,7 +411,7 @@ def test_a_stream_may_be_made_before_a_loop_runs_and_read_on_several(run: Run) -
 
 async def test_another_thread_may_not_touch_the_events_of_a_bus_in_use() -> None:
     bus = Bus(SimulatedClock())
-    bus.check_thread()
+    bus._check_thread()
     with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
         await anyio.to_thread.run_sync(bus.events)
     with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):

@@ -79,16 +79,16 @@ class Buffer:
         named = as_prefix(prefix, shared)
         self._prefix = None if named is None else LocalNames(named)
         self._feed = LiveTree(keep)
-        self._room = Lookups(self._feed, bus.clock, bus.check_thread, self._prefix)
+        self._room = Lookups(self._feed, bus.clock, bus._check_thread, self._prefix)
         answer = self._feed.tree.answer
         self._answer = answer if self._prefix is None else self._prefix.around(answer)
         if prefill is not None:
             tree = prefill.tree if isinstance(prefill, Buffer) else prefill
             if not isinstance(tree, TransformTree):
                 raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
-            bus.check_thread()
+            bus._check_thread()
             self._feed.prefill(tree)
-        bus.attach(self._feed)
+        bus._attach(self._feed)
 
     @property
     def tree(self) -> TransformTree:
@@ -323,7 +323,7 @@ class Buffer:
             If a threshold is negative or an angle of more than pi, a rate is not greater than zero, or something is not
             a number.
         """
-        self.bus.check_thread()
+        self.bus._check_thread()
         question = Question(target, source, LATEST, max_age=max_age, policy=policy_of(tolerance, max_gap, extrapolate))
         return Watch(
             self._on_bus(question),
@@ -333,7 +333,7 @@ class Buffer:
             self._feed,
             self._room,
             self._clock,
-            self.bus.check_thread,
+            self.bus._check_thread,
         )
 
     def explain(
@@ -384,7 +384,7 @@ class Buffer:
 
     def close(self) -> None:
         """Leave the bus; lookups that wait end with `BusClosedError`. What is buffered can still be looked up."""
-        self.bus.detach(self._feed)
+        self.bus._detach(self._feed)
         self._feed.end("the buffer is closed")
         self._feed.tell_the_end()
 

@@ -102,7 +102,7 @@ class Bus:
             If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
         """
         if get_ident() != self._owner.thread:
-            self.check_thread()
+            self._check_thread()
         if self._closed:
             raise BusClosedError
         if invalid != "raise" and invalid != "drop":
@@ -130,7 +130,7 @@ class Bus:
         if callbacks:
             self._subscribers.deliver(batch)
 
-    def check_thread(self) -> None:
+    def _check_thread(self) -> None:
         """Raise `RuntimeError` unless the caller may use the bus directly.
 
         The first event loop to use a bus that another thread has made takes it over.
@@ -168,7 +168,7 @@ class Bus:
         BusClosedError
         """
         self._check_usable()
-        stream = Stream(capacity, overflow, self.check_thread, self._detach_stream)
+        stream = Stream(capacity, overflow, self._check_thread, self._detach_stream)
         latched = tuple(self._topology.latched.values())
         if latched:
             stream.put(latched)
@@ -199,13 +199,13 @@ class Bus:
         BusClosedError
         """
         self._check_usable()
-        events = EventStream(capacity, stale_after, self._topology, self.clock, self.check_thread, self._detach_events)
+        events = EventStream(capacity, stale_after, self._topology, self.clock, self._check_thread, self._detach_events)
         self._events.append(events)
         return events
 
-    def announce(self, event: Event) -> None:
+    def _announce(self, event: Event) -> None:
         """Tell whoever reads `events` of something that the bus cannot know: for links, recorders and players."""
-        self.check_thread()
+        self._check_thread()
         self._announcer.tell(event)
 
     def reserve(self, frame: str, authority: str) -> Registration:
@@ -236,7 +236,7 @@ class Bus:
         self._check_usable()
         return ThreadPublisher(capacity, self._attach_publisher, self._publish_from_thread, self._threads.remove)
 
-    def attach(self, feed: LiveTree) -> None:
+    def _attach(self, feed: LiveTree) -> None:
         """Have a buffer's feed receive what is latched now and all that is published from now on."""
         self._check_usable()
         latched = tuple(self._topology.latched.values())
@@ -244,10 +244,10 @@ class Bus:
         if latched:
             feed.receive(latched)
 
-    def detach(self, feed: LiveTree) -> None:
+    def _detach(self, feed: LiveTree) -> None:
         """Take a feed off the bus, if it is on it."""
         if feed.anyone_waits:
-            self.check_thread()
+            self._check_thread()
         self._feeds.pop(feed, None)
 
     def remove_frame(self, frame: str) -> None:
@@ -303,7 +303,7 @@ class Bus:
             return
         readers: list[Stream | EventStream] = [*self._streams, *self._events]
         if any(reader.waiting for reader in readers) or any(feed.anyone_waits for feed in self._feeds):
-            self.check_thread()
+            self._check_thread()
         self._closed = True
         self._jumps.close()
         for publisher in self._threads:
@@ -327,7 +327,7 @@ class Bus:
         self.close()
 
     def _check_usable(self) -> None:
-        self.check_thread()
+        self._check_thread()
         if self._closed:
             raise BusClosedError
 
@@ -362,7 +362,7 @@ class Bus:
             for events in self._events:
                 events.wake()
             return
-        self.check_thread()
+        self._check_thread()
         self._resets += 1
         self._log.warning(("clock", before, after), "the clock jumped back: moving samples are dropped")
         self._topology.clear_moving()

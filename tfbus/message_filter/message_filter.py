@@ -213,7 +213,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     async def __aenter__(self) -> "MessageFilter[MessageT, AnswerT]":
         if self._tasks is not None:
             raise RuntimeError("a message filter is entered once: make another one")
-        self.buffer.bus.check_thread()
+        self.buffer.bus._check_thread()
         self._tasks = await anyio.create_task_group().__aenter__()
         source = anyio.CancelScope()
         self._registrations = [

@@ -163,7 +163,7 @@ class Recorder:
         lost = self._backlog.put(now, batch)
         if lost and not self._behind:
             self._behind = True
-            self.bus.announce(RecordingDropped(now, self.path, self._backlog.dropped))
+            self.bus._announce(RecordingDropped(now, self.path, self._backlog.dropped))
         self._arrived.set()
 
     async def _work(self, opened: anyio.Event, failures: list[Exception]) -> None:
@@ -234,7 +234,7 @@ class Recorder:
             self._registration.close()
         self._backlog.clear()
         logging.getLogger("tfbus").warning("the recording %s has ended early", self.path, exc_info=error)
-        self.bus.announce(RecordingFailed(self.bus.clock.now(), self.path, error))
+        self.bus._announce(RecordingFailed(self.bus.clock.now(), self.path, error))
 
 
 def _set_all(events: list[anyio.Event]) -> None:

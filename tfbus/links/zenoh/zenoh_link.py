@@ -178,7 +178,7 @@ class ZenohLink:
     async def __aenter__(self) -> "ZenohLink":
         if self._session is not None:
             raise RuntimeError("a link is entered once: make another one")
-        self.bus.check_thread()
+        self.bus._check_thread()
         if self.bus.closed:
             raise BusClosedError
         for bell in (self._arrived, self._turn_ends):
@@ -311,20 +311,20 @@ class ZenohLink:
                     # It was lost, and zenoh does not bring again what it has brought before.
                     self._hear_again = True
                     self._statics_changed.set()
-                self.bus.announce(PeerJoined(self.bus.clock.now(), self.domain, sender))
+                self.bus._announce(PeerJoined(self.bus.clock.now(), self.domain, sender))
             return
         peer = self._peers.forget(sender)
         if peer is not None:
             frames = self._relay.lose(peer, self._outbox, self._drop_lost)
             authorities = tuple(sorted(peer.authorities))
-            self.bus.announce(PeerLost(self.bus.clock.now(), self.domain, sender, authorities, frames))
+            self.bus._announce(PeerLost(self.bus.clock.now(), self.domain, sender, authorities, frames))
 
     def _report(self, sender: str, reason: str, error: Exception) -> None:
         self._log.warning(
             (sender, reason), "refused what peer %s sent over the link %s: %s", sender, self.domain, error
         )
         # A copy has no traceback that would keep the message.
-        self.bus.announce(PeerRejected(self.bus.clock.now(), self.domain, sender, reason, copy(error)))
+        self.bus._announce(PeerRejected(self.bus.clock.now(), self.domain, sender, reason, copy(error)))
 
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
