@@ -1,50 +1,56 @@
-"""Log lines that come once."""
+"""Log lines that are written once for each cause."""
 
 import logging
 from collections.abc import Hashable
 
-_REMEMBERED = 1_000
+_KEPT = 1_000
 
 
 class SeenKeys:
-    """Tells what comes for the first time; only the last so many keys are remembered."""
+    """A set of keys that forgets the oldest when it is full.
 
-    __slots__ = ("_remembered", "_seen")
+    Parameters
+    ----------
+    capacity : int
+        Number of keys that it keeps.
+    """
 
-    def __init__(self, remembered: int = _REMEMBERED) -> None:
-        self._remembered = remembered
-        self._seen: dict[Hashable, None] = {}
+    __slots__ = ("_capacity", "_keys")
 
-    def first(self, key: Hashable) -> bool:
-        """Whether `key` is new."""
-        if key in self._seen:
+    def __init__(self, capacity: int = _KEPT) -> None:
+        self._capacity = capacity
+        self._keys: dict[Hashable, None] = {}
+
+    def add(self, key: Hashable) -> bool:
+        """Add a key; return whether it is new."""
+        if key in self._keys:
             return False
-        self._seen[key] = None
-        if len(self._seen) > self._remembered:
-            del self._seen[next(iter(self._seen))]
+        self._keys[key] = None
+        if len(self._keys) > self._capacity:
+            del self._keys[next(iter(self._keys))]
         return True
 
 
 class OnceLogger:
-    """Logs a line the first time its key is seen; the last thousand keys are remembered.
+    """Writes a log line the first time that its key is seen; the last thousand keys are kept.
 
-    A diagnostic that repeats at 100 Hz buries the others, so what happens again is only counted by whoever calls this.
+    A line that repeats at 100 Hz buries all others. Callers count the repetitions.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
         self._logger = logger
-        self._once = SeenKeys()
+        self._seen = SeenKeys()
 
     def info(self, key: Hashable, message: str, *args: object) -> None:
-        """Log what is worth knowing, unless `key` was seen."""
+        """Log at the level INFO, unless `key` was seen."""
         self._log(logging.INFO, key, message, args, None)
 
     def warning(self, key: Hashable, message: str, *args: object, exc_info: BaseException | None = None) -> None:
-        """Log what is probably a mistake, unless `key` was seen."""
+        """Log at the level WARNING, unless `key` was seen."""
         self._log(logging.WARNING, key, message, args, exc_info)
 
     def _log(
         self, level: int, key: Hashable, message: str, args: tuple[object, ...], exc_info: BaseException | None
     ) -> None:
-        if self._once.first(key):
+        if self._seen.add(key):
             self._logger.log(level, message, *args, exc_info=exc_info)

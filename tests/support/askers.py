@@ -29,7 +29,7 @@ def policy(rng: Random) -> dict[str, Any]:
     return {} if kind == "none" else {kind: Hold(seconds) if kind == "extrapolate" else seconds}
 
 
-def patience(rng: Random) -> float:
+def longest_hold(rng: Random) -> float:
     """In s; now and then there is no end to it."""
     return math.inf if rng.random() < 0.1 else rng.uniform(0.0, 4.0)
 
@@ -73,7 +73,7 @@ async def watch(crowd: Crowd, rng: Random) -> None:
         target, source = rng.sample(FRAMES, 2)
         options = {**policy(rng), "max_age": rng.choice((None, 0.5)), "max_rate": rng.choice((None, 5.0))}
         changes = rng.choice(crowd.buffers).watch(target, source, min_translation=rng.choice((0.0, 0.1)), **options)
-        with changes, crowd.clock.move_on_after(patience(rng)):
+        with changes, crowd.clock.move_on_after(longest_hold(rng)):
             for _ in range(3):
                 try:
                     async for found in changes:
@@ -119,7 +119,7 @@ async def filter_messages(crowd: Crowd, rng: Random) -> None:
         )
         crowd.filters.append(pairs)
         try:
-            with crowd.clock.move_on_after(patience(rng)):
+            with crowd.clock.move_on_after(longest_hold(rng)):
                 async with pairs:
                     async for message, _ in pairs:
                         ended.append(message)

@@ -19,7 +19,7 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree._extrapolation import Place, place, place_many
+from tfbus.tree._extrapolation import ReadStamp, read_stamp, read_stamps_at_many
 from tfbus.tree.history import FrameHistory, Samples
 from tfbus.tree.policy import Policy
 
@@ -35,25 +35,25 @@ def history(samples: Iterable[int] | dict[int, str], keep: int | None = None) ->
     return made
 
 
-def around(edge: FrameHistory, asked: list[int]) -> Samples:
+def samples_samples_around(edge: FrameHistory, asked: list[int]) -> Samples:
     """What is copied for some questions, by the first and the last."""
-    return edge.between(min(asked, default=0), max(asked, default=0))
+    return edge.samples_between(min(asked, default=0), max(asked, default=0))
 
 
-def rule(stamps: list[int], at: int, policy: Policy) -> Place | None:
+def rule(stamps: list[int], at: int, policy: Policy) -> ReadStamp | None:
     """Read at the stamp where it is a sample, or between two that are near enough; else the nearest that may."""
     if at in stamps:
-        return Place(at, 0, 0)
+        return ReadStamp(at, 0, 0)
     older = [stamp for stamp in stamps if stamp < at]
     newer = [stamp for stamp in stamps if stamp > at]
     if older and newer and (policy.max_gap is None or min(newer) - max(older) <= policy.max_gap):
-        return Place(at, 0, min(newer) - max(older))
+        return ReadStamp(at, 0, min(newer) - max(older))
     allowed = [stamp for stamp in older if at - stamp <= max(policy.tolerance, policy.hold)]
     allowed += [stamp for stamp in newer if stamp - at <= policy.tolerance]
     if not allowed:
         return None
     nearest = min(allowed, key=lambda stamp: abs(at - stamp))
-    return Place(nearest, abs(at - nearest), 0)
+    return ReadStamp(nearest, abs(at - nearest), 0)
 
 
 stamp_sets = st.sets(st.integers(-30, 30), max_size=8)
@@ -66,7 +66,7 @@ def test_an_edge_is_read_where_the_rule_says(stamps: set[int], policy: Policy) -
     for at in range(-60, 61):
         expected = rule(sorted(stamps), at, policy)
         try:
-            found: Place | None = place(edge, at, policy)
+            found: ReadStamp | None = read_stamp(edge, at, policy)
         except ExtrapolationError:
             found = None
         assert found == expected
@@ -77,10 +77,10 @@ def test_many_stamps_are_placed_as_one_by_one(
     stamps: set[int], policy: Policy, asked: list[int], keep: int | None
 ) -> None:
     edge = history(sorted(stamps), keep)
-    read_at, away, gap = place_many(around(edge, asked), np.array(asked, np.int64), policy)
+    read_at, away, gap = read_stamps_at_many(samples_around(edge, asked), np.array(asked, np.int64), policy)
     for i, at in enumerate(asked):
         try:
-            found = place(edge, at, policy)
+            found = read_stamp(edge, at, policy)
         except ExtrapolationError:
             assert away[i] == -1
         else:
@@ -91,10 +91,10 @@ def test_many_stamps_are_placed_as_one_by_one(
 def test_no_sample_with_another_parent_stands_in(parents: dict[int, str], policy: Policy) -> None:
     edge = history(dict(sorted(parents.items())))
     asked = np.arange(-60, 61)
-    read_at, away, _ = place_many(around(edge, asked.tolist()), asked, policy)
+    read_at, away, _ = read_stamps_at_many(samples_around(edge, asked.tolist()), asked, policy)
     for i, at in enumerate(asked.tolist()):
         try:
-            found = place(edge, at, policy)
+            found = read_stamp(edge, at, policy)
         except ExtrapolationError:
             assert away[i] == -1
             continue
@@ -107,17 +107,21 @@ def test_stamps_further_apart_than_a_signed_number_says_are_not_near() -> None:
     edge = history([STAMP_MIN, STAMP_MAX])
     policy = Policy(tolerance=5, max_gap=5)
     with pytest.raises(GapError):
-        place(edge, 0, policy)
-    _, away, _ = place_many(edge.between(STAMP_MIN, STAMP_MAX), np.array([0, STAMP_MAX - 5, STAMP_MIN + 6]), policy)
+        read_stamp(edge, 0, policy)
+    _, away, _ = read_stamps_at_many(
+        edge.samples_between(STAMP_MIN, STAMP_MAX), np.array([0, STAMP_MAX - 5, STAMP_MIN + 6]), policy
+    )
     assert away.tolist() == [-1, 5, -1]
     for sample, at in ((STAMP_MIN, STAMP_MAX), (STAMP_MAX, STAMP_MIN)):
-        assert place_many(history([sample]).between(at, at), np.array([at]), policy)[1].tolist() == [-1]
+        assert read_stamps_at_many(history([sample]).samples_between(at, at), np.array([at]), policy)[1].tolist() == [
+            -1
+        ]
 
 
 def test_of_many_stamps_a_gap_is_told_as_far_as_a_signed_number_says() -> None:
     edge = history([STAMP_MIN, STAMP_MAX])
-    assert place(edge, 0, Policy()).gap == STAMP_MAX - STAMP_MIN
-    assert place_many(edge.between(0, 0), np.array([0]), Policy())[2].tolist() == [STAMP_MAX]
+    assert read_stamp(edge, 0, Policy()).gap == STAMP_MAX - STAMP_MIN
+    assert read_stamps_at_many(edge.samples_between(0, 0), np.array([0]), Policy())[2].tolist() == [STAMP_MAX]
 
 
 @pytest.mark.parametrize(
@@ -129,7 +133,7 @@ def test_an_edge_that_nothing_stands_in_for_says_how_far_it_was_looked(
 ) -> None:
     edge = history([10, 20])
     with pytest.raises(kind) as caught:
-        place(edge, at, Policy(tolerance=5, hold=20))
+        read_stamp(edge, at, Policy(tolerance=5, hold=20))
     assert (caught.value.stamp, caught.value.slack) == (at, slack)
     assert (caught.value.oldest, caught.value.newest, caught.value.authority) == (10, 20, "odometry")
 
@@ -137,7 +141,7 @@ def test_an_edge_that_nothing_stands_in_for_says_how_far_it_was_looked(
 def test_a_gap_is_refused_with_its_two_samples() -> None:
     edge = history([0, SECOND, 4 * SECOND])
     with pytest.raises(GapError) as caught:
-        place(edge, 2 * SECOND, Policy(max_gap=SECOND))
+        read_stamp(edge, 2 * SECOND, Policy(max_gap=SECOND))
     error = caught.value
     assert (error.child, error.stamp, error.before, error.after) == ("robot", 2 * SECOND, SECOND, 4 * SECOND)
     assert (error.oldest, error.newest, error.max_gap) == (0, 4 * SECOND, SECOND)
@@ -151,7 +155,7 @@ def test_a_gap_is_refused_with_its_two_samples() -> None:
 def test_a_gap_that_nothing_stands_in_for_says_how_far_it_was_looked(policy: tuple[int, int], slack: int) -> None:
     edge = history([0, 100])
     with pytest.raises(GapError) as caught:
-        place(edge, 50, Policy(tolerance=policy[0], hold=policy[1], max_gap=20))
+        read_stamp(edge, 50, Policy(tolerance=policy[0], hold=policy[1], max_gap=20))
     assert (caught.value.stamp, caught.value.slack) == (50, slack)
 
 

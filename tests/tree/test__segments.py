@@ -27,7 +27,7 @@ def edge(poses: Iterable[tuple[int, Transform]], parents: Sequence[str] = ("pare
 
 
 def curve(frame: FrameHistory, stamps: Sequence[int]) -> Segments:
-    return Segments(frame.between(min(stamps), max(stamps)), np.array(stamps, np.int64))
+    return Segments(frame.samples_between(min(stamps), max(stamps)), np.array(stamps, np.int64))
 
 
 def at(frame: FrameHistory, stamps: Sequence[int]) -> list[list[float]]:

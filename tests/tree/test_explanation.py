@@ -173,8 +173,8 @@ def test_at_latest_all_that_lag_behind_the_one_with_the_shortest_past_are_to_bla
     tree = tree_of(*over("map", "a", (1, 10)), *over("a", "b", (1, 20)), *over("b", "c", (30, 40)))
     found = tree.explain("map", "c")
     assert [facts(error) for error in found.errors] == [
-        (FutureExtrapolationError, str(tree.forest.frames["a"].missing(30))),
-        (FutureExtrapolationError, str(tree.forest.frames["b"].missing(30))),
+        (FutureExtrapolationError, str(tree._forest.frames["a"].extrapolation_error(30))),
+        (FutureExtrapolationError, str(tree._forest.frames["b"].extrapolation_error(30))),
     ]
     assert isinstance(found.errors[0].__cause__, PastExtrapolationError)
     assert [(edge.before, edge.after) for edge in found.edges] == [(10, 10), (1, 20), (None, 30)]
@@ -368,7 +368,7 @@ def questions() -> Iterable[tuple[str, str, int | Latest]]:
 
 def has_a_loop(tree: TransformTree) -> bool:
     """Whether late samples have made frames hang on each other in the past; then an edge cannot be asked by itself."""
-    frames = tree.forest.frames
+    frames = tree._forest.frames
     for frame, stamp in product(frames, range(-1, 7)):
         here, seen = frame, {frame}
         while here in frames:

@@ -8,23 +8,23 @@ from tfbus.tree.forest import Forest
 def forest(*batch: TransformStamped, window: int | None = None) -> Forest:
     made = Forest(window)
     for sample in batch:
-        made.store(sample)
+        made.insert_judged(sample)
     return made
 
 
 def test_storing_tells_what_it_did() -> None:
     known = forest(moving("a", "b", 10), window=5)
-    assert known.store(moving("a", "b", 4)) is Outcome.EXPIRED
-    assert known.store(moving("a", "b", 5)) is Outcome.INSERTED
-    assert known.store(moving("a", "b", 5)) is Outcome.REPLACED
+    assert known.insert_judged(moving("a", "b", 4)) is Outcome.EXPIRED
+    assert known.insert_judged(moving("a", "b", 5)) is Outcome.INSERTED
+    assert known.insert_judged(moving("a", "b", 5)) is Outcome.REPLACED
 
 
 def test_a_path_that_holds_at_every_stamp_is_found_once() -> None:
     known = forest(moving("a", "b", 0), static("b", "c"))
     path = known.find_path("a", "c", LATEST)
     assert known.find_path("a", "c", 12_345) is path
-    known.store(moving("a", "b", 1))
-    known.store(moving("elsewhere", "x", 1))
+    known.insert_judged(moving("a", "b", 1))
+    known.insert_judged(moving("elsewhere", "x", 1))
     assert known.find_path("a", "c", 7) is path, "neither a newer sample nor a new frame makes it another path"
 
 
@@ -49,11 +49,11 @@ def test_the_paths_that_are_remembered_have_a_bound() -> None:
 
 def test_more_of_the_same_is_not_noted() -> None:
     known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"), window=15)
-    known.joined.clear()
+    known.new_parents.clear()
     known.changed.clear()
     for sample in (moving("a", "b", 20), moving("a", "b", 15), moving("a", "b", 30), static("b", "c", stamp=9)):
-        known.store(sample)
-    assert (known.joined, known.changed) == (set(), set())
+        known.insert_judged(sample)
+    assert (known.new_parents, known.changed) == (set(), set())
 
 
 @pytest.mark.parametrize(
@@ -69,41 +69,41 @@ def test_more_of_the_same_is_not_noted() -> None:
 def test_what_may_change_more_than_the_future_of_one_edge_is_noted(change: TransformStamped) -> None:
     known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"))
     known.changed.clear()
-    known.joined.clear()
-    known.store(change)
+    known.new_parents.clear()
+    known.insert_judged(change)
     assert known.changed == {change.child}
-    assert change.parent in known.joined
+    assert change.parent in known.new_parents
 
 
 @pytest.mark.parametrize("change", [moving("a", "b", 20), moving("a", "b", 5), static("b", "c", x=1.0)])
 def test_what_changes_no_path_is_not_noted(change: TransformStamped) -> None:
     known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"))
     known.changed.clear()
-    known.store(change)
+    known.insert_judged(change)
     assert known.changed == set()
 
 
 def test_the_end_of_an_old_parent_is_noted() -> None:
     known = forest(moving("old", "b", 0), moving("new", "b", 10), window=10)
     known.changed.clear()
-    known.store(moving("new", "b", 11))
+    known.insert_judged(moving("new", "b", 11))
     assert known.changed == {"b"}
     assert "old" not in known.names
 
 
 def test_a_first_parent_is_noted_and_so_is_a_root_that_gets_one() -> None:
     known = forest(moving("a", "b", 0))
-    assert (known.joined, known.changed) == ({"a"}, set())
-    known.joined.clear()
-    known.store(moving("root", "a", 0))
-    assert (known.joined, known.changed) == ({"root"}, {"a"})
+    assert (known.new_parents, known.changed) == ({"a"}, set())
+    known.new_parents.clear()
+    known.insert_judged(moving("root", "a", 0))
+    assert (known.new_parents, known.changed) == ({"root"}, {"a"})
 
 
 def test_below_a_frame_is_all_that_has_hung_under_it_within_the_window() -> None:
     known = forest(moving("a", "b", 0), moving("b", "c", 0), moving("x", "c", 5), static("c", "d"), moving("x", "y", 0))
-    assert known.below({"b"}) == {"b", "c", "d"}
-    assert known.below({"x"}) == {"x", "c", "d", "y"}
-    assert known.below({"nowhere"}) == {"nowhere"}
+    assert known.with_descendants({"b"}) == {"b", "c", "d"}
+    assert known.with_descendants({"x"}) == {"x", "c", "d", "y"}
+    assert known.with_descendants({"nowhere"}) == {"nowhere"}
 
 
 # What was emptied
@@ -113,7 +113,7 @@ def test_an_emptied_frame_gives_way_to_news_that_it_contradicts() -> None:
     known = forest(moving("map", "odom", 0), moving("odom", "base", 0), static("base", "camera"))
     known.clear()
     assert known.find_path("map", "camera", LATEST).frames == ("map", "odom", "base", "camera")
-    known.store(moving("base", "map", 1))
+    known.insert_judged(moving("base", "map", 1))
     assert known.find_path("base", "map", LATEST).frames == ("base", "map")
     assert sorted(known.frames) == ["camera", "map"]
 
@@ -121,8 +121,8 @@ def test_an_emptied_frame_gives_way_to_news_that_it_contradicts() -> None:
 def test_an_emptied_frame_keeps_its_place_as_long_as_nothing_contradicts_it() -> None:
     known = forest(moving("map", "odom", 0), moving("odom", "base", 0))
     known.clear()
-    known.store(moving("odom", "base", 1))
-    known.store(moving("world", "map", 1))
+    known.insert_judged(moving("odom", "base", 1))
+    known.insert_judged(moving("world", "map", 1))
     assert known.find_path("world", "base", LATEST).frames == ("world", "map", "odom", "base")
 
 
@@ -133,14 +133,14 @@ def test_the_parents_of_all_frames_change_at_these_stamps_in_order() -> None:
     known = forest(*(moving(parent, "b", at) for parent, at in (("a", 0), ("z", 30), ("a", 50))), static("b", "s"))
     assert known.parent_changes() == [30, 50]
     for sample in (moving("a", "c", 5), moving("b", "c", 10), moving("a", "d", 20), moving("z", "d", 30)):
-        known.store(sample)
+        known.insert_judged(sample)
     assert known.parent_changes() == [10, 30, 50], "a stamp at which two frames change counts once"
 
 
 def test_a_copy_with_shorter_windows_knows_the_frames_that_are_left_in_them() -> None:
     known = forest(moving("old", "b", 0), moving("a", "b", 10), static("a", "c"), window=100)
-    short = known.within(5)
+    short = known.copy_within(5)
     assert (short.names.sorted(), known.names.sorted()) == (("a", "b", "c"), ("a", "b", "c", "old"))
-    assert (short.window, short.changed, short.joined) == (5, set(), set())
-    short.store(moving("a", "b", 20))
+    assert (short.window, short.changed, short.new_parents) == (5, set(), set())
+    short.insert_judged(moving("a", "b", 20))
     assert (len(short.frames["b"]), len(known.frames["b"])) == (1, 2)

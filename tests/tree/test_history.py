@@ -60,7 +60,7 @@ def test_out_of_order_inside_the_window_gives_the_same_as_in_order(order: list[i
         shuffled.insert(parents[stamp], stamp, row(float(stamp * stamp)), parents[stamp])
 
     assert shuffled.edge() == in_order.edge()
-    assert set(shuffled.mentioned) == set(in_order.mentioned)
+    assert set(shuffled.named_parents) == set(in_order.named_parents)
     for stamp in range(-1, 13):
         assert shuffled.covers(stamp) == in_order.covers(stamp)
         assert shuffled.parent_at(stamp) == in_order.parent_at(stamp)
@@ -88,7 +88,7 @@ def test_what_expired_leaves_no_trace() -> None:
     before = samples.edge()
     assert samples.insert("other parent", 89, row(0.0), "late") is EXPIRED
     assert samples.edge() == before
-    assert samples.mentioned == ("parent",)
+    assert samples.named_parents == ("parent",)
     assert not samples.changed
 
 
@@ -135,7 +135,7 @@ def test_replacing_the_newest_sample_can_change_the_newest_parent() -> None:
     assert samples.changed
     assert (samples.parent_at(1), samples.parent_at(2)) == ("parent", "other")
     samples.insert("parent", 2, row(2.0), "")
-    assert samples.mentioned == ("parent",)
+    assert samples.named_parents == ("parent",)
 
 
 def test_each_sample_keeps_its_own_parent() -> None:
@@ -143,7 +143,7 @@ def test_each_sample_keeps_its_own_parent() -> None:
     samples.insert("new", 30, row(0.0), "")
     samples.insert("new", 40, row(0.0), "")
     assert [samples.parent_at(stamp) for stamp in (10, 20, 29, 30, 40)] == ["parent", "parent", "parent", "new", "new"]
-    assert set(samples.mentioned) == {"parent", "new"}
+    assert set(samples.named_parents) == {"parent", "new"}
 
 
 def test_outside_the_window_the_parent_is_that_of_the_nearest_sample() -> None:
@@ -160,7 +160,7 @@ def test_an_old_parent_is_forgotten_with_the_last_sample_in_the_window_that_name
         samples.insert("new", stamp, row(0.0), "")
         oldest = max(0, stamp - 160)
         expected = {"parent", "new"} if oldest < switch else {"new"}
-        assert set(samples.mentioned) == expected
+        assert set(samples.named_parents) == expected
         assert samples.parent_at(oldest) == ("parent" if oldest < switch else "new")
 
 
@@ -207,7 +207,7 @@ def test_a_static_sample_drops_the_moving_history() -> None:
     assert samples.insert_static("third", 0, row(9.0), "urdf") is INSERTED
     assert samples.changed
     assert samples.static
-    assert samples.mentioned == ("third",)
+    assert samples.named_parents == ("third",)
     assert (samples.oldest, samples.newest, len(samples)) == (None, None, 1)
 
 
@@ -226,18 +226,18 @@ def test_clear_drops_the_samples_and_remembers_the_newest_parent() -> None:
     samples.insert("new", 105, row(0.0), "sender")
     samples.clear()
     assert (samples.oldest, samples.newest, len(samples)) == (None, None, 0)
-    assert (samples.parent, samples.authority, samples.mentioned) == ("new", "sender", ("new",))
+    assert (samples.parent, samples.authority, samples.named_parents) == ("new", "sender", ("new",))
     assert samples.insert("new", 3, row(1.0), "") is INSERTED, "the window starts anew, so time may run again"
 
 
 def test_an_extrapolation_has_all_facts() -> None:
     samples = history(stamps=[10, 20])
     samples.insert("parent", 30, row(0.0), "odometry")
-    future = samples.missing(31)
+    future = samples.extrapolation_error(31)
     assert type(future) is FutureExtrapolationError
     assert (future.child, future.stamp, future.oldest, future.newest) == ("child", 31, 10, 30)
     assert future.authority == "odometry"
-    past = samples.missing(9)
+    past = samples.extrapolation_error(9)
     assert type(past) is PastExtrapolationError
     assert (past.child, past.stamp, past.oldest, past.newest) == ("child", 9, 10, 30)
 
@@ -245,13 +245,13 @@ def test_an_extrapolation_has_all_facts() -> None:
 def test_one_sample_answers_only_at_its_own_stamp() -> None:
     samples = history(stamps=[10])
     assert [samples.covers(stamp) for stamp in (9, 10, 11)] == [False, True, False]
-    assert type(samples.missing(9)) is PastExtrapolationError
-    assert type(samples.missing(11)) is FutureExtrapolationError
+    assert type(samples.extrapolation_error(9)) is PastExtrapolationError
+    assert type(samples.extrapolation_error(11)) is FutureExtrapolationError
 
 
 @pytest.mark.parametrize("stamp", [5, LATEST])
 def test_an_empty_history_is_short_of_the_future(stamp: int | Latest) -> None:
-    error = history().missing(stamp)
+    error = history().extrapolation_error(stamp)
     assert type(error) is FutureExtrapolationError
     assert (error.oldest, error.newest) == (None, None)
 
@@ -279,7 +279,7 @@ def test_the_short_cut_for_the_next_sample_does_what_an_insertion_does(
         slow.insert(parent, stamp, pose, authority)
         quick.append(parent, stamp, pose, authority) or quick.insert(parent, stamp, pose, authority)
         assert quick.edge() == slow.edge()
-        assert set(quick.mentioned) == set(slow.mentioned)
+        assert set(quick.named_parents) == set(slow.named_parents)
         for at in range(stamp - 6, stamp + 1):
             assert quick.covers(at) == slow.covers(at)
             if slow.covers(at):
@@ -305,7 +305,7 @@ def test_a_copy_shares_nothing() -> None:
     samples.insert("parent", 10, row(-1.0), "")
     assert twin.edge() == before
     assert x_at(twin, 10) == 10.0
-    assert set(twin.mentioned) == {"parent", "other"}
+    assert set(twin.named_parents) == {"parent", "other"}
     twin.clear()
     assert samples.newest == 30
 
@@ -313,7 +313,7 @@ def test_a_copy_shares_nothing() -> None:
 def test_a_copy_with_another_window_begins_with_what_counts_and_forgets_by_its_own_window() -> None:
     samples = history(keep=160, stamps=range(0, 170, 5))
     assert (samples.oldest, samples.stamps[0]) == (5, 0), "one sample that does not count any more is still there"
-    long, short = samples.within(None), samples.within(100)
+    long, short = samples.copy_within(None), samples.copy_within(100)
     assert (long.oldest, short.oldest) == (5, 65)
     assert long.insert("parent", 1, row(1.0), "") is INSERTED
     assert samples.insert("parent", 1, row(1.0), "") is EXPIRED
@@ -325,19 +325,19 @@ def test_a_copy_with_another_window_begins_with_what_counts_and_forgets_by_its_o
 def test_a_copy_with_a_shorter_window_knows_no_parent_that_has_left_it() -> None:
     samples = history(keep=100, stamps=[0, 10])
     samples.insert("other", 20, row(20.0), "sender")
-    both, one = samples.within(20), samples.within(5)
-    assert (set(both.mentioned), set(one.mentioned)) == ({"parent", "other"}, {"other"})
+    both, one = samples.copy_within(20), samples.copy_within(5)
+    assert (set(both.named_parents), set(one.named_parents)) == ({"parent", "other"}, {"other"})
     assert (one.parents, one.changed) == (None, False)
-    assert set(samples.mentioned) == {"parent", "other"}
+    assert set(samples.named_parents) == {"parent", "other"}
 
 
 def test_a_static_sample_and_an_empty_history_fit_any_window() -> None:
     fixed = FrameHistory("child", "parent", static=True, keep=10)
     fixed.insert_static("parent", 3, row(1.0), "sender")
-    assert fixed.within(0).edge() == fixed.edge()
+    assert fixed.copy_within(0).edge() == fixed.edge()
     emptied = history(stamps=[10])
     emptied.clear()
-    twin = emptied.within(5)
+    twin = emptied.copy_within(5)
     assert (len(twin), twin.parent) == (0, "parent")
     assert twin.insert("parent", 1, row(1.0), "") is INSERTED
 
@@ -367,7 +367,7 @@ def test_parents_that_alternate_for_ever_take_no_more_than_the_window() -> None:
     for stamp in range(1, 20_000):
         samples.insert(f"parent {stamp % 2}", stamp, row(0.0), "")
         assert len(samples.stamps) <= 1_001
-    assert set(samples.mentioned) == {"parent 0", "parent 1"}
+    assert set(samples.named_parents) == {"parent 0", "parent 1"}
 
 
 # What many lookups take
@@ -406,7 +406,7 @@ def test_between_two_stamps_numpy_reads_what_was_put_in(order: list[int], one: i
     samples = FrameHistory("child", "parent", static=False, keep=None)
     for number in order:
         samples.insert("parent", 10 * number, (number, 0.1, -0.2, 0.5, 0.5, -0.5, 0.5), "")
-    taken = samples.between(low, high)
+    taken = samples.samples_between(low, high)
     # From the last sample not after the first stamp, to the first sample not before the last stamp.
     numbers = range(low // 10, -(-high // 10) + 1)
     assert np.frombuffer(taken.stamps, np.int64).tolist() == [10 * number for number in numbers]
@@ -416,7 +416,7 @@ def test_between_two_stamps_numpy_reads_what_was_put_in(order: list[int], one: i
 
 def test_what_is_taken_is_a_copy_so_that_the_history_can_grow_while_numpy_looks_at_it() -> None:
     samples = history(stamps=[10, 20, 30])
-    taken = samples.between(10, 30)
+    taken = samples.samples_between(10, 30)
     stamps, rows = np.frombuffer(taken.stamps, np.int64), numpy_rows(taken)
     samples.insert("parent", 40, row(40.0), "")
     samples.insert("parent", 20, row(-1.0), "")
@@ -428,11 +428,11 @@ def test_each_sample_is_taken_with_its_parent_where_there_are_several() -> None:
     samples = history(stamps=[10, 20])
     for stamp in (30, 40, 50):
         samples.insert("new", stamp, row(0.0), "")
-    taken = samples.between(15, 35)
+    taken = samples.samples_between(15, 35)
     assert (list(taken.stamps), taken.parents) == ([10, 20, 30, 40], ["parent", "parent", "new", "new"])
 
 
 def test_nothing_is_taken_that_has_left_the_window() -> None:
     # The window's slack, a sixteenth, is ten here: what has left the window is still in memory.
     samples = history(keep=160, stamps=range(166))
-    assert list(samples.between(5, 6).stamps) == [5, 6]
+    assert list(samples.samples_between(5, 6).stamps) == [5, 6]

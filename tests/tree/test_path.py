@@ -182,13 +182,13 @@ def test_a_path_goes_over_the_lowest_common_ancestor(target: str, source: str, f
 def test_the_search_goes_no_further_above_the_common_ancestor_than_the_path_is_long() -> None:
     asked: list[str] = []
 
-    class Watched(dict[str, FrameHistory]):
+    class WatchState(dict[str, FrameHistory]):
         def get(self, key: str, default: FrameHistory | None = None) -> FrameHistory | None:  # type: ignore[override]
             asked.append(key)
             return super().get(key, default)
 
     trunk = {f"trunk {depth + 1}": f"trunk {depth}" for depth in range(5_000)}
-    frames = Watched(hanging({**trunk, "left": "trunk 5000", "right": "trunk 5000", "tip": "right"}))
+    frames = WatchState(hanging({**trunk, "left": "trunk 5000", "right": "trunk 5000", "tip": "right"}))
     assert find_path(frames, "left", "tip", None).frames == ("left", "trunk 5000", "right", "tip")
     assert len(asked) <= 6
 
@@ -246,9 +246,9 @@ def test_a_path_is_lasting_unless_a_frame_on_it_changes_its_parent() -> None:
     changing = moving("left", "child", [(0, Transform())])
     changing.insert("right", 10, IDENTITY, "")
     frames = {**hanging({"left": "root", "right": "root", "below": "child"}), "child": changing}
-    assert not find_path(frames, "root", "below", None).lasting
-    assert find_path(frames, "child", "below", None).lasting
-    assert find_path(frames, "left", "right", None).lasting
+    assert not find_path(frames, "root", "below", None).permanent
+    assert find_path(frames, "child", "below", None).permanent
+    assert find_path(frames, "left", "right", None).permanent
 
 
 def test_static_edges_have_no_say_in_what_is_moving() -> None:
@@ -309,16 +309,16 @@ def test_an_edge_without_samples_has_no_newest_stamp_in_common_with_others() -> 
 
 
 def test_an_edge_that_begins_too_late_decides_before_all_that_may_still_come() -> None:
-    error = path_over((0, 10), (20, 30), None).blocker(15)
+    error = path_over((0, 10), (20, 30), None).deciding_error(15)
     assert type(error) is PastExtrapolationError
     assert (error.child, error.stamp, error.oldest) == ("1", 15, 20)
 
 
 def test_among_edges_that_may_still_come_the_one_that_lags_most_decides() -> None:
-    error = path_over((0, 12), (0, 10), (0, 20)).blocker(15)
+    error = path_over((0, 12), (0, 10), (0, 20)).deciding_error(15)
     assert type(error) is FutureExtrapolationError
     assert (error.child, error.newest) == ("1", 10)
-    assert path_over((0, 12), None, (0, 10)).blocker(15).child == "1"
+    assert path_over((0, 12), None, (0, 10)).deciding_error(15).child == "1"
 
 
 @settings(deadline=None)
@@ -333,7 +333,7 @@ def test_a_path_has_an_answer_exactly_where_every_moving_edge_has_one(windows: l
     else:
         with pytest.raises(ExtrapolationError):
             path.row(at)
-        assert isinstance(path.blocker(at), PastExtrapolationError) == any(at < low for low, _ in windows)
+        assert isinstance(path.deciding_error(at), PastExtrapolationError) == any(at < low for low, _ in windows)
 
 
 @pytest.mark.parametrize(("target", "source"), ["ac", "ca", "ab", "bd", "cd", "aa"])

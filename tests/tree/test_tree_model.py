@@ -32,7 +32,7 @@ from tfbus import (
     TransformTree,
     UnknownFrameError,
 )
-from tfbus.tree._lookup_many import FEW
+from tfbus.tree._lookup_many import ONE_BY_ONE
 
 Matrix = npt.NDArray[np.float64]
 At = int | Latest
@@ -98,7 +98,7 @@ class Child:
         after = next(sample for sample in self.samples if sample.stamp >= at)
         if before.parent != after.parent or before.stamp == at:
             return matrix_of(before.transform)
-        return between(before.transform, after.transform, (at - before.stamp) / (after.stamp - before.stamp))
+        return interpolated(before.transform, after.transform, (at - before.stamp) / (after.stamp - before.stamp))
 
     def facts(self, name: str, at: At) -> Facts:
         """Those of the error that says that `at` is not covered."""
@@ -114,7 +114,7 @@ def matrix_of(transform: Transform) -> Matrix:
     return matrix
 
 
-def between(first: Transform, second: Transform, fraction: float) -> Matrix:
+def interpolated(first: Transform, second: Transform, fraction: float) -> Matrix:
     """A straight line, and a turn about a fixed axis by the smaller angle."""
     turn = quaternions.qmult(quaternions.qinverse(first.as_wxyz()), second.as_wxyz())
     axis, angle = quaternions.quat2axangle(turn if turn[0] >= 0 else -turn)
@@ -433,7 +433,7 @@ class TreeMachine(RuleBasedStateMachine):
         else:
             assert_same(travel(), expected)
 
-    @rule(ends=questions, data=st.data(), times=st.sampled_from((1, FEW)))
+    @rule(ends=questions, data=st.data(), times=st.sampled_from((1, ONE_BY_ONE)))
     def ask_for_many_at_once(self, ends: tuple[str, str], data: st.DataObject, times: int) -> None:
         drawn = [self.draw_stamp(data) for _ in range(4)]
         stamps = [at for at in drawn if not isinstance(at, Latest)]

@@ -56,7 +56,7 @@ def test_what_waiting_cannot_help_is_not_parked() -> None:
     with pytest.raises(TypeError, match="waiting cannot help"):
         index.park(waiter(), PastExtrapolationError(child="tool", stamp=1, oldest=2, newest=3))
     assert len(index) == 0
-    assert index.take_all() == []
+    assert index.pop_all() == []
 
 
 def test_an_edge_takes_whoever_needs_no_more_than_its_newest_stamp_in_order_of_stamp() -> None:
@@ -123,7 +123,7 @@ def test_a_removed_waiter_is_never_taken_and_removing_it_again_does_nothing() ->
         index.remove(gone)
     assert len(index) == 1
     assert set(index.blocked) == {"tool"}
-    assert index.take_all() == [stays]
+    assert index.pop_all() == [stays]
 
 
 def test_removing_one_of_many_with_the_same_stamp_removes_that_one() -> None:
@@ -137,8 +137,8 @@ def test_take_all_takes_everybody_in_order_of_arrival_and_leaves_nothing() -> No
     index = WaitingIndex()
     errors = (unknown("camera"), short_of("tool", 9), apart("map", "odom"), short_of("tool", 1))
     waiters = [parked(index, error) for error in errors]
-    assert index.take_all() == waiters
-    assert (len(index), index.blocked, index.pending(), index.take_all()) == (0, {}, (), [])
+    assert index.pop_all() == waiters
+    assert (len(index), index.blocked, index.pending(), index.pop_all()) == (0, {}, (), [])
 
 
 def test_a_taken_waiter_can_park_again_under_another_cause() -> None:
@@ -227,9 +227,9 @@ class IndexMachine(RuleBasedStateMachine):
         self.leave(expected)
 
     @rule()
-    def take_all(self) -> None:
+    def pop_all(self) -> None:
         expected = [waiting for waiting, _ in self.model]
-        assert self.index.take_all() == expected
+        assert self.index.pop_all() == expected
         self.leave(expected)
 
     def leave(self, waiters: list[Waiter]) -> None:

@@ -6,7 +6,7 @@ from support.samples import any_samples, moving, static
 
 from tfbus import ClockResetError, InvalidTransformError, TransformLookupError, TransformStamped, TransformTree
 from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.watch_index import Watched
+from tfbus.waiting.watch_index import WatchState
 
 
 class Watcher:
@@ -14,7 +14,7 @@ class Watcher:
 
     def __init__(self, feed: LiveTree, target: str, source: str) -> None:
         self.feed = feed
-        self.state = Watched(target, source, self._woken)
+        self.state = WatchState(target, source, self._woken)
         self.woken = 0
         feed.watching.add(self.state)
 

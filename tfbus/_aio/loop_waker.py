@@ -1,4 +1,4 @@
-"""How other threads wake the event loop."""
+"""Wake-ups of the event loop from other threads."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -7,60 +7,66 @@ import anyio.lowlevel
 
 
 class LoopWaker:
-    """Has the event loop call a function soon, once for all the rings since it was last called.
+    """Calls a function on the event loop soon after any thread has asked for it.
+
+    Requests that come before the call share one call.
 
     Parameters
     ----------
-    answer : callable
-        Called on the loop. It must not raise, and take care of all that has gathered.
+    callback : callable
+        Called on the loop. It must not raise, and must process everything that has been queued.
 
     Notes
     -----
-    A ring is for something that was queued before. The bell is armed again before `answer` is called, so what comes
-    right behind it rings once more; it can be one ring too many, and never one too few.
+    Queue first, then call `wake`. The waker accepts new requests before it calls `callback`, so a request that comes
+    during the call leads to another call: there may be one call too many, never one too few.
     """
 
-    def __init__(self, answer: Callable[[], object]) -> None:
-        self._answer = answer
-        self._soon: Callable[[Callable[[], object]], object] | None = None
-        self._has_ended: Callable[[], bool] = bool
-        self._armed = True
+    def __init__(self, callback: Callable[[], object]) -> None:
+        self._callback = callback
+        self._call_soon: Callable[[Callable[[], object]], object] | None = None
+        self._loop_is_closed: Callable[[], bool] = _never
+        self._requested = False
 
     @property
-    def connected(self) -> bool:
-        """Whether `connect` was called."""
-        return self._soon is not None
+    def bound(self) -> bool:
+        """Whether `bind` was called."""
+        return self._call_soon is not None
 
-    def connect(self) -> None:
-        """Wake the event loop that runs now, from now on."""
-        # anyio has no public call for this; both loops' own one is the only thing that wakes them from a thread.
+    def bind(self) -> None:
+        """Wake the running event loop from now on."""
+        # anyio has no public function for this; only the loops' own functions wake them from a thread.
         native = cast(Any, anyio.lowlevel.current_token().native_token)
-        self._soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
-        # trio answers each ring that it has taken; asyncio's loops may end with some.
-        self._has_ended = getattr(native, "is_closed", bool)
-        # An earlier loop may have ended with a ring that it never answered.
-        self._armed = True
+        self._call_soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
+        # trio answers each request that it has accepted. An asyncio loop may be closed with requests left.
+        self._loop_is_closed = getattr(native, "is_closed", _never)
+        # An earlier loop may have ended without answering a request.
+        self._requested = False
 
-    def ring(self) -> None:
-        """Have it answered; for any thread.
+    def wake(self) -> None:
+        """Have the callback called soon; for any thread.
 
         Raises
         ------
         RuntimeError
-            If the event loop has ended, or there was none.
+            If the event loop has ended, or `bind` was never called.
         """
-        if self._soon is None:
-            raise RuntimeError("connect the doorbell on the event loop first")
-        if self._armed:
-            self._armed = False
+        if self._call_soon is None:
+            raise RuntimeError("bind the waker on the event loop first")
+        if not self._requested:
+            self._requested = True
             try:
-                self._soon(self._open)
+                self._call_soon(self._call)
             except BaseException:
-                self._armed = True
+                self._requested = False
                 raise
-        elif self._has_ended():
-            raise RuntimeError("the event loop has ended before it answered an earlier ring")
+        elif self._loop_is_closed():
+            raise RuntimeError("the event loop has ended before it answered an earlier request")
 
-    def _open(self) -> None:
-        self._armed = True
-        self._answer()
+    def _call(self) -> None:
+        self._requested = False
+        self._callback()
+
+
+def _never() -> bool:
+    return False

@@ -1,4 +1,4 @@
-"""What every stream has in common: one reader, who waits until there is something, and an end."""
+"""Async iterators that one task at a time may read."""
 
 from collections.abc import Callable
 from types import TracebackType
@@ -10,16 +10,52 @@ import anyio.lowlevel
 ItemT = TypeVar("ItemT")
 
 
-class OneReaderStream(Generic[ItemT]):
-    """An async iterator for one reader at a time, fed by a bus.
+class OneReader(anyio.ResourceGuard):
+    """A ``with`` for the one task that reads and waits; a second task gets `anyio.BusyResourceError`.
 
-    The iteration ends when the bus or the stream is closed and what was pending has been read. Whoever derives from
-    this says what comes next.
+    Nothing is lost between a look for an item and `wait`: the reader and the code that calls `wake` run in one thread,
+    and the reader does not pass a checkpoint in between.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("reading from")
+        self._woken: anyio.Event | None = None
+        self._was_woken = False
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the reader waits."""
+        return self._woken is not None
+
+    @property
+    def was_woken(self) -> bool:
+        """Whether `wake` was called during the last wait, also if that was cancelled in the same turn of the loop."""
+        return self._was_woken
+
+    def wake(self) -> None:
+        """End the wait of the reader, if it waits."""
+        if self._woken is not None:
+            self._woken.set()
+
+    async def wait(self) -> None:
+        """Wait for the next call of `wake`."""
+        self._woken = woken = anyio.Event()
+        try:
+            await woken.wait()
+        finally:
+            self._was_woken = woken.is_set()
+            self._woken = None
+
+
+class OneReaderStream(Generic[ItemT]):
+    """An async iterator that one task at a time may read, filled by a bus.
+
+    The iteration ends when the stream is closed and all pending items have been read. A subclass implements `_next`.
 
     Parameters
     ----------
     check_thread : callable
-        Raises unless the caller may read here.
+        Raises unless the calling thread may read here.
     detach : callable
         Takes the stream off the bus.
     """
@@ -27,22 +63,20 @@ class OneReaderStream(Generic[ItemT]):
     def __init__(self, check_thread: Callable[[], object], detach: Callable[[Any], object]) -> None:
         self._check_thread = check_thread
         self._detach = detach
-        self._one_reader = anyio.ResourceGuard("reading from")
-        self._reader: anyio.Event | None = None
+        self._reader = OneReader()
         self._ended = False
 
     @property
     def waiting(self) -> bool:
-        """Whether a reader waits for something."""
-        return self._reader is not None
+        """Whether a reader waits for an item."""
+        return self._reader.waiting
 
     def wake(self) -> None:
-        """Have the reader look again."""
-        if self._reader is not None:
-            self._reader.set()
+        """Have a waiting reader look for the next item again."""
+        self._reader.wake()
 
     def end(self) -> None:
-        """Let the reader finish what is pending, then stop."""
+        """Let the reader read all pending items, then end the iteration."""
         self._ended = True
         self.wake()
 
@@ -64,22 +98,18 @@ class OneReaderStream(Generic[ItemT]):
 
     async def __anext__(self) -> ItemT:
         self._check_thread()
-        with self._one_reader:
+        with self._reader:
             await anyio.lowlevel.checkpoint()
             while (item := self._next()) is None:
                 if self._ended:
                     raise StopAsyncIteration
-                self._reader = anyio.Event()
-                try:
-                    await self._wait(self._reader)
-                finally:
-                    self._reader = None
+                await self._wait()
         return item
 
     def _next(self) -> ItemT | None:
         """The next item; None while there is none."""
         raise NotImplementedError
 
-    async def _wait(self, woken: anyio.Event) -> None:
-        """Wait until somebody calls `wake`, or until it is time to look again."""
-        await woken.wait()
+    async def _wait(self) -> None:
+        """Wait until `wake` is called, or until it is time to look again."""
+        await self._reader.wait()

@@ -1,12 +1,13 @@
-"""The end of tasks that belong to an object which is an ``async with`` itself."""
+"""Task groups that belong to an object with an ``async with`` of its own."""
 
 import anyio.abc
 
 
 async def close_task_group(tasks: anyio.abc.TaskGroup) -> None:
-    """Wait until all tasks of a group have ended that was entered by hand; what one of them raises comes out as it is.
+    """Wait until all tasks have ended, and raise the error of a single failed task without an `ExceptionGroup`.
 
-    A group that is left in the usual way wraps what the body has raised as well, so it is not told of that.
+    The group was entered by hand. It is not told of an error in the body of the ``async with``, because it would wrap
+    that error as well.
     """
     try:
         await tasks.__aexit__(None, None, None)

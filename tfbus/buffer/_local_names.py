@@ -1,25 +1,17 @@
-"""The names of one robot in questions and answers, on a bus that several robots share."""
+"""The local names of one robot, on a bus that several robots share."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 from tfbus.frames import Prefix
 from tfbus.geometry.stamped import TransformStamped, renamed
-from tfbus.stamps import Latest
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.history import Edge
-from tfbus.tree.policy import Policy
 from tfbus.tree.question import Question
 from tfbus.waiting.waiting_index import PendingLookup
 
-Answer = Callable[
-    [str, str, int | Latest, int | Latest | None, str | None, int | None, Policy | None], TransformStamped
-]
-"""`TransformTree.answer`."""
-
 
 class LocalNames:
-    """Translates questions to the names of the bus, and answers back.
+    """Translates questions into the names of the bus, and answers into local names.
 
     Parameters
     ----------
@@ -28,6 +20,10 @@ class LocalNames:
 
     def __init__(self, prefix: Prefix) -> None:
         self._prefix = prefix
+
+    def on_bus(self, name: str) -> str:
+        """The name of a frame on the bus."""
+        return self._prefix.on_bus(name)
 
     def question(self, asked: Question) -> Question:
         """A question with the names of the bus."""
@@ -41,7 +37,7 @@ class LocalNames:
         return renamed(found, self._prefix.local(found.parent), self._prefix.local(found.child))
 
     def pending(self, found: PendingLookup) -> PendingLookup:
-        """A lookup that waits, with the local names that it was asked with; its error has those of the bus."""
+        """A waiting lookup with the local names of its question; its error keeps the names of the bus."""
         asked = found.question
         fixed = None if asked.fixed is None else self._prefix.local(asked.fixed)
         asked = replace(
@@ -54,7 +50,7 @@ class LocalNames:
         return replace(found, parent=self._prefix.local(found.parent), child=self._prefix.local(found.child))
 
     def explanation(self, found: Explanation, target: str, source: str) -> Explanation:
-        """An explanation with local names, in the question as they were asked; its errors have those of the bus."""
+        """An explanation with local names, target and source as asked; its errors keep the names of the bus."""
         return replace(
             found,
             target=target,
@@ -66,23 +62,3 @@ class LocalNames:
                 for edge in found.edges
             ),
         )
-
-    def around(self, answer: Answer) -> Answer:
-        """`answer`, asked and answering with local names."""
-
-        def answer_locally(
-            target: str,
-            source: str,
-            at: int | Latest,
-            source_at: int | Latest | None,
-            fixed: str | None,
-            not_before: int | None,
-            policy: Policy | None,
-        ) -> TransformStamped:
-            via = None if fixed is None else self._prefix.on_bus(fixed)
-            found = answer(
-                self._prefix.on_bus(target), self._prefix.on_bus(source), at, source_at, via, not_before, policy
-            )
-            return renamed(found, target, source)
-
-        return answer_locally

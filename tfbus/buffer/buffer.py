@@ -1,4 +1,4 @@
-"""A tree that a bus feeds, and lookups that wait for what is still missing."""
+"""The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
 from collections.abc import Callable, Iterable
 from types import TracebackType
@@ -15,10 +15,12 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.registration import Registration
 from tfbus.stamps import LATEST, Latest
 from tfbus.tree.explanation import Explanation
+from tfbus.tree.forest import Forest
+from tfbus.tree.lookup import answer
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.question import Question, question_of
 from tfbus.tree.rendering import describe
-from tfbus.tree.tree import TransformTree
+from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import PendingLookup
 
@@ -31,19 +33,19 @@ class Buffer:
     Parameters
     ----------
     bus : Bus
-        It feeds the buffer from now on, what is latched included, and holds it until `close`.
+        It fills the buffer from now on, first with the latched samples, and holds it until `close`.
     keep : float or None
-        How much history to keep for each frame, in s before that frame's newest stamp; None keeps everything.
+        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything.
     prefix : str, optional
-        What the bus has before the names of this buffer's frames, such as ``"robot1/"``, so that several robots with
-        the same frames can share a bus. All methods take and give names without it.
+        Put before the names of this buffer's frames on the bus, such as ``"robot1/"``, so that several robots with the
+        same frames can share a bus. All methods take and give names without it.
     shared : iterable of str
-        Names that have no prefix, because they are the same for everybody, such as ``{"map"}``.
+        Names without a prefix, because they are the same for all robots, such as ``{"map"}``.
     prefill : Buffer or TransformTree, optional
-        Start with a copy of its history, as far as `keep` reaches. If it is a buffer on the same bus, this one then
-        answers as if it had been there all along. Otherwise, what is latched on this bus comes on top, and the stamps
-        of both have to be of one time: a sample older than the window that it falls into expires as always. What was
-        removed after a buffer was closed, that buffer still has.
+        Start with a copy of its history, as far as `keep` reaches. With a buffer of the same bus, this one then answers
+        as if it had been there from the beginning. Otherwise the latched samples of this bus are added, and the stamps
+        of both must be of the same time: a sample older than its window expires. A closed buffer still has the frames
+        that were removed after it was closed.
 
     Raises
     ------
@@ -55,14 +57,12 @@ class Buffer:
     TypeError
         If an argument is of another type, or there are shared names but no prefix.
 
-    Notes
-    -----
-    What only reads may be used from any thread, at any time; what is awaited, watched or closed, only on the bus's
-    event loop.
+    Notes ----- Any thread may use the methods that only read. `lookup`, `transform`, `watch` and `close` belong to the
+    event loop of the bus.
 
-    With a prefix, another robot's frames have no name here: to ask for them, use a buffer without one. `tree` and all
-    errors have the names of the bus; pictures and explanations write a frame that is somebody else's with a slash
-    in front.
+    With a prefix, the frames of another robot have no name here: to ask for them, use a buffer without a prefix. `tree`
+    and all errors have the names of the bus. Texts and explanations write a frame of another robot with a slash in
+    front.
     """
 
     def __init__(
@@ -77,23 +77,25 @@ class Buffer:
         self.bus = bus
         self._clock = bus.clock
         named = as_prefix(prefix, shared)
-        self._prefix = None if named is None else LocalNames(named)
-        self._feed = LiveTree(keep)
-        self._room = Lookups(self._feed, bus.clock, bus._check_thread, self._prefix)
-        answer = self._feed.tree.answer
-        self._answer = answer if self._prefix is None else self._prefix.around(answer)
-        if prefill is not None:
+        self._local_names = None if named is None else LocalNames(named)
+        window = window_of(keep)
+        if prefill is None:
+            self._forest = Forest(window)
+        else:
             tree = prefill.tree if isinstance(prefill, Buffer) else prefill
             if not isinstance(tree, TransformTree):
                 raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
             bus._check_thread()
-            self._feed.prefill(tree)
-        bus._attach(self._feed)
+            self._forest = forest_of(tree).copy_within(window)
+        self._tree = tree_of(self._forest, keep)
+        self._live = LiveTree(self._forest)
+        self._lookups = Lookups(self._live, bus.clock, bus._check_thread, self._local_names)
+        bus._attach(self._live)
 
     @property
     def tree(self) -> TransformTree:
-        """The tree behind this buffer, to read: its samples come from the bus."""
-        return self._feed.tree
+        """The tree behind this buffer. It can only be read: its samples come from the bus."""
+        return self._tree
 
     def lookup_nowait(
         self,
@@ -125,12 +127,17 @@ class Buffer:
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
         """
-        not_before = None if max_age is None else self._room.not_before(max_age, at, source_at)
+        not_before = None if max_age is None else self._lookups.not_before(max_age, at, source_at)
         policy = None
         if tolerance != 0.0 or max_gap is not None or extrapolate is not None:
             # Not called for nothing, which would cost a twentieth of a lookup.
             policy = policy_of(tolerance, max_gap, extrapolate)
-        return self._answer(target, source, at, source_at, fixed, not_before, policy)
+        names = self._local_names
+        if names is None:
+            return answer(self._forest, target, source, at, source_at, fixed, not_before, policy)
+        via = None if fixed is None else names.on_bus(fixed)
+        found = answer(self._forest, names.on_bus(target), names.on_bus(source), at, source_at, via, not_before, policy)
+        return names.answer(found)
 
     async def lookup(
         self,
@@ -148,9 +155,9 @@ class Buffer:
     ) -> TransformStamped:
         """Where `source` is, seen from `target`, as soon as that can be answered.
 
-        What can be answered is answered after one checkpoint. What waiting cannot help fails at once: a stamp older
-        than an edge's window raises `PastExtrapolationError`. Everything else waits; a frame that nobody ever
-        publishes waits for ever, unless there is a timeout, and is logged after 5 s.
+        If the answer is known, it comes after one checkpoint. If waiting cannot help, the lookup fails at once: a stamp
+        older than an edge's window raises `PastExtrapolationError`. Otherwise it waits; for a frame that nobody
+        publishes, it waits for ever unless there is a timeout, and is logged after 5 s.
 
         Parameters
         ----------
@@ -165,7 +172,7 @@ class Buffer:
         source_at : int or LATEST, optional
             Take source at this stamp instead, and carry it to `at` through `fixed`.
         fixed : str, optional
-            The frame that is held still between the two stamps.
+            The frame that stands still between the two stamps.
         tolerance, max_gap, extrapolate
             As `TransformTree.lookup`. The wait ends at the first moment at which they allow an answer.
 
@@ -181,9 +188,9 @@ class Buffer:
         PastExtrapolationError
             If it is older than an edge's window.
         GapError
-            If it lies in a gap that is too long.
+            If the stamp lies in a gap that is too long.
         BusClosedError
-            If it cannot be answered and nothing more will come.
+            If there is no answer and no more samples will come.
         ClockResetError
             If the clock jumped back meanwhile.
         UnknownFrameError
@@ -193,7 +200,7 @@ class Buffer:
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         question = Question(target, source, at, source_at, fixed, max_age, policy)
-        return await self._room.wait(self._on_bus(question), timeout)
+        return await self._lookups.lookup(self._on_bus(question), timeout)
 
     async def transform(
         self,
@@ -220,7 +227,7 @@ class Buffer:
         at : int or LATEST, optional
             Move the data from their own stamp to this one (ns), through `fixed`.
         fixed : str, optional
-            The frame that is held still between the two stamps.
+            The frame that stands still between the two stamps.
         tolerance, max_gap, extrapolate
             As `lookup`. The data do not say what was done; where that matters, look the transform up.
 
@@ -238,7 +245,7 @@ class Buffer:
             As `lookup`.
         """
         question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
-        moved: DataT = do_transform(data, await self._room.wait(self._on_bus(question), timeout))
+        moved: DataT = do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
         return moved
 
     def transform_nowait(
@@ -263,7 +270,7 @@ class Buffer:
             As `transform`.
         """
         question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
-        moved: DataT = do_transform(data, self._room.ask(self._on_bus(question)))
+        moved: DataT = do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
         return moved
 
     def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
@@ -289,10 +296,10 @@ class Buffer:
     ) -> Watch:
         """The answer at `LATEST` whenever it has changed: ``with buffer.watch(...) as w: async for transform in w``.
 
-        It starts with the present answer and then compares with the last one that it gave. A slow reader gets what is
-        newest when it reads, and nobody is woken by an insertion elsewhere in the tree. While there is no answer it
-        waits, as `lookup` does, and goes on with the next one. Of the errors of `lookup` none is raised: at `LATEST`
-        nothing is too old or in a gap for good, it only waits for the edge that lags.
+        It starts with the present answer and then compares with the last one that it gave. A slow reader gets the
+        newest answer when it reads, and an insertion elsewhere in the tree wakes no watch. While there is no answer it
+        waits as `lookup` does, and goes on with the next answer. It raises none of the errors of `lookup`: at `LATEST`
+        no stamp is too old or in a gap for good; the watch waits for the lagging edge.
 
         Parameters
         ----------
@@ -305,7 +312,7 @@ class Buffer:
         max_rate : float, optional
             Give no more than this many answers per s on the bus's clock. Only the last, after the end, may come sooner.
         max_age : float, optional
-            Count an answer that is older than this many s as none. It does not end by itself what was given already.
+            Ignore answers that are older than this many s. An answer that was given is not withdrawn when it gets old.
         tolerance, max_gap, extrapolate
             As `lookup`.
 
@@ -313,7 +320,7 @@ class Buffer:
         -------
         Watch
             It belongs to the buffer until it is closed. When the clock jumps back, it raises `ClockResetError` once and
-            starts over; when it, the buffer or the bus is closed, it ends, after what had changed before.
+            starts over. When the watch, the buffer or the bus is closed, it gives a pending change, then ends.
 
         Raises
         ------
@@ -330,8 +337,8 @@ class Buffer:
             min_translation,
             min_rotation,
             max_rate,
-            self._feed,
-            self._room,
+            self._live,
+            self._lookups,
             self._clock,
             self.bus._check_thread,
         )
@@ -347,7 +354,7 @@ class Buffer:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> Explanation:
-        """How `lookup_nowait` with these arguments comes to its answer, or all that keeps it from one.
+        """How `lookup_nowait` with these arguments finds its answer, or everything that blocks it.
 
         See `TransformTree.explain`; ages are counted from the clock's now.
         """
@@ -356,41 +363,41 @@ class Buffer:
             asked.target,
             asked.source,
             at,
-            not_before=None if max_age is None else self._room.not_before(max_age, at, None),
+            not_before=None if max_age is None else self._lookups.not_before(max_age, at, None),
             tolerance=tolerance,
             max_gap=max_gap,
             extrapolate=extrapolate,
             now=self._clock.now(),
         )
-        return found if self._prefix is None else self._prefix.explanation(found, target, source)
+        return found if self._local_names is None else self._local_names.explanation(found, target, source)
 
     def pending(self) -> tuple[PendingLookup, ...]:
-        """The lookups that wait now, and the watches without an answer, with what blocks each."""
-        pending = self._feed.waiting.pending()
-        return pending if self._prefix is None else tuple(map(self._prefix.pending, pending))
+        """The lookups that wait now, and the watches without an answer, each with the error that blocks it."""
+        pending = self._live.waiting.pending()
+        return pending if self._local_names is None else tuple(map(self._local_names.pending, pending))
 
     def describe(self) -> str:
         """The tree as text, with each edge's rate, age, span and authority, and the lookups that wait."""
         edges = self.tree.edges()
-        if self._prefix is not None:
-            edges = sorted(map(self._prefix.edge, edges), key=lambda edge: edge.child)
+        if self._local_names is not None:
+            edges = sorted(map(self._local_names.edge, edges), key=lambda edge: edge.child)
         lines = [describe(edges, self._clock.now())]
         lines += [f"waiting: {pending}" for pending in self.pending()]
         return "\n".join(lines)
 
     def on_close(self, callback: Callable[[], object]) -> Registration:
         """Call `callback` once, on the event loop: when this buffer or its bus is closed, or now if one is."""
-        return self._feed.on_end(callback)
+        return self._live.on_end(callback)
 
     def close(self) -> None:
-        """Leave the bus; lookups that wait end with `BusClosedError`. What is buffered can still be looked up."""
-        self.bus._detach(self._feed)
-        self._feed.end("the buffer is closed")
-        self._feed.tell_the_end()
+        """Leave the bus; waiting lookups end with `BusClosedError`. Buffered transforms can still be looked up."""
+        self.bus._detach(self._live)
+        self._live.end("the buffer is closed")
+        self._live.call_end_callbacks()
 
     def _on_bus(self, question: Question) -> Question:
-        """A question with the names that the bus has."""
-        return question if self._prefix is None else self._prefix.question(question)
+        """A question with the names of the bus."""
+        return question if self._local_names is None else self._local_names.question(question)
 
     def __enter__(self) -> "Buffer":
         return self

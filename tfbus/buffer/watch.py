@@ -1,12 +1,12 @@
-"""A transform that is followed: its newest value, each time that it has changed."""
+"""Watches: the newest value of a transform, each time that it has changed."""
 
 import math
 from collections.abc import Callable
 from types import TracebackType
 
-import anyio
 import anyio.lowlevel
 
+from tfbus._aio.one_reader import OneReader
 from tfbus.buffer._waiting_lookup import REPORT_AFTER, Lookups
 from tfbus.clock import Clock
 from tfbus.errors import MAY_COME, ClockResetError, TransformLookupError, UnknownFrameError
@@ -16,20 +16,19 @@ from tfbus.stamps import SECOND, STAMP_MAX, is_real, to_seconds
 from tfbus.tree.question import Question
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import Waiter, without_traceback
-from tfbus.waiting.watch_index import Watched
+from tfbus.waiting.watch_index import WatchState
 
 
 class Watch:
-    """What `Buffer.watch` gives: ``async for transform in watch``, for one reader.
+    """The result of `Buffer.watch`: ``async for transform in watch``, for one reader.
 
-    It holds no queue: each answer is worked out when it is read, so a slow reader skips and never lags. The iteration
-    ends when the watch, the buffer or the bus is closed and what had changed before has been read.
+    It has no queue: each answer is computed when it is read, so a slow reader skips answers and never lags. The
+    iteration ends when the watch, the buffer or the bus is closed and a pending change has been read.
 
     Attributes
     ----------
     skipped : int
-        Batches that touched the watched path, while there was an answer, and that no evaluation saw, because a later
-        one had come by then.
+        Number of batches that touched the watched path and that no answer shows, because a later batch had come.
     """
 
     def __init__(
@@ -38,48 +37,47 @@ class Watch:
         min_translation: float,
         min_rotation: float,
         max_rate: float | None,
-        feed: LiveTree,
-        room: Lookups,
+        live: LiveTree,
+        lookups: Lookups,
         clock: Clock,
         check_thread: Callable[[], object],
     ) -> None:
         for name in (question.target, question.source):
             if not is_frame(name):
-                raise UnknownFrameError(frame=name, known=feed.tree.frames())
+                raise UnknownFrameError(frame=name, known=live.forest.known_frames())
         if question.max_age is not None:
-            room.not_before(question.max_age, question.at, question.source_at)
+            lookups.not_before(question.max_age, question.at, question.source_at)
         self.skipped = 0
         self._question = question
         self._min_translation = _threshold(min_translation, "min_translation", "m", math.inf)
         self._min_rotation = _threshold(min_rotation, "min_rotation", "rad", math.pi)
         self._period = _period(max_rate)
-        self._feed = feed
-        self._room = room
+        self._live = live
+        self._lookups = lookups
         self._clock = clock
         self._check_thread = check_thread
-        self._reading = anyio.ResourceGuard("reading from")
-        self._reader: anyio.Event | None = None
+        self._reader = OneReader()
         self._last: TransformStamped | None = None
-        self._rests_since: int | None = None
-        self._state = Watched(question.target, question.source, self._wake)
-        if feed.ended:
+        self._last_given_at: int | None = None
+        self._state = WatchState(question.target, question.source, self._reader.wake)
+        if live.end_reason is not None:
             self._state.ended = True
             return
-        feed.watching.add(self._state)
+        live.watching.add(self._state)
         try:
-            self._look()
+            self._update()
         except MAY_COME:
             return
-        # Nobody has seen that one; it was looked up to count from here on.
-        self._state.flagged = True
+        # The reader has not seen this answer. It was looked up to count the updates from here on.
+        self._state.outdated = True
 
     def close(self) -> None:
         """End the iteration; a second call does nothing."""
         if self._state.waiting:
             self._check_thread()
-        self._feed.watching.remove(self._state)
+        self._live.watching.remove(self._state)
         self._state.ended = True
-        self._wake()
+        self._reader.wake()
 
     def __enter__(self) -> "Watch":
         return self
@@ -94,7 +92,7 @@ class Watch:
 
     async def __anext__(self) -> TransformStamped:
         self._check_thread()
-        with self._reading:
+        with self._reader:
             await anyio.lowlevel.checkpoint()
             return await self._next_change()
 
@@ -104,23 +102,23 @@ class Watch:
         while True:
             if state.reset is not None:
                 raise self._start_over(state.reset)
-            if not state.flagged:
+            if not state.outdated:
                 if state.ended:
                     raise StopAsyncIteration
                 await self._wait()
                 continue
-            if not state.ended and (rest := self._rest()) > 0.0:
-                if not await self._wait(rest):
-                    self._rests_since = None
+            if not state.ended and (pause := self._remaining_pause()) > 0.0:
+                if not await self._wait(pause):
+                    self._last_given_at = None
                 continue
             try:
-                answer = self._look()
+                answer = self._update()
             except MAY_COME as error:
                 blocker = without_traceback(error)
             else:
                 if self._is_change(answer):
                     self._last = answer
-                    self._rests_since = self._clock.now()
+                    self._last_given_at = self._clock.now()
                     return answer
                 continue
             if state.ended:
@@ -128,18 +126,18 @@ class Watch:
             since = self._clock.now() if since is None else since
             await self._park(blocker, since)
 
-    def _look(self) -> TransformStamped:
-        """The answer now; from here on, what it is made of flags the watch."""
+    def _update(self) -> TransformStamped:
+        """The answer now; a later change on its path makes the watch outdated."""
         state = self._state
         self.skipped += max(0, state.updates - 1)
         state.updates = 0
         try:
-            answer = self._room.ask(self._question)
+            answer = self._lookups.lookup_nowait(self._question)
         except MAY_COME:
-            self._feed.watching.forget(state)
+            self._live.watching.set_no_answer(state)
             raise
-        self._feed.watching.follow(state, self._feed.tree.forest, answer.stamp)
-        state.flagged = False
+        self._live.watching.set_answer(state, self._live.forest, answer.stamp)
+        state.outdated = False
         return answer
 
     def _is_change(self, answer: TransformStamped) -> bool:
@@ -155,50 +153,44 @@ class Watch:
         return bool(self._min_rotation) and (before.inverse() @ now).as_axis_angle()[1] >= self._min_rotation
 
     def _start_over(self, reset: ClockResetError) -> ClockResetError:
-        """Forget what was before a jump back of the clock; the error that says so."""
+        """Forget everything from before a jump back of the clock; return the error that announces it."""
         state = self._state
         self.skipped += state.updates
         state.updates = 0
         state.reset = None
         self._last = None
-        self._rests_since = None
+        self._last_given_at = None
         return ClockResetError(before=reset.before, after=reset.after)
 
-    def _rest(self) -> float:
-        """How long `max_rate` still holds the next answer back, in s."""
-        if self._rests_since is None:
+    def _remaining_pause(self) -> float:
+        """The time until `max_rate` allows the next answer, in s."""
+        if self._last_given_at is None:
             return 0.0
-        left = self._period - (self._clock.now() - self._rests_since)
+        left = self._period - (self._clock.now() - self._last_given_at)
         # The machine's time may have been set back.
         return min(left, self._period) / SECOND
 
     async def _park(self, blocker: TransformLookupError, since: int) -> None:
-        """Wait until something comes that can have removed what blocks the answer."""
-        waiter = Waiter(self._question, since, self._wake)
-        self._feed.waiting.park(waiter, blocker)
+        """Wait for a sample that may have removed the cause of `blocker`."""
+        waiter = Waiter(self._question, since, self._reader.wake)
+        self._live.waiting.park(waiter, blocker)
         try:
-            quiet = REPORT_AFTER - to_seconds(self._clock.now() - since)
-            if quiet <= 0.0 or not await self._wait(quiet):
-                self._room.report(self._question, blocker)
+            silent = REPORT_AFTER - to_seconds(self._clock.now() - since)
+            if silent <= 0.0 or not await self._wait(silent):
+                self._lookups.report(self._question, blocker)
                 await self._wait()
         finally:
-            self._feed.waiting.remove(waiter)
+            self._live.waiting.remove(waiter)
 
     async def _wait(self, seconds: float = math.inf) -> bool:
-        """Wait until something happens, but no longer than this; whether something has happened."""
-        self._reader = woken = anyio.Event()
+        """Wait until the watch is woken, at most for some time; return whether it was woken."""
         self._state.waiting = True
         try:
             with self._clock.move_on_after(seconds):
-                await woken.wait()
+                await self._reader.wait()
         finally:
-            self._reader = None
             self._state.waiting = False
-        return woken.is_set()
-
-    def _wake(self) -> None:
-        if self._reader is not None:
-            self._reader.set()
+        return self._reader.was_woken
 
 
 def _threshold(value: float, name: str, unit: str, greatest: float) -> float:

@@ -1,4 +1,4 @@
-"""From what causes events to whoever reads them."""
+"""Announces events to the streams that read them."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -7,30 +7,34 @@ from tfbus.events import Event
 
 
 class Listener(Protocol):
-    """Somebody who is told of events."""
+    """A reader of events."""
 
     def put(self, event: Event) -> object: ...
 
 
 class Announcer:
-    """Tells all listeners; false while there are none, so that nobody makes events for nobody.
+    """Passes each event to all listeners.
+
+    Check `has_listeners` before making an event: most programs have none, and an event costs more than the check.
 
     Parameters
     ----------
     now : callable
-        The present stamp, in ns: events carry it.
+        Gives the present stamp in ns, which events carry.
     listeners : sequence of Listener
-        Whoever is in it when something happens; somebody else adds and removes.
+        The bus adds and removes listeners here.
     """
 
     def __init__(self, now: Callable[[], int], listeners: Sequence[Listener] = ()) -> None:
         self.now = now
         self._listeners = listeners
 
-    def __bool__(self) -> bool:
-        return bool(self._listeners)
+    @property
+    def has_listeners(self) -> bool:
+        """Whether anybody reads events."""
+        return len(self._listeners) > 0
 
-    def tell(self, event: Event) -> None:
-        """Tell everybody."""
+    def announce(self, event: Event) -> None:
+        """Pass an event to every listener."""
         for listener in self._listeners:
             listener.put(event)

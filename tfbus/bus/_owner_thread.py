@@ -1,4 +1,4 @@
-"""Which thread a bus belongs to."""
+"""The thread that a bus belongs to."""
 
 import asyncio
 from threading import get_ident
@@ -7,12 +7,12 @@ import anyio
 
 
 class OwnerThread:
-    """A thread's claim on a bus: first that of the thread that made it, then of the first event loop that uses it.
+    """The thread that may use a bus: first the one that made it, then that of the first event loop that uses it.
 
     Attributes
     ----------
     thread : int
-        The thread's identity.
+        Its identity, as `threading.get_ident` gives it.
     """
 
     __slots__ = ("_on_a_loop", "thread")
@@ -22,7 +22,7 @@ class OwnerThread:
         self._on_a_loop = _runs_a_loop()
 
     def check(self) -> None:
-        """Raise `RuntimeError` unless this thread has the claim, or runs an event loop and may take it over."""
+        """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
         thread = get_ident()
         if thread == self.thread and self._on_a_loop:
             return
@@ -35,7 +35,7 @@ class OwnerThread:
 
 
 def _runs_a_loop() -> bool:
-    """Whether this thread runs an event loop; of one that is in a bare asyncio callback, anyio does not know."""
+    """Whether this thread runs an event loop. In a bare asyncio callback only asyncio knows."""
     for probe in (asyncio.get_running_loop, anyio.get_current_task):
         try:
             probe()

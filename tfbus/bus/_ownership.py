@@ -1,25 +1,19 @@
-"""Who may publish which child: by reservation, and by having been the first where the policy says so."""
+"""The right to publish a child: by reservation, or by being its first authority if the policy says so."""
 
 from collections.abc import Mapping
-from typing import Literal, Protocol, get_args
+from typing import Literal, get_args
 
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
+from tfbus.tree.cycles import NewestEdge
 
 OnConflict = Literal["last", "reject"]
 
 
-class Published(Protocol):
-    """What is known of a child that somebody has published."""
-
-    @property
-    def authority(self) -> str: ...
-
-
 class Ownership:
-    """The rights of authorities; false while everybody may publish everything.
+    """The rights of authorities to publish children.
 
     Parameters
     ----------
@@ -39,23 +33,25 @@ class Ownership:
         self._reserved: dict[str, tuple[str, int]] = {}
         self._first: dict[str, str] = {}
 
-    def __bool__(self) -> bool:
-        return self._first_keeps or bool(self._reserved)
+    @property
+    def restricts(self) -> bool:
+        """Whether some sample could be refused."""
+        return self._first_keeps or len(self._reserved) > 0
 
     def remembers(self, frame: str) -> bool:
-        """Whether a frame is kept for its first authority although nothing else is known of it."""
+        """Whether a frame without an edge is kept for its first authority."""
         return frame in self._first
 
-    def remember(self, known: Mapping[str, Published]) -> None:
-        """Keep children for those who published them, if that is the policy, while nothing else is known of them.
+    def remember(self, known: Mapping[str, NewestEdge]) -> None:
+        """Keep children for their first authorities across a jump of the clock, if that is the policy.
 
-        It is one name a child that was published and not removed, as many as are known if the clock is never reset.
+        It costs one name for each child that was published and not removed.
         """
         if self._first_keeps:
-            self._first.update((child, published.authority) for child, published in known.items())
+            self._first.update((child, edge.authority) for child, edge in known.items())
 
     def forget(self, frame: str) -> None:
-        """Let a frame that was removed be anybody's; a reservation stays."""
+        """Let any authority publish a frame that was removed; a reservation stays."""
         self._first.pop(frame, None)
 
     def reserved_for(self, frame: str) -> str | None:
@@ -64,7 +60,7 @@ class Ownership:
         return authority
 
     def reserve(self, frame: str, authority: str) -> Registration:
-        """Let only this authority publish a frame; if it has reserved it already, until both are closed.
+        """Let only this authority publish a frame, until every registration of it is closed.
 
         Raises
         ------
@@ -88,7 +84,7 @@ class Ownership:
         self._reserved[frame] = (authority, times + 1)
         return Registration(lambda: self._release(frame))
 
-    def split(self, batch: Batch, known: Mapping[str, Published]) -> tuple[Batch, list[InvalidTransformError]]:
+    def split(self, batch: Batch, known: Mapping[str, NewestEdge]) -> tuple[Batch, list[InvalidTransformError]]:
         """The samples of a batch whose authorities may publish them, and the errors of the others, in order."""
         allowed: list[TransformStamped] = []
         refused: list[InvalidTransformError] = []

@@ -1,79 +1,66 @@
-"""Which moving frames have had nothing new for too long.
+"""Finds the moving frames whose newest sample is too old.
 
-Nothing is timed here: whoever wants to know asks, and is told when to ask again. A frame costs a few steps once it may
-have become stale, and none for each of its samples.
+There is no timer here: the caller asks for changes and for the time of the next one. A frame costs a few steps each
+time that it may have become stale, and nothing for each sample.
 """
 
 from collections.abc import Callable
 from heapq import heapify, heappop, heappush
-from typing import Protocol
 
 from tfbus.events import FrameLive, FrameStale
 from tfbus.geometry.stamped import Batch
+from tfbus.tree.cycles import NewestEdge
 
 _SPARE = 64
 
 
-class LastHeard(Protocol):
-    """The newest that is known of one child."""
-
-    @property
-    def static(self) -> bool: ...
-
-    @property
-    def newest(self) -> int | None: ...
-
-    @property
-    def authority(self) -> str: ...
-
-
 class Staleness:
-    """Tells stale frames from live ones: those whose newest stamp is more than a limit behind the clock.
+    """The stale frames of a bus: those whose newest stamp is more than a limit behind the clock.
 
     Parameters
     ----------
     limit : int
         ns.
-    known : callable
-        Gives the newest of a child, or None if nothing is known of it.
+    newest_edge : callable
+        Gives the newest edge of a child, or None if it has none.
     """
 
-    def __init__(self, limit: int, known: Callable[[str], LastHeard | None]) -> None:
+    def __init__(self, limit: int, newest_edge: Callable[[str], NewestEdge | None]) -> None:
         self._limit = limit
-        self._known = known
-        # The last stamp at which a frame is live for sure, and all of these in order, with some that hold no longer.
+        self._newest_edge = newest_edge
+        # The last stamp at which each frame is surely live, and a heap of these, in which some are outdated.
         self._live: dict[str, int] = {}
         self._due: list[tuple[int, str]] = []
         self._stale: set[str] = set()
-        self._heard: dict[str, None] = {}
+        self._noted: dict[str, None] = {}
 
     def __len__(self) -> int:
         return len(self._due) + len(self._stale)
 
     def arrived(self, batch: Batch) -> bool:
-        """Take note of samples that the bus has accepted; whether it is worth asking for news."""
+        """Note accepted samples; return whether `changes` may have something new."""
         live = self._live
-        news = False
+        changed = False
         for sample in batch:
             _, child, _, _, _, static = sample._fields
             if static or child not in live:
-                news |= self.hear(child)
-        return news
+                changed |= self.note(child)
+        return changed
 
-    def hear(self, frame: str) -> bool:
-        """Take note of a frame that is new, stale or static; whether it is worth asking for news."""
+    def note(self, frame: str) -> bool:
+        """Note a sample of a new, stale or static frame; return whether `changes` may have something new."""
         if frame in self._stale:
-            self._heard[frame] = None
+            self._noted[frame] = None
             return True
         self._live.pop(frame, None)
         return self._watch(frame)
 
-    def news(self, now: int) -> list[FrameStale | FrameLive]:
-        """What has changed since it was last asked, as seen at a stamp."""
+    def changes(self, now: int) -> list[FrameStale | FrameLive]:
+        """The frames that have become stale or live since the last call, as of the stamp `now`."""
         found: list[FrameStale | FrameLive] = []
-        heard, self._heard = self._heard, {}
-        for frame in heard:
-            known = self._known(frame)
+        noted, self._noted = self._noted, {}
+        for frame in noted:
+            known = self._newest_edge(frame)
             if known is not None and (known.newest is None or known.newest + self._limit >= now):
                 self._stale.discard(frame)
                 self._watch(frame)
@@ -83,7 +70,7 @@ class Staleness:
             if self._live.get(frame) != due:
                 continue
             del self._live[frame]
-            known = self._known(frame)
+            known = self._newest_edge(frame)
             if known is None or known.newest is None:
                 continue
             if known.newest + self._limit == due:
@@ -94,26 +81,26 @@ class Staleness:
         return found
 
     def due(self) -> int | None:
-        """The first stamp at which there may be news if nothing arrives, in ns; None if there is none."""
+        """The first stamp, in ns, at which `changes` may have something new if no sample arrives; None if never."""
         while self._due and self._live.get(self._due[0][1]) != self._due[0][0]:
             heappop(self._due)
         return self._due[0][0] + 1 if self._due else None
 
     def forget(self, frame: str) -> None:
-        """Take note that a frame was removed."""
+        """Forget a frame that was removed."""
         self._live.pop(frame, None)
         self._stale.discard(frame)
-        self._heard.pop(frame, None)
+        self._noted.pop(frame, None)
 
     def clear(self) -> None:
         """Forget every frame: the clock has jumped back."""
         self._live.clear()
         self._due.clear()
         self._stale.clear()
-        self._heard.clear()
+        self._noted.clear()
 
     def _watch(self, frame: str) -> bool:
-        known = self._known(frame)
+        known = self._newest_edge(frame)
         if known is None or known.newest is None:
             return False
         due = known.newest + self._limit

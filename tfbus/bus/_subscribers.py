@@ -1,4 +1,4 @@
-"""Callbacks that are called with each batch."""
+"""The callbacks that a bus calls with each batch."""
 
 from collections import deque
 from collections.abc import Callable
@@ -22,19 +22,19 @@ _QUEUED_BATCHES = 1_000
 class Subscribers:
     """Calls subscribers one batch after the other, and keeps them from harming each other or the publisher.
 
-    A batch that a subscriber publishes waits until everybody has had the current one, so all see the same order. If one
-    removes a frame or turns the clock back, those behind it get the current batch without what is gone.
+    A batch that a subscriber publishes is delivered after the current one, so all subscribers see the same order. If a
+    subscriber removes a frame or sets the clock back, the later ones get the current batch without the removed samples.
 
     Attributes
     ----------
     callbacks : dict of int to callable
     failures : int
-        Exceptions that subscribers raised.
+        Number of exceptions that subscribers raised.
     """
 
-    def __init__(self, log: OnceLogger, news: Announcer) -> None:
+    def __init__(self, log: OnceLogger, announcer: Announcer) -> None:
         self._log = log
-        self._announcer = news
+        self._announcer = announcer
         self.callbacks: dict[int, BatchCallback] = {}
         self._removal_callbacks: dict[int, FrameCallback] = {}
         self._keys = count()
@@ -44,8 +44,8 @@ class Subscribers:
         self._queued = 0
         self.failures = 0
 
-    def add(self, callback: BatchCallback, latched: Batch, removed: FrameCallback | None = None) -> Registration:
-        """Register a callback, and call it with what is latched if that is anything."""
+    def subscribe(self, callback: BatchCallback, latched: Batch, removed: FrameCallback | None = None) -> Registration:
+        """Register a callback, and call it with the latched samples if there are any."""
         for function in (callback, removed):
             if function is not None and not callable(function):
                 raise TypeError(f"a subscriber must be callable, not {function!r}")
@@ -86,11 +86,11 @@ class Subscribers:
         self._keep_only(lambda sample: sample.static)
 
     def forget(self, child: str) -> None:
-        """Deliver no sample of a removed frame to anybody any more."""
+        """Take the samples of a removed frame out of the batches that are not delivered yet."""
         self._keep_only(lambda sample: sample.child != child)
 
-    def tell_removed(self, child: str) -> None:
-        """Tell those who want to know that a frame was removed; what one of them publishes comes behind that."""
+    def notify_removed(self, child: str) -> None:
+        """Call the removal callbacks with a frame; batches that they publish are delivered afterwards."""
         outer = self._calling
         try:
             for key, removed in tuple(self._removal_callbacks.items()):
@@ -128,11 +128,11 @@ class Subscribers:
     def _call(self, key: int, callback: Callable[[GivenT], object], given: GivenT) -> None:
         try:
             callback(given)
-        except Exception as error:  # noqa: BLE001 - a subscriber is somebody else's code
+        except Exception as error:  # noqa: BLE001 - a subscriber must not stop the publisher
             self.failures += 1
             self._log.warning(("subscriber", key), "the subscriber %s raised", _name(callback), exc_info=error)
-            if self._announcer:
-                self._announcer.tell(SubscriberFailed(self._announcer.now(), _name(callback), error))
+            if self._announcer.has_listeners:
+                self._announcer.announce(SubscriberFailed(self._announcer.now(), _name(callback), error))
 
 
 def _name(callback: Callable[..., object] | None) -> str:

@@ -1,8 +1,7 @@
-"""Who hangs on whom by the newest samples, and whether a batch may change it.
+"""The newest edges of a bus, and the judgement of each batch before it is committed.
 
-The newest edges must form a forest, judged after the whole batch: one batch may turn an edge round. The bus keeps a
-`Topology` and asks it before anything is committed, so that the sender hears of a bad edge; a tree that is used alone
-has its own histories judged by `admit`.
+The newest edges must form a forest. The bus judges a batch by them before any buffer gets it, so that the sender learns
+of a bad edge at once.
 """
 
 from collections import Counter
@@ -19,20 +18,20 @@ from tfbus.registration import Registration
 from tfbus.tree.cycles import NewestEdge, admit
 
 
-class _Newest:
-    """The newest that a topology knows of one child.
+class _Edge:
+    """The newest edge of one child.
 
-    `plain` is the authority whose moving samples under the same parent need no judgement; None while there is none.
+    `trusted` is the authority whose moving samples under the same parent need no judgement; None if there is none.
     """
 
-    __slots__ = ("authority", "newest", "parent", "plain", "static")
+    __slots__ = ("authority", "newest", "parent", "static", "trusted")
 
     def __init__(self, parent: str, static: bool, authority: str) -> None:
         self.parent = parent
         self.static = static
         self.newest: int | None = None
         self.authority = authority
-        self.plain: str | None = None
+        self.trusted: str | None = None
 
 
 class Topology:
@@ -42,9 +41,9 @@ class Topology:
     ----------
     log : OnceLogger
     ownership : Ownership
-        Who may publish what.
-    news : Announcer
-        Is told what changes, and what is refused.
+        Says who may publish which child.
+    announcer : Announcer
+        Announces changes and refusals.
 
     Attributes
     ----------
@@ -53,14 +52,14 @@ class Topology:
     rejected : Counter
         Samples that were refused, by reason.
     reparented, kind_changes, conflicts : int
-        Samples that gave a child another newest parent, or another kind, or came from another authority than before.
+        Number of samples that gave a child another newest parent, another kind, or another authority than before.
     """
 
-    def __init__(self, log: OnceLogger, ownership: Ownership, news: Announcer) -> None:
+    def __init__(self, log: OnceLogger, ownership: Ownership, announcer: Announcer) -> None:
         self._log = log
         self._ownership = ownership
-        self._announcer = news
-        self._newest: dict[str, _Newest] = {}
+        self._announcer = announcer
+        self._newest: dict[str, _Edge] = {}
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
         self.reparented = 0
@@ -78,18 +77,18 @@ class Topology:
         return {*self._newest, *(known.parent for known in self._newest.values())}
 
     def newest(self, child: str) -> NewestEdge | None:
-        """The newest that is known of a child, if anything is."""
+        """The newest edge of a child, if it has one."""
         return self._newest.get(child)
 
     def known(self) -> list[FrameAdded]:
-        """Every child, as if it were new."""
+        """An event for each child that has a parent, as if it were new."""
         now = self._announcer.now()
         return [
             FrameAdded(now, child, known.parent, known.authority, known.static) for child, known in self._newest.items()
         ]
 
-    def take(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
-        """Judge a batch, note what may be committed of it, and give that back.
+    def accept(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
+        """Judge a batch, record the samples that may be committed, and return them.
 
         Raises
         ------
@@ -101,9 +100,9 @@ class Topology:
         for sample in batch:
             parent, child, _, _, authority, static = sample._fields
             known = newest.get(child)
-            if known is None or known.parent != parent or known.plain != authority or static:
+            if known is None or known.parent != parent or known.trusted != authority or static:
                 return self._judge(batch, invalid)
-        # Nearly always: more of the same, of which only the stamps are news.
+        # Nearly always all samples continue known edges, so that only the stamps are new.
         for sample in batch:
             fields = sample._fields
             known = newest[fields[1]]
@@ -116,35 +115,35 @@ class Topology:
         registration = self._ownership.reserve(child, authority)
         known = self._newest.get(child)
         if known is not None and known.authority != authority:
-            known.plain = None
+            known.trusted = None
         return registration
 
     def remove(self, child: str) -> None:
-        """Forget a child, and who was the first to publish it."""
+        """Forget a child and its first authority."""
         self.latched.pop(child, None)
         self._ownership.forget(child)
-        if self._newest.pop(child, None) is not None and self._announcer:
-            self._announcer.tell(FrameRemoved(self._announcer.now(), child))
+        if self._newest.pop(child, None) is not None and self._announcer.has_listeners:
+            self._announcer.announce(FrameRemoved(self._announcer.now(), child))
 
     def clear_moving(self) -> None:
-        """Forget every child that is not static, but not for whom it is kept."""
+        """Forget every moving child, but keep the right of its first authority."""
         self._ownership.remember({child: known for child, known in self._newest.items() if not known.static})
         self._newest = {child: known for child, known in self._newest.items() if known.static}
 
     def reject(self, reason: str, error: Exception) -> None:
-        """Count a sample that was refused, and tell of it."""
+        """Count and announce a sample that was refused."""
         self.rejected[reason] += 1
-        if not self._announcer:
+        if not self._announcer.has_listeners:
             return
         child = parent = authority = None
         if isinstance(error, InvalidTransformError):
             child, parent, authority = error.child, error.parent, error.authority
-        # A copy has no traceback that would keep the sender's variables.
-        self._announcer.tell(SampleRejected(self._announcer.now(), reason, child, parent, authority, copy(error)))
+        # A copy, because the traceback of the original keeps the sender's variables alive.
+        self._announcer.announce(SampleRejected(self._announcer.now(), reason, child, parent, authority, copy(error)))
 
     def _judge(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
         refused: list[InvalidTransformError] = []
-        if self._ownership:
+        if self._ownership.restricts:
             batch, refused = self._ownership.split(batch, self._newest)
         accepted, looped = admit(self._newest, batch)
         refused += looped
@@ -155,17 +154,17 @@ class Topology:
         for error in refused:
             self._log.warning((error.reason, error.child, error.authority), "dropped a sample: %s", error)
         for sample in accepted:
-            self._note(sample)
+            self._record(sample)
         return accepted
 
-    def _note(self, sample: TransformStamped) -> None:
+    def _record(self, sample: TransformStamped) -> None:
         parent, child, stamp, _, authority, static = sample._fields
-        news = self._announcer
+        announcer = self._announcer
         known = self._newest.get(child)
         if known is None:
-            known = self._newest[child] = _Newest(parent, static, authority)
-            if news:
-                news.tell(FrameAdded(news.now(), child, parent, authority, static))
+            known = self._newest[child] = _Edge(parent, static, authority)
+            if announcer.has_listeners:
+                announcer.announce(FrameAdded(announcer.now(), child, parent, authority, static))
         if known.authority != authority:
             if self._ownership.reserved_for(child) is None:
                 self._conflict(child, authority, known.authority)
@@ -175,14 +174,14 @@ class Topology:
             kind = "static" if static else "moving"
             self._log.warning(("kind", child, authority), "frame %r is now %s, from %r", child, kind, authority)
             known.static = static
-            if news:
-                news.tell(KindChanged(news.now(), child, static, authority))
+            if announcer.has_listeners:
+                announcer.announce(KindChanged(announcer.now(), child, static, authority))
         if static or known.newest is None or stamp >= known.newest:
             known.newest = None if static else stamp
             if known.parent != parent:
                 self._reparent(child, parent, known.parent, authority)
                 known.parent = parent
-        known.plain = None if static else authority
+        known.trusted = None if static else authority
         if static:
             self.latched[child] = sample
         else:
@@ -193,12 +192,12 @@ class Topology:
         first, second = sorted((other, authority))
         key = ("authority", child, first, second)
         self._log.warning(key, "frame %r comes from two authorities, %r and %r", child, first, second)
-        if self._announcer:
-            self._announcer.tell(AuthorityConflict(self._announcer.now(), child, authority, other))
+        if self._announcer.has_listeners:
+            self._announcer.announce(AuthorityConflict(self._announcer.now(), child, authority, other))
 
     def _reparent(self, child: str, parent: str, old_parent: str, authority: str) -> None:
         self.reparented += 1
         key = ("parent", child, authority)
         self._log.info(key, "frame %r moves from %r to %r, says %r", child, old_parent, parent, authority)
-        if self._announcer:
-            self._announcer.tell(Reparented(self._announcer.now(), child, parent, old_parent, authority))
+        if self._announcer.has_listeners:
+            self._announcer.announce(Reparented(self._announcer.now(), child, parent, old_parent, authority))

@@ -1,4 +1,4 @@
-"""Sending transforms under one name."""
+"""A publisher of transforms under one authority."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -17,12 +17,12 @@ class TransformBroadcaster:
     ----------
     bus : Bus
     authority : str
-        Who says so: shown in errors and tools.
+        The name of the sender, which errors and tools show.
     prefix : str, optional
-        What the bus has before the names of this broadcaster's frames, such as ``"robot1/"``, so that several robots
-        with the same frames can share a bus. The names that the methods take are without it.
+        Put before the names of this broadcaster's frames on the bus, such as ``"robot1/"``, so that several robots
+        with the same frames can share a bus. The methods take names without it.
     shared : iterable of str
-        Names that get no prefix, because they are the same for everybody, such as ``{"map"}``.
+        Names without a prefix, because they are the same for all robots, such as ``{"map"}``.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class TransformBroadcaster:
         self.bus.publish([self._sample(sample, stamp) for sample in samples])
 
     def send_static(self, parent: str, child: str, transform: Transform) -> None:
-        """Publish a transform that holds at every stamp. Whoever joins later gets it too; sending it again replaces it.
+        """Publish a transform that holds at every stamp. Later subscribers get it too; sending it again replaces it.
 
         Raises
         ------
@@ -92,10 +92,10 @@ class TransformBroadcaster:
 
     @contextmanager
     def owning(self, *frames: str) -> Iterator[None]:
-        """Have frames for as long as a ``with`` lasts: nobody else may publish them, and at its end they are removed.
+        """Own frames inside a ``with``: no other authority may publish them, and at its end they are removed.
 
-        They are removed whoever published them: also what another authority, or this one, had sent before the ``with``
-        began. Nothing happens to a frame that was never published, and nothing at all once the bus is closed.
+        All samples of a frame are removed, also those that this or another authority sent before the ``with`` began. A
+        frame that was never published is left out. Once the bus is closed, nothing is removed.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class TransformBroadcaster:
                         self.bus.remove_frame(name)
 
     def _on_bus(self, name: str) -> str:
-        """The name that the bus has for a frame."""
+        """The name of a frame on the bus."""
         return name if self._prefix is None else self._prefix.on_bus(name)
 
     def _stamp(self, at: int | None) -> int:

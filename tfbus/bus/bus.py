@@ -1,7 +1,7 @@
-"""The bus: who publishes reaches every buffer, stream and subscriber.
+"""The bus: published samples reach every buffer, stream and subscriber.
 
-`Bus.publish` is a plain function that does its work at once: it judges a batch by the newest parents that it knows of,
-has every buffer insert it and wake its waiters, then calls the subscribers. The bus owns no task and no loop, so
+`Bus.publish` is a plain function that does its work at once: it judges a batch by the newest edges, inserts it into
+every buffer, wakes the lookups that waited for it, then calls the subscribers. The bus owns no task and no loop, so
 nothing can be lost between "sent" and "buffered".
 """
 
@@ -36,10 +36,11 @@ class Bus:
     Parameters
     ----------
     clock : Clock, optional
-        Where stamps, timeouts and timed tasks take their time from; by default a `SystemClock`.
+        The source of stamps, and the clock of timeouts and timed tasks; by default a `SystemClock`.
     on_conflict : {"last", "reject"}
-        What happens to samples of a child that another authority has published before: they are taken and reported,
-        or refused until the frame is removed, across jumps of the clock. No authority, ``""``, is one like any other.
+        What happens to samples of a child that another authority has published before: they are accepted and reported,
+        or refused until the frame is removed, across jumps of the clock. The empty authority ``""`` is one like any
+        other.
 
     Raises
     ------
@@ -62,7 +63,7 @@ class Bus:
         self._announcer = Announcer(self.clock.now, self._events)
         self._topology = Topology(self._log, Ownership(on_conflict), self._announcer)
         self._subscribers = Subscribers(self._log, self._announcer)
-        self._feeds: dict[LiveTree, int] = {}
+        self._buffers: dict[LiveTree, int] = {}
         self._streams: list[Stream] = []
         self._threads: list[ThreadPublisher] = []
         self._samples = 0
@@ -86,8 +87,8 @@ class Bus:
         samples : TransformStamped or iterable of them
         invalid : {"raise", "drop"}
             What to do with a sample that would close a loop of parents, or whose authority may not publish the child:
-            refuse the whole batch, or leave that sample out and count it. ``"drop"`` is for those who pass on what
-            others have sent.
+            refuse the whole batch, or leave that sample out and count it. ``"drop"`` is for programs that pass on the
+            samples of others.
 
         Raises
         ------
@@ -116,12 +117,12 @@ class Bus:
         callbacks = self._subscribers.callbacks
         if callbacks:
             self._subscribers.check_backlog()
-        batch = self._topology.take(batch, invalid)
+        batch = self._topology.accept(batch, invalid)
         if not batch:
             return
         self._samples += len(batch)
-        for feed in self._feeds:
-            feed.receive(batch)
+        for buffer in self._buffers:
+            buffer.insert(batch)
         for stream in self._streams:
             stream.put(batch)
         if self._events:
@@ -131,7 +132,7 @@ class Bus:
             self._subscribers.deliver(batch)
 
     def _check_thread(self) -> None:
-        """Raise `RuntimeError` unless the caller may use the bus directly.
+        """Raise `RuntimeError` unless this thread may use the bus. Called by buffers, message filters and links.
 
         The first event loop to use a bus that another thread has made takes it over.
         """
@@ -141,17 +142,17 @@ class Bus:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
 
         It is called inside `publish`, so it should be quick; if it publishes, those batches are delivered behind the
-        current one. If it raises an `Exception`, that is logged once and counted, and nobody else notices. What is
-        latched, it is given at once.
+        current one. If it raises an `Exception`, that is logged once and counted, and no other subscriber is affected.
+        It is called with the latched samples at once.
 
-        `removed` is called with each frame that `remove_frame` takes away, between the batches before and after it.
+        `removed` is called with each frame that `remove_frame` removes, between the batches before and after it.
 
         Raises
         ------
         BusClosedError
         """
         self._check_usable()
-        return self._subscribers.add(callback, tuple(self._topology.latched.values()), removed)
+        return self._subscribers.subscribe(callback, tuple(self._topology.latched.values()), removed)
 
     def stream(self, capacity: int = 1_000, overflow: Overflow = "conflate") -> Stream:
         """The batches as an async iterator: ``with bus.stream() as batches: async for batch in batches``.
@@ -176,21 +177,21 @@ class Bus:
         return stream
 
     def events(self, capacity: int = 1_000, stale_after: float | None = 1.0) -> EventStream:
-        """What happens besides samples: ``with bus.events() as events: async for event in events``.
+        """Everything that happens besides samples: ``with bus.events() as events: async for event in events``.
 
-        It begins with a `FrameAdded` for each frame that has a parent by now. Each failure of a subscriber is an event;
-        what is rejected is told once for each frame, authority and reason. Of two authorities that argue about a frame,
-        each pair is told once, and each parent and kind that one of them claims. That lasts until the frame is removed,
-        or the clock jumps back; the counters count every time.
+        It begins with a `FrameAdded` for each frame that has a parent by now. Each failure of a subscriber is an event.
+        A rejected sample is an event once for each frame, authority and reason. A conflict about a frame is an event
+        once for each pair of authorities, and then once for each parent and kind that one of them claims. This starts
+        anew when the frame is removed or the clock jumps back. The counters count every case.
 
         Parameters
         ----------
         capacity : int
-            How many events may wait for the reader; then the oldest are dropped and counted. What was there at the
-            beginning, and who is stale or live, is never dropped.
+            How many events may wait for the reader; then the oldest are dropped and counted. The events of the frames
+            at the beginning, and of stale and live frames, are never dropped.
         stale_after : float or None
             A moving frame is stale when its newest stamp is more than this many s behind the clock, and live again when
-            it is not; None for no such events. It is worked out while somebody reads, without a timer of its own.
+            it is not; None for no such events. It is found while a task reads, without a timer of its own.
 
         Raises
         ------
@@ -204,15 +205,15 @@ class Bus:
         return events
 
     def _announce(self, event: Event) -> None:
-        """Tell whoever reads `events` of something that the bus cannot know: for links, recorders and players."""
+        """Announce an event that the bus cannot know. Called by links and recorders."""
         self._check_thread()
-        self._announcer.tell(event)
+        self._announcer.announce(event)
 
     def reserve(self, frame: str, authority: str) -> Registration:
         """Let only `authority` publish a frame, whatever `on_conflict` says, until the registration is closed.
 
-        What another authority has published of it stays; from now on it is refused, with ``reason="reserved"``. One
-        authority may reserve a frame several times.
+        Earlier samples of another authority stay; later ones are refused with ``reason="reserved"``. One authority may
+        reserve a frame several times.
 
         Raises
         ------
@@ -224,10 +225,11 @@ class Bus:
         return self._topology.reserve(frame, authority)
 
     def threadsafe(self, capacity: int = 10_000) -> ThreadPublisher:
-        """A way in for other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
+        """A function to publish from other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
 
-        ``publish(samples)`` may then be called from any thread. The bus publishes what has gathered with
-        ``invalid="drop"``; when more than `capacity` moving samples wait, the oldest batches are dropped and counted.
+        ``publish(samples)`` may then be called from any thread. The bus publishes the queued batches with
+        ``invalid="drop"``. When more than `capacity` moving samples are queued, the oldest batches are dropped and
+        counted.
 
         Raises
         ------
@@ -236,32 +238,32 @@ class Bus:
         self._check_usable()
         return ThreadPublisher(capacity, self._attach_publisher, self._publish_from_thread, self._threads.remove)
 
-    def _attach(self, feed: LiveTree) -> None:
-        """Have a buffer's feed receive what is latched now and all that is published from now on."""
+    def _attach(self, buffer: LiveTree) -> None:
+        """Give a buffer the latched samples, and from now on all that are published. Called by `Buffer`."""
         self._check_usable()
         latched = tuple(self._topology.latched.values())
-        self._feeds[feed] = self._samples - len(latched)
+        self._buffers[buffer] = self._samples - len(latched)
         if latched:
-            feed.receive(latched)
+            buffer.insert(latched)
 
-    def _detach(self, feed: LiveTree) -> None:
-        """Take a feed off the bus, if it is on it."""
-        if feed.anyone_waits:
+    def _detach(self, buffer: LiveTree) -> None:
+        """Take a buffer off the bus, if it is on it. Called by `Buffer`."""
+        if buffer.has_waiters:
             self._check_thread()
-        self._feeds.pop(feed, None)
+        self._buffers.pop(buffer, None)
 
     def remove_frame(self, frame: str) -> None:
-        """Make a frame disappear: from every buffer, from what streams still hold, and for whoever joins later.
+        """Remove a frame from every buffer and from pending batches, and do not give it to later subscribers.
 
         Frames below it stay, as a tree of their own.
 
         Raises
         ------
         UnknownFrameError
-            If neither the bus nor a buffer knows it.
+            If neither the bus nor a buffer knows the frame.
         """
         self._check_usable()
-        if frame not in self._topology and not any(frame in feed.tree for feed in self._feeds):
+        if frame not in self._topology and not any(frame in buffer.forest.names for buffer in self._buffers):
             names = self._topology.names()
             if frame not in names:
                 raise UnknownFrameError(frame=frame, known=tuple(names))
@@ -271,9 +273,9 @@ class Bus:
             publisher.forget(frame)
         for stream in self._streams:
             stream.queue.forget(frame)
-        for feed in self._feeds:
-            feed.remove_frame(frame)
-        self._subscribers.tell_removed(frame)
+        for buffer in self._buffers:
+            buffer.remove_frame(frame)
+        self._subscribers.notify_removed(frame)
 
     def statistics(self) -> BusStatistics:
         """All counters, as they are now."""
@@ -286,7 +288,7 @@ class Bus:
             clock_resets=self._resets,
             callbacks_failed=self._subscribers.failures,
             frames=len(self._topology),
-            buffers=tuple(feed.statistics(self._samples - before) for feed, before in self._feeds.items()),
+            buffers=tuple(buffer.statistics(self._samples - before) for buffer, before in self._buffers.items()),
             queues=(
                 *(stream.queue.statistics("stream") for stream in self._streams),
                 *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
@@ -302,7 +304,7 @@ class Bus:
         if self._closed:
             return
         readers: list[Stream | EventStream] = [*self._streams, *self._events]
-        if any(reader.waiting for reader in readers) or any(feed.anyone_waits for feed in self._feeds):
+        if any(reader.waiting for reader in readers) or any(buffer.has_waiters for buffer in self._buffers):
             self._check_thread()
         self._closed = True
         self._jumps.close()
@@ -311,12 +313,12 @@ class Bus:
             publisher.discard()
         for reader in readers:
             reader.end()
-        feeds = tuple(self._feeds)
-        for feed in feeds:
-            feed.end("the bus is closed")
-        # Only now, when everybody has been woken, somebody else's code.
-        for feed in feeds:
-            feed.tell_the_end()
+        buffers = tuple(self._buffers)
+        for buffer in buffers:
+            buffer.end("the bus is closed")
+        # These run foreign code, so only after every waiter has been woken.
+        for buffer in buffers:
+            buffer.call_end_callbacks()
 
     def __enter__(self) -> "Bus":
         return self
@@ -344,7 +346,7 @@ class Bus:
             self._events.remove(events)
 
     def _well_typed(self, samples: object) -> Batch:
-        """The samples of a batch; whatever else is in it is counted."""
+        """The samples in a batch; anything else in it is counted as rejected."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
         batch = tuple(thing for thing in things if isinstance(thing, TransformStamped))
         if len(batch) < len(things):
@@ -366,11 +368,11 @@ class Bus:
         self._resets += 1
         self._log.warning(("clock", before, after), "the clock jumped back: moving samples are dropped")
         self._topology.clear_moving()
-        self._announcer.tell(ClockReset(after, before))
+        self._announcer.announce(ClockReset(after, before))
         self._subscribers.discard_moving()
         for publisher in self._threads:
             publisher.discard()
         for stream in self._streams:
             stream.queue.discard_moving()
-        for feed in self._feeds:
-            feed.reset(before, after)
+        for buffer in self._buffers:
+            buffer.reset(before, after)

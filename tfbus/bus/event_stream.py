@@ -3,8 +3,6 @@
 import math
 from collections.abc import Callable
 
-import anyio
-
 from tfbus._aio.one_reader import OneReaderStream
 from tfbus.bus._event_queue import EventQueue
 from tfbus.bus._staleness import Staleness
@@ -16,10 +14,10 @@ from tfbus.stamps import as_duration, from_seconds, to_seconds
 
 
 class EventStream(OneReaderStream[Event]):
-    """What `Bus.events` gives: ``async for event in events``, for one reader.
+    """The result of `Bus.events`: ``async for event in events``, for one reader.
 
-    The iteration ends when the bus or the stream is closed and what was pending has been read. Whether a frame is stale
-    is worked out while somebody reads, once nothing is pending; what that gives is told in full, whatever the capacity.
+    The iteration ends when the bus or the stream is closed and what was pending has been read. Stale frames are
+    found while a task reads and nothing else is pending; their events are never dropped.
     """
 
     def __init__(
@@ -38,7 +36,7 @@ class EventStream(OneReaderStream[Event]):
         if stale_after is not None and as_duration(stale_after, "stale_after") != math.inf:
             self._staleness = Staleness(from_seconds(stale_after), topology.newest)
             for event in known:
-                self._staleness.hear(event.frame)
+                self._staleness.note(event.frame)
         self._clock = clock
 
     @property
@@ -57,22 +55,22 @@ class EventStream(OneReaderStream[Event]):
         self.wake()
 
     def arrived(self, batch: Batch) -> None:
-        """Wake the reader if samples that the bus has accepted may have changed what is stale."""
+        """Wake the reader if accepted samples may have changed which frames are stale."""
         if self._staleness is not None and self._staleness.arrived(batch):
             self.wake()
 
     def _next(self) -> Event | None:
         event = self.queue.get()
         if event is None and self._staleness is not None and not self._ended:
-            self.queue.put_news(self._staleness.news(self._clock.now()))
+            self.queue.put_staleness(self._staleness.changes(self._clock.now()))
             event = self.queue.get()
         return event
 
-    async def _wait(self, woken: anyio.Event) -> None:
+    async def _wait(self) -> None:
         due = None if self._staleness is None else self._staleness.due()
         if due is None:
-            await woken.wait()
+            await super()._wait()
             return
-        # Another frame may be stale then.
+        # At `due` another frame may become stale.
         with self._clock.move_on_after(max(0.0, to_seconds(due - self._clock.now()))):
-            await woken.wait()
+            await super()._wait()

@@ -8,7 +8,7 @@ from tfbus.geometry.stamped import Batch
 
 
 class Stream(OneReaderStream[Batch]):
-    """What `Bus.stream` gives: ``async for batch in stream``, for one reader.
+    """The result of `Bus.stream`: ``async for batch in stream``, for one reader.
 
     The iteration ends when the bus or the stream is closed and what was pending has been read.
     """

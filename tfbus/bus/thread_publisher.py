@@ -11,7 +11,7 @@ from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
 
 
 class ThreadPublisher:
-    """What `Bus.threadsafe` gives: inside its ``with``, a function that any thread may call.
+    """The result of `Bus.threadsafe`: inside its ``with``, a function that any thread may call.
 
     Samples are queued here and published on the event loop, with one wake-up of the loop for all that has gathered.
 
@@ -39,11 +39,11 @@ class ThreadPublisher:
         self._lock = threading.Lock()
         self._deliver = deliver
         self._detach = detach
-        self._bell = LoopWaker(self._drain)
+        self._waker = LoopWaker(self._drain)
         self._ended = False
 
     def __enter__(self) -> "ThreadPublisher":
-        self._bell.connect()
+        self._waker.bind()
         try:
             self._attach(self)
         except BaseException:
@@ -72,17 +72,17 @@ class ThreadPublisher:
 
         Notes
         -----
-        What only the bus can judge, such as a loop of parents, is dropped and counted there.
+        A sample that only the bus can judge, such as one that closes a loop of parents, is dropped and counted there.
         """
         batch = as_batch(samples)
-        if not self._bell.connected:
+        if not self._waker.bound:
             raise RuntimeError("enter the `with` of bus.threadsafe() on the event loop first")
         with self._lock:
             if self._ended:
                 raise BusClosedError("the bus takes no more samples from this thread: its `with` has ended")
             self.queue.put(batch)
         try:
-            self._bell.ring()
+            self._waker.wake()
         except RuntimeError as error:
             self.end()
             raise BusClosedError("the event loop of the bus has ended") from error
@@ -93,19 +93,19 @@ class ThreadPublisher:
             self._ended = True
 
     def discard(self) -> None:
-        """Drop what was queued before the clock jumped back; static samples stay."""
+        """Drop the moving samples that were queued before the clock jumped back."""
         with self._lock:
             self.queue.discard_moving()
 
     def forget(self, child: str) -> None:
-        """Drop what is queued of a removed frame."""
+        """Drop the queued samples of a removed frame."""
         with self._lock:
             self.queue.forget(child)
 
     def _drain(self) -> None:
         with self._lock:
             pending = len(self.queue)
-        # One by one: what is delivered may make the clock jump, and that discards the rest.
+        # One by one: a batch may make the clock jump, and that discards the rest.
         for _ in range(pending):
             with self._lock:
                 batch = self.queue.get()

@@ -1,8 +1,8 @@
 """The arithmetic of rigid transforms, on rows.
 
 A *row* is one transform as a tuple of seven floats: ``(tx, ty, tz, qx, qy, qz, qw)``. `compose`, `invert` and `rotate`
-take arrays in place of floats as well. The kernel of the lookup repeats this arithmetic in one loop; these functions are
-its readable definition.
+take arrays in place of floats as well. The kernel of the lookup repeats this arithmetic in one loop; these functions
+are its readable definition.
 """
 
 import math

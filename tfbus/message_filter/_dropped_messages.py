@@ -1,4 +1,4 @@
-"""Messages that a filter gives up: counted by reason, and told to whoever wants to know."""
+"""The messages that a filter drops: counted by reason, and passed to a callback."""
 
 import logging
 from collections import Counter
@@ -15,7 +15,7 @@ DropReason = Literal["too old", "queue full", "timed out", "unknown frame", "clo
 
 
 class DroppedMessages(Generic[MessageT]):
-    """Counts drops, and calls a callback that can harm nobody.
+    """Counts dropped messages and calls a callback for each; its errors are logged and counted.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class DroppedMessages(Generic[MessageT]):
     counts : Counter
         By reason.
     callbacks_failed : int
-        Exceptions that the callback raised.
+        Number of exceptions that the callback raised.
     """
 
     def __init__(self, on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None) -> None:
@@ -40,20 +40,20 @@ class DroppedMessages(Generic[MessageT]):
         self.counts: Counter[DropReason] = Counter()
         self.callbacks_failed = 0
 
-    def add(self, message: MessageT, reason: DropReason, error: TransformError | None) -> None:
-        """Count one; an `Exception` of the callback is logged the first time."""
+    def drop(self, message: MessageT, reason: DropReason, error: TransformError | None) -> None:
+        """Count a message and call the callback; its first `Exception` is logged."""
         self.counts[reason] += 1
         if self._on_drop is None:
             return
         try:
             self._on_drop(message, reason, error)
-        except Exception as raised:  # noqa: BLE001 - the callback is somebody else's code
+        except Exception as raised:  # noqa: BLE001 - the callback must not stop the filter
             self.callbacks_failed += 1
             self._log.warning("on_drop", "the on_drop callback %r raised", self._on_drop, exc_info=raised)
 
 
 def reason_of(error: TransformError) -> DropReason:
-    """Under which reason a message is counted whose lookup ended with `error`."""
+    """The reason for dropping a message whose lookup ended with `error`."""
     if isinstance(error, LookupTimeoutError):
         return "unknown frame" if isinstance(error.__cause__, UnknownFrameError) else "timed out"
     if isinstance(error, UnknownFrameError):

@@ -1,17 +1,18 @@
-"""Messages that wait for an answer, or for somebody to read it, and the order in which they leave."""
+"""A queue of messages that wait for their transforms, and then for the reader."""
 
 from bisect import bisect_left, insort
 from collections.abc import Callable
 from itertools import count
 from typing import Generic, Literal, TypeVar
 
+from tfbus.bus.sample_queue import check_capacity
 from tfbus.stamps import Latest
 
 MessageT = TypeVar("MessageT")
 AnswerT = TypeVar("AnswerT")
 
 Order = Literal["ready", "stamp", "arrival"]
-"""As they become answerable; by stamp; or as they came."""
+"""The order of delivery: as messages become ready, by stamp, or by arrival."""
 
 
 class PendingMessage(Generic[MessageT, AnswerT]):
@@ -19,35 +20,35 @@ class PendingMessage(Generic[MessageT, AnswerT]):
 
     Attributes
     ----------
-    answers : list
-        What is delivered with it, as its one element; empty while it waits.
-    stop : callable
-        Called when what it waits for is no longer wanted.
+    answer : transform or tuple of transforms, or None
+        Delivered with the message; None while it waits.
+    stop_waiting : callable
+        Ends the wait for the answer.
     number : int
-        How many arrived before it.
+        Number of messages that arrived before it.
     place : tuple of int or None
-        Where it stands in line: its rank, then its number.
+        Its place in the order of delivery: its rank, then its number.
     """
 
-    __slots__ = ("answers", "frame", "message", "number", "place", "stamp", "stop")
+    __slots__ = ("answer", "frame", "message", "number", "place", "stamp", "stop_waiting")
 
     def __init__(self, message: MessageT, frame: str, stamp: int | Latest) -> None:
         self.message = message
         self.frame = frame
         self.stamp = stamp
-        self.answers: list[AnswerT] = []
-        self.stop: Callable[[], object] = _nothing
+        self.answer: AnswerT | None = None
+        self.stop_waiting: Callable[[], object] = _nothing
         self.number = -1
         self.place: tuple[int, int] | None = None
 
 
 class MessageQueue(Generic[MessageT, AnswerT]):
-    """A bounded queue that only answered messages leave by themselves.
+    """A bounded queue from which the reader gets only answered messages.
 
     Parameters
     ----------
     capacity : int
-        How many may wait or be ready; at least one. Whoever adds one makes room first.
+        How many may wait or be ready; at least one. The caller of `append` makes room first.
     order : {"ready", "stamp", "arrival"}
         With ``"stamp"`` and ``"arrival"``, a message that waits holds back those behind it.
 
@@ -58,10 +59,7 @@ class MessageQueue(Generic[MessageT, AnswerT]):
     """
 
     def __init__(self, capacity: int, order: Order) -> None:
-        if isinstance(capacity, bool) or not isinstance(capacity, int):
-            raise TypeError(f"capacity must be an int, not {capacity!r}")
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}")
+        check_capacity(capacity)
         if order not in ("ready", "stamp", "arrival"):
             raise ValueError(f"order must be 'ready', 'stamp' or 'arrival', not {order!r}")
         self.capacity = capacity
@@ -69,7 +67,7 @@ class MessageQueue(Generic[MessageT, AnswerT]):
         self.unanswered = 0
         self._arrivals = count()
         self._pending: dict[int, PendingMessage[MessageT, AnswerT]] = {}
-        # The places in the order of leaving; with "ready", of those that are answered.
+        # The places in the order of delivery; with "ready", only those of answered messages.
         self._line: list[tuple[int, int]] = []
 
     def __len__(self) -> int:
@@ -80,30 +78,30 @@ class MessageQueue(Generic[MessageT, AnswerT]):
 
     @property
     def full(self) -> bool:
-        """Whether one more would be too many."""
+        """Whether there is no room for another message."""
         return len(self._pending) >= self.capacity
 
     @property
-    def everything(self) -> tuple[PendingMessage[MessageT, AnswerT], ...]:
-        """All that are here, in the order of arrival."""
+    def messages(self) -> tuple[PendingMessage[MessageT, AnswerT], ...]:
+        """All messages, in the order of arrival."""
         return tuple(self._pending.values())
 
     @property
     def waiting(self) -> tuple[PendingMessage[MessageT, AnswerT], ...]:
-        """Those without an answer, in the order of arrival."""
-        return tuple(pending for pending in self._pending.values() if not pending.answers)
+        """The messages without an answer, in the order of arrival."""
+        return tuple(pending for pending in self._pending.values() if pending.answer is None)
 
     @property
     def oldest(self) -> PendingMessage[MessageT, AnswerT]:
-        """The one that arrived first."""
+        """The message that arrived first."""
         return next(iter(self._pending.values()))
 
-    def waits(self, pending: PendingMessage[MessageT, AnswerT]) -> bool:
-        """Whether this one is here and has no answer."""
-        return pending in self and not pending.answers
+    def is_waiting(self, pending: PendingMessage[MessageT, AnswerT]) -> bool:
+        """Whether a message is in the queue and has no answer."""
+        return pending in self and pending.answer is None
 
-    def add(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
-        """Take in one that has just arrived and has no answer; where the order is by stamp, it has a stamp."""
+    def append(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
+        """Add a message without an answer; with the order "stamp" it must have a stamp."""
         pending.number = next(self._arrivals)
         self._pending[pending.number] = pending
         self.unanswered += 1
@@ -112,29 +110,29 @@ class MessageQueue(Generic[MessageT, AnswerT]):
         elif self.order == "stamp" and not isinstance(pending.stamp, Latest):
             self._line_up(pending, pending.stamp)
 
-    def answer(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT, moment: int) -> None:
-        """Give one that waits its answer; of two at one moment, the first to arrive is ready first."""
-        pending.answers.append(answer)
+    def set_answer(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT, moment: int) -> None:
+        """Give a waiting message its answer. Of two at one moment, the one that arrived first is ready first."""
+        pending.answer = answer
         self.unanswered -= 1
         if pending.place is None:
             self._line_up(pending, moment)
 
     def remove(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
-        """Take out one that is here, answered or not."""
+        """Remove a message, answered or not."""
         del self._pending[pending.number]
-        self.unanswered -= not pending.answers
+        self.unanswered -= pending.answer is None
         if pending.place is not None:
             del self._line[bisect_left(self._line, pending.place)]
 
-    def take(self) -> PendingMessage[MessageT, AnswerT] | None:
-        """Take out the next one in line, if it has its answer."""
+    def pop_ready(self) -> tuple[MessageT, AnswerT] | None:
+        """Remove the next message in the order of delivery if it has its answer, and return both."""
         if not self._line:
             return None
         pending = self._pending[self._line[0][1]]
-        if not pending.answers:
+        if pending.answer is None:
             return None
         self.remove(pending)
-        return pending
+        return pending.message, pending.answer
 
     def _line_up(self, pending: PendingMessage[MessageT, AnswerT], rank: int) -> None:
         pending.place = rank, pending.number
@@ -142,4 +140,4 @@ class MessageQueue(Generic[MessageT, AnswerT]):
 
 
 def _nothing() -> None:
-    """Nothing has been started that could be stopped."""
+    """Do nothing: no wait has been started."""

@@ -1,4 +1,4 @@
-"""What has to be looked up for a message: one frame or several, at its stamp and perhaps some time after it."""
+"""The lookups that a message needs: into one target or several, at its stamp and perhaps some time later."""
 
 from collections.abc import Iterator, Sequence
 from typing import Generic, TypeVar, cast
@@ -14,15 +14,15 @@ AnswerT = TypeVar("AnswerT")
 
 
 class Targets(Generic[AnswerT]):
-    """The frames that messages are wanted in.
+    """The target frames of a message filter.
 
     Parameters
     ----------
     buffer : Buffer
     target : str or sequence of str
-        Of one, an answer is a transform; of a sequence, a tuple of them in that order.
+        With one, an answer is a transform; with a sequence, a tuple of transforms in that order.
     tolerance : float
-        In s. The stamp that lies this much later has to be answerable too.
+        In s. The transform at this much later has to be known too.
 
     Raises
     ------
@@ -39,7 +39,7 @@ class Targets(Generic[AnswerT]):
         self._tolerance = from_seconds(as_duration(tolerance, "tolerance"))
 
     def replace(self, target: str | Sequence[str]) -> None:
-        """Want other frames from now on; `TypeError` unless it is again one, or again a sequence."""
+        """Change the targets; `TypeError` unless both are one frame, or both a sequence."""
         if isinstance(target, str) is not self._one:
             wanted = "one target" if self._one else "a sequence of targets"
             raise TypeError(f"the filter was made for {wanted}, and its pairs keep their shape: not {target!r}")
@@ -54,13 +54,13 @@ class Targets(Generic[AnswerT]):
                 yield target, min(stamp + self._tolerance, STAMP_MAX)
             yield target, stamp
 
-    def ask(self, frame: str, stamp: int | Latest) -> AnswerT:
-        """The answer, as far as there is one now.
+    def lookup_nowait(self, frame: str, stamp: int | Latest) -> AnswerT:
+        """The answer, or an error at once.
 
         Raises
         ------
         TransformLookupError
-            If there is none. An error that waiting cannot help comes before one that it can.
+            If there is none. An error that waiting cannot help is raised before one that it may help.
         """
         now = self._buffer.bus.clock.now() if isinstance(stamp, Latest) else stamp
         found = {frame: answer_of(frame, frame, now, IDENTITY, static=True)}
@@ -81,17 +81,17 @@ class Targets(Generic[AnswerT]):
             await self._buffer.lookup(target, frame, at)
 
     def blocker(self, frame: str, stamp: int | Latest) -> TransformLookupError | None:
-        """What is lacking for an answer now; None if nothing is."""
+        """The error that an answer has now; None if there is an answer."""
         try:
-            self.ask(frame, stamp)
+            self.lookup_nowait(frame, stamp)
         except TransformLookupError as error:
             return error
         return None
 
-    def ask_for_the_last_time(self, frame: str, stamp: int | Latest, timeout: float) -> AnswerT:
-        """As `ask`, of a message that has waited for `timeout` s: what may still come is a `LookupTimeoutError` now."""
+    def lookup_at_timeout(self, frame: str, stamp: int | Latest, timeout: float) -> AnswerT:
+        """The answer for a message that has waited `timeout` s; `LookupTimeoutError` where waiting might still help."""
         try:
-            return self.ask(frame, stamp)
+            return self.lookup_nowait(frame, stamp)
         except MAY_COME:
             for target, at in self.questions(frame, stamp):
                 try:

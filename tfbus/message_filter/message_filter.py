@@ -1,8 +1,8 @@
-"""Messages come in as they like and come out with their transform, as soon as that is known.
+"""A filter that pairs each message with the transform of its own stamp, as soon as that is known.
 
-One task reads the source. A message that can be answered on arrival is ready at once; any other gets a task that waits
-for its transforms, so there are never more than `capacity` of these. No task raises: what goes wrong with a message is
-a drop, and what the source raises is kept for the reader.
+One task reads the source. A message whose transform is known on arrival is ready at once. Any other message gets a task
+that waits for its transforms, so there are never more than `capacity` tasks. No task raises: a message that fails is
+dropped, and an error of the source is kept for the reader.
 """
 
 import math
@@ -17,6 +17,8 @@ import anyio
 import anyio.abc
 import anyio.lowlevel
 
+from tfbus._aio.one_reader import OneReader
+from tfbus._aio.task_groups import close_task_group
 from tfbus.buffer.buffer import Buffer
 from tfbus.errors import MAY_COME, ClockResetError, TransformError, TransformLookupError, UnknownFrameError
 from tfbus.frames import is_frame
@@ -38,37 +40,37 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     """Pairs each message with its transform: ``async with MessageFilter(...) as pairs: async for message, t in pairs``.
 
     Every message that arrives is delivered once or dropped once, and no drop is silent: `dropped` counts them by
-    reason, and `on_drop` hears of each. The iteration ends when the source is exhausted and nothing waits any more, or
-    when the bus or the buffer is closed and what is ready has been read. The filter is for one reader at a time.
+    reason, and `on_drop` is called for each. The iteration ends when the source is exhausted and no message waits any
+    more, or when the bus or the buffer is closed and all ready messages have been read. One task at a time may read.
 
     Parameters
     ----------
     messages : async iterable
-        Where messages come from: an async generator, a stream of anyio, anything with ``__aiter__``. Leaving the
-        ``async with`` closes an async generator, which can be read no further, and nothing else.
+        The source: an async generator, a stream of anyio, anything with ``__aiter__``. Leaving the ``async with``
+        closes an async generator, which can be read no further, and no other source.
     buffer : Buffer
     target : str or sequence of str
-        The frame that messages are wanted in. Of several, all are needed, and the pair holds a tuple of transforms in
-        that order. A message that is in the target already is ready at once, whatever the buffer knows.
+        The frame into which the transforms lead. With a sequence, all of them are needed, and the pair holds a tuple of
+        transforms in that order. A message that is in the target already is ready at once, whatever the buffer knows.
     frame, stamp : callable, optional
         Give the frame and the stamp (ns, or `LATEST`) of a message; by default its attributes `frame` and `stamp`.
     tolerance : float
-        In s. Demands more, where that of a lookup allows more: a message is answered only when its stamp and the one
-        this much later both can be.
+        In s. It demands more, unlike that of a lookup: a message is ready only when the transforms at its stamp and at
+        this much later are both known.
     timeout : float, optional
-        How long a message may wait, in s on the bus's clock from its arrival; None for ever. One that is ready does
-        not time out.
+        How long a message may wait, in s on the bus's clock from its arrival; None for ever. A ready message does not
+        time out.
     capacity : int
         How many messages may wait or be ready and unread.
     overflow : {"drop_oldest", "drop_newest", "block"}
-        What happens when one more arrives: the first that arrived is dropped, or the new one, or none, because the
-        source is not read until there is room. To replay what does not wait by itself, such as a recording, block.
+        What happens when one more arrives: the oldest is dropped, or the new one, or none, because the source is not
+        read until there is room. Use ``"block"`` for a source that does not wait by itself, such as a recording.
     order : {"ready", "stamp", "arrival"}
-        Deliver as messages become answerable; or by stamp, which holds back what is newer than a message that waits;
-        or as they came, which holds back what came after one that waits.
+        Deliver messages as they become ready; or by stamp, which holds back messages newer than one that waits; or in
+        the order of arrival, which holds back messages that came after one that waits.
     on_drop : callable, optional
-        Called with a message, the reason, and the error that says what it lacked, or None for one that lacked
-        nothing. If it raises an `Exception`, that is logged once and counted.
+        Called with a message, the reason, and the error that says what it lacked, or None for a ready message. If it
+        raises an `Exception`, that is logged once and counted.
 
     Raises
     ------
@@ -84,9 +86,9 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     ``"clock reset"`` (it waited when the clock jumped back) and ``"closed"`` (the bus or the buffer was closed, or the
     ``async with`` was left).
 
-    What the source raises, and what `frame` and `stamp` raise, comes out of the iteration as it is, after what is
-    ready; if nobody reads on, out of the end of the ``async with``, unless that is left by another exception. What is
-    no `Exception`, such as Ctrl-C, stops the body at once, and comes out of the ``async with`` as it is.
+    An error of the source, or of `frame` and `stamp`, is raised unchanged by the iteration, after the ready messages;
+    if nobody reads on, by the end of the ``async with``, unless that is left by another exception. An exception that is
+    no `Exception`, such as Ctrl-C, stops the body at once, and is raised unchanged by the ``async with``.
     """
 
     @overload
@@ -160,42 +162,41 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         self._registrations: list[Registration] = []
         self._error: BaseException | None = None
         self._exhausted = False
-        self._reading = anyio.ResourceGuard("reading from")
-        self._reader: anyio.Event | None = None
+        self._reader = OneReader()
         self._room: anyio.Event | None = None
 
     @property
     def arrived(self) -> int:
-        """Messages that have come from the source: ``arrived == delivered + sum(dropped.values()) + pending``."""
+        """Number of messages from the source: ``arrived == delivered + sum(dropped.values()) + pending``."""
         return self._arrived
 
     @property
     def delivered(self) -> int:
-        """Messages that the reader has got."""
+        """Number of messages that the reader has got."""
         return self._delivered
 
     @property
     def pending(self) -> int:
-        """Messages that wait, or are ready and unread."""
+        """Number of messages that wait, or are ready and unread."""
         return len(self._pending)
 
     @property
     def dropped(self) -> Counter[DropReason]:
-        """How many messages were dropped for which reason; a copy."""
+        """Number of dropped messages by reason; a copy."""
         return self._drops.counts.copy()
 
     @property
     def callbacks_failed(self) -> int:
-        """Exceptions that `on_drop` raised."""
+        """Number of exceptions that `on_drop` raised."""
         return self._drops.callbacks_failed
 
     def set_target(self, target: str | Sequence[str]) -> None:
-        """Want messages in another frame from now on, those that wait too; what is ready keeps its transform.
+        """Change the target, also for the messages that wait; ready messages keep their transform.
 
         Parameters
         ----------
         target : str or sequence of str
-            As at the beginning: one frame if it was one, and else a sequence.
+            One frame if the filter was made with one, otherwise a sequence.
 
         Raises
         ------
@@ -208,7 +209,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         """
         self._targets.replace(target)
         for pending in self._pending.waiting:
-            pending.stop()
+            pending.stop_waiting()
 
     async def __aenter__(self) -> "MessageFilter[MessageT, AnswerT]":
         if self._tasks is not None:
@@ -229,16 +230,15 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         assert self._tasks is not None
         self._tasks.cancel_scope.cancel()
         try:
-            # A task group would wrap what the body raises, so it is not told.
-            await self._tasks.__aexit__(None, None, None)
-        except BaseExceptionGroup as group:
-            if len(group.exceptions) > 1:
-                raise
-            self._error, error = group.exceptions[0], None
+            await close_task_group(self._tasks)
+        except BaseExceptionGroup:
+            raise
+        except BaseException as raised:  # noqa: BLE001 - raised below
+            self._error, error = raised, None
         finally:
             for registration in self._registrations:
                 registration.close()
-            for pending in self._pending.everything:
+            for pending in self._pending.messages:
                 self._drop(pending, "closed", self._blocker(pending))
         if error is None:
             self._raise_error()
@@ -249,20 +249,16 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     async def __anext__(self) -> tuple[MessageT, AnswerT]:
         if self._tasks is None:
             raise RuntimeError("enter the message filter first: async with MessageFilter(...) as pairs")
-        with self._reading:
+        with self._reader:
             await anyio.lowlevel.checkpoint()
-            while (pending := self._pending.take()) is None:
+            while (ready := self._pending.pop_ready()) is None:
                 self._raise_error()
                 if self._exhausted and not self._pending.unanswered:
                     raise StopAsyncIteration
-                self._reader = anyio.Event()
-                try:
-                    await self._reader.wait()
-                finally:
-                    self._reader = None
+                await self._reader.wait()
         self._delivered += 1
         self._wake()
-        return pending.message, pending.answers[0]
+        return ready
 
     async def _read_source(self, scope: anyio.CancelScope) -> None:
         try:
@@ -271,7 +267,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
                 messages = aiter(self._messages)
                 try:
                     async for message in messages:
-                        self._arrive(message)
+                        self._accept(message)
                         await anyio.lowlevel.checkpoint()
                         await self._make_room()
                 finally:
@@ -280,7 +276,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         except anyio.get_cancelled_exc_class() as error:
             if anyio.current_effective_deadline() == -math.inf:
                 raise
-            # Nobody cancels this task: the source was cancelled in its own right, as a task of asyncio can be.
+            # This task was not cancelled: the source itself was, as a task of asyncio can be.
             self._error = error
         except Exception as error:  # noqa: BLE001 - the reader raises it
             self._error = error
@@ -296,72 +292,72 @@ class MessageFilter(Generic[MessageT, AnswerT]):
             finally:
                 self._room = None
 
-    def _arrive(self, message: MessageT) -> None:
+    def _accept(self, message: MessageT) -> None:
         frame, stamp = self._frame(message), self._stamp(message)
         if stamp is not LATEST or self._pending.order == "stamp":
             stamp = as_stamp(stamp)
         named = is_frame(frame)
         self._arrived += 1
         if not named:
-            self._drops.add(message, "unknown frame", UnknownFrameError(frame=frame, known=self.buffer.tree.frames()))
+            self._drops.drop(message, "unknown frame", UnknownFrameError(frame=frame, known=self.buffer.tree.frames()))
             return
-        answers: list[AnswerT] = []
+        answer: AnswerT | None = None
         blocker: TransformLookupError | None = None
         try:
             if self._timeout:
-                answers.append(self._targets.ask(frame, stamp))
+                answer = self._targets.lookup_nowait(frame, stamp)
             else:
-                answers.append(self._targets.ask_for_the_last_time(frame, stamp, 0.0))
+                answer = self._targets.lookup_at_timeout(frame, stamp, 0.0)
         except MAY_COME as error:
             blocker = error
         except TransformLookupError as error:
-            self._drops.add(message, reason_of(error), error)
+            self._drops.drop(message, reason_of(error), error)
             return
         if self._pending.full and self._overflow == "drop_newest":
-            self._drops.add(message, "queue full", blocker)
+            self._drops.drop(message, "queue full", blocker)
             return
         dropped = [self._pending.oldest] if self._pending.full else []
         lacking = [self._blocker(pending) for pending in dropped]
         for pending in dropped:
             self._remove(pending)
-        self._take_in(PendingMessage(message, frame, stamp), answers)
-        # Told last, so that a callback finds the books balanced.
+        self._enqueue(PendingMessage(message, frame, stamp), answer)
+        # Last, so that the callback finds consistent counters.
         for pending, lack in zip(dropped, lacking, strict=True):
-            self._drops.add(pending.message, "queue full", lack)
+            self._drops.drop(pending.message, "queue full", lack)
 
-    def _take_in(self, pending: PendingMessage[MessageT, AnswerT], answers: list[AnswerT]) -> None:
+    def _enqueue(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT | None) -> None:
         assert self._tasks is not None
-        self._pending.add(pending)
-        if answers:
-            self._answer(pending, answers[0])
+        self._pending.append(pending)
+        if answer is not None:
+            self._answer(pending, answer)
         else:
             self._tasks.start_soon(self._wait, pending)
 
     async def _wait(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
-        """Wait until a message has its answer, cannot have one, or is out of time."""
+        """Wait until a message has its answer, cannot have one, or has timed out."""
         frame, stamp = pending.frame, pending.stamp
         try:
             with self.buffer.bus.clock.move_on_after(self._timeout):
-                while self._pending.waits(pending):
-                    # Left early when the message is dropped, and to ask for other targets.
+                while self._pending.is_waiting(pending):
+                    # Cancelled when the message is dropped or the targets change.
                     with anyio.CancelScope() as scope:
-                        pending.stop = scope.cancel
+                        pending.stop_waiting = scope.cancel
                         await self._targets.wait(frame, stamp)
-                    if self._pending.waits(pending):
+                    if self._pending.is_waiting(pending):
                         with suppress(*MAY_COME):
-                            self._answer(pending, self._targets.ask(frame, stamp))
-            if self._pending.waits(pending):
-                self._answer(pending, self._targets.ask_for_the_last_time(frame, stamp, self._timeout))
+                            self._answer(pending, self._targets.lookup_nowait(frame, stamp))
+            if self._pending.is_waiting(pending):
+                self._answer(pending, self._targets.lookup_at_timeout(frame, stamp, self._timeout))
         except TransformError as error:
             self._drop(pending, reason_of(error), error)
 
     def _answer(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT) -> None:
         tree = self.buffer.tree
-        self._pending.answer(pending, answer, moment=tree.inserted + tree.replaced)
+        self._pending.set_answer(pending, answer, moment=tree.inserted + tree.replaced)
         self._wake()
 
     def _blocker(self, pending: PendingMessage[MessageT, AnswerT]) -> TransformLookupError | None:
-        return None if pending.answers else self._targets.blocker(pending.frame, pending.stamp)
+        return None if pending.answer is not None else self._targets.blocker(pending.frame, pending.stamp)
 
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
@@ -373,17 +369,17 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     ) -> None:
         if pending in self._pending:
             self._remove(pending)
-            self._drops.add(pending.message, reason, error)
+            self._drops.drop(pending.message, reason, error)
 
     def _remove(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
         self._pending.remove(pending)
-        pending.stop()
+        pending.stop_waiting()
         self._wake()
 
     def _wake(self) -> None:
-        for event in (self._reader, self._room):
-            if event is not None:
-                event.set()
+        self._reader.wake()
+        if self._room is not None:
+            self._room.set()
 
     def _raise_error(self) -> None:
         error, self._error = self._error, None
@@ -392,6 +388,6 @@ class MessageFilter(Generic[MessageT, AnswerT]):
             try:
                 raise error
             finally:
-                # Raising has put what is handled here in the place of what it was raised from.
+                # `raise` has replaced the context of the error by the exception that is handled here.
                 error.__context__ = context
                 del error

@@ -1,4 +1,4 @@
-"""Where a policy reads an edge: at the stamp itself, at a sample that stands in for it, or nowhere."""
+"""Extrapolation as a policy allows it: the stamp at which an edge is read, which may be that of a nearby sample."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,37 +14,37 @@ from tfbus.tree.path import Path
 from tfbus.tree.policy import Policy
 
 
-class Place(NamedTuple):
-    """Where an edge is read, and how far that departs from what was asked; all in ns."""
+class ReadStamp(NamedTuple):
+    """The stamp at which an edge is read in place of the one that was asked, and how far they differ; all in ns."""
 
     stamp: int
     extrapolated_by: int
     gap: int
 
 
-def place(edge: FrameHistory, at: int, policy: Policy) -> Place:
-    """Where to read an edge for a stamp.
+def read_stamp(edge: FrameHistory, at: int, policy: Policy) -> ReadStamp:
+    """The stamp at which to read an edge for the stamp `at`.
 
     Raises
     ------
     ExtrapolationError
         If the policy does not allow any sample to stand in.
     """
-    before, after = edge.around(at)
+    before, after = edge.neighbours(at)
     if after == at:
-        return Place(at, 0, 0)
+        return ReadStamp(at, 0, 0)
     if before is not None and after is not None and (policy.max_gap is None or after - before <= policy.max_gap):
-        return Place(at, 0, after - before)
-    patience = policy.patience
+        return ReadStamp(at, 0, after - before)
+    patience = policy.longest_hold
     standing_in = []
     if before is not None and at - before <= patience:
-        standing_in.append(Place(before, at - before, 0))
+        standing_in.append(ReadStamp(before, at - before, 0))
     if after is not None and after - at <= policy.tolerance and edge.parent_at(after) == edge.parent_at(at):
-        standing_in.append(Place(after, after - at, 0))
+        standing_in.append(ReadStamp(after, after - at, 0))
     if standing_in:
         return min(standing_in, key=lambda found: found.extrapolated_by)
     if before is None or after is None or policy.max_gap is None:
-        raise edge.missing(at, patience if after is None else policy.tolerance)
+        raise edge.extrapolation_error(at, patience if after is None else policy.tolerance)
     raise GapError(
         child=edge.child,
         stamp=at,
@@ -58,19 +58,19 @@ def place(edge: FrameHistory, at: int, policy: Policy) -> Place:
     )
 
 
-def place_all(edges: tuple[FrameHistory, ...], at: int, policy: Policy) -> list[Place]:
-    """Where to read each edge for a stamp.
+def read_stamps(edges: tuple[FrameHistory, ...], at: int, policy: Policy) -> list[ReadStamp]:
+    """The stamps at which to read some edges for the stamp `at`.
 
     Raises
     ------
     ExtrapolationError
-        That of the edge that decides: the first that waiting cannot help, or the last to come.
+        Of the deciding edge: the first that waiting cannot help, else the one that lags most.
     """
-    found: list[Place] = []
+    found: list[ReadStamp] = []
     errors: list[ExtrapolationError] = []
     for edge in edges:
         try:
-            found.append(place(edge, at, policy))
+            found.append(read_stamp(edge, at, policy))
         except ExtrapolationError as error:
             errors.append(error)
     if errors:
@@ -84,8 +84,8 @@ def _decisive(error: ExtrapolationError) -> int:
     return STAMP_MIN if error.newest is None else error.newest
 
 
-def place_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps, Stamps, Stamps]:
-    """As `place`, for many stamps: where to read, `extrapolated_by` (-1 for nowhere), and `gap`, each of shape (n,)."""
+def read_stamps_at_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps, Stamps, Stamps]:
+    """The fields of `ReadStamp` at many stamps, as arrays of shape (n,); `extrapolated_by` is -1 without an answer."""
     own = np.frombuffer(samples.stamps, np.int64)
     if not len(own):
         return stamps, np.full(len(stamps), -1), np.zeros(len(stamps), np.int64)
@@ -100,7 +100,7 @@ def place_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps
     if policy.max_gap is not None:
         between &= gap <= policy.max_gap
     alone = ~(exact | between)
-    by_before = alone & has_before & (late <= policy.patience)
+    by_before = alone & has_before & (late <= policy.longest_hold)
     by_after = alone & has_after & (early <= policy.tolerance) & ~(by_before & (late <= early))
     if samples.parents is not None:
         parents = np.array(samples.parents, object)
@@ -112,14 +112,14 @@ def place_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps
     return read_at, away, np.minimum(np.where(between, gap, 0), STAMP_MAX).astype(np.int64)
 
 
-class Leniency:
-    """Reads paths as a policy allows, and remembers what that took.
+class Extrapolation:
+    """Reads the edges of one lookup as a policy allows, and records how far that went.
 
     Attributes
     ----------
     policy : Policy
     extrapolated_by, gap : int
-        The greatest over all edges that were read, in ns, as `TransformStamped` has them.
+        The greatest values over all edges that were read, in ns, as in `TransformStamped`.
     """
 
     __slots__ = ("extrapolated_by", "gap", "policy")
@@ -136,18 +136,18 @@ class Leniency:
         ------
         ExtrapolationError
         """
-        places = place_all(path.moving, at, self.policy)
-        for found in places:
+        stamps = read_stamps(path.moving, at, self.policy)
+        for found in stamps:
             self.extrapolated_by = max(self.extrapolated_by, found.extrapolated_by)
             self.gap = max(self.gap, found.gap)
-        ahead = iter(places)
+        ahead = iter(stamps)
         up = _climb(path.up, ahead)
         return up if not path.down else compose(invert(_climb(path.down, ahead)), up)
 
 
-def _climb(steps: tuple[Step, ...], places: Iterator[Place]) -> Row:
+def _climb(steps: tuple[Step, ...], stamps: Iterator[ReadStamp]) -> Row:
     row = IDENTITY
     for step in steps:
-        here = climb((step,), next(places).stamp) if isinstance(step, FrameHistory) else step
+        here = climb((step,), next(stamps).stamp) if isinstance(step, FrameHistory) else step
         row = compose(here, row)
     return row

@@ -1,49 +1,49 @@
-"""Which frames are known: those that a sample in some window names."""
+"""The names of all frames that a sample in some window names."""
 
 
 class KnownFrames:
-    """Counts who names whom, so that a frame is forgotten with the last sample that names it."""
+    """Counts the samples that name each frame, so that a frame is forgotten with the last sample that names it."""
 
-    __slots__ = ("_mentions", "_named", "_sorted")
+    __slots__ = ("_mentions", "_parents_of", "_sorted")
 
     def __init__(self) -> None:
-        self._named: dict[str, tuple[str, ...]] = {}
+        self._parents_of: dict[str, tuple[str, ...]] = {}
         self._mentions: dict[str, int] = {}
         self._sorted: tuple[str, ...] | None = None
 
     def __contains__(self, frame: object) -> bool:
-        return frame in self._named or frame in self._mentions
+        return frame in self._parents_of or frame in self._mentions
 
     def update(self, child: str, parents: tuple[str, ...]) -> None:
-        """Take note that the samples of `child` name these parents, and no others."""
-        before = self._named.get(child)
+        """Note that the samples of `child` name exactly these parents."""
+        before = self._parents_of.get(child)
         if before == parents:
             return
         for parent in parents:
             self._mentions[parent] = self._mentions.get(parent, 0) + 1
-        self._forget(before or ())
-        self._named[child] = parents
+        self._forget_mentions(before or ())
+        self._parents_of[child] = parents
         self._sorted = None
 
     def remove(self, child: str) -> None:
-        """Take note that no sample of `child` is left."""
-        self._forget(self._named.pop(child))
+        """Note that no sample of `child` is left."""
+        self._forget_mentions(self._parents_of.pop(child))
         self._sorted = None
 
     def sorted(self) -> tuple[str, ...]:
-        """All of them, in order."""
+        """All names in alphabetical order."""
         if self._sorted is None:
-            self._sorted = tuple(sorted({*self._named, *self._mentions}))
+            self._sorted = tuple(sorted({*self._parents_of, *self._mentions}))
         return self._sorted
 
     def copy(self) -> "KnownFrames":
         """An independent copy."""
         twin = KnownFrames()
-        twin._named = self._named.copy()
+        twin._parents_of = self._parents_of.copy()
         twin._mentions = self._mentions.copy()
         return twin
 
-    def _forget(self, parents: tuple[str, ...]) -> None:
+    def _forget_mentions(self, parents: tuple[str, ...]) -> None:
         for parent in parents:
             self._mentions[parent] -= 1
             if not self._mentions[parent]:

@@ -1,121 +1,158 @@
-"""One question at many stamps.
+"""Lookups at many stamps at once.
 
-While the tree is locked, `take` finds the paths that hold between the first stamp and the last, and copies the samples
-on them, as blocks of memory. All that numpy does comes after that, in chunks that stay in the cache. Which error the
-first stamp without an answer gets, the scalar lookup is asked afterwards.
+The samples are copied under the lock, and numpy works on the copies in chunks that stay in the cache. Where a stamp has
+no answer, the lookup at one stamp is asked, so that both raise the same error.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.errors import DisconnectedError
+from tfbus.data import PointCloud
+from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError
 from tfbus.geometry.rows import IDENTITY, Columns, Row, compose, invert
-from tfbus.geometry.transform_array import TransformArray, from_columns, move
-from tfbus.stamps import Stamps
-from tfbus.tree._extrapolation import place_many
-from tfbus.tree._lookup import resolve, resolve_travel
-from tfbus.tree._python_kernel import Step
+from tfbus.geometry.transform_array import TransformArray, from_columns, from_rows, move
+from tfbus.stamps import LATEST, Stamps
+from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Places, copy_paths
+from tfbus.tree._extrapolation import read_stamps_at_many
 from tfbus.tree._segments import Floats, Segments
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import FrameHistory, Samples
-from tfbus.tree.path import Path
+from tfbus.tree.history import Samples
+from tfbus.tree.lookup import answer, find, find_in_time_travel
 from tfbus.tree.policy import Policy
 
-FEW = 40
-"""Up to so many stamps are answered faster one by one."""
+ONE_BY_ONE = 40
+"""Up to this many stamps are answered faster one by one."""
 _CHUNK = 2048
 
 OutOfRange = Literal["raise", "nan"]
-Places = slice | npt.NDArray[np.intp]
 
 
-class Leg(NamedTuple):
-    """Where a source is, seen from a target, at many stamps."""
+class Query(NamedTuple):
+    """The question where `source` is, seen from `target`, at many stamps."""
 
     target: str
     source: str
     stamps: Stamps
 
-    def ends(self) -> tuple[int, int] | None:
-        """The first and the last stamp; None if there are none."""
+    def span(self) -> tuple[int, int] | None:
+        """The first and the last stamp, in ns; None if there are none."""
         return (int(self.stamps.min()), int(self.stamps.max())) if len(self.stamps) else None
 
 
-class Route(NamedTuple):
-    """A path with copies of the samples on its moving edges; of static ones, the row that they amount to."""
+def lookup_many(
+    forest: Forest,
+    target: str,
+    source: str,
+    stamps: Stamps,
+    source_stamps: Stamps | None,
+    fixed: str | None,
+    out_of_range: OutOfRange,
+    policy: Policy | None,
+) -> TransformArray:
+    """The answers of `TransformTree.lookup_many`; `source_stamps` and `fixed` are given both or not at all."""
+    check_out_of_range(out_of_range)
+    if len(stamps) <= ONE_BY_ONE and policy is None:
+        try:
+            with forest.lock:
+                rows = _rows_one_by_one(forest, target, source, stamps, source_stamps, fixed)
+        except (ExtrapolationError, DisconnectedError):
+            pass
+        else:
+            return from_rows(rows)
 
-    up: tuple[Samples | Row, ...]
-    down: tuple[Samples | Row, ...]
+    def lookup_one(place: int) -> None:
+        source_stamp = None if source_stamps is None else int(source_stamps[place])
+        answer(forest, target, source, int(stamps[place]), source_stamp, fixed, None, policy)
 
-    @property
-    def moving(self) -> list[Samples]:
-        """The moving edges, in the order up, then down."""
-        return [step for step in (*self.up, *self.down) if isinstance(step, Samples)]
-
-    def covers(self, stamps: Stamps) -> bool:
-        """Whether each edge covers all of some stamps."""
-        low, high = stamps.min(), stamps.max()
-        return all(edge.stamps and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
-
-
-class Taken(NamedTuple):
-    """What the answers between two stamps are made of."""
-
-    changes: list[int]
-    """The stamps, in ns, at which the path may change."""
-    routes: list[Route | None]
-    """One before the first change, and one from each on; None where the frames are not connected."""
-
-
-def take(forest: Forest, target: str, source: str, stamps: tuple[int, int] | None) -> Taken:
-    """Take what the transforms from source to target need, from a first stamp to a last; None for no stamps.
-
-    The caller holds the lock.
-
-    Raises
-    ------
-    UnknownFrameError
-    """
-    forest.check_known(target)
-    forest.check_known(source)
-    if stamps is None:
-        return Taken([], [None])
-    low, high = stamps
-    paths: list[Path | None] = [_path(forest, target, source, low)]
-    changes: list[int] = []
-    if paths[0] is None or not paths[0].lasting:
-        changes = [stamp for stamp in forest.parent_changes() if low < stamp <= high]
-        paths += [_path(forest, target, source, stamp) for stamp in changes]
-    routes: dict[tuple[tuple[Step, ...], tuple[Step, ...]], Route] = {}
-    for path in paths:
-        if path is not None and (path.up, path.down) not in routes:
-            up = tuple(_copy(step, low, high) for step in path.up)
-            down = tuple(_copy(step, low, high) for step in path.down)
-            routes[path.up, path.down] = Route(up, down)
-    return Taken(changes, [None if path is None else routes[path.up, path.down] for path in paths])
+    queries = [Query(target, source, stamps)]
+    if source_stamps is not None and fixed is not None:
+        queries = [Query(target, fixed, stamps), Query(fixed, source, source_stamps)]
+    return _composed(_answers(forest, queries, lookup_one, policy, out_of_range))
 
 
-def _path(forest: Forest, target: str, source: str, at: int) -> Path | None:
-    try:
-        return forest.find_path(target, source, at)
-    except DisconnectedError:
-        return None
+def deskew(forest: Forest, cloud: PointCloud, target: str, fixed: str, out_of_range: OutOfRange) -> PointCloud:
+    """The cloud of `TransformTree.deskew`."""
+    if cloud.stamps is None:
+        raise ValueError("the points of the cloud have no stamps")
+    at = cloud.stamp
+    if at is LATEST and len(cloud):
+        at = int(cloud.stamps.max())
+    check_out_of_range(out_of_range)
+    target_from_fixed = answer(forest, target, fixed, at, None, None, None, None)
+    query = Query(fixed, cloud.frame, cloud.stamps)
+    (answers,) = _answers(forest, [query], partial(_lookup_at, forest, query), None, out_of_range)
+    points = answers.apply(cloud.points, target_from_fixed.transform._row)
+    return PointCloud(target, target_from_fixed.stamp, points, fields=cloud.fields)
 
 
-def _copy(step: Step, low: int, high: int) -> Samples | Row:
-    return step.between(low, high) if isinstance(step, FrameHistory) else step
+def check_out_of_range(value: OutOfRange) -> None:
+    """Raise `ValueError` unless the value is ``"raise"`` or ``"nan"``."""
+    if value not in ("raise", "nan"):
+        raise ValueError(f"out_of_range must be 'raise' or 'nan', not {value!r}")
+
+
+def _rows_one_by_one(
+    forest: Forest, target: str, source: str, stamps: Stamps, source_stamps: Stamps | None, fixed: str | None
+) -> list[Row]:
+    """The rows at a few stamps; errors as for the lookup at one stamp. The caller holds the lock."""
+    path = forest.paths.get((target, source))
+    if path is not None and source_stamps is None:
+        return path.rows(stamps.tolist())
+    for name in (target, source) if fixed is None else (target, source, fixed):
+        forest.check_known(name)
+    if source_stamps is None:
+        return [find(forest, target, source, at, None)[1] for at in stamps.tolist()]
+    both = zip(stamps.tolist(), source_stamps.tolist(), strict=True)
+    return [find_in_time_travel(forest, target, source, at, then, fixed, None)[1] for at, then in both]
+
+
+def _answers(
+    forest: Forest,
+    queries: list[Query],
+    lookup_one: Callable[[int], object],
+    policy: Policy | None,
+    out_of_range: OutOfRange,
+) -> list["Answers"]:
+    """The answers of each query; `lookup_one` raises the error of a place without an answer."""
+    spans = [query.span() for query in queries]
+    while True:
+        with forest.lock:
+            copies = [copy_paths(forest, *query[:2], span) for query, span in zip(queries, spans, strict=True)]
+        answers = [Answers(paths, query.stamps, policy) for paths, query in zip(copies, queries, strict=True)]
+        missing = [found.first_missing for found in answers if found.first_missing is not None]
+        if not missing:
+            return answers
+        unconnected = [query for found, query in zip(answers, queries, strict=True) if not found.connected]
+        if out_of_range == "nan" and not unconnected:
+            return answers
+        first = min(missing)
+        try:
+            if out_of_range == "raise":
+                lookup_one(first)
+            else:
+                _lookup_at(forest, unconnected[0], first)
+        except TransformLookupError as error:
+            error.index = first
+            raise
+        # The missing samples have arrived since the copies were made.
+
+
+def _lookup_at(forest: Forest, query: Query, place: int) -> None:
+    answer(forest, query.target, query.source, int(query.stamps[place]), None, None, None, None)
 
 
 class Answers:
-    """The answers at many stamps, worked out piece by piece when they are read.
+    """The answers at many stamps, computed chunk by chunk when they are read.
 
     Parameters
     ----------
-    taken : Taken
-    leg : Leg
+    paths : PathsOverTime
+    stamps : integer array of shape (n,)
+        ns.
     policy : Policy or None
 
     Attributes
@@ -123,147 +160,97 @@ class Answers:
     first_missing : int or None
         The first place without an answer.
     connected : bool
-        Whether the frames are connected at any of the stamps, or there are none.
-    done : integer array of shape (2, n), or None
-        What the policy did at each stamp, `extrapolated_by` and `gap` in ns; None without one.
+        Whether the frames are connected at any of the stamps, or there are no stamps.
+    extrapolation : integer array of shape (2, n), or None
+        `extrapolated_by` and `gap` of each answer, in ns; None without a policy.
     """
 
-    def __init__(self, taken: Taken, leg: Leg, policy: Policy | None) -> None:
-        stamps = leg.stamps
+    def __init__(self, paths: PathsOverTime, stamps: Stamps, policy: Policy | None) -> None:
         self._count = len(stamps)
-        self._pieces: list[_Piece] = []
+        self._parts: list[_Part] = []
         self.first_missing: int | None = None
         self.connected = not len(stamps)
-        self.done = None if policy is None else np.zeros((2, len(stamps)), np.int64)
-        for places, route in _by_route(taken, stamps):
-            its_stamps = stamps[places]
-            if not len(its_stamps):
+        self.extrapolation = None if policy is None else np.zeros((2, len(stamps)), np.int64)
+        for places, path in paths.split(stamps):
+            here = stamps[places]
+            if not len(here):
                 continue
-            if route is None:
-                self._miss(places, np.zeros(len(its_stamps), np.bool_))
+            if path is None:
+                self._note_missing(places, np.zeros(len(here), np.bool_))
             else:
                 self.connected = True
-                self._add(places, its_stamps, route, policy)
-
-    def _add(self, places: Places, stamps: Stamps, route: Route, policy: Policy | None) -> None:
-        read_at = [stamps] * len(route.moving)
-        if policy is None:
-            known = None if route.covers(stamps) else _covered(route, stamps)
-        else:
-            known, read_at, done = _placed(route, stamps, policy)
-            assert self.done is not None
-            self.done[:, places] = done
-        if known is not None and not known.all():
-            self._miss(places, known)
-            places = np.arange(self._count)[places][known]
-            read_at = [its[known] for its in read_at]
-            stamps = stamps[known]
-        if len(stamps):
-            self._pieces.append(_Piece(places, len(stamps), route, read_at))
-
-    def _miss(self, places: Places, known: npt.NDArray[np.bool_]) -> None:
-        first = int(np.arange(self._count)[places][known.argmin()])
-        self.first_missing = first if self.first_missing is None else min(first, self.first_missing)
+                self._add_part(places, here, path, policy)
 
     def columns(self) -> Floats:
         """All answers, shape (7, n); NaN where there is none."""
         columns = np.full((7, self._count), np.nan)
-        for places, part in self._chunks():
-            for column, values in zip(columns, part, strict=True):
+        for places, chunk in self._chunks():
+            for column, values in zip(columns, chunk, strict=True):
                 column[places] = values
         return columns
 
     def apply(self, points: npt.NDArray[Any], then: Row) -> npt.NDArray[Any]:
-        """Points of shape (n, 3), each moved by the answer at its place and then by another transform."""
+        """Points of shape (n, 3), each moved by the answer at its place and then by the transform `then`."""
         moved = np.full(points.shape, np.nan, points.dtype)
-        # What a sensor sends for "nothing there" may be infinite.
+        # A sensor may send infinity where it saw nothing.
         with np.errstate(invalid="ignore"):
-            for places, part in self._chunks():
-                x, y, z = move(part, *points[places].T.astype(np.float64))
+            for places, chunk in self._chunks():
+                x, y, z = move(chunk, *points[places].T.astype(np.float64))
                 if then != IDENTITY:
                     x, y, z = move(then, x, y, z)
                 for axis, values in enumerate((x, y, z)):
                     moved[places, axis] = values
         return moved
 
-    def _chunks(self) -> Iterator[tuple[Places, Columns]]:
-        for piece in self._pieces:
-            yield from piece.chunks()
-
-
-def resolve_few(
-    forest: Forest, target: str, source: str, stamps: Stamps, source_stamps: Stamps | None, fixed: str | None
-) -> list[Row]:
-    """The answers, one by one; errors as for the scalar lookup. The caller holds the lock."""
-    path = forest.paths.get((target, source))
-    if path is not None and source_stamps is None:
-        return path.rows(stamps.tolist())
-    for name in (target, source) if fixed is None else (target, source, fixed):
-        forest.check_known(name)
-    if source_stamps is None:
-        return [resolve(forest, target, source, at, None)[1] for at in stamps.tolist()]
-    both = zip(stamps.tolist(), source_stamps.tolist(), strict=True)
-    return [resolve_travel(forest, target, source, at, then, fixed, None)[1] for at, then in both]
-
-
-def join(legs: list[Answers]) -> TransformArray:
-    """The answers of one leg, or of two that meet in a fixed frame."""
-    columns = legs[0].columns()
-    done = legs[0].done
-    for leg in legs[1:]:
-        columns = np.stack(compose((*columns,), (*leg.columns(),)))
-        done = None if done is None or leg.done is None else np.maximum(done, leg.done)
-    return from_columns(columns, done)
-
-
-def _by_route(taken: Taken, stamps: Stamps) -> list[tuple[Places, Route | None]]:
-    """The places of the stamps that each route is for."""
-    if not taken.changes:
-        return [(slice(len(stamps)), taken.routes[0])]
-    different = list({id(route): route for route in taken.routes}.values())
-    which = np.array([next(i for i, its in enumerate(different) if its is route) for route in taken.routes])
-    its_route = which[np.array(taken.changes, np.int64).searchsorted(stamps, "right")]
-    return [(np.flatnonzero(its_route == i), route) for i, route in enumerate(different)]
-
-
-def _covered(route: Route, stamps: Stamps) -> npt.NDArray[np.bool_]:
-    covered = np.ones(len(stamps), np.bool_)
-    for samples in route.moving:
-        if not samples.stamps:
-            covered[:] = False
+    def _add_part(self, places: Places, stamps: Stamps, path: CopiedPath, policy: Policy | None) -> None:
+        """Note the answers along one path, and which of its stamps have none."""
+        read_at = [stamps] * len(path.moving)
+        if policy is None:
+            answered = None if path.covers_all(stamps) else path.covered(stamps)
         else:
-            covered &= (samples.stamps[0] <= stamps) & (stamps <= samples.stamps[-1])
-    return covered
+            answered, read_at, extrapolation = _read_with_policy(path, stamps, policy)
+            assert self.extrapolation is not None
+            self.extrapolation[:, places] = extrapolation
+        if answered is not None and not answered.all():
+            self._note_missing(places, answered)
+            places = np.arange(self._count)[places][answered]
+            read_at = [edge_stamps[answered] for edge_stamps in read_at]
+            stamps = stamps[answered]
+        if len(stamps):
+            self._parts.append(_Part(places, len(stamps), path, read_at))
+
+    def _note_missing(self, places: Places, answered: npt.NDArray[np.bool_]) -> None:
+        first = int(np.arange(self._count)[places][answered.argmin()])
+        self.first_missing = first if self.first_missing is None else min(first, self.first_missing)
+
+    def _chunks(self) -> Iterator[tuple[Places, Columns]]:
+        for part in self._parts:
+            yield from part.chunks()
 
 
-def _placed(route: Route, stamps: Stamps, policy: Policy) -> tuple[npt.NDArray[np.bool_], list[Stamps], Stamps]:
-    """Which stamps have an answer, where to read each edge for them, and what that takes."""
-    known = np.ones(len(stamps), np.bool_)
-    read_at: list[Stamps] = []
-    done = np.zeros((2, len(stamps)), np.int64)
-    for samples in route.moving:
-        here, away, gap = place_many(samples, stamps, policy)
-        read_at.append(here)
-        known &= away >= 0
-        np.maximum(done, (away, gap), out=done)
-    done[:, ~known] = 0
-    return known, read_at, done
+class _Part:
+    """The answers along one path.
 
+    Parameters
+    ----------
+    places : Places
+    count : int
+    path : CopiedPath
+    read_at : list of integer array of shape (count,)
+        For each moving edge, the stamps at which it is read, in ns.
+    """
 
-class _Piece:
-    """The answers that share one route."""
-
-    def __init__(self, places: Places, count: int, route: Route, read_at: list[Stamps]) -> None:
+    def __init__(self, places: Places, count: int, path: CopiedPath, read_at: list[Stamps]) -> None:
         self._places = places
         self._count = count
-        self._route = route
+        self._path = path
         self._read_at = read_at
 
     def chunks(self) -> Iterator[tuple[Places, Columns]]:
-        ahead = iter(self._read_at)
+        read_at = iter(self._read_at)
         up, down = (
-            [Segments(step, next(ahead)) if isinstance(step, Samples) else step for step in steps]
-            for steps in (self._route.up, self._route.down)
+            [Segments(step, next(read_at)) if isinstance(step, Samples) else step for step in steps]
+            for steps in (self._path.up, self._path.down)
         )
         for start in range(0, self._count, _CHUNK):
             part = slice(start, min(start + _CHUNK, self._count))
@@ -273,9 +260,36 @@ class _Piece:
             yield part if isinstance(self._places, slice) else self._places[part], columns
 
 
-def _climb(legs: Sequence[Segments | Row], part: slice) -> Columns:
+def _climb(steps: Sequence[Segments | Row], part: slice) -> Columns:
     columns: Columns | None = None
-    for leg in legs:
-        here = leg.at(part) if isinstance(leg, Segments) else leg
+    for step in steps:
+        here = step.at(part) if isinstance(step, Segments) else step
         columns = here if columns is None else compose(here, columns)
     return IDENTITY if columns is None else columns
+
+
+def _read_with_policy(
+    path: CopiedPath, stamps: Stamps, policy: Policy
+) -> tuple[npt.NDArray[np.bool_], list[Stamps], Stamps]:
+    """Which stamps have an answer, where each edge is read for it, and `extrapolated_by` and `gap`, shape (2, n)."""
+    answered = np.ones(len(stamps), np.bool_)
+    read_at: list[Stamps] = []
+    extrapolation = np.zeros((2, len(stamps)), np.int64)
+    for samples in path.moving:
+        edge_stamps, away, gap = read_stamps_at_many(samples, stamps, policy)
+        read_at.append(edge_stamps)
+        answered &= away >= 0
+        np.maximum(extrapolation, (away, gap), out=extrapolation)
+    extrapolation[:, ~answered] = 0
+    return answered, read_at, extrapolation
+
+
+def _composed(answers: list[Answers]) -> TransformArray:
+    """The answers of one query, or of two that meet in a fixed frame."""
+    columns = answers[0].columns()
+    extrapolation = answers[0].extrapolation
+    for found in answers[1:]:
+        columns = np.stack(compose((*columns,), (*found.columns(),)))
+        if extrapolation is not None and found.extrapolation is not None:
+            extrapolation = np.maximum(extrapolation, found.extrapolation)
+    return from_columns(columns, extrapolation)

@@ -35,11 +35,11 @@ def climb(steps: tuple[Step, ...], at: int) -> Row:
             except struct.error:
                 # There is no pair round the first stamp, nor beyond the last.
                 if not step.covers(at):
-                    raise step.missing(at) from None
+                    raise step.extrapolation_error(at) from None
                 _, ax, ay, az, ai, aj, ak, aw = _unpack(step.records)
             else:
                 if s0 < step.horizon and not step.covers(at):
-                    raise step.missing(at)
+                    raise step.extrapolation_error(at)
                 if at == s1:
                     ax, ay, az, ai, aj, ak, aw = bx, by, bz, bi, bj, bk, bw
                 elif step.parents is None or step.origins[i - 1][0] == step.origins[i][0]:

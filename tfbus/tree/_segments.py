@@ -1,7 +1,7 @@
-"""One edge's interpolation at many stamps.
+"""Interpolation of one edge at many stamps.
 
-The edge is prepared once: for each sample the rates towards the next one, so that a stamp costs one search, one sine
-and one cosine. Where there are fewer stamps than samples, only the samples that are asked for are prepared.
+Each segment between two samples is prepared once, so that a stamp costs one search, one sine and one cosine. If there
+are fewer stamps than samples, only the segments that are needed are prepared.
 """
 
 import numpy as np
@@ -14,11 +14,11 @@ from tfbus.tree.history import Samples
 Floats = npt.NDArray[np.float64]
 
 _STRAIGHT = 1e-9
-"""In place of an angle that rounds to zero: its own cosine is one to the last digit, so the arc is a straight line."""
+"""Replaces an angle that rounds to zero. Its cosine is one to the last digit, so the arc is a straight line."""
 
 
 class Segments:
-    """One edge's interpolation at given stamps, prepared.
+    """The segments of one edge, prepared for interpolation at given stamps.
 
     A segment goes from one sample to the next: ``t(s) = t0 + s v`` and ``q(s) = q0 cos(s w) + p sin(s w)``, with s the
     ns since its first sample, and p the unit quaternion a right angle away from q0 on the shorter arc to the next
@@ -27,19 +27,19 @@ class Segments:
     """
 
     def __init__(self, samples: Samples, stamps: Stamps) -> None:
-        its_stamps = np.frombuffer(samples.stamps, np.int64)
+        own_stamps = np.frombuffer(samples.stamps, np.int64)
         rows = np.frombuffer(samples.records, np.float64).reshape(-1, 8)[:, 1:]
-        self._segments: npt.NDArray[np.intp] | None = its_stamps.searchsorted(stamps, "right") - 1
-        self._elapsed = _nanoseconds(its_stamps[self._segments], stamps)
-        first = np.arange(len(its_stamps))
-        if len(stamps) < len(its_stamps):
+        self._segments: npt.NDArray[np.intp] | None = own_stamps.searchsorted(stamps, "right") - 1
+        self._elapsed = _nanoseconds(own_stamps[self._segments], stamps)
+        first = np.arange(len(own_stamps))
+        if len(stamps) < len(own_stamps):
             first, self._segments = self._segments, None
-        last = np.minimum(first + 1, len(its_stamps) - 1)
+        last = np.minimum(first + 1, len(own_stamps) - 1)
         if samples.parents is not None:
             parents = np.array(samples.parents, object)
             last = np.where(parents[first] == parents[last], last, first)
         a, b = rows[first].T, rows[last].T
-        duration = _nanoseconds(its_stamps[first], its_stamps[last])
+        duration = _nanoseconds(own_stamps[first], own_stamps[last])
         duration[first == last] = np.inf
         dot = (a[3:] * b[3:]).sum(axis=0)
         cosine = np.minimum(np.abs(dot), 1.0)
@@ -63,5 +63,5 @@ class Segments:
 
 
 def _nanoseconds(begin: Stamps, end: Stamps) -> Floats:
-    """From one stamp to a later one, however far they are apart."""
+    """The time between two stamps; exact for differences that exceed a signed 64-bit integer."""
     return (end - begin).view(np.uint64).astype(np.float64)

@@ -12,17 +12,17 @@ from typing import NamedTuple
 from tfbus.errors import PastExtrapolationError
 from tfbus.geometry.rows import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
 from tfbus.stamps import LATEST, SECOND
-from tfbus.tree._lookup import At, resolve
 from tfbus.tree._python_kernel import Step, climb
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import RECORD, RECORD_SIZE, FrameHistory
+from tfbus.tree.lookup import At, find
 from tfbus.tree.path import Path
 
-STILL: Vector = (0.0, 0.0, 0.0)
+ZERO: Vector = (0.0, 0.0, 0.0)
 
 
 class Motion(NamedTuple):
-    """Where a frame is and how it moves, seen from another; everything along that one's axes."""
+    """The pose and the velocity of a frame in another, along the axes of that other frame."""
 
     row: Row
     linear: Vector
@@ -37,34 +37,34 @@ def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tupl
     The errors are those of `TransformTree.twist`. The caller holds the lock.
     """
     stamp = _common_stamp(forest, frame, reference, axes) if at is LATEST else at
-    # For its errors: of several edges without an answer, it names the one that decides.
-    resolve(forest, reference, frame, stamp, None)
-    turn = resolve(forest, axes, reference, stamp, None)[1][3:]
+    # This lookup raises the error of the deciding edge where several have no answer.
+    find(forest, reference, frame, stamp, None)
+    turn = find(forest, axes, reference, stamp, None)[1][3:]
     linear, angular = _motion(forest.find_path(reference, frame, stamp), stamp)
     return stamp, rotate(turn, *linear), rotate(turn, *angular)
 
 
 def _common_stamp(forest: Forest, frame: str, reference: str, axes: str) -> int:
     """The newest stamp at which both the frame and the axes are known; that of static samples if nothing moves."""
-    stamp, _, static = resolve(forest, reference, frame, LATEST, None)
-    other, _, still = resolve(forest, axes, reference, LATEST, None)
-    if still or static or stamp == other:
-        return stamp if still else other
-    (lagging_end, ahead_end), common = ((frame, axes), stamp) if stamp < other else ((axes, frame), other)
+    stamp, _, frame_static = find(forest, reference, frame, LATEST, None)
+    axes_stamp, _, axes_static = find(forest, axes, reference, LATEST, None)
+    if axes_static or frame_static or stamp == axes_stamp:
+        return stamp if axes_static else axes_stamp
+    (lagging_end, ahead_end), common = ((frame, axes), stamp) if stamp < axes_stamp else ((axes, frame), axes_stamp)
     try:
-        resolve(forest, reference, ahead_end, common, None)
+        find(forest, reference, ahead_end, common, None)
     except PastExtrapolationError as error:
-        # As for one path, the edge that lags has to come as far as the others still reach back.
+        # As on one path, the lagging edge has to reach what the others still hold.
         lagging = forest.find_path(reference, lagging_end, LATEST).newest_common()[1]
-        raise lagging.missing(common if error.oldest is None else error.oldest) from error
+        raise lagging.extrapolation_error(common if error.oldest is None else error.oldest) from error
     return common
 
 
 def _motion(path: Path, at: int) -> tuple[Vector, Vector]:
     """The linear and angular velocity of a path's source, seen from its target.
 
-    Both ends are seen from the common ancestor first. Then the target's own motion is taken off, as in Craig,
-    "Introduction to Robotics", 3rd edition, section 5.3, and what is left is told along the target's axes.
+    Both are computed in the common ancestor. The target's own motion is subtracted (Craig, "Introduction to Robotics",
+    3rd edition, section 5.3), and the difference is rotated into the target's axes.
     """
     above, below = _climb(path.up, at), _climb(path.down, at)
     arm = _difference(above.row[:3], below.row[:3])
@@ -76,9 +76,9 @@ def _motion(path: Path, at: int) -> tuple[Vector, Vector]:
 
 def _climb(steps: tuple[Step, ...], at: int) -> Motion:
     """The motion of the first step's child, seen from the last step's parent."""
-    row, linear, angular = Motion(IDENTITY, STILL, STILL)
+    row, linear, angular = Motion(IDENTITY, ZERO, ZERO)
     for step in steps:
-        here = _edge_motion(step, at) if isinstance(step, FrameHistory) else Motion(step, STILL, STILL)
+        here = _edge_motion(step, at) if isinstance(step, FrameHistory) else Motion(step, ZERO, ZERO)
         turn = here.row[3:]
         arm = rotate(turn, *row[:3])
         linear = _sum(_sum(here.linear, _cross(here.angular, arm)), rotate(turn, *linear))
@@ -90,13 +90,13 @@ def _climb(steps: tuple[Step, ...], at: int) -> Motion:
 def _edge_motion(edge: FrameHistory, at: int) -> Motion:
     row = climb((edge,), at)
     i = bisect_left(edge.stamps, at)
-    if edge.stamps[i] == at and not _joined(edge, i):
+    if edge.stamps[i] == at and not _is_segment(edge, i):
         i += 1
         if i == len(edge.stamps):
-            # A lone sample says where the frame is, but not where it is going.
-            raise edge.missing(at + 1)
-    if not _joined(edge, i):
-        return Motion(row, STILL, STILL)
+            # A lone sample has a pose but no velocity.
+            raise edge.extrapolation_error(at + 1)
+    if not _is_segment(edge, i):
+        return Motion(row, ZERO, ZERO)
     stamp, ax, ay, az, *before = RECORD.unpack_from(edge.records, (i - 1) * RECORD_SIZE)
     until, bx, by, bz, *after = RECORD.unpack_from(edge.records, i * RECORD_SIZE)
     rate = SECOND / (until - stamp)
@@ -104,8 +104,8 @@ def _edge_motion(edge: FrameHistory, at: int) -> Motion:
     return Motion(row, linear, _turn_rate(tuple(before), tuple(after), rate))
 
 
-def _joined(edge: FrameHistory, i: int) -> bool:
-    """Whether there is a segment from the sample before to this one: both in the window, with the same parent."""
+def _is_segment(edge: FrameHistory, i: int) -> bool:
+    """Whether samples i - 1 and i are both in the window and have the same parent."""
     if not edge.start < i < len(edge.stamps):
         return False
     return edge.parents is None or edge.origins[i - 1][0] == edge.origins[i][0]
@@ -116,8 +116,8 @@ def _turn_rate(before: Quaternion, after: Quaternion, rate: float) -> Vector:
     x, y, z, _ = compose((0.0, 0.0, 0.0, *after), invert((0.0, 0.0, 0.0, *before)))[3:]
     sine = math.hypot(x, y, z)
     if sine == 0.0:
-        return STILL
-    # Added up as the lookup does it, for where this is all rounding it decides which way a half turn goes.
+        return ZERO
+    # The same order of additions as in the lookup: in a half turn, rounding decides the direction.
     ai, aj, ak, aw = before
     bi, bj, bk, bw = after
     dot = ai * bi + aj * bj + ak * bk + aw * bw

@@ -13,7 +13,7 @@ _SHOWN = 10
 
 
 class NewestEdge(Protocol):
-    """The newest that is known of one child."""
+    """The newest edge of one child. `newest` is its stamp in ns, None if there is no moving sample."""
 
     @property
     def parent(self) -> str: ...
@@ -31,7 +31,7 @@ class NewestEdge(Protocol):
 def admit(
     edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]
 ) -> tuple[Batch, list[InvalidTransformError]]:
-    """Split a batch into the samples that leave a forest and the errors of those that do not.
+    """Split a batch into the samples that close no loop of parents, and the errors of those that do.
 
     Of the samples that close a loop, the last one in the batch is refused, and so on until no loop is left.
 
@@ -81,7 +81,7 @@ def _parent(edge: NewestEdge | None) -> str | None:
 
 
 def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
-    """The children whose newest parent is another one after the batch, with that parent."""
+    """The new parent of each child whose newest parent the batch changes."""
     parents: dict[str, str] = {}
     stamps: dict[str, int | None] = {}
     for sample in batch:
@@ -98,7 +98,7 @@ def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformS
 
 
 def _find_loops(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> list[tuple[str, ...]]:
-    """The loops that run through a changed child, each from a frame over its parents; they share no frame."""
+    """The loops through a changed child, as frames in the order of their parents. They share no frame."""
     loops: list[tuple[str, ...]] = []
     judged: set[str] = set()
     for child in changes:
@@ -110,7 +110,7 @@ def _find_loops(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> 
         if here in walk:
             frames = list(walk)
             circle = tuple(frames[frames.index(here) :])
-            # There may be others that are none of this batch's.
+            # A loop that this batch does not change is not judged here.
             if not changes.keys().isdisjoint(circle):
                 loops.append(circle)
         judged.update(walk)

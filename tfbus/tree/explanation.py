@@ -1,6 +1,6 @@
-"""Why a lookup has the answer that it has, or none: what each edge on the path can tell of the instant.
+"""Explanations: how each edge on a path contributes to an answer, and which edges block it.
 
-The caller of `explain` holds the lock; making text of an `Explanation` needs none.
+The caller of `explain` holds the lock. Formatting an `Explanation` as text needs no lock.
 """
 
 from contextlib import suppress
@@ -9,11 +9,10 @@ from itertools import pairwise
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.stamps import LATEST, Latest, format_duration, format_stamp, to_seconds
-from tfbus.tree._extrapolation import Leniency
-from tfbus.tree._extrapolation import place as place_of
-from tfbus.tree._lookup import At, resolve
+from tfbus.tree._extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
+from tfbus.tree.lookup import At, find
 from tfbus.tree.path import Path
 from tfbus.tree.policy import Policy
 from tfbus.tree.rendering import format_rate
@@ -21,19 +20,20 @@ from tfbus.tree.rendering import format_rate
 
 @dataclass(frozen=True, slots=True)
 class ExplainedEdge:
-    """What one edge tells of the instant that was asked for.
+    """How one edge contributes to an answer.
 
     Attributes
     ----------
     parent, child : str
     static : bool
     before, after : int or None
-        The stamps of the samples round the instant, in ns: the same twice if one has it, None where there is none.
+        The stamps of the samples on either side of the stamp that was asked, in ns: twice the same if a sample has it,
+        None where there is none.
     fraction : float or None
-        How much of `after` is in the answer, 0 to 1: 0 where a sample has the instant, or where the parent changes at
+        The weight of `after` in the answer, 0 to 1: 0 where a sample has the stamp, or where the parent changes at
         `after`. None if the edge is static or does not answer.
     extrapolated_by : int
-        How far a sample is away that stands in for the instant, in ns.
+        The distance to the sample that stands in, in ns.
     newest : int or None
         The stamp of the newest sample, in ns; None if the edge is static or has none.
     age : float or None
@@ -43,7 +43,7 @@ class ExplainedEdge:
     authority : str
         Who sent the newest sample; may be empty.
     error : ExtrapolationError or None
-        Why this edge blocks the answer.
+        The reason why this edge blocks the answer.
     """
 
     parent: str
@@ -62,26 +62,26 @@ class ExplainedEdge:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """How a lookup comes to its answer, or what keeps it from one. As a string, a text of several lines.
+    """How a lookup finds its answer, or what blocks it. ``str`` gives a text of several lines.
 
     Attributes
     ----------
     target, source : str
     at : int or LATEST
-        What was asked; ns.
+        The stamp that was asked, in ns.
     stamp : int or None
         The stamp of the answer, in ns; None if there is none.
     now : int or None
-        The instant that ages are counted from, in ns.
+        The stamp that ages are counted from, in ns.
     chain : tuple of str
         The frames from target to source; empty where there is no path.
     half_chains : tuple of tuple of str
-        Where the two frames are in different trees: the frames from target up to its root, and those from source. If
-        they hang in a loop, the frame where it closes comes twice. Else empty.
+        If the two frames are in different trees: the frames from target up to its root, and those from source. In a
+        loop of parents, the frame where it closes comes twice. Otherwise empty.
     edges : tuple of ExplainedEdge
-        One for each two neighbours in the chain, in its order; or in those of target's half chain, then source's.
+        One for each two neighbours in the chain, in its order; or in the two half chains, target's first.
     errors : tuple of TransformLookupError
-        All that blocks the answer. The one that a lookup raises is among them.
+        All errors that block the answer, among them the one that a lookup raises.
     """
 
     target: str
@@ -122,7 +122,7 @@ class Explanation:
 
 
 def _cells(edge: ExplainedEdge, whole: Explanation) -> list[str]:
-    """What is told of an edge, a column each."""
+    """The cells of one edge's line of text."""
     below = not whole.half_chains and whole.chain.index(edge.parent) < whole.chain.index(edge.child)
     age = ""
     if edge.newest is not None and whole.now is not None:
@@ -158,11 +158,12 @@ def _aligned(rows: list[list[str]]) -> list[str]:
 def explain(
     forest: Forest, target: str, source: str, at: At, not_before: int | None, policy: Policy | None, now: int | None
 ) -> Explanation:
-    """What a lookup with these arguments goes by. The parameters are those of `TreeReader.explain`."""
+    """The explanation of a lookup; the parameters are those of `TransformTree.explain`."""
+    extrapolation = None if policy is None else Extrapolation(policy)
     stamp: int | None = None
     raised: TransformLookupError | None = None
     try:
-        stamp, _, _ = resolve(forest, target, source, at, not_before, None if policy is None else Leniency(policy))
+        stamp, _, _ = find(forest, target, source, at, not_before, extrapolation)
     except TransformLookupError as error:
         raised = error
     if isinstance(raised, UnknownFrameError):
@@ -201,7 +202,7 @@ def _unknown(forest: Forest, *frames: str) -> tuple[UnknownFrameError, ...]:
 
 
 def _up_to_root(forest: Forest, frame: str, instant: int | None) -> tuple[str, ...]:
-    """A frame, its parent and so on, up to a frame without one or to one that comes again."""
+    """A frame and its ancestors, up to the root or to the first frame that comes again."""
     walk = {frame: None}
     here = frame
     while (edge := forest.frames.get(here)) is not None:
@@ -213,7 +214,7 @@ def _up_to_root(forest: Forest, frame: str, instant: int | None) -> tuple[str, .
 
 
 def _reached(path: Path) -> int | None:
-    """The newest stamp that all moving edges have reached; None if one has no samples."""
+    """The newest common stamp of all moving edges; None if one has no samples."""
     return path.newest_common()[0] if all(edge.stamps for edge in path.moving) else None
 
 
@@ -232,18 +233,18 @@ def _explained(
     before = after = fraction = None
     away = 0
     if instant is not None:
-        before, after = edge.around(instant)
+        before, after = edge.neighbours(instant)
         with suppress(ExtrapolationError):
-            place = place_of(edge, instant, policy or Policy())
-            away = place.extrapolated_by
-            fraction = _fraction(edge, place.stamp, before, after)
+            found = read_stamp(edge, instant, policy or Policy())
+            away = found.extrapolated_by
+            fraction = _fraction(edge, found.stamp, before, after)
     return ExplainedEdge(
         parent, edge.child, False, before, after, fraction, away, facts.newest, age, facts.rate, facts.authority, error
     )
 
 
 def _fraction(edge: FrameHistory, stamp: int, before: int | None, after: int | None) -> float:
-    """How much of `after` is in what the edge tells of a stamp that it covers."""
+    """The weight of `after` in the interpolation at a covered stamp."""
     if before is None or after is None or stamp == before:
         return 0.0 if stamp == before else 1.0
     if stamp < after and edge.parent_at(before) != edge.parent_at(after):
@@ -252,20 +253,20 @@ def _fraction(edge: FrameHistory, stamp: int, before: int | None, after: int | N
 
 
 def _block(edge: FrameHistory, at: At, raised: ExtrapolationError, policy: Policy | None) -> ExtrapolationError | None:
-    """Why an edge blocks an answer, if it does; `raised` is what the lookup says."""
+    """The error of an edge that blocks an answer; `raised` is the error of the lookup."""
     if edge.child == raised.child:
         return raised
     if edge.static:
         return None
     if not isinstance(at, Latest):
         try:
-            place_of(edge, at, policy or Policy())
+            read_stamp(edge, at, policy or Policy())
         except ExtrapolationError as error:
             return error
         return None
-    # `LATEST` waits until those that lag have come as far as the others reach back.
+    # `LATEST` waits until the lagging edges reach what the others still hold.
     if isinstance(raised.stamp, Latest):
-        return None if edge.stamps else edge.missing(LATEST)
+        return None if edge.stamps else edge.extrapolation_error(LATEST)
     if edge.stamps and edge.stamps[-1] >= raised.stamp - raised.slack:
         return None
-    return edge.missing(raised.stamp, raised.slack)
+    return edge.extrapolation_error(raised.stamp, raised.slack)

@@ -1,12 +1,16 @@
-"""What a tree is made of: each frame's history, the names that are known, and the paths that have been found.
+"""All frames of a tree: the history of each, the names that are known, and the paths that have been found.
 
-No lock and no questions: `tfbus.tree` has those.
+`Forest` stores samples and finds paths; `tfbus.tree.lookup` and its neighbours answer questions with it. One lock is
+held for one lookup or one batch, so worker threads may read while the loop inserts.
 """
 
+import threading
+
 from tfbus.errors import UnknownFrameError
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import Latest, as_stamp
 from tfbus.tree._known_frames import KnownFrames
+from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
 from tfbus.tree.path import Path, find_path
 
@@ -14,57 +18,152 @@ _PATHS_KEPT = 10_000
 
 
 class Forest:
-    """All frames that have a parent.
+    """The histories of all frames that have a parent.
+
+    `insert`, `commit`, `remove`, `clear`, `known_frames`, `copy` and `copy_within` take the lock themselves. The caller
+    of every other method holds it.
 
     Parameters
     ----------
     window : int or None
-        How much history to keep for each frame, in ns; None keeps everything.
+        Length of the history of each frame, in ns; None keeps everything.
 
     Attributes
     ----------
+    lock : threading.Lock
+        Guards everything below.
     window : int or None
     frames : dict of str to FrameHistory
         By child.
-    names : FrameNames
+    names : KnownFrames
     paths : dict of (target, source) to Path
-        Those that hold at every stamp. Whatever could make one stale empties it.
+        The permanent paths that have been found. A change that could make one wrong empties it.
     changed : set of str
-        Frames that got another parent or kind, or a longer past: then a lookup from `below` them may have another
-        answer. Whoever acts on it clears it.
-    joined : set of str
-        Frames that became somebody's parent: then they may have become known. Cleared likewise.
+        Frames with another parent or kind, or a longer past, since `forget_changes`: a lookup from a frame below one of
+        them may have another answer.
+    new_parents : set of str
+        Frames that have become a parent since `forget_changes`, so that they may have become known.
+    inserted, replaced, expired : int
+        Number of samples that had each `Outcome`.
     """
 
-    __slots__ = ("changed", "frames", "joined", "names", "paths", "window")
+    __slots__ = (
+        "changed",
+        "expired",
+        "frames",
+        "inserted",
+        "lock",
+        "names",
+        "new_parents",
+        "paths",
+        "replaced",
+        "window",
+    )
 
     def __init__(self, window: int | None) -> None:
+        self.lock = threading.Lock()
         self.window = window
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
         self.paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
-        self.joined: set[str] = set()
+        self.new_parents: set[str] = set()
+        self.inserted = 0
+        self.replaced = 0
+        self.expired = 0
 
-    def store(self, sample: TransformStamped) -> Outcome:
-        """Put a sample into its frame's history."""
+    # Changes
+
+    def insert(self, batch: Batch) -> list[Outcome]:
+        """Store a batch, all of it or nothing.
+
+        Raises
+        ------
+        InvalidTransformError
+            If a sample would close a loop of parents, judged after the whole batch.
+        """
+        with self.lock:
+            _, refused = admit(self.frames, batch)
+            if refused:
+                raise refused[0]
+            outcomes = [self.insert_judged(sample) for sample in batch]
+            self.forget_changes()
+            return outcomes
+
+    def commit(self, batch: Batch) -> bool:
+        """Store a batch that the bus has judged already.
+
+        Returns
+        -------
+        bool
+            Whether every sample was the next one of its frame, so that nothing but stamps has changed.
+        """
+        frames = self.frames
+        plain = True
+        with self.lock:
+            for sample in batch:
+                parent, child, stamp, row, authority, static = sample._fields
+                history = frames.get(child)
+                if history is not None and not static and history.append(parent, stamp, row, authority):
+                    self.inserted += 1
+                else:
+                    plain = False
+                    self.insert_judged(sample)
+        return plain
+
+    def insert_judged(self, sample: TransformStamped) -> Outcome:
+        """Store one sample that closes no loop."""
         parent, child, stamp, row, authority, static = sample._fields
         history = self.frames.get(child)
         if history is None:
-            history = self._add(child, parent, static)
+            history = self._add_frame(child, parent, static)
         if static:
             if row != history.row:
-                # The paths hold what static edges amount to.
+                # The paths hold the rows of static edges.
                 self.paths.clear()
             outcome = history.insert_static(parent, stamp, row, authority)
         else:
             outcome = history.insert(parent, stamp, row, authority)
         if history.changed:
             self._restructure(history)
+        if outcome is Outcome.INSERTED:
+            self.inserted += 1
+        elif outcome is Outcome.REPLACED:
+            self.replaced += 1
+        else:
+            self.expired += 1
         return outcome
 
+    def remove(self, frame: str) -> None:
+        """Take a frame off its parent, if it has one, and forget its samples.
+
+        Raises
+        ------
+        UnknownFrameError
+            If no sample names the frame.
+        """
+        with self.lock:
+            self.check_known(frame)
+            self._remove(frame)
+
+    def clear(self) -> None:
+        """Drop all moving samples. Static ones and names stay."""
+        with self.lock:
+            for history in self.frames.values():
+                history.clear()
+                history.changed = False
+                self.names.update(history.child, history.named_parents)
+            self.paths.clear()
+
+    def forget_changes(self) -> None:
+        """Empty `changed` and `new_parents`."""
+        self.changed.clear()
+        self.new_parents.clear()
+
+    # Questions
+
     def find_path(self, target: str, source: str, at: int | Latest) -> Path:
-        """The path between two frames at a stamp, or with the newest parents; remembered if it is that of every stamp.
+        """The path between two frames at a stamp, or by the newest parents. A permanent path is kept.
 
         Raises
         ------
@@ -79,47 +178,33 @@ class Forest:
         self.check_known(target)
         self.check_known(source)
         path = find_path(self.frames, target, source, instant)
-        if path.lasting:
+        if path.permanent:
             if len(self.paths) >= _PATHS_KEPT:
                 self.paths.clear()
             self.paths[target, source] = path
         return path
 
     def parent_changes(self) -> list[int]:
-        """Every stamp at which some frame changes its parent, in order: between two of them all paths stay."""
+        """The stamps at which some frame changes its parent, in order. Between two of them all paths stay."""
         return sorted({stamp for history in self.frames.values() for stamp in history.parent_changes()})
 
+    def known_frames(self) -> tuple[str, ...]:
+        """Every frame that a sample names, sorted. Takes the lock."""
+        with self.lock:
+            return self.names.sorted()
+
     def check_known(self, frame: str) -> None:
-        """Raise `UnknownFrameError` unless a sample names the frame."""
+        """Raise `UnknownFrameError` unless a sample names the frame, `TypeError` unless it is a string."""
         if frame not in self.names:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
             raise UnknownFrameError(frame=frame, known=self.names.sorted())
 
-    def remove(self, frame: str) -> None:
-        """Take a frame off its parent, if it has one, and forget its samples."""
-        if self.frames.pop(frame, None) is not None:
-            self.names.remove(frame)
-            self.paths.clear()
-
-    def clear(self) -> None:
-        """Drop all moving samples; static ones and names stay."""
-        for history in self.frames.values():
-            history.clear()
-            history.changed = False
-            self.names.update(history.child, history.mentioned)
-        self.paths.clear()
-
-    def forget_changes(self) -> None:
-        """Clear what was noted for whoever waits."""
-        self.changed.clear()
-        self.joined.clear()
-
-    def below(self, frames: set[str]) -> set[str]:
-        """These frames and all that hang below them, by any parent that a sample in the window names."""
+    def with_descendants(self, frames: set[str]) -> set[str]:
+        """These frames and all below them, by any parent that a sample in the window names."""
         children: dict[str, list[str]] = {}
         for child, history in self.frames.items():
-            for parent in history.mentioned:
+            for parent in history.named_parents:
                 children.setdefault(parent, []).append(child)
         found = set(frames)
         ahead = list(frames)
@@ -130,43 +215,47 @@ class Forest:
         return found
 
     def copy(self) -> "Forest":
-        """An independent copy."""
+        """An independent copy of the samples; its counters start at zero."""
         twin = Forest(self.window)
-        twin.frames = {child: history.copy() for child, history in self.frames.items()}
-        twin.names = self.names.copy()
+        with self.lock:
+            twin.frames = {child: history.copy() for child, history in self.frames.items()}
+            twin.names = self.names.copy()
         return twin
 
-    def within(self, window: int | None) -> "Forest":
-        """An independent copy of what the windows hold, with windows of this length from now on."""
+    def copy_within(self, window: int | None) -> "Forest":
+        """An independent copy of the samples in the windows, with windows of another length (ns) from now on."""
         twin = Forest(window)
-        for child, history in self.frames.items():
-            short = twin.frames[child] = history.within(window)
-            twin.names.update(child, short.mentioned)
+        with self.lock:
+            for child, history in self.frames.items():
+                short = twin.frames[child] = history.copy_within(window)
+                twin.names.update(child, short.named_parents)
         return twin
 
-    def _add(self, child: str, parent: str, static: bool) -> FrameHistory:
+    # Bookkeeping
+
+    def _add_frame(self, child: str, parent: str, static: bool) -> FrameHistory:
         has_children = child in self.names
         history = self.frames[child] = FrameHistory(child, parent, static, self.window)
-        self.names.update(child, history.mentioned)
-        self.joined.add(parent)
+        self.names.update(child, history.named_parents)
+        self.new_parents.add(parent)
         if has_children:
             # A root that gets a parent leaves the paths below it as they are, unless late samples formed a loop there.
             self.paths.clear()
             self.changed.add(child)
-            self._forget_empty_loop(history)
+            self._drop_emptied_loop(history)
         return history
 
     def _restructure(self, history: FrameHistory) -> None:
-        """Forget what an insertion may have made stale."""
+        """Forget the paths that an insertion may have made wrong, and note the change for waiting lookups."""
         history.changed = False
         self.paths.clear()
         self.changed.add(history.child)
-        self.joined.update(history.mentioned)
-        self.names.update(history.child, history.mentioned)
-        self._forget_empty_loop(history)
+        self.new_parents.update(history.named_parents)
+        self.names.update(history.child, history.named_parents)
+        self._drop_emptied_loop(history)
 
-    def _forget_empty_loop(self, history: FrameHistory) -> None:
-        """Drop emptied frames that now stand in a loop: their last parent is no longer the truth."""
+    def _drop_emptied_loop(self, history: FrameHistory) -> None:
+        """Drop frames without samples that now stand in a loop: their last parent holds no longer."""
         walk = {history: None}
         here = history
         while (above := self.frames.get(here.parent)) is not None and above not in walk:
@@ -176,4 +265,9 @@ class Forest:
             for edge in walk:
                 if edge is not history and not len(edge):
                     self.changed.add(edge.child)
-                    self.remove(edge.child)
+                    self._remove(edge.child)
+
+    def _remove(self, frame: str) -> None:
+        if self.frames.pop(frame, None) is not None:
+            self.names.remove(frame)
+            self.paths.clear()

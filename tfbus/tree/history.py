@@ -1,8 +1,8 @@
-"""One frame's samples in stamp order.
+"""The samples of one frame in the order of their stamps.
 
-Storage is by column: stamps for `bisect`, one 64-byte record a sample (stamp, translation, rotation) from which the
-lookup unpacks two neighbours in a single call, and who sent it. What is older than the horizon does not count and is
-cut off some time later, because moving the rest down costs as much for one sample as for a hundred. Every sample
+Storage is by column: stamps for `bisect`; one 64-byte record a sample (stamp, translation, rotation), from which the
+lookup unpacks two neighbours in a single call; and the parent and authority of each sample. Samples older than the
+horizon do not count. They are cut off later, many at once, because each cut moves all remaining samples. Every sample
 carries its own parent, because a frame may be reparented.
 """
 
@@ -25,7 +25,7 @@ _pack = RECORD.pack
 
 
 class Outcome(Enum):
-    """What an insertion did."""
+    """The effect of an insertion."""
 
     INSERTED = "inserted"
     """A sample at a new stamp."""
@@ -37,7 +37,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """What is known of one frame and its newest parent; stamps in ns, None where there is no moving sample."""
+    """The newest edge of one frame; stamps in ns, None where there is no moving sample."""
 
     parent: str
     child: str
@@ -56,19 +56,19 @@ class Edge:
 
 
 class Samples(NamedTuple):
-    """Moving samples of one frame, in stamp order, readable by numpy as they are."""
+    """Copies of moving samples of one frame, in stamp order; numpy reads them without another copy."""
 
     stamps: "array[int]"
     """ns."""
     records: bytearray
     """64 bytes each: the stamp, then the seven floats of the row."""
     parents: list[str] | None
-    """One each; None where they are all the same."""
+    """The parent of each sample; None if all have the same."""
 
 
 @final
 class FrameHistory:
-    """The samples of one child frame inside its window, or the one static sample that holds always.
+    """The moving samples of one child frame inside its window, or its one static sample.
 
     Parameters
     ----------
@@ -89,8 +89,8 @@ class FrameHistory:
     horizon : int
         Samples with a stamp before this one, in ns, have left the window.
     changed : bool
-        Set when an insertion may change the path of a lookup: another parent or kind, or a longer past. Whoever acts
-        on it clears it.
+        Set by an insertion that may change the path of a lookup: another parent or kind, or a longer past. The forest
+        clears it.
     """
 
     __slots__ = (
@@ -147,12 +147,12 @@ class FrameHistory:
         return self.stamps[-1] if self.stamps else None
 
     @property
-    def mentioned(self) -> tuple[str, ...]:
-        """Every parent that a sample in the window names."""
+    def named_parents(self) -> tuple[str, ...]:
+        """The parents that samples in the window name."""
         return (self.parent,) if self.parents is None else tuple(self.parents)
 
     def append(self, parent: str, stamp: int, row: Row, authority: str) -> bool:
-        """Store a moving sample if it is just the next one of the same kind, as nearly all are; else do nothing."""
+        """Store a moving sample that is newer and has the same parent and authority, as nearly all; else do nothing."""
         stamps = self.stamps
         origin = self._origin
         if (
@@ -228,26 +228,26 @@ class FrameHistory:
         return self.origins[max(bisect_right(self.stamps, stamp, start) - 1, start)][0]
 
     def covers(self, stamp: int) -> bool:
-        """Whether a lookup at `stamp` has an answer here."""
+        """Whether the samples surround `stamp`, or the edge is static."""
         return self.static or (bool(self.stamps) and self.stamps[self.start] <= stamp <= self.stamps[-1])
 
-    def missing(self, stamp: int | Latest, slack: int = 0) -> ExtrapolationError:
-        """The error that says why `stamp` is not covered, nor any sample within `slack` ns of it."""
+    def extrapolation_error(self, stamp: int | Latest, slack: int = 0) -> ExtrapolationError:
+        """The error of a `stamp` that is not covered, and is further than `slack` ns from every sample."""
         oldest, newest = self.oldest, self.newest
         past = oldest is not None and isinstance(stamp, int) and stamp < oldest
         kind = PastExtrapolationError if past else FutureExtrapolationError
         return kind(child=self.child, stamp=stamp, oldest=oldest, newest=newest, authority=self.authority, slack=slack)
 
     def parent_changes(self) -> list[int]:
-        """The stamps inside the window at which the parent is another one than before."""
+        """The stamps inside the window at which the parent changes."""
         if self.parents is None:
             return []
         parents = [parent for parent, _ in self.origins[self.start :]]
         stamps = self.stamps[self.start :]
         return [stamp for stamp, old, new in zip(stamps[1:], parents, parents[1:], strict=False) if new != old]
 
-    def around(self, stamp: int) -> tuple[int | None, int | None]:
-        """The stamps of the samples on either side of one, in ns; twice the same if a sample has it."""
+    def neighbours(self, stamp: int) -> tuple[int | None, int | None]:
+        """The stamps of the samples before and after `stamp`, in ns; twice the same if a sample has it."""
         stamps, start = self.stamps, self.start
         i = bisect_left(stamps, stamp, start)
         after = stamps[i] if i < len(stamps) else None
@@ -255,8 +255,8 @@ class FrameHistory:
             return after, after
         return stamps[i - 1] if i > start else None, after
 
-    def between(self, low: int, high: int) -> Samples:
-        """Copies of the samples from stamp `low` to `high`, and of the nearest one on either side."""
+    def samples_between(self, low: int, high: int) -> Samples:
+        """Copies of the samples from stamp `low` to `high`, and of the next one on either side."""
         start = self.start
         first = max(bisect_right(self.stamps, low) - 1, start)
         end = max(bisect_left(self.stamps, high), start) + 1
@@ -264,7 +264,7 @@ class FrameHistory:
         return Samples(self.stamps[first:end], self.records[first * RECORD_SIZE : end * RECORD_SIZE], parents)
 
     def edge(self) -> Edge:
-        """The facts of this frame's newest edge."""
+        """The newest edge as plain data."""
         return Edge(self.parent, self.child, self.static, len(self), self.oldest, self.newest, self.authority)
 
     def copy(self) -> "FrameHistory":
@@ -278,7 +278,7 @@ class FrameHistory:
         twin.parents = None if self.parents is None else self.parents.copy()
         return twin
 
-    def within(self, keep: int | None) -> "FrameHistory":
+    def copy_within(self, keep: int | None) -> "FrameHistory":
         """An independent copy of the samples in the window, with a window of another length from now on."""
         twin = self.copy()
         twin._keep = FOREVER if keep is None else keep
@@ -297,7 +297,7 @@ class FrameHistory:
         self.changed = True
 
     def _reparent(self, parent: str) -> None:
-        """Take note that the sample which is about to become the newest names another parent."""
+        """Note that the next sample, which will be the newest, names another parent."""
         if self.stamps and self.parents is None:
             self._cut()
             self.parents = Counter({self.parent: len(self)})
@@ -335,12 +335,12 @@ class FrameHistory:
         return Outcome.REPLACED if replaces else Outcome.INSERTED
 
     def _shared(self, parent: str, authority: str) -> tuple[str, str]:
-        """An origin; the very tuple of the newest sample if it is equal, because one for each would take 56 bytes."""
+        """A parent and an authority. Equal ones share one tuple, because one for each sample would take 56 bytes."""
         origin = parent, authority
         return self._origin if self._origin == origin else origin
 
     def _cut(self) -> None:
-        """Cut off what has left the window; with one parent throughout, again when a sixteenth more has."""
+        """Cut off samples that have left the window; with only one parent, not again before 1/16 of it has passed."""
         start = self.start
         if self.parents is not None:
             for parent, _ in self.origins[:start]:
@@ -352,7 +352,7 @@ class FrameHistory:
         self._cut_after = self.stamps[0] + self._keep + (0 if self.parents is not None else self._keep // 16)
 
     def _forget(self, parent: str) -> None:
-        """One sample that named `parent` has gone."""
+        """Note that a sample that names `parent` has gone."""
         assert self.parents is not None
         self.parents[parent] -= 1
         if not self.parents[parent]:

@@ -1,9 +1,7 @@
-"""The way between two frames, and the arithmetic along it.
+"""Paths between two frames.
 
 A path climbs from the source to the lowest common ancestor and from the target to the same frame, so no edge above that
-can fail or slow a lookup. Runs of static edges are folded into one row. `climb` is the kernel of every scalar lookup:
-one loop over Python floats, because a function call or a small array for each edge would cost more than its arithmetic.
-Its formulas are those of `tfbus.geometry`.
+can fail or slow a lookup. Runs of static edges are folded into one row.
 """
 
 from collections.abc import Mapping
@@ -16,12 +14,12 @@ from tfbus.tree.history import FrameHistory
 
 
 class Path:
-    """How to get from `source` to `target`, with the parents that hold at one instant.
+    """The edges from `source` to `target`, by the parents that hold at one stamp.
 
     Attributes
     ----------
     up, down : tuple of steps
-        From source, and from target, to the common ancestor: moving edges, and the rows that static ones amount to.
+        From source, and from target, to the common ancestor: moving edges, and one row for each run of static edges.
     frames : tuple of str
         From target to source, the common ancestor once.
     root : str
@@ -29,10 +27,10 @@ class Path:
     moving : tuple of FrameHistory
         The edges that are not static.
     lasting : bool
-        Whether it is the path at every stamp, because no frame on it changes parent inside its window.
+        Whether it holds at every stamp, because no frame on it changes its parent inside its window.
     """
 
-    __slots__ = ("_static", "down", "frames", "lasting", "moving", "root", "up")
+    __slots__ = ("_static", "down", "frames", "permanent", "moving", "root", "up")
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
         edges = ups + downs
@@ -41,16 +39,16 @@ class Path:
         self.root = root
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
-        self.lasting = all(edge.parents is None for edge in edges)
+        self.permanent = all(edge.parents is None for edge in edges)
         self._static = tuple(edge for edge in edges if edge.static)
 
     @property
     def static_stamp(self) -> int:
-        """The newest stamp among the static samples, in ns; sending one again may change it, but not the path."""
+        """The newest stamp among the static samples, in ns; sending one again changes it, but not the path."""
         return max((edge.static_stamp or 0 for edge in self._static), default=0)
 
     def row(self, at: int) -> Row:
-        """Source in target at a stamp.
+        """The row of source in target at a stamp.
 
         Raises
         ------
@@ -62,7 +60,7 @@ class Path:
         return compose(invert(climb(self.down, at)), climb(self.up, at))
 
     def rows(self, stamps: list[int]) -> list[Row]:
-        """As `row`, at some stamps."""
+        """The rows at some stamps."""
         if not self.down:
             return [climb(self.up, at) for at in stamps]
         return [self.row(at) for at in stamps]
@@ -79,14 +77,14 @@ class Path:
         common = STAMP_MAX
         for edge in self.moving:
             if not edge.stamps:
-                raise edge.missing(LATEST)
+                raise edge.extrapolation_error(LATEST)
             if edge.stamps[-1] < common:
                 lagging, common = edge, edge.stamps[-1]
         return common, lagging
 
-    def blocker(self, at: int) -> ExtrapolationError:
-        """The edge that decides among those that do not cover a stamp: one past for good, or the last to come."""
-        missing = [edge.missing(at) for edge in self.moving if not edge.covers(at)]
+    def deciding_error(self, at: int) -> ExtrapolationError:
+        """The error of a stamp that is not covered: of an edge that has lost it, else of the one that lags most."""
+        missing = [edge.extrapolation_error(at) for edge in self.moving if not edge.covers(at)]
         for error in missing:
             if isinstance(error, PastExtrapolationError):
                 return error
@@ -106,7 +104,7 @@ def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
 
 
 def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: int | None) -> Path:
-    """The path that holds at a stamp, or with each frame's newest parent.
+    """The path that holds at a stamp, or by the newest parents.
 
     Both ends climb in turn, so the search stops at most one side's length beyond the common ancestor.
 
@@ -120,7 +118,7 @@ def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: 
     Raises
     ------
     DisconnectedError
-        If they do not meet, or a side comes back to where it was: out-of-order samples can form a loop in the past.
+        If the two ends do not meet, or one runs into a loop, which out-of-order samples can form in the past.
     """
     up, down = _Climber(frames, source, at), _Climber(frames, target, at)
     while True:
@@ -136,7 +134,7 @@ def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: 
 
 
 class _Climber:
-    """One end of a path on its way to the root."""
+    """One end of a path search, which climbs towards the root."""
 
     __slots__ = ("_at", "_frames", "edges", "ended", "here", "loop", "seen")
 

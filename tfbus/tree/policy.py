@@ -1,4 +1,4 @@
-"""What counts as answerable, beyond what lies between two samples.
+"""Policies: which stamps a lookup may answer although no two close samples surround them.
 
 Without a policy nothing is extrapolated, and any two samples are interpolated between, however far apart they are.
 """
@@ -46,8 +46,8 @@ class Policy:
     hold: int = 0
 
     @property
-    def patience(self) -> int:
-        """For how long a sample may stand in for the stamps after it, for whichever reason."""
+    def longest_hold(self) -> int:
+        """How long a sample may stand in for later stamps, by `tolerance` or by `hold`, in ns."""
         return max(self.tolerance, self.hold)
 
 

@@ -9,7 +9,7 @@ from tfbus.tree.policy import Policy
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What a lookup asks: its arguments, stamps in ns, `max_age` in s."""
+    """The arguments of a lookup: stamps in ns, `max_age` in s."""
 
     target: str
     source: str

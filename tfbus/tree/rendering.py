@@ -1,4 +1,4 @@
-"""Pictures of a tree: text for people, Graphviz, and tf2's YAML."""
+"""Renderings of a tree: text for people, Graphviz, and tf2's YAML."""
 
 import json
 import re
@@ -32,7 +32,7 @@ def describe(edges: Sequence[Edge], now: int | None = None) -> str:
 
 
 def facts(edge: Edge, now: int) -> dict[str, str]:
-    """What is known of an edge, for people: rate, age, span and authority, as far as it has them."""
+    """The rate, age, span and authority of an edge as texts; what an edge does not have is left out."""
     known = {"rate": _rate(edge)}
     if edge.oldest is not None and edge.newest is not None:
         known["age"] = f"age {format_duration(now - edge.newest)}"
@@ -47,7 +47,7 @@ def _rate(edge: Edge) -> str:
 
 
 def format_rate(static: bool, newest: int | None, rate: float | None) -> str:
-    """How often samples come, for people: ``static``, ``10.0 Hz``, ``one sample``."""
+    """The rate of an edge as text: ``static``, ``10.0 Hz``, ``one sample``."""
     if static:
         return "static"
     if newest is None:
@@ -58,7 +58,7 @@ def format_rate(static: bool, newest: int | None, rate: float | None) -> str:
 
 
 class Branch(NamedTuple):
-    """One line of a picture: the frame, what is drawn before it, and its edge unless it is a root."""
+    """One line of a drawn tree: the lines before the frame, the frame, and its edge (None for a root)."""
 
     guides: str
     frame: str
@@ -66,7 +66,7 @@ class Branch(NamedTuple):
 
 
 def branches(edges: Sequence[Edge]) -> Iterator[Branch]:
-    """All frames as they are drawn, roots first; a loop is opened at one of its frames."""
+    """The lines of a drawn tree, roots first. A loop of parents is opened at one of its frames."""
     below: dict[str, list[Edge]] = {}
     for edge in edges:
         below.setdefault(edge.parent, []).append(edge)
@@ -75,7 +75,7 @@ def branches(edges: Sequence[Edge]) -> Iterator[Branch]:
     for frame in [*sorted(parent for parent in below if parent not in above), *sorted(above)]:
         if frame in drawn:
             continue
-        # What no root leads to hangs in a loop, or below one: up to the first frame that comes again.
+        # A frame that no root leads to is in a loop, or below one: climb to the first frame that comes again.
         root = frame
         climbed: set[str] = set()
         while root in above and root not in climbed:

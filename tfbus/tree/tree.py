@@ -1,29 +1,39 @@
-"""All frames: who hangs on whom, and where one is, seen from another.
+"""The tree of all frames: where one frame is, seen from another.
 
-`TransformTree` has no clock, no event loop and no I/O: it answers or it raises. One lock is held for one lookup or one
-batch, so worker threads may read while the loop inserts.
+`TransformTree` has no clock, no event loop and no input or output: it answers or it raises.
 """
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
-from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
-from tfbus.stamps import LATEST, Latest, as_duration, as_stamp, from_seconds
-from tfbus.tree._lookup import At
-from tfbus.tree.cycles import admit
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.data import PointCloud, TwistStamped
+from tfbus.errors import TransformLookupError
+from tfbus.geometry.stamped import TransformStamped, as_batch
+from tfbus.geometry.transform_array import TransformArray
+from tfbus.stamps import LATEST, Latest, Stamps, as_duration, as_stamp, as_stamps, from_seconds
+from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
+from tfbus.tree._velocity import twist
+from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, Outcome
-from tfbus.tree.reader import TreeReader
+from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer
+from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.rendering import describe, to_dot, to_yaml
 
 
-class TransformTree(TreeReader):
+class TransformTree:
     """The transforms between any two frames, over the last few seconds.
+
+    Any thread may read it while another one inserts.
 
     Parameters
     ----------
     keep : float or None
-        How much history to keep for each frame, in s before that frame's newest stamp; None keeps everything.
+        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything.
 
     Raises
     ------
@@ -33,10 +43,6 @@ class TransformTree(TreeReader):
     Attributes
     ----------
     keep : float or None
-    inserted, replaced, expired : int
-        How many samples had each `Outcome`.
-    forest : Forest
-        What the tree is made of. For the rest of the package: reading it is not covered by the lock.
 
     Examples
     --------
@@ -48,12 +54,9 @@ class TransformTree(TreeReader):
     """
 
     def __init__(self, keep: float | None = 10.0) -> None:
-        seconds = None if keep is None else as_duration(keep, "keep")
         self.keep = keep
-        super().__init__(Forest(None if seconds is None or seconds == math.inf else from_seconds(seconds)))
-        self.inserted = 0
-        self.replaced = 0
-        self.expired = 0
+        self._forest = Forest(window_of(keep))
+        self._filled_by_bus = False
 
     # Insertion
 
@@ -79,52 +82,281 @@ class TransformTree(TreeReader):
         TypeError
             If something in it is not a `TransformStamped`.
         """
-        batch = as_batch(samples)
-        with self._lock:
-            _, refused = admit(self.forest.frames, batch)
-            if refused:
-                raise refused[0]
-            outcomes = [self._store(sample) for sample in batch]
-            self.forest.forget_changes()
-            return outcomes
+        self._check_writable("use bus.publish, or a copy() of the tree")
+        return self._forest.insert(as_batch(samples))
 
-    def _store(self, sample: TransformStamped) -> Outcome:
-        outcome = self.forest.store(sample)
-        if outcome is Outcome.INSERTED:
-            self.inserted += 1
-        elif outcome is Outcome.REPLACED:
-            self.replaced += 1
-        else:
-            self.expired += 1
-        return outcome
+    @property
+    def inserted(self) -> int:
+        """Number of samples at a new stamp."""
+        return self._forest.inserted
 
-    def commit(self, batch: Batch) -> bool:
-        """Store a batch that somebody has judged already, such as the bus; what is too old expires.
+    @property
+    def replaced(self) -> int:
+        """Number of samples that replaced another one at the same stamp."""
+        return self._forest.replaced
+
+    @property
+    def expired(self) -> int:
+        """Number of samples that were older than the window of their frame."""
+        return self._forest.expired
+
+    # Questions about transforms
+
+    def lookup(
+        self,
+        target: str,
+        source: str,
+        at: At = LATEST,
+        *,
+        source_at: At | None = None,
+        fixed: str | None = None,
+        not_before: int | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> TransformStamped:
+        """Where `source` is, seen from `target`: the transform that maps source's data into target.
+
+        Parameters
+        ----------
+        target, source : str
+        at : int or LATEST
+            ns. `LATEST` is the newest stamp that every moving edge on the path can answer; with `extrapolate`, the
+            newest stamp of any of them, as far as the lagging one may be held.
+        source_at : int or LATEST, optional
+            Take source at this stamp instead, and carry it to `at` through `fixed`.
+        fixed : str, optional
+            The frame that is held still between the two stamps.
+        not_before : int, optional
+            Count a `LATEST` answer older than this (ns) as not yet arrived.
+        tolerance : float
+            Where an edge does not cover the stamp, or only by a gap that is too long, let its nearest sample within so
+            many s stand in.
+        max_gap : float, optional
+            Refuse to interpolate between samples that are more than so many s apart.
+        extrapolate : Hold, optional
+            Where an edge has no sample after the stamp, or none that `max_gap` lets it interpolate to, let the one
+            before it stand in, for a while.
 
         Returns
         -------
-        bool
-            Whether every sample was just the next one of its frame, so that nothing but stamps has changed.
+        TransformStamped
+            Parent is target and child is source; its stamp is `at`, or the one that `LATEST` found. An answer whose
+            whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples. In time
+            travel, a `LATEST` that only static edges answer takes the stamp of source. With a tolerance, a gap or
+            a hold, `extrapolated_by` and `gap` say what was done.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError, FutureExtrapolationError
+            If it cannot be answered now, but may be later.
+        PastExtrapolationError
+            If it is older than an edge's window.
+        GapError
+            If it lies in a gap that is too long.
+        TypeError
+            If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
+            `not_before` comes without a `LATEST`.
         """
-        frames = self.forest.frames
-        plain = True
-        with self._lock:
-            for sample in batch:
-                parent, child, stamp, row, authority, static = sample._fields
-                history = frames.get(child)
-                if history is not None and not static and history.append(parent, stamp, row, authority):
-                    self.inserted += 1
-                else:
-                    plain = False
-                    self._store(sample)
-        return plain
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        return answer(self._forest, target, source, at, source_at, fixed, not_before, policy)
+
+    def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
+        """Whether `lookup` with the same arguments has an answer now."""
+        try:
+            self.lookup(target, source, at, **question)
+        except TransformLookupError:
+            return False
+        return True
+
+    def explain(
+        self,
+        target: str,
+        source: str,
+        at: At = LATEST,
+        *,
+        not_before: int | None = None,
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+        now: int | None = None,
+    ) -> Explanation:
+        """How `lookup` with these arguments comes to its answer, or all that keeps it from one; made to be printed.
+
+        Parameters
+        ----------
+        target, source, at, not_before, tolerance, max_gap, extrapolate
+            As `lookup`. Each leg of a time travel is a question of its own.
+        now : int, optional
+            The stamp that ages are counted from, in ns; by default the newest in the tree.
+
+        Raises
+        ------
+        TypeError
+            As `lookup`. What a lookup has no answer to is no error here.
+        """
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        if not_before is not None and at is not LATEST:
+            raise TypeError(AT_LATEST_ONLY)
+        if at is not LATEST:
+            at = as_stamp(at)
+        with self._forest.lock:
+            return explain(self._forest, target, source, at, not_before, policy, now)
+
+    def lookup_many(
+        self,
+        target: str,
+        source: str,
+        stamps: npt.ArrayLike,
+        *,
+        source_at: npt.ArrayLike | None = None,
+        fixed: str | None = None,
+        out_of_range: OutOfRange = "raise",
+        tolerance: float = 0.0,
+        max_gap: float | None = None,
+        extrapolate: Hold | None = None,
+    ) -> TransformArray:
+        """As `lookup`, at many stamps at once.
+
+        Parameters
+        ----------
+        target, source : str
+        stamps : integer array of shape (n,)
+            ns, in any order.
+        source_at : int, or integer array of shape (n,), optional
+            Take source at these stamps instead, and carry it to `stamps` through `fixed`.
+        fixed : str, optional
+            The frame that is held still between the two stamps.
+        out_of_range : {"raise", "nan"}
+            What becomes of stamps without an answer: an error that names the first, or NaN in their places.
+        tolerance, max_gap, extrapolate
+            As `lookup`.
+
+        Returns
+        -------
+        TransformArray
+            One transform a stamp, in the order of `stamps`; its `extrapolated_by` and `gap` say what was done.
+
+        Raises
+        ------
+        UnknownFrameError
+        DisconnectedError
+            If there is no path at some stamp; with ``"nan"``, only if there is none at any.
+        ExtrapolationError
+            If a stamp is outside an edge's window; `index` says which.
+        TypeError
+            If stamps are not integers, or only one of `source_at` and `fixed` is given.
+        ValueError
+            If shapes do not agree.
+        """
+        asked = as_stamps(stamps)
+        if (source_at is None) != (fixed is None):
+            raise TypeError(GO_TOGETHER)
+        source_stamps = None if source_at is None else _as_many(source_at, len(asked))
+        policy = policy_of(tolerance, max_gap, extrapolate)
+        return lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
+
+    def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
+        """A cloud from a moving sensor, as if all points had been seen at once, at the stamp of the cloud.
+
+        Each point goes by the transform of its own stamp into `fixed`, and from there into `target` at the stamp of the
+        cloud.
+
+        Parameters
+        ----------
+        cloud : PointCloud
+            With a stamp for each point. If its own is `LATEST`, that of the newest point is meant.
+        target : str
+            The frame of the result; often that of the cloud.
+        fixed : str
+            The frame that stands still meanwhile, such as ``"odom"``.
+        out_of_range : {"raise", "nan"}
+            As for `lookup_many`; points without an answer become NaN. The stamp of the cloud itself has to be covered.
+
+        Returns
+        -------
+        PointCloud
+            In `target`, without stamps for the points, of the same float type and with the same fields.
+
+        Raises
+        ------
+        TransformLookupError
+            As for `lookup_many`.
+        ValueError
+            If the points have no stamps.
+        """
+        return deskew(self._forest, cloud, target, fixed, out_of_range)
+
+    def twist(self, frame: str, reference: str, at: At = LATEST, *, expressed_in: str | None = None) -> TwistStamped:
+        """How `frame` moves, seen from `reference`: the derivative of what `lookup` interpolates.
+
+        Parameters
+        ----------
+        frame, reference : str
+        at : int or LATEST
+            ns. `LATEST` is the newest stamp at which all that is needed can be answered.
+        expressed_in : str, optional
+            The frame along whose axes the velocities are told; by default `reference`.
+
+        Returns
+        -------
+        TwistStamped
+            Its frame is `expressed_in`, but `linear` is the velocity of the origin of `frame` in m/s, whatever the
+            axes; `angular` is the angular velocity in rad/s. At a sample it is the derivative from before, at the first
+            of an edge's window or of a new parent that from after. From the last sample with one parent to the first
+            with another an edge stands still.
+
+        Raises
+        ------
+        TransformLookupError
+            As `lookup`; and `FutureExtrapolationError` at an edge's newest sample if it is the only one, or the only
+            one with its parent.
+
+        Notes
+        -----
+        Move only an answer with ``expressed_in=frame`` by `do_transform`: it is the twist of the body that the frame is
+        fixed to, told at the frame's own origin, and can be told at other frames of that body. In other axes, as by
+        default, it is not told at the origin of its frame, and `do_transform` would give a wrong velocity.
+
+        tf2's `lookupVelocity` gives other numbers: it rotates what is in the observer's axes once more by the body's
+        rotation.
+        """
+        axes = reference if expressed_in is None else expressed_in
+        if at is not LATEST:
+            at = as_stamp(at)
+        with self._forest.lock:
+            stamp, linear, angular = twist(self._forest, frame, reference, at, axes)
+        return TwistStamped(axes, stamp, linear, angular)
+
+    def latest_common_stamp(self, target: str, source: str) -> int | None:
+        """The stamp that `LATEST` means for these two frames, in ns; None where the whole path is static.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError, FutureExtrapolationError
+            As `lookup`.
+        """
+        with self._forest.lock:
+            path = self._forest.find_path(target, source, LATEST)
+            return path.newest_common()[0] if path.moving else None
+
+    def chain(self, target: str, source: str, at: At = LATEST) -> list[str]:
+        """The frames on the path, from target to source, both included.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError
+        """
+        if at is not LATEST:
+            at = as_stamp(at)
+        with self._forest.lock:
+            return list(self._forest.find_path(target, source, at).frames)
 
     # Questions about the tree itself
 
     def frames(self) -> list[str]:
         """Every frame that a sample in the tree names, sorted."""
-        with self._lock:
-            return list(self.forest.names.sorted())
+        return list(self._forest.known_frames())
 
     def parent(self, frame: str, at: At = LATEST) -> str | None:
         """The frame's parent: at a stamp, or the newest one. None for a root.
@@ -137,25 +369,25 @@ class TransformTree(TreeReader):
         """
         if at is not LATEST:
             at = as_stamp(at)
-        with self._lock:
-            self.forest.check_known(frame)
-            history = self.forest.frames.get(frame)
+        with self._forest.lock:
+            self._forest.check_known(frame)
+            history = self._forest.frames.get(frame)
             if history is None:
                 return None
             if isinstance(at, Latest):
                 return history.parent
             if not history.covers(at):
-                raise history.missing(at)
+                raise history.extrapolation_error(at)
             return history.parent_at(at)
 
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
-        with self._lock:
-            return [self.forest.frames[child].edge() for child in sorted(self.forest.frames)]
+        with self._forest.lock:
+            return [self._forest.frames[child].edge() for child in sorted(self._forest.frames)]
 
     def __contains__(self, frame: object) -> bool:
-        with self._lock:
-            return frame in self.forest.names
+        with self._forest.lock:
+            return frame in self._forest.names
 
     # Changes other than samples
 
@@ -166,30 +398,21 @@ class TransformTree(TreeReader):
         ------
         UnknownFrameError
         """
-        with self._lock:
-            self.forest.check_known(frame)
-            self.forest.remove(frame)
+        self._check_writable("use bus.remove_frame, or a copy() of the tree")
+        self._forest.remove(frame)
 
     def clear(self) -> None:
         """Drop all moving samples. Static ones and the frames' names stay."""
-        with self._lock:
-            self.forest.clear()
+        self._check_writable("clear a copy() of it")
+        self._forest.clear()
 
     def copy(self) -> "TransformTree":
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
         twin = TransformTree(self.keep)
-        with self._lock:
-            twin.forest = self.forest.copy()
+        twin._forest = self._forest.copy()
         return twin
 
-    def adopt(self, other: "TransformTree") -> None:
-        """Hold a copy of what another tree holds, as far back as this one keeps it, instead of its own samples."""
-        with other._lock:
-            forest = other.forest.within(self.forest.window)
-        with self._lock:
-            self.forest = forest
-
-    # Pictures
+    # Text
 
     def describe(self, now: int | None = None) -> str:
         """The tree as text, with each edge's rate, age, span and authority.
@@ -208,3 +431,42 @@ class TransformTree(TreeReader):
     def to_yaml(self) -> str:
         """The tree as YAML with tf2's keys; stamps in s."""
         return to_yaml(self.edges())
+
+    def _check_writable(self, instead: str) -> None:
+        if self._filled_by_bus:
+            raise RuntimeError(f"a bus feeds this tree: {instead}")
+
+
+def tree_of(forest: Forest, keep: float | None) -> TransformTree:
+    """The tree over a forest that a bus fills; nobody else may change it, because that would wake no waiting lookup."""
+    tree = TransformTree(keep)
+    tree._forest = forest
+    tree._filled_by_bus = True
+    return tree
+
+
+def forest_of(tree: TransformTree) -> Forest:
+    """The forest behind a tree."""
+    return tree._forest
+
+
+def window_of(keep: float | None) -> int | None:
+    """The length of history in ns that `keep` in s asks for; None for all of it.
+
+    Raises
+    ------
+    ValueError
+        If `keep` is negative or NaN.
+    """
+    seconds = None if keep is None else as_duration(keep, "keep")
+    return None if seconds is None or seconds == math.inf else from_seconds(seconds)
+
+
+def _as_many(source_at: npt.ArrayLike, count: int) -> Stamps:
+    """An array of `count` stamps, made of one stamp for all or of one each."""
+    if np.ndim(source_at) == 0:
+        return np.full(count, as_stamp(source_at))
+    stamps = as_stamps(source_at)
+    if len(stamps) != count:
+        raise ValueError(f"source_at must be one stamp, or have shape ({count},) as stamps has, got {stamps.shape}")
+    return stamps

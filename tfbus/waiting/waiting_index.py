@@ -1,9 +1,9 @@
-"""Who waits for what.
+"""An index of the waiting lookups by the frames that block them.
 
-A lookup that cannot be answered is parked under what blocks it: an edge whose newest stamp is too old, ordered by the
-stamp it needs; a frame that nobody has named; or the roots of two trees. An insertion then finds those that it can have
-unblocked without looking at the others. Nothing here waits or evaluates: whoever inserts takes the waiters that are due
-and wakes them, and they read again for themselves.
+A lookup that cannot be answered is parked under the frame that blocks it: an edge whose newest stamp is too old,
+ordered by the stamp that the lookup needs; an unknown frame; or the roots of two trees. An insertion then finds the
+lookups that it may have unblocked without looking at the others. Nothing here waits or computes an answer: the
+inserting code pops the waiters that may have an answer and wakes them, and each asks the tree again.
 """
 
 from bisect import bisect_left, insort
@@ -27,7 +27,7 @@ _Place = tuple[int, int, "Waiter"]
 
 @dataclass(frozen=True, slots=True)
 class PendingLookup:
-    """One lookup that waits: its question, since when (ns on the bus's clock), and the error that blocks it."""
+    """A waiting lookup: its question, when it began to wait (ns on the bus's clock), and the error that blocks it."""
 
     question: Question
     since: int
@@ -44,9 +44,9 @@ class Waiter:
     ----------
     question : Question
     since : int
-        When the lookup began to wait, in ns.
+        The stamp at which the lookup began to wait, in ns.
     wake : callable
-        Called once, by whoever took the waiter from the index.
+        Called once, after the waiter was popped from the index.
     """
 
     __slots__ = ("blocked_by", "names", "place", "question", "since", "wake")
@@ -61,7 +61,7 @@ class Waiter:
 
 
 def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
-    """The frames of which a sample may remove what `error` says.
+    """The frames of which a new sample may remove the cause of `error`.
 
     Raises
     ------
@@ -78,10 +78,10 @@ def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
 
 
 def without_traceback(error: TransformLookupError) -> TransformLookupError:
-    """An error to be kept while a lookup waits.
+    """The error without its traceback, to be kept while a lookup waits.
 
-    A traceback holds the frames that it has been through, the waiting one among them, which holds the error: every wait
-    would leave a cycle for the garbage collector, and that stops the loop for 100 ms now and then.
+    A traceback refers to the waiting stack frame, which refers to the error: every wait would leave a reference cycle,
+    and the garbage collector then stops the loop for 100 ms now and then.
     """
     here: BaseException | None = error
     while here is not None:
@@ -90,10 +90,10 @@ def without_traceback(error: TransformLookupError) -> TransformLookupError:
     return error
 
 
-class _Blocked:
+class _FrameWaiters:
     """The waiters under one frame: by the stamp that its edge must reach, and those that need any sample of it.
 
-    The places are sorted backwards, by negative stamp and negative order, so that whoever is due stands at the end.
+    The places are sorted backwards, by negative stamp and negative order, so that the next due waiter is the last.
     """
 
     __slots__ = ("for_any", "places")
@@ -108,12 +108,12 @@ class WaitingIndex:
 
     Attributes
     ----------
-    blocked : mapping
-        The frames that somebody is parked under. A frame that is not in it has nothing to take.
+    by_frame : mapping
+        The waiters under each frame that blocks a lookup.
     """
 
     def __init__(self) -> None:
-        self.blocked: dict[str, _Blocked] = {}
+        self.by_frame: dict[str, _FrameWaiters] = {}
         self._waiters: dict[Waiter, None] = {}
         self._order = count()
 
@@ -121,7 +121,7 @@ class WaitingIndex:
         return len(self._waiters)
 
     def park(self, waiter: Waiter, error: TransformLookupError) -> None:
-        """Put a waiter under what `error` says is missing.
+        """Put a waiter under the frames that `error` says it lacks.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class WaitingIndex:
         waiter.names = blocking_frames(error)
         cause = error.__cause__
         if isinstance(cause, (*MAY_COME, GapError)):
-            # At the stamp that all have reached, something else is missing as well; late data may bring it.
+            # At the newest common stamp something else is missing as well; late data may bring it.
             also = (cause.child,) if isinstance(cause, GapError) else blocking_frames(cause)
             waiter.names = tuple(dict.fromkeys((*waiter.names, *also)))
         if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
@@ -146,12 +146,12 @@ class WaitingIndex:
         self._waiters[waiter] = None
 
     def remove(self, waiter: Waiter) -> None:
-        """Take one waiter out, if it is still parked."""
+        """Remove one waiter, if it is still parked."""
         if waiter not in self._waiters:
             return
         del self._waiters[waiter]
         for name in waiter.names:
-            blocked = self.blocked.get(name)
+            blocked = self.by_frame.get(name)
             if blocked is None:
                 continue
             if waiter.place is not None:
@@ -159,15 +159,16 @@ class WaitingIndex:
             else:
                 blocked.for_any.pop(waiter, None)
             if not blocked.places and not blocked.for_any:
-                del self.blocked[name]
+                del self.by_frame[name]
         waiter.place = None
 
-    def take(self, frame: str, stamp: int | None) -> list[Waiter]:
-        """Take out those that a sample of `frame` can have unblocked: who needs any, or its stamp or an older one.
+    def pop_unblocked(self, frame: str, stamp: int | None) -> list[Waiter]:
+        """Remove and return the waiters that a sample of `frame` at `stamp` may have unblocked.
 
-        Who needs an older one than the newest has never been parked, so a late sample unblocks nobody else.
+        These are the waiters that need any sample, and those that need this stamp or an older one. No waiter needs a
+        stamp older than the newest sample, so a late sample unblocks no others.
         """
-        blocked = self.blocked.get(frame)
+        blocked = self.by_frame.get(frame)
         if blocked is None:
             return []
         ready = list(blocked.for_any)
@@ -176,16 +177,16 @@ class WaitingIndex:
         places = blocked.places
         while stamp is not None and places and -places[-1][0] <= stamp:
             waiter = places.pop()[2]
-            # It holds the waiter, which would be a cycle for the garbage collector.
+            # The place refers to the waiter: without this line they form a reference cycle.
             waiter.place = None
             del self._waiters[waiter]
             ready.append(waiter)
         if not places:
-            self.blocked.pop(frame, None)
+            self.by_frame.pop(frame, None)
         return ready
 
-    def take_asking(self, frames: set[str]) -> list[Waiter]:
-        """Take out those whose question names one of these frames."""
+    def pop_asking_for(self, frames: set[str]) -> list[Waiter]:
+        """Remove and return the waiters whose question names one of the frames."""
         ready = [
             waiter
             for waiter in self._waiters
@@ -195,24 +196,24 @@ class WaitingIndex:
             self.remove(waiter)
         return ready
 
-    def take_all(self) -> list[Waiter]:
-        """Take everybody out, as when a frame is removed, the clock jumps back, or nothing more will come."""
+    def pop_all(self) -> list[Waiter]:
+        """Remove and return all waiters."""
         ready = list(self._waiters)
         for waiter in ready:
             waiter.place = None
         self._waiters.clear()
-        self.blocked.clear()
+        self.by_frame.clear()
         return ready
 
-    def _under(self, frame: str) -> _Blocked:
-        blocked = self.blocked.get(frame)
+    def _under(self, frame: str) -> _FrameWaiters:
+        blocked = self.by_frame.get(frame)
         if blocked is None:
-            blocked = self.blocked[frame] = _Blocked()
+            blocked = self.by_frame[frame] = _FrameWaiters()
         return blocked
 
     def pending(self) -> tuple[PendingLookup, ...]:
-        """Who waits, and what blocks each."""
-        # Copied first, because another thread may ask while the loop parks and wakes.
+        """All waiting lookups with the errors that block them."""
+        # Copied first, because another thread may call this while the loop parks and wakes.
         return tuple(
             PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
             for waiter in list(self._waiters)

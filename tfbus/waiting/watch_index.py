@@ -1,7 +1,7 @@
-"""Who watches which path.
+"""An index of the open watches by the frames of their answers.
 
-A watch that has an answer is kept under the frames that the answer is made of, so an insertion finds those that it
-concerns without looking at the others. It only flags them: whoever reads a watch evaluates it.
+A watch that has an answer is kept under the frames on the path of the answer, so an insertion finds the watches that it
+concerns without looking at the others. It only marks them as outdated: the reader of a watch computes the new answer.
 """
 
 from collections.abc import Callable, Iterable
@@ -11,21 +11,21 @@ from tfbus.tree.forest import Forest
 from tfbus.tree.path import Path, find_path
 
 
-class Watched:
-    """What has happened to a watch since somebody last looked.
+class WatchState:
+    """The changes that concern a watch since its last answer.
 
     Parameters
     ----------
     target, source : str
     wake : callable
-        Called when something happens to a watch that had no flag.
+        Called when an up-to-date watch becomes outdated.
 
     Attributes
     ----------
-    flagged : bool
-        Whether the answer may be another one.
+    outdated : bool
+        Whether the answer may have changed.
     updates : int
-        How many batches have touched the answer's frames.
+        Number of batches that have touched the frames of the answer.
     reset : ClockResetError or None
         The last jump back of the clock.
     ended : bool
@@ -33,18 +33,18 @@ class Watched:
     waiting : bool
         Whether a task waits to be woken.
     frames : frozenset of str
-        What it is kept under.
+        The frames that the index keeps it under.
     path : Path or None
-        Where those frames come from, if it is a path that holds at every stamp.
+        The path of the answer, if it is a permanent one.
     """
 
-    __slots__ = ("ended", "flagged", "frames", "path", "reset", "source", "target", "updates", "waiting", "wake")
+    __slots__ = ("ended", "frames", "outdated", "path", "reset", "source", "target", "updates", "waiting", "wake")
 
     def __init__(self, target: str, source: str, wake: Callable[[], object]) -> None:
         self.target = target
         self.source = source
         self.wake = wake
-        self.flagged = True
+        self.outdated = True
         self.updates = 0
         self.reset: ClockResetError | None = None
         self.ended = False
@@ -58,108 +58,108 @@ class WatchIndex:
 
     Attributes
     ----------
-    under : mapping
-        The frames that some answer is made of. A sample of any other concerns nobody.
+    by_frame : mapping
+        The watches under each frame that some answer depends on.
     """
 
     def __init__(self) -> None:
-        self.under: dict[str, dict[Watched, None]] = {}
-        self._open: dict[Watched, None] = {}
+        self.by_frame: dict[str, dict[WatchState, None]] = {}
+        self._open: dict[WatchState, None] = {}
 
     def __len__(self) -> int:
         return len(self._open)
 
     @property
-    def anyone_waits(self) -> bool:
-        """Whether a task waits for one of them."""
-        return any(watched.waiting for watched in self._open)
+    def has_waiters(self) -> bool:
+        """Whether a task waits for one of the watches."""
+        return any(state.waiting for state in self._open)
 
-    def add(self, watched: Watched) -> None:
-        """Take a watch in; it hears of nothing but resets and the end until it follows an answer."""
-        self._open[watched] = None
+    def add(self, state: WatchState) -> None:
+        """Add a watch without an answer; only resets and the end concern it."""
+        self._open[state] = None
 
-    def remove(self, watched: Watched) -> None:
-        """Take a watch out, if it is in."""
-        self.forget(watched)
-        self._open.pop(watched, None)
+    def remove(self, state: WatchState) -> None:
+        """Remove a watch, if it is open."""
+        self.set_no_answer(state)
+        self._open.pop(state, None)
 
-    def follow(self, watched: Watched, forest: Forest, stamp: int) -> None:
-        """Keep an open watch under the frames that its answer at `stamp` (ns) was made of."""
-        if watched not in self._open:
+    def set_answer(self, state: WatchState, forest: Forest, stamp: int) -> None:
+        """Keep an open watch under the frames of its answer at `stamp` (ns)."""
+        if state not in self._open:
             return
-        target, source = watched.target, watched.source
+        target, source = state.target, state.source
         path = forest.paths.get((target, source))
-        if path is not None and path is watched.path:
+        if path is not None and path is state.path:
             return
-        watched.path = path
+        state.path = path
         if path is not None:
             frames = _frames_of(path)
         else:
-            # The stamp was found on the newest path, and the answer along the one that held then.
+            # The newest path gives the stamp of the answer, and the path at that stamp gives the answer.
             frames = _frames_of(find_path(forest.frames, target, source, None))
             frames |= _frames_of(find_path(forest.frames, target, source, stamp))
-        if frames != watched.frames:
-            self._put(watched, frames)
+        if frames != state.frames:
+            self._move(state, frames)
 
-    def forget(self, watched: Watched) -> None:
-        """Keep a watch under no frame: it has no answer."""
-        watched.path = None
-        self._put(watched, frozenset())
+    def set_no_answer(self, state: WatchState) -> None:
+        """Keep a watch that has no answer under no frame."""
+        state.path = None
+        self._move(state, frozenset())
 
-    def flag(self, frames: Iterable[str]) -> list[Watched]:
-        """Flag the watches under these frames; those that had no flag before are to be woken."""
-        touched: dict[Watched, None] = {}
+    def mark(self, frames: Iterable[str]) -> list[WatchState]:
+        """Mark the watches under some frames as outdated; return those that were up to date, to be woken."""
+        touched: dict[WatchState, None] = {}
         for frame in frames:
-            watches = self.under.get(frame)
-            if watches is not None:
-                touched.update(watches)
-        fresh = [watched for watched in touched if not watched.flagged]
-        for watched in touched:
-            watched.updates += 1
-            watched.flagged = True
+            states = self.by_frame.get(frame)
+            if states is not None:
+                touched.update(states)
+        fresh = [state for state in touched if not state.outdated]
+        for state in touched:
+            state.updates += 1
+            state.outdated = True
         return fresh
 
-    def flag_asking(self, frames: set[str]) -> list[Watched]:
-        """Flag the watches between these frames whose path is not that of every stamp; who had no flag is to be woken.
+    def mark_asking_for(self, frames: set[str]) -> list[WatchState]:
+        """Mark the watches of some frames that have no permanent path; return those that were up to date.
 
-        Late samples can form a loop at the stamp of the answer: then an edge beyond the path may be another way.
+        Late samples can form a loop at the stamp of an answer. Then an edge beyond the path may open another path.
         """
         fresh = [
-            watched
-            for watched in self._open
-            if watched.path is None and not watched.flagged and (watched.target in frames or watched.source in frames)
+            state
+            for state in self._open
+            if state.path is None and not state.outdated and (state.target in frames or state.source in frames)
         ]
-        for watched in fresh:
-            watched.flagged = True
+        for state in fresh:
+            state.outdated = True
         return fresh
 
-    def reset(self, error: ClockResetError) -> list[Watched]:
-        """Flag everybody, with the jump back of the clock; all are to be woken."""
-        for watched in self._open:
-            watched.reset = error
-            watched.flagged = True
-            self.forget(watched)
+    def reset(self, error: ClockResetError) -> list[WatchState]:
+        """Mark all watches with a jump back of the clock; return all, to be woken."""
+        for state in self._open:
+            state.reset = error
+            state.outdated = True
+            self.set_no_answer(state)
         return list(self._open)
 
-    def end(self) -> list[Watched]:
-        """Take everybody out, for good; all are to be woken."""
+    def end(self) -> list[WatchState]:
+        """Remove all watches for good; return all, to be woken."""
         ended = list(self._open)
-        for watched in ended:
-            watched.ended = True
-            self.remove(watched)
+        for state in ended:
+            state.ended = True
+            self.remove(state)
         return ended
 
-    def _put(self, watched: Watched, frames: frozenset[str]) -> None:
-        for frame in watched.frames - frames:
-            watches = self.under[frame]
-            del watches[watched]
-            if not watches:
-                del self.under[frame]
-        for frame in frames - watched.frames:
-            self.under.setdefault(frame, {})[watched] = None
-        watched.frames = frames
+    def _move(self, state: WatchState, frames: frozenset[str]) -> None:
+        for frame in state.frames - frames:
+            states = self.by_frame[frame]
+            del states[state]
+            if not states:
+                del self.by_frame[frame]
+        for frame in frames - state.frames:
+            self.by_frame.setdefault(frame, {})[state] = None
+        state.frames = frames
 
 
 def _frames_of(path: Path) -> frozenset[str]:
-    """The children whose edges make up a path; the frame itself where there is none."""
+    """The children of the edges on a path; the frame itself if the path has no edges."""
     return frozenset(path.frames) - {path.root} or frozenset(path.frames)

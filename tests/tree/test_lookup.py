@@ -1,39 +1,152 @@
 import math
 import random
-import sys
-import threading
-from array import array
-from collections.abc import Callable
 from functools import partial
 from itertools import permutations, product
-from types import FrameType
 from typing import Any
 
 import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of, x_of
 from support.strategies import TODAY
-from support.threads import threads_that
 
 from tfbus import (
     LATEST,
     SECOND,
-    Buffer,
-    Bus,
     DisconnectedError,
     ExtrapolationError,
     FutureExtrapolationError,
     Latest,
     PastExtrapolationError,
-    PointCloud,
     Transform,
+    TransformLookupError,
     TransformStamped,
     TransformTree,
     UnknownFrameError,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.testing import assert_close
-from tfbus.tree._lookup_many import FEW, OutOfRange
+from tfbus.tree.forest import Forest
+from tfbus.tree.lookup import find, find_in_time_travel
+from tfbus.tree.tree import forest_of
+
+
+def forest(*batch: TransformStamped) -> Forest:
+    return forest_of(tree_of(*batch))
+
+
+@pytest.mark.parametrize(
+    ("target", "source", "at", "stamp", "x", "still"),
+    [
+        ("a", "b", 5, 5, 5.0, False),
+        ("a", "b", LATEST, 30, 30.0, False),
+        ("b", "c", LATEST, 20, 20.0, False),
+        ("a", "d", LATEST, 20, 140.0, False),
+        ("c", "d", 77, 77, 100.0, True),
+        ("c", "d", LATEST, 4, 100.0, True),
+        ("d", "d", LATEST, 4, 0.0, True),
+        ("b", "b", LATEST, 30, 0.0, True),
+        ("a", "a", LATEST, 0, 0.0, True),
+        ("a", "a", 77, 77, 0.0, True),
+    ],
+)
+def test_a_question_amounts_to_a_stamp_a_row_and_whether_it_holds_for_ever(
+    target: str, source: str, at: int | Latest, stamp: int, x: float, still: bool
+) -> None:
+    known = forest(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]), static("c", "d", 100.0, stamp=4))
+    found = find(known, target, source, at, None)
+    assert (found[0], found[1][0], found[2]) == (stamp, x, still)
+    assert type(found[0]) is int
+    again = find(known, target, source, at, None)
+    assert again == found, "now with a path that is remembered"
+
+
+@pytest.mark.parametrize("at", [-1, 31, LATEST])
+@pytest.mark.parametrize(("target", "source"), ["ac", "ca"])
+def test_whether_the_path_is_remembered_changes_no_error(target: str, source: str, at: int | Latest) -> None:
+    known = forest(*over("a", "b", [0, 30]), *over("b", "c", [40, 50]))
+    facts = []
+    for _ in range(2):
+        with pytest.raises(TransformLookupError) as caught:
+            find(known, target, source, at, None)
+        facts.append((type(caught.value), vars(caught.value)))
+    assert facts[0] == facts[1]
+
+
+def test_latest_is_looked_up_on_the_path_that_holds_then() -> None:
+    known = forest(*over("map", "base", [0, 15]), *over("map", "tool", [0, 10], 3.0), *over("base", "tool", [20, 30]))
+    stamp, row, still = find(known, "map", "tool", LATEST, None)
+    assert (stamp, row[0], still) == (15, 30.0, False), "the new parent begins only at 20"
+
+
+@pytest.mark.parametrize("not_before", [20, 21])
+def test_a_newest_common_stamp_that_is_too_old_is_what_the_lagging_edge_is_short_of(not_before: int) -> None:
+    known = forest(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]))
+    if not_before <= 20:
+        assert find(known, "a", "c", LATEST, not_before)[0] == 20
+        return
+    with pytest.raises(FutureExtrapolationError) as caught:
+        find(known, "a", "c", LATEST, not_before)
+    assert (caught.value.child, caught.value.stamp) == ("c", 21)
+
+
+@pytest.mark.parametrize(
+    ("at", "source_at", "stamp", "x"),
+    [(8, 3, 8, -5.0), (LATEST, 3, 10, -7.0), (8, LATEST, 8, 2.0), (LATEST, LATEST, 10, 0.0)],
+)
+def test_in_time_travel_the_stamp_is_that_of_the_target(
+    at: int | Latest, source_at: int | Latest, stamp: int, x: float
+) -> None:
+    known = forest(*over("map", "cart", [0, 10]))
+    found = find_in_time_travel(known, "cart", "cart", at, source_at, "map", None)
+    assert (found[0], found[1][0], found[2]) == (stamp, x, False)
+
+
+@pytest.mark.parametrize(("source_at", "stamp"), [(3, 3), (LATEST, 10)])
+def test_in_time_travel_to_a_latest_that_only_static_edges_answer_the_stamp_is_that_of_the_source(
+    source_at: int | Latest, stamp: int
+) -> None:
+    known = forest(*over("map", "cart", [0, 10]), static("map", "wall", stamp=7))
+    assert find_in_time_travel(known, "wall", "cart", LATEST, source_at, "map", None)[0] == stamp
+    assert find_in_time_travel(known, "wall", "map", LATEST, source_at, "map", None)[::2] == (7, True)
+
+
+@pytest.mark.parametrize(
+    ("target", "at", "source", "source_at", "kind", "child"),
+    [
+        ("a", 99, "b", 5, FutureExtrapolationError, "a"),
+        ("a", 5, "b", 99, FutureExtrapolationError, "b"),
+        ("a", 99, "b", 99, FutureExtrapolationError, "b"),
+        ("a", 99, "b", -1, PastExtrapolationError, "b"),
+        ("a", -1, "b", 99, PastExtrapolationError, "a"),
+        ("a", -1, "b", -1, PastExtrapolationError, "a"),
+        ("y", 5, "b", 99, DisconnectedError, None),
+        ("y", 5, "b", -1, PastExtrapolationError, "b"),
+        ("a", 99, "y", 5, DisconnectedError, None),
+        ("a", -1, "y", 5, PastExtrapolationError, "a"),
+    ],
+)
+def test_of_two_legs_without_an_answer_the_one_that_waiting_cannot_help_decides(
+    target: str, at: int, source: str, source_at: int, kind: type[TransformLookupError], child: str | None
+) -> None:
+    known = forest(*over("map", "a", [0, 10]), *over("map", "b", [0, 10]), *over("x", "y", [0, 10]))
+    with pytest.raises(kind) as caught:
+        find_in_time_travel(known, target, source, at, source_at, "map", None)
+    assert getattr(caught.value, "child", None) == child
+
+
+@pytest.mark.parametrize("names", [("nobody", "b", "a"), ("a", "nobody", "b"), ("a", "b", "nobody")])
+def test_unknown_frames_come_before_all_else(names: tuple[str, str, str]) -> None:
+    target, source, fixed = names
+    with pytest.raises(UnknownFrameError) as caught:
+        find_in_time_travel(forest(moving("a", "b", 5)), target, source, -1, 99, fixed, None)
+    assert caught.value.frame == "nobody"
+
+
+@pytest.mark.parametrize(("source_at", "fixed"), [(5, None), (None, "a"), (1.5, "a"), (True, "a")])
+def test_what_is_no_second_instant_is_a_type_error(source_at: Any, fixed: str | None) -> None:
+    with pytest.raises(TypeError):
+        find_in_time_travel(forest(moving("a", "b", 5)), "a", "b", 5, source_at, fixed, None)
+
 
 # The configurations of tf2's own tests: each child with its parent and its distance from it
 
@@ -611,393 +724,3 @@ def test_a_stamp_beyond_64_bits_is_a_value_error(source: str) -> None:
 def test_a_frame_that_is_no_string_is_a_type_error(names: tuple[Any, Any]) -> None:
     with pytest.raises(TypeError, match="must be a str"):
         tree_of(moving("a", "b", 5)).lookup(*names)
-
-
-# Many stamps
-
-
-@pytest.mark.parametrize("times", [1, FEW])
-@pytest.mark.parametrize(
-    "made",
-    [
-        list,
-        tuple,
-        np.array,
-        lambda stamps: np.array(stamps, np.uint8),
-        lambda stamps: np.array(stamps, np.uint64),
-        lambda stamps: np.array(stamps, ">i8"),
-        lambda stamps: np.array(stamps, object),
-        lambda stamps: np.repeat(stamps, 2)[::2],
-        lambda stamps: array("q", stamps),
-        lambda stamps: [np.int32(stamp) for stamp in stamps],
-    ],
-)
-def test_any_integers_are_stamps_and_stay_as_they_are(made: Callable[[list[int]], Any], times: int) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]))
-    stamps = made([7, 3, 10] * times)
-    if isinstance(stamps, np.ndarray):
-        stamps.flags.writeable = False
-    expected = [7.0, 3.0, 10.0] * times
-    assert tree.lookup_many("a", "b", stamps).translations[:, 0].tolist() == pytest.approx(expected)
-    found = tree.lookup_many("a", "b", [99] * len(expected), source_at=stamps, fixed="a")
-    assert found.translations[:, 0].tolist() == pytest.approx(expected)
-    assert list(stamps) == [7, 3, 10] * times
-
-
-@pytest.mark.parametrize("stamps", [[], (), np.array([], np.int64), np.array([])])
-def test_of_no_stamps_there_are_no_transforms(stamps: Any) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]))
-    for source in "ab":
-        assert len(tree.lookup_many("a", source, stamps)) == 0
-        assert len(tree.lookup_many("a", source, stamps, source_at=stamps, fixed="a")) == 0
-        assert len(tree.lookup_many("a", source, stamps, source_at=5, fixed="a", out_of_range="nan")) == 0
-
-
-@pytest.mark.parametrize("stamps", [[], [5], [5] * 100])
-@pytest.mark.parametrize("names", [("nobody", "b", "a"), ("a", "nobody", "b"), ("a", "b", "nobody")])
-@pytest.mark.parametrize("out_of_range", ["raise", "nan"])
-def test_many_lookups_are_of_known_frames_even_if_there_are_none(
-    stamps: list[int], names: tuple[str, str, str], out_of_range: OutOfRange
-) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]))
-    target, source, fixed = names
-    with pytest.raises(UnknownFrameError) as caught:
-        tree.lookup_many(target, source, stamps, source_at=stamps, fixed=fixed, out_of_range=out_of_range)
-    assert (caught.value.frame, caught.value.index) == ("nobody", None)
-    if "nobody" in (target, source):
-        with pytest.raises(UnknownFrameError):
-            tree.lookup_many(target, source, stamps, out_of_range=out_of_range)
-
-
-@pytest.mark.parametrize("bad", [1.5, True, None, LATEST, "5", np.float64(5.0), np.True_])
-@pytest.mark.parametrize("others", [[], [5], [5] * 100])
-def test_stamps_that_are_no_integers_are_a_type_error_wherever_they_stand(bad: Any, others: list[int]) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]), static("a", "c"))
-    for stamps in ([bad, *others], [*others, bad], np.array([bad, bad])):
-        for source in "bc":
-            with pytest.raises(TypeError, match="a stamp is an int"):
-                tree.lookup_many("a", source, stamps)
-            with pytest.raises(TypeError, match="a stamp is an int"):
-                tree.lookup_many("a", source, [5] * len(stamps), source_at=stamps, fixed="a")
-
-
-@pytest.mark.parametrize("bad", [1.5, True, LATEST, "5", np.float64(5.0)])
-def test_a_second_instant_for_all_is_an_integer(bad: Any) -> None:
-    with pytest.raises(TypeError, match="a stamp is an int"):
-        tree_of(moving("a", "b", 5)).lookup_many("a", "b", [5], source_at=bad, fixed="a")
-
-
-def test_floats_for_stamps_name_the_way_to_convert_them() -> None:
-    with pytest.raises(TypeError, match=r"from_seconds\(1\.5\)"):
-        tree_of(moving("a", "b", 5)).lookup_many("a", "b", [5, 1.5])
-
-
-@pytest.mark.parametrize("stamps", [5, [[5]], np.zeros((2, 2), int), np.zeros((0, 3), int)])
-def test_stamps_are_a_row(stamps: Any) -> None:
-    with pytest.raises(ValueError, match="shape"):
-        tree_of(moving("a", "b", 5)).lookup_many("a", "b", stamps)
-
-
-@pytest.mark.parametrize("source_at", [[], [5], [5] * 3, [[5, 5]]])
-def test_second_instants_are_one_or_as_many(source_at: Any) -> None:
-    with pytest.raises(ValueError, match="shape"):
-        tree_of(moving("a", "b", 5)).lookup_many("a", "b", [5, 5], source_at=source_at, fixed="a")
-
-
-@pytest.mark.parametrize("stamps", [[2**63], [-1, 2**63], [-(2**63) - 1], np.array([2**63], np.uint64)])
-def test_stamps_beyond_64_bits_are_a_value_error(stamps: Any) -> None:
-    tree = tree_of(moving("a", "b", 5), static("a", "c"))
-    for source in "bc":
-        with pytest.raises(ValueError, match="64-bit"):
-            tree.lookup_many("a", source, stamps)
-
-
-@pytest.mark.parametrize("question", [{"source_at": [5]}, {"source_at": 5}, {"fixed": "a"}])
-def test_for_many_too_a_second_instant_and_a_fixed_frame_go_together(question: dict[str, Any]) -> None:
-    with pytest.raises(TypeError, match="source_at and fixed go together"):
-        tree_of(moving("a", "b", 5)).lookup_many("a", "b", [5], **question)
-
-
-@pytest.mark.parametrize("stamps", [[], [5], [5] * 100])
-def test_what_is_out_of_range_is_raised_or_nan_and_nothing_else(stamps: list[int]) -> None:
-    with pytest.raises(ValueError, match="'drop'"):
-        tree_of(moving("a", "b", 5)).lookup_many("a", "b", stamps, out_of_range="drop")  # type: ignore[arg-type]
-
-
-def test_many_lookups_find_the_frames_whole_while_another_thread_inserts() -> None:
-    # With so short a window, nearly every insertion moves the samples down.
-    tree = tree_of(moving("body", "left", 0), moving("body", "right", 0), static("left", "tip", 1.0), keep=60e-9)
-
-    def read() -> None:
-        newest = tree.lookup("body", "left").stamp
-        stamps = np.arange(max(0, newest - 50), newest + 1)
-        for few_or_many in (stamps[-20:], stamps):
-            seen = tree.lookup_many("body", "tip", few_or_many, out_of_range="nan")
-            assert (seen.translations[:, 0] == few_or_many + 1)[seen.valid].all()
-            between = tree.lookup_many("left", "right", few_or_many, out_of_range="nan")
-            assert not between.translations[between.valid].any()
-
-    with threads_that(read):
-        for stamp in range(1, 10_000):
-            tree.insert_many(moving("body", side, stamp, float(stamp)) for side in ("left", "right"))
-
-
-class NumpyFreeLock:
-    """A lock that notes the functions which work on arrays while it is held."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self.taken = 0
-        self.seen: list[str] = []
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-        self.taken += 1
-        sys.setprofile(self._note)
-
-    def __exit__(self, *_: object) -> None:
-        sys.setprofile(None)
-        self._lock.release()
-
-    def _note(self, frame: FrameType, event: str, called: Any) -> None:
-        at_hand = frame.f_locals.values() if event == "return" else [getattr(called, "__self__", None)]
-        if any(isinstance(value, np.ndarray) for value in at_hand):
-            self.seen.append(frame.f_code.co_qualname)
-
-
-STAMPS = np.arange(10_000) % 2_001 * 10
-LOCKED_QUESTIONS: list[Any] = [
-    pytest.param(lambda tree: tree.lookup_many("map", "cart", STAMPS), id="plain"),
-    pytest.param(lambda tree: tree.lookup_many("cart", "map", STAMPS + 50, tolerance=1.0, max_gap=1.0), id="policy"),
-    pytest.param(lambda tree: tree.lookup_many("map", "guest", STAMPS), id="reparented"),
-    pytest.param(lambda tree: tree.lookup_many("map", "guest", STAMPS, tolerance=1.0), id="reparented with a policy"),
-    pytest.param(lambda tree: tree.lookup_many("map", "cart", STAMPS - 50, out_of_range="nan"), id="nan"),
-    pytest.param(
-        lambda tree: tree.lookup_many("cart", "cart", STAMPS, source_at=STAMPS[::-1], fixed="map"), id="time travel"
-    ),
-    pytest.param(lambda tree: tree.deskew(scan(np.zeros((10_000, 3)), STAMPS), "cart", "map"), id="deskew"),
-    pytest.param(
-        lambda tree: tree.deskew(scan(np.zeros((10_000, 3)), STAMPS - 50, 0), "cart", "map", out_of_range="nan"),
-        id="deskew with nan",
-    ),
-]
-
-
-@pytest.mark.parametrize("ask", LOCKED_QUESTIONS)
-def test_no_array_is_worked_on_while_the_tree_is_locked(ask: Callable[[TransformTree], object]) -> None:
-    tree = tree_of(*over("map", "cart", range(0, 20_001, 10)), static("cart", "lidar"))
-    tree.insert_many([*over("cart", "guest", range(0, 10_000, 10)), *over("map", "guest", range(10_000, 20_001, 10))])
-    watched: Any = tree
-    watched._lock = lock = NumpyFreeLock()
-    ask(tree)
-    assert lock.taken
-    assert lock.seen == []
-
-
-def test_a_subscriber_may_ask_for_many_lookups_with_what_it_was_just_sent() -> None:
-    bus = Bus()
-    seen: list[list[float]] = []
-
-    def ask(batch: tuple[TransformStamped, ...]) -> None:
-        found = buffer.tree.lookup_many("a", "b", [sample.stamp for sample in batch])
-        seen.append(found.translations[:, 0].tolist())
-
-    with Buffer(bus) as buffer, bus.subscribe(ask):
-        bus.publish(over("a", "b", [1, 2, 3]))
-        bus.publish(over("a", "b", range(10, 100)))
-    assert seen == [[1.0, 2.0, 3.0], [float(stamp) for stamp in range(10, 100)]]
-
-
-# Clouds from a moving sensor
-
-
-def scan(points: Any, stamps: Any, stamp: int | Latest = LATEST, **fields: Any) -> PointCloud:
-    return PointCloud("lidar", stamp, np.asarray(points), stamps, fields)
-
-
-def straight(time: float) -> Transform:
-    return Transform((time, 0.0, 0.0))
-
-
-def along(path: Callable[[float], Transform]) -> TransformTree:
-    """A cart that goes on a path for 1 s, with a lidar on it, 1 m ahead and turned by a right angle."""
-    tree = TransformTree()
-    for percent in range(0, 101, 5):
-        tree.insert(TransformStamped("odom", "cart", percent * SECOND // 100, path(percent / 100)))
-    mount = Transform.from_axis_angle((0, 0, 1), math.pi / 2, (1.0, 0.0, 0.0))
-    tree.insert(TransformStamped("cart", "lidar", 0, mount, static=True))
-    return tree
-
-
-def wall() -> tuple[Any, Any]:
-    """300 points of a wall 9 m ahead of the start, and when each is seen."""
-    y = np.linspace(-4.0, 4.0, 300)
-    return np.column_stack((np.full(300, 9.0), y, y / 8.0)), np.linspace(0, SECOND, 300).astype(np.int64)
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(lambda time: Transform((3.0 * time, 0.0, 0.0)), id="straight on"),
-        pytest.param(lambda time: Transform.from_axis_angle((0, 0, 1), 2.5 * time), id="on the spot"),
-        pytest.param(lambda time: Transform.from_axis_angle((1, 2, 3), 2.5 * time, (time, -2 * time, 0)), id="both"),
-    ],
-)
-@pytest.mark.parametrize("at", [LATEST, 0, SECOND // 2, SECOND])
-def test_a_wall_that_was_seen_on_the_move_becomes_straight(
-    path: Callable[[float], Transform], at: int | Latest
-) -> None:
-    tree = along(path)
-    expected, stamps = wall()
-    cart_from_lidar = Transform.from_axis_angle((0, 0, 1), math.pi / 2, (1.0, 0.0, 0.0))
-    odom_from_lidar = [path(stamp / SECOND) @ cart_from_lidar for stamp in stamps.tolist()]
-    seen = [pose.inverse().apply(tuple(point)) for pose, point in zip(odom_from_lidar, expected.tolist(), strict=True)]
-    cloud = scan(seen, stamps, at)
-    np.testing.assert_allclose(tree.deskew(cloud, "odom", "odom").points, expected, rtol=0, atol=1e-12)
-    found = tree.deskew(cloud, "cart", "odom")
-    now = SECOND if isinstance(at, Latest) else at
-    assert (found.frame, found.stamp, found.stamps) == ("cart", now, None)
-    np.testing.assert_allclose(found.points, path(now / SECOND).inverse().apply(expected), rtol=0, atol=1e-12)
-
-
-def shaken(seed: int) -> TransformTree:
-    """Two moving edges above the lidar and one beside it, each with poses of its own."""
-    rng = np.random.default_rng(seed)
-    tree = TransformTree()
-    for parent, child in (("map", "odom"), ("odom", "cart"), ("map", "beacon")):
-        for stamp in range(0, 1_001, 50):
-            rotation = rng.normal(size=4)
-            pose = Transform(rng.normal(size=3), rotation / np.linalg.norm(rotation))
-            tree.insert(TransformStamped(parent, child, stamp, pose))
-    tree.insert(TransformStamped("cart", "lidar", 0, Transform.from_xyz_rpy((1, 2, 3), (0.1, 0.2, 0.3)), static=True))
-    return tree
-
-
-FRAMES = ("lidar", "cart", "odom", "map", "beacon")
-
-
-@pytest.mark.parametrize("target", FRAMES)
-@pytest.mark.parametrize("fixed", FRAMES)
-def test_a_cloud_is_moved_as_its_points_are_one_by_one(target: str, fixed: str) -> None:
-    tree, rng = shaken(1), np.random.default_rng(2)
-    points, stamps = rng.normal(size=(60, 3)), rng.integers(0, 1_001, 60)
-    found = tree.deskew(scan(points, stamps, 333), target, fixed)
-    one_by_one = [
-        tree.lookup(target, "lidar", 333, source_at=stamp, fixed=fixed).transform.apply(tuple(point))
-        for point, stamp in zip(points.tolist(), stamps.tolist(), strict=True)
-    ]
-    np.testing.assert_allclose(found.points, one_by_one, rtol=0, atol=1e-12 * 10)
-    assert (found.frame, found.stamp) == (target, 333)
-
-
-def test_a_cloud_of_more_points_than_fit_the_cache_is_moved_as_its_parts_are() -> None:
-    tree, rng = shaken(1), np.random.default_rng(2)
-    points, stamps = rng.normal(size=(5_000, 3)), rng.integers(0, 1_001, 5_000)
-    whole = tree.deskew(scan(points, stamps, 500), "map", "odom").points
-    for first in range(0, 5_000, 700):
-        part = slice(first, first + 700)
-        again = tree.deskew(scan(points[part], stamps[part], 500), "map", "odom").points
-        np.testing.assert_allclose(whole[part], again, rtol=0, atol=1e-12)
-
-
-def test_points_of_float32_stay_so_and_lose_only_their_own_rounding() -> None:
-    tree, rng = shaken(1), np.random.default_rng(2)
-    points, stamps = rng.normal(size=(500, 3)).astype(np.float32), rng.integers(0, 1_001, 500)
-    single = tree.deskew(scan(points, stamps, 500), "map", "odom").points
-    double = tree.deskew(scan(points.astype(np.float64), stamps, 500), "map", "odom").points
-    assert (single.dtype, double.dtype) == (np.dtype(np.float32), np.dtype(np.float64))
-    np.testing.assert_array_equal(single, double.astype(np.float32))
-
-
-def test_what_else_is_known_of_the_points_is_carried_and_the_cloud_stays_as_it_was() -> None:
-    points, stamps = np.zeros((2, 3)), np.array([0, SECOND])
-    cloud = scan(points, stamps, SECOND, intensity=[0.5, 0.7], ring=[[1, 2], [3, 4]])
-    found = along(straight).deskew(cloud, "cart", "odom")
-    assert {name: column.tolist() for name, column in found.fields.items()} == {
-        "intensity": [0.5, 0.7],
-        "ring": [[1, 2], [3, 4]],
-    }
-    assert found.points.tolist() == [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
-    assert (cloud.frame, cloud.stamp, cloud.stamps is None) == ("lidar", SECOND, False)
-    assert (points.tolist(), stamps.tolist()) == ([[0.0] * 3] * 2, [0, SECOND])
-
-
-def test_the_latest_of_a_cloud_is_the_stamp_of_its_newest_point() -> None:
-    tree = along(straight)
-    cloud = scan(np.zeros((3, 3)), [SECOND // 4, SECOND // 2, 0])
-    found = tree.deskew(cloud, "cart", "odom")
-    assert found.stamp == SECOND // 2
-    assert found.points[:, 0].tolist() == pytest.approx([0.75, 1.0, 0.5])
-
-
-def test_a_missing_point_stays_missing_and_spoils_no_other() -> None:
-    tree = along(straight)
-    nowhere = (math.nan, 0.0, 0.0)
-    found = tree.deskew(scan([(0, 0, 0), nowhere, (0, 0, 0)], [0, 5, SECOND]), "odom", "odom")
-    assert found.points[[0, 2]].tolist() == pytest.approx(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
-    assert np.isnan(found.points[1]).any()
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_an_infinite_point_stays_not_finite_without_a_warning(dtype: Any) -> None:
-    tree = along(lambda time: Transform.from_axis_angle((1, 2, 3), time, (time, 0.0, 0.0)))
-    points = np.array([(np.inf, 0, 0), (0, -np.inf, 0), (np.inf, -np.inf, np.nan), (1, 2, 3)], dtype)
-    for target in ("odom", "cart"):
-        found = tree.deskew(scan(points, [0, 5, SECOND, SECOND // 2]), target, "odom")
-        assert np.isfinite(found.points).all(axis=1).tolist() == [False, False, False, True]
-
-
-def test_points_that_cannot_be_placed_are_an_error_that_names_the_first_or_nan() -> None:
-    tree = along(straight)
-    cloud = scan(np.zeros((4, 3), np.float32), [5, SECOND + 1, -1, 5], 0, ring=[1, 2, 3, 4])
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.deskew(cloud, "cart", "odom")
-    assert (caught.value.index, caught.value.child, caught.value.stamp) == (1, "cart", SECOND + 1)
-    found = tree.deskew(cloud, "cart", "odom", out_of_range="nan")
-    assert np.isnan(found.points).all(axis=1).tolist() == [False, True, True, False]
-    assert (found.points.dtype, found.fields["ring"].tolist()) == (np.dtype(np.float32), [1, 2, 3, 4])
-    with pytest.raises(ValueError, match="'drop'"):
-        tree.deskew(cloud, "cart", "odom", out_of_range="drop")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("out_of_range", ["raise", "nan"])
-def test_a_cloud_that_no_path_joins_with_the_fixed_frame_or_that_with_the_target_is_disconnected(
-    out_of_range: OutOfRange,
-) -> None:
-    tree = along(straight)
-    tree.insert_many([static("world", "tower")])
-    for target, fixed in (("tower", "odom"), ("tower", "world")):
-        with pytest.raises(DisconnectedError):
-            tree.deskew(scan(np.zeros((2, 3)), [0, 5]), target, fixed, out_of_range=out_of_range)
-
-
-def test_the_stamp_of_the_cloud_must_be_covered_though_its_points_are() -> None:
-    tree = along(straight)
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.deskew(scan(np.zeros((2, 3)), [0, 5], 2 * SECOND), "cart", "odom")
-    assert (caught.value.index, caught.value.stamp) == (None, 2 * SECOND)
-
-
-@pytest.mark.parametrize("at", [LATEST, SECOND // 2])
-def test_an_empty_cloud_stays_empty(at: int | Latest) -> None:
-    tree = along(straight)
-    found = tree.deskew(scan(np.zeros((0, 3), np.float32), [], at, ring=[]), "cart", "odom")
-    assert (found.points.shape, found.points.dtype, found.frame) == ((0, 3), np.dtype(np.float32), "cart")
-    assert found.stamp == (SECOND if at is LATEST else at)
-
-
-@pytest.mark.parametrize("count", [0, 2])
-@pytest.mark.parametrize(
-    "names", [("nobody", "cart", "odom"), ("lidar", "nobody", "odom"), ("lidar", "cart", "nobody")]
-)
-def test_a_cloud_needs_three_frames_that_are_known(count: int, names: tuple[str, str, str]) -> None:
-    frame, target, fixed = names
-    cloud = PointCloud(frame, 0, np.zeros((count, 3)), [0] * count)  # type: ignore[arg-type]
-    with pytest.raises(UnknownFrameError) as caught:
-        along(straight).deskew(cloud, target, fixed)
-    assert caught.value.frame == "nobody"
-
-
-def test_points_without_stamps_cannot_be_deskewed() -> None:
-    with pytest.raises(ValueError, match="no stamps"):
-        along(straight).deskew(scan(np.zeros((2, 3)), None), "cart", "odom")

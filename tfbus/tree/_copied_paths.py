@@ -1,0 +1,116 @@
+"""Copies of the samples that a lookup at many stamps needs.
+
+While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies the
+samples on them as blocks of memory. All work in numpy comes after that, on the copies.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.errors import DisconnectedError
+from tfbus.geometry.rows import Row
+from tfbus.stamps import Stamps
+from tfbus.tree._python_kernel import Step
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import FrameHistory, Samples
+from tfbus.tree.path import Path
+
+Places = slice | npt.NDArray[np.intp]
+"""Indices into the stamps that were asked for."""
+
+
+class CopiedPath(NamedTuple):
+    """A path with copies of the samples on its moving edges, and one row for each run of static edges."""
+
+    up: tuple[Samples | Row, ...]
+    down: tuple[Samples | Row, ...]
+
+    @property
+    def moving(self) -> list[Samples]:
+        """The moving edges, those of `up` first."""
+        return [step for step in (*self.up, *self.down) if isinstance(step, Samples)]
+
+    def covers_all(self, stamps: Stamps) -> bool:
+        """Whether each edge covers every one of the stamps."""
+        low, high = stamps.min(), stamps.max()
+        return all(edge.stamps and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
+
+    def covered(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
+        """Which of the stamps all edges cover, shape (n,)."""
+        covered = np.ones(len(stamps), np.bool_)
+        for samples in self.moving:
+            if not samples.stamps:
+                covered[:] = False
+            else:
+                covered &= (samples.stamps[0] <= stamps) & (stamps <= samples.stamps[-1])
+        return covered
+
+
+class PathsOverTime(NamedTuple):
+    """The paths between two frames over some time.
+
+    Attributes
+    ----------
+    changes : list of int
+        The stamps, in ns, at which the path may change.
+    paths : list of (CopiedPath or None)
+        The path before the first change, and the one from each change on; None where the frames are not connected.
+    """
+
+    changes: list[int]
+    paths: list[CopiedPath | None]
+
+    def split(self, stamps: Stamps) -> list[tuple[Places, CopiedPath | None]]:
+        """The places of the stamps that each path answers."""
+        if not self.changes:
+            return [(slice(len(stamps)), self.paths[0])]
+        different = list({id(path): path for path in self.paths}.values())
+        number = np.array([next(i for i, other in enumerate(different) if other is path) for path in self.paths])
+        numbers = number[np.array(self.changes, np.int64).searchsorted(stamps, "right")]
+        return [(np.flatnonzero(numbers == i), path) for i, path in enumerate(different)]
+
+
+def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] | None) -> PathsOverTime:
+    """Copy the paths from source to target that hold from a first stamp to a last. The caller holds the lock.
+
+    Parameters
+    ----------
+    forest : Forest
+    target, source : str
+    span : (int, int) or None
+        The first and the last stamp, in ns; None if there are no stamps.
+
+    Raises
+    ------
+    UnknownFrameError
+    """
+    forest.check_known(target)
+    forest.check_known(source)
+    if span is None:
+        return PathsOverTime([], [None])
+    low, high = span
+    paths: list[Path | None] = [_path_at(forest, target, source, low)]
+    changes: list[int] = []
+    if paths[0] is None or not paths[0].permanent:
+        changes = [stamp for stamp in forest.parent_changes() if low < stamp <= high]
+        paths += [_path_at(forest, target, source, stamp) for stamp in changes]
+    copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
+    for path in paths:
+        if path is not None and (path.up, path.down) not in copies:
+            up = tuple(_copy(step, low, high) for step in path.up)
+            down = tuple(_copy(step, low, high) for step in path.down)
+            copies[path.up, path.down] = CopiedPath(up, down)
+    return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
+
+
+def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
+    try:
+        return forest.find_path(target, source, at)
+    except DisconnectedError:
+        return None
+
+
+def _copy(step: Step, low: int, high: int) -> Samples | Row:
+    return step.samples_between(low, high) if isinstance(step, FrameHistory) else step

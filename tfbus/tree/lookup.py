@@ -1,0 +1,158 @@
+"""Lookups at one stamp: the stamp that `LATEST` means, the transform along the path, and the error if there is none."""
+
+from contextlib import suppress
+
+from tfbus.errors import (
+    DisconnectedError,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    GapError,
+    TransformLookupError,
+)
+from tfbus.geometry.rows import Row, compose
+from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
+from tfbus.stamps import LATEST, Latest, as_stamp
+from tfbus.tree._extrapolation import Extrapolation
+from tfbus.tree._python_kernel import climb
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.path import Path, find_path
+from tfbus.tree.policy import Policy
+
+At = int | Latest
+Found = tuple[int, Row, bool]
+"""Stamp in ns, row, and whether the whole path is static."""
+
+GO_TOGETHER = "source_at and fixed go together: source at its stamp, carried through the fixed frame"
+AT_LATEST_ONLY = "not_before goes with LATEST: an answer at a given stamp never gets newer"
+
+
+def answer(
+    forest: Forest,
+    target: str,
+    source: str,
+    at: At,
+    source_at: At | None,
+    fixed: str | None,
+    not_before: int | None,
+    policy: Policy | None,
+) -> TransformStamped:
+    """The answer of `TransformTree.lookup`, without keywords: each of them costs a twentieth of a lookup."""
+    if not_before is not None and at is not LATEST and source_at is not LATEST:
+        raise TypeError(AT_LATEST_ONLY)
+    if type(at) is not int and at is not LATEST:
+        at = as_stamp(at)
+    extrapolation = None if policy is None else Extrapolation(policy)
+    with forest.lock:
+        if source_at is None and fixed is None:
+            stamp, row, static = find(forest, target, source, at, not_before, extrapolation)
+        else:
+            stamp, row, static = find_in_time_travel(
+                forest, target, source, at, source_at, fixed, not_before, extrapolation
+            )
+    if extrapolation is None:
+        return answer_of(target, source, stamp, row, static)
+    return qualified_answer(target, source, stamp, row, static, extrapolation.extrapolated_by, extrapolation.gap)
+
+
+def find(
+    forest: Forest, target: str, source: str, at: At, not_before: int | None, extrapolation: Extrapolation | None = None
+) -> Found:
+    """Source in target at one stamp. The caller holds the lock; the errors are those of `TransformTree.lookup`."""
+    path = forest.paths.get((target, source))
+    if path is None:
+        path = forest.find_path(target, source, at)
+    if not path.moving:
+        if isinstance(at, Latest):
+            at = path.static_stamp if len(path.frames) > 1 else _newest_stamp(forest, target)
+        return as_stamp(at), path.row(0), True
+    if at is LATEST:
+        return _find_latest(forest, path, not_before, extrapolation)
+    if extrapolation is not None:
+        return at, extrapolation.row(path, as_stamp(at)), False
+    try:
+        return at, climb(path.up, at) if not path.down else path.row(at), False
+    except ExtrapolationError:
+        # Another edge may decide. The error is raised outside, so that it keeps no traceback of this one alive.
+        pass
+    raise path.deciding_error(as_stamp(at))
+
+
+def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolation: Extrapolation | None) -> Found:
+    """Source in target at the newest stamp that every moving edge has reached.
+
+    Under a policy it is the newest stamp of any edge, as far as the lagging edge may be held.
+    """
+    common, lagging = path.newest_common()
+    if extrapolation is not None:
+        common = min(common + extrapolation.policy.hold, max(edge.stamps[-1] for edge in path.moving))
+    if not_before is not None and common < not_before:
+        raise _latest_error(path, lagging, not_before, extrapolation, 0)
+    try:
+        path_then = path
+        if not path.permanent:
+            path_then = find_path(forest.frames, path.frames[0], path.frames[-1], common)
+        return common, path_then.row(common) if extrapolation is None else extrapolation.row(path_then, common), False
+    except TransformLookupError as error:
+        # The lagging edge has to reach what the others still hold, or the far end of their gap. Where a parent has
+        # changed, any later stamp of it may be enough.
+        needed = common + 1
+        if isinstance(error, GapError):
+            needed = error.after
+        elif path.permanent:
+            needed = max(common if edge.oldest is None else edge.oldest for edge in path.moving)
+        tolerance = 0 if extrapolation is None else extrapolation.policy.tolerance
+        raise _latest_error(path, lagging, needed, extrapolation, tolerance) from error
+
+
+def _latest_error(
+    path: Path, lagging: FrameHistory, needed: int, extrapolation: Extrapolation | None, slack: int
+) -> ExtrapolationError:
+    """The error of a `LATEST` lookup that waits until the lagging edge reaches `needed`.
+
+    Under a policy, a sample of any other edge may help as well, because it may stand in for a missing one.
+    """
+    if extrapolation is None:
+        return lagging.extrapolation_error(needed)
+    error = lagging.extrapolation_error(needed, slack + extrapolation.policy.hold)
+    if isinstance(error, FutureExtrapolationError):
+        error.others = tuple(edge.child for edge in path.moving if edge is not lagging)
+    return error
+
+
+def find_in_time_travel(
+    forest: Forest,
+    target: str,
+    source: str,
+    at: At,
+    source_at: At | None,
+    fixed: str | None,
+    not_before: int | None,
+    extrapolation: Extrapolation | None = None,
+) -> Found:
+    """Source at its own stamp, carried through the fixed frame into target at another. The caller holds the lock."""
+    if source_at is None or fixed is None:
+        raise TypeError(GO_TOGETHER)
+    if source_at is not LATEST:
+        source_at = as_stamp(source_at)
+    for name in (target, source, fixed):
+        forest.check_known(name)
+    try:
+        stamp, target_from_fixed, target_static = find(forest, target, fixed, at, not_before, extrapolation)
+    except FutureExtrapolationError:
+        # Waiting for this half is useless if waiting cannot help the other one: then that error is raised.
+        find(forest, fixed, source, source_at, not_before, extrapolation)
+        raise
+    except DisconnectedError:
+        with suppress(DisconnectedError, FutureExtrapolationError):
+            find(forest, fixed, source, source_at, not_before, extrapolation)
+        raise
+    source_stamp, fixed_from_source, source_static = find(forest, fixed, source, source_at, not_before, extrapolation)
+    if at is LATEST and target_static and not source_static:
+        stamp = source_stamp
+    return stamp, compose(target_from_fixed, fixed_from_source), target_static and source_static
+
+
+def _newest_stamp(forest: Forest, frame: str) -> int:
+    history = forest.frames.get(frame)
+    return 0 if history is None else history.static_stamp or history.newest or 0
