@@ -4,12 +4,33 @@ Build it with ``sphinx-build -W -n -b html demos/guide "$(mktemp -d)"``; nothing
 """
 
 import importlib
+import inspect
+import re
+from collections.abc import Iterator
 from importlib.metadata import version as version_of
+from typing import Generic, TypeVar
 
+import numpy.typing
+import numpydoc.xref
 from docutils.nodes import Element, TextElement
 from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+
+ScalarT = TypeVar("ScalarT")
+
+
+class ArrayLike:
+    """Stands in for numpy's, which signatures would show as the union of a dozen types."""
+
+
+class NDArray(Generic[ScalarT]):
+    """Stands in for numpy's, which signatures would show as an array of a shape and a dtype."""
+
+
+# Before tfbus is imported, which evaluates its annotations then.
+numpy.typing.ArrayLike = ArrayLike  # type: ignore[misc, assignment]
+numpy.typing.NDArray = NDArray  # type: ignore[misc, assignment]
 
 project = "tfbus"
 author = "the authors of tfbus"
@@ -17,6 +38,23 @@ version = release = version_of("tfbus")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc"]
 nitpicky = True
+nitpick_ignore = [
+    ("py:obj", "anyio.move_on_after"),
+    ("py:obj", "functools.partial"),
+    ("py:obj", "functools.singledispatch"),
+    ("py:obj", "math.inf"),
+    ("py:obj", "lookupVelocity"),
+    ("py:class", "anyio.CancelScope"),
+    ("py:class", "collections.Counter"),
+    ("py:class", "contextlib.AbstractContextManager"),
+    ("py:class", "os.PathLike"),
+    ("py:class", "pathlib.Path"),
+]
+nitpick_ignore_regex = [
+    ("py:class", r"(ArrayLike|NDArray|(collections\.abc|numpy)\.\w+)"),
+    # What a recording's messages may have as errors, beside those that are public.
+    ("py:class", r"tfbus\..*\.MalformedMessageError"),
+]
 
 html_theme = "furo"
 html_title = f"tfbus {version}"
@@ -54,10 +92,27 @@ def public_names() -> dict[int, str]:
 
 
 NAMES = public_names()
+BARE = {name.rpartition(".")[2]: name for name in NAMES.values()}
 
+# Python's own types are no links, for there is nothing here to link to.
+numpydoc.xref.DEFAULT_LINKS.clear()
 numpydoc_xref_param_type = True
 numpydoc_xref_ignore = "all"
-numpydoc_xref_aliases = {name.rpartition(".")[2]: name for name in NAMES.values()}
+numpydoc_xref_aliases = BARE
+
+
+def words() -> Iterator[str]:
+    """What docstrings may call by its bare name: every argument and attribute of something public."""
+    for name in NAMES.values():
+        thing = find(name)
+        members = [member for key, member in inspect.getmembers(thing) if not key.startswith("_") or key == "__init__"]
+        for member in (thing, *(members if inspect.isclass(thing) else ())):
+            if inspect.isfunction(member) or inspect.ismethod(member):
+                yield from inspect.signature(member).parameters
+            for names in re.findall(r"^ *(\w+(?:, \w+)*) : ", inspect.getdoc(member) or "", re.MULTILINE):
+                yield from names.split(", ")
+        yield from (key for key, member in inspect.getmembers(thing) if isinstance(member, property))
+        yield from getattr(thing, "__annotations__", ())
 
 
 def find(dotted: str) -> object:
@@ -73,17 +128,33 @@ def find(dotted: str) -> object:
     return thing
 
 
-def resolve_by_identity(app: Sphinx, env: BuildEnvironment, node: pending_xref, contnode: TextElement) -> Element | None:
-    """Link a name that annotations have from an inner module, such as ``tfbus.stamps.Latest``, to the public one."""
-    target = node.get("reftarget", "")
-    if node.get("refdomain") != "py" or not target.startswith("tfbus."):
+WORDS = frozenset(words())
+
+
+def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
+    """What the reference has under another name, or what is no reference at all.
+
+    Annotations have names from inner modules, such as ``tfbus.stamps.Latest``: they are found by identity. Docstrings
+    of one import path name what is in another, such as `SimulatedClock` in ``tfbus.testing``. Arguments and attributes
+    are code and link to nothing.
+    """
+    if node.get("refdomain") != "py":
         return None
-    public = NAMES.get(id(find(target)))
-    if public is None or public == target:
-        return None
-    domain = env.domains.python_domain
-    return domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, contnode)
+    target: str = node["reftarget"]
+    if target.startswith("tfbus."):
+        thing = find(target)
+        if isinstance(thing, TypeVar):
+            return content
+        public = NAMES.get(id(thing))
+    else:
+        first, _, attribute = target.partition(".")
+        public = BARE.get(first)
+        if public is not None and attribute and attribute not in WORDS:
+            public = f"{public}.{attribute}"
+    if public is not None and public != target:
+        return env.domains.python_domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
+    return content if target in WORDS else None
 
 
 def setup(app: Sphinx) -> None:
-    app.connect("missing-reference", resolve_by_identity)
+    app.connect("missing-reference", resolve)
