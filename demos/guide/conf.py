@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from importlib.metadata import version as version_of
 from typing import Generic, TypeVar
 
-import numpy.typing
+import numpy.typing as npt
 import numpydoc.xref
 from docutils.nodes import Element, TextElement
 from sphinx.addnodes import pending_xref
@@ -29,8 +29,8 @@ class NDArray(Generic[ScalarT]):
 
 
 # Before tfbus is imported, which evaluates its annotations then.
-numpy.typing.ArrayLike = ArrayLike  # type: ignore[misc, assignment]
-numpy.typing.NDArray = NDArray  # type: ignore[misc, assignment]
+npt.ArrayLike = ArrayLike  # type: ignore[assignment]
+npt.NDArray = NDArray  # type: ignore[assignment]
 
 project = "tfbus"
 author = "the authors of tfbus"
@@ -58,6 +58,8 @@ nitpick_ignore_regex = [
 
 html_theme = "furo"
 html_title = f"tfbus {version}"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 html_copy_source = False
 html_theme_options = {"navigation_with_keys": True}
 
@@ -152,7 +154,9 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Tex
         if public is not None and attribute and attribute not in WORDS:
             public = f"{public}.{attribute}"
     if public is not None and public != target:
-        return env.domains.python_domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
+        domain = env.domains.python_domain
+        found: Element | None = domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
+        return found
     return content if target in WORDS else None
 
 
