@@ -61,6 +61,7 @@ html_title = f"tfbus {version}"
 html_static_path = ["_static"]
 html_css_files = ["wide.css"]
 html_copy_source = False
+html_show_copyright = False
 html_theme_options = {"navigation_with_keys": True}
 
 # The anchors that GitHub gives to headings, so that a link works there and here.
