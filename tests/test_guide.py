@@ -100,6 +100,14 @@ def test_every_demo_and_every_page_is_named_by_the_readme_or_the_guide() -> None
     assert {f"{name}.md" for name in listed if "/" not in name} == {page.name for page in PAGES[1:]} - {"index.md"}
 
 
+def test_the_urls_of_the_package_lead_to_pages_that_are_here() -> None:
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    for name, url in urls.items():
+        assert url.startswith(urls["Source"])
+        path = url.partition("/blob/main/")[2]
+        assert not path or (ROOT / path).is_file(), name
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_can_be_typed(command: str) -> None:
     words = shlex.split(command)

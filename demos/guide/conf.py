@@ -155,7 +155,7 @@ def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: Tex
         if public is not None and attribute and attribute not in WORDS:
             public = f"{public}.{attribute}"
     if public is not None and public != target:
-        domain = env.domains.python_domain
+        domain = env.get_domain("py")
         found: Element | None = domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
         return found
     return content if target in WORDS else None
