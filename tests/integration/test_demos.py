@@ -232,6 +232,82 @@ def test_the_demo_of_a_recording_finds_the_camera_where_it_was_and_keeps_the_fil
     assert path.stat().st_size > 0
 
 
+def output_of(demo: str) -> list[str]:
+    """The lines that a demo prints when it is run as a script."""
+    done = subprocess.run([sys.executable, DEMOS / demo], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_the_demo_of_a_scan_makes_a_wall_straight_that_was_seen_bent() -> None:
+    late, bent, straight, by_now = output_of("deskew.py")
+    assert late == "the transform of the last ray came 30 ms late"
+    # Each ray's way to the wall, drawn from where the robot was at the first ray.
+    xs = []
+    for ray in range(181):
+        angle, seconds = math.pi / 2 * (ray / 180 - 0.5), 0.1 * ray / 180
+        xs.append((3.0 - 2.0 * seconds) / math.cos(angle + 1.5 * seconds) * math.cos(angle))
+    assert bent == f"all rays at one instant: the wall is {min(xs):.3f} m to {max(xs):.3f} m away"
+    assert straight == "each ray at its own: the wall is 3.000 m to 3.000 m away"
+    # The plane as complex numbers: the robot has driven 0.2 m and turned by 0.15 rad.
+    seen = (3.0 - 0.2) * cmath.exp(-0.15j)
+    assert by_now == f"seen straight ahead at first, and by now at ({seen.real:.3f}, {seen.imag:.3f})"
+
+
+def test_the_demo_of_a_path_agrees_with_the_cycloid_that_the_tool_goes_along() -> None:
+    path, *speeds, body, late = output_of("path_and_velocity.py")
+    velocities = [abs(0.5 + 2j * cmath.exp(0.001j * (k + 0.5))) for k in range(10_000)]
+    assert path == f"10001 positions, a path of {0.001 * math.fsum(velocities):.3f} m"
+    assert len(speeds) == 3
+    for second, line in zip((1, 3, 5), speeds, strict=True):
+        speed = abs(0.5 + 2j * cmath.exp(1j * second))
+        assert line == f"at {second} s: {speed:.3f} m/s, by the closed form {speed:.3f} m/s; 1.000 rad/s"
+    assert body == f"the table at 0.500 m/s carries the tool at {abs(0.5 + 2j * cmath.exp(5j)):.3f} m/s"
+    assert late == "at 5 s and 11 s there is an answer: [True, False]"
+
+
+def test_the_demo_of_drivers_in_threads_loses_nothing_and_keeps_each_drivers_order() -> None:
+    refused, counted, apart = output_of("driver_threads.py")
+    assert re.fullmatch(r"RuntimeError: .*bus\.threadsafe.*", refused)
+    assert counted == "{'left_wheel': 50, 'right_wheel': 50}, in order: True, dropped: 0"
+    # Each has gone 49 steps of 1 cm, the other way.
+    assert apart == f"the wheels are {2 * 49 / 100:.2f} m apart"
+
+
+def test_the_demo_of_events_tells_the_story_of_the_tool() -> None:
+    lines = output_of("events_and_ownership.py")
+    (refused,) = (line for line in lines if line.startswith("refused"))
+    assert refused.startswith("refused (reserved, owner 'arm'): frame 'gripper_tool' is reserved for 'arm'")
+    found = [re.match(r"(\d+\.\d+) s: (.*)", line) for line in lines]
+    events = [(float(match[1]), match[2]) for match in found if match]
+    # Silent for more than 0.5 s after 1.0 s; taken up after 0.25 s, and held for 2 s.
+    assert [(round(seconds, 3), text.partition(",")[0].partition(":")[0]) for seconds, text in events] == [
+        (0.0, "moving frame 'base_link' is new under 'odom'"),
+        (0.25, "static frame 'gripper_tool' is new under 'flange'"),
+        (0.25, "a sample from 'other_arm' was rejected"),
+        (1.5, "frame 'base_link' is stale"),
+        (2.0, "frame 'base_link' is live again"),
+        (2.25, "frame 'gripper_tool' was removed"),
+        (2.25, "moving frame 'odom' is new under 'map'"),
+        (2.25, "frame 'odom' comes from two authorities"),
+    ]
+    assert lines[-1] == "rejected: {'reserved': 1}, conflicts: 1"
+
+
+def test_the_demo_of_simulated_time_patrols_for_an_hour_and_jumps_back() -> None:
+    *pictures, reset, on_the_base, on_the_map = output_of("simulated_time.py")
+    assert len(pictures) == 4
+    for quarter, line in zip((1, 2, 3, 4), pictures, strict=True):
+        # Half way and more between two samples a second apart, on a straight line between them.
+        before, after = (cmath.exp(2j * math.pi * (900 * quarter - back) / 600) for back in (1, 0))
+        place = 0.25 * before + 0.75 * after
+        assert line == (
+            f"picture at {900 * quarter - 0.25:.2f} s: ({place.real:.3f}, {place.imag:.3f}, 1.500), known 0.25 s later"
+        )
+    assert reset == "ClockResetError: the clock jumped back from 3601.000 s to 0.000 s"
+    assert (on_the_base, on_the_map) == ("camera on the base: True", "camera on the map: False")
+
+
 @pytest.fixture(scope="module")
 def server() -> Iterator[str]:
     """The web application under a real server on loopback; its address."""

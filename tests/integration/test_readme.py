@@ -1,4 +1,4 @@
-"""The README tells the truth."""
+"""The README tells the truth; that its programs run and its links lead somewhere is in `test_guide.py`."""
 
 import re
 from pathlib import Path
@@ -9,13 +9,8 @@ import tfbus
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
+TF2 = (ROOT / "demos" / "guide" / "tf2.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-
-
-@pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
-def test_every_python_block_runs(block: str, capsys: pytest.CaptureFixture[str]) -> None:
-    exec(compile(block, "README.md", "exec"), {"__name__": "__main__"})
-    assert capsys.readouterr().out
 
 
 def test_the_embedding_example_prints_the_point_in_the_base(capsys: pytest.CaptureFixture[str]) -> None:
@@ -32,12 +27,13 @@ def test_the_waiting_example_prints_the_position_half_way_and_the_close_match(
     assert "did you mean 'base_link'?" in output
 
 
-def test_the_examples_are_as_short_as_promised() -> None:
+def test_the_examples_and_the_whole_are_as_short_as_promised() -> None:
     assert len(BLOCKS[0].strip().splitlines()) <= 12
+    assert len(README.splitlines()) <= 150
 
 
 def test_every_name_that_the_table_for_tf2_users_mentions_exists() -> None:
-    table = README.partition("## Coming from tf2")[2].partition("## Conventions")[0]
+    table = TF2.partition("## Names")[2].partition("## ")[0]
     ours = "".join(line.split("|")[2] for line in table.splitlines() if line.count("|") == 3)
     owners = {
         "buffer": tfbus.Buffer,

@@ -1,0 +1,165 @@
+"""The site: the pages of this folder, and the reference, made from the docstrings of all public names.
+
+Build it with ``sphinx-build -W -n -b html demos/guide "$(mktemp -d)"``; nothing is fetched from elsewhere.
+"""
+
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from importlib.metadata import version as version_of
+from typing import Generic, TypeVar
+
+import numpy.typing as npt
+import numpydoc.xref
+from docutils.nodes import Element, TextElement
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+
+ScalarT = TypeVar("ScalarT")
+
+
+class ArrayLike:
+    """Stands in for numpy's, which signatures would show as the union of a dozen types."""
+
+
+class NDArray(Generic[ScalarT]):
+    """Stands in for numpy's, which signatures would show as an array of a shape and a dtype."""
+
+
+# Before tfbus is imported, which evaluates its annotations then.
+npt.ArrayLike = ArrayLike  # type: ignore[assignment]
+npt.NDArray = NDArray  # type: ignore[assignment]
+
+project = "tfbus"
+author = "the authors of tfbus"
+version = release = version_of("tfbus")
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc"]
+nitpicky = True
+nitpick_ignore = [
+    ("py:obj", "anyio.move_on_after"),
+    ("py:obj", "functools.partial"),
+    ("py:obj", "functools.singledispatch"),
+    ("py:obj", "math.inf"),
+    ("py:obj", "lookupVelocity"),
+    ("py:class", "anyio.CancelScope"),
+    ("py:class", "collections.Counter"),
+    ("py:class", "contextlib.AbstractContextManager"),
+    ("py:class", "os.PathLike"),
+    ("py:class", "pathlib.Path"),
+]
+nitpick_ignore_regex = [
+    ("py:class", r"(ArrayLike|NDArray|(collections\.abc|numpy)\.\w+)"),
+    # What a recording's messages may have as errors, beside those that are public.
+    ("py:class", r"tfbus\..*\.MalformedMessageError"),
+]
+
+html_theme = "furo"
+html_title = f"tfbus {version}"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+html_copy_source = False
+html_show_copyright = False
+html_theme_options = {"navigation_with_keys": True}
+
+# The anchors that GitHub gives to headings, so that a link works there and here.
+myst_heading_anchors = 3
+
+autodoc_default_options = {
+    "members": True,
+    # What Python's own classes have is not told again.
+    "inherited-members": "BaseException, Enum, tuple, object",
+    "member-order": "bysource",
+}
+autodoc_typehints_format = "short"
+autodoc_preserve_defaults = True
+python_use_unqualified_type_names = True
+numpydoc_show_class_members = False
+default_role = "py:obj"
+
+# The import paths of which the reference tells, the preferred one first. Modules may move below them.
+PATHS = ("tfbus", "tfbus.links.zenoh", "tfbus.recording", "tfbus.testing", "tfbus.data")
+
+
+def public_names() -> dict[int, str]:
+    """By the identity of each public object, the name under which the reference has it."""
+    names: dict[int, str] = {}
+    for path in PATHS:
+        module = importlib.import_module(path)
+        own = [name for name, thing in vars(module).items() if getattr(thing, "__module__", None) == path]
+        for name in getattr(module, "__all__", own):
+            names.setdefault(id(getattr(module, name)), f"{path}.{name}")
+    return names
+
+
+NAMES = public_names()
+BARE = {name.rpartition(".")[2]: name for name in NAMES.values()}
+
+# Python's own types are no links, for there is nothing here to link to.
+numpydoc.xref.DEFAULT_LINKS.clear()
+numpydoc_xref_param_type = True
+numpydoc_xref_ignore = "all"
+numpydoc_xref_aliases = BARE
+
+
+def words() -> Iterator[str]:
+    """What docstrings may call by its bare name: every argument and attribute of something public."""
+    for name in NAMES.values():
+        thing = find(name)
+        members = [member for key, member in inspect.getmembers(thing) if not key.startswith("_") or key == "__init__"]
+        for member in (thing, *(members if inspect.isclass(thing) else ())):
+            if inspect.isfunction(member) or inspect.ismethod(member):
+                yield from inspect.signature(member).parameters
+            for names in re.findall(r"^ *(\w+(?:, \w+)*) : ", inspect.getdoc(member) or "", re.MULTILINE):
+                yield from names.split(", ")
+        yield from (key for key, member in inspect.getmembers(thing) if isinstance(member, property))
+        yield from getattr(thing, "__annotations__", ())
+
+
+def find(dotted: str) -> object:
+    """The object that an import path and attributes lead to; None if there is none."""
+    path, _, rest = dotted.partition(".")
+    thing: object = importlib.import_module(path)
+    for part in rest.split(".") if rest else ():
+        path = f"{path}.{part}"
+        try:
+            thing = getattr(thing, part) if hasattr(thing, part) else importlib.import_module(path)
+        except ImportError:
+            return None
+    return thing
+
+
+WORDS = frozenset(words())
+
+
+def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
+    """What the reference has under another name, or what is no reference at all.
+
+    Annotations have names from inner modules, such as ``tfbus.stamps.Latest``: they are found by identity. Docstrings
+    of one import path name what is in another, such as `SimulatedClock` in ``tfbus.testing``. Arguments and attributes
+    are code and link to nothing.
+    """
+    if node.get("refdomain") != "py":
+        return None
+    target: str = node["reftarget"]
+    if target.startswith("tfbus."):
+        thing = find(target)
+        if isinstance(thing, TypeVar):
+            return content
+        public = NAMES.get(id(thing))
+    else:
+        first, _, attribute = target.partition(".")
+        public = BARE.get(first)
+        if public is not None and attribute and attribute not in WORDS:
+            public = f"{public}.{attribute}"
+    if public is not None and public != target:
+        domain = env.get_domain("py")
+        found: Element | None = domain.resolve_xref(env, node["refdoc"], app.builder, "obj", public, node, content)
+        return found
+    return content if target in WORDS else None
+
+
+def setup(app: Sphinx) -> None:
+    app.connect("missing-reference", resolve)

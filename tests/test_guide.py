@@ -1,0 +1,135 @@
+"""The guide and the README tell the truth: their programs run, their commands parse, and their links lead somewhere.
+
+A block of ``python`` runs by itself and prints something. A block of ``text`` right below it is what it prints.
+"""
+
+import importlib
+import re
+import shlex
+import tomllib
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from tfbus.cli import app
+
+ROOT = Path(__file__).parent.parent
+GUIDE = ROOT / "demos" / "guide"
+PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md"))]
+REFERENCE = sorted((GUIDE / "reference").glob("*.rst"))
+PUBLIC = ["tfbus", "tfbus.data", "tfbus.links.zenoh", "tfbus.recording", "tfbus.robot", "tfbus.testing"]
+CONSOLE = re.compile(r"^```console\n([\s\S]*?)^```|((?:^    \S.*\n)+)", re.MULTILINE)
+
+
+class Block(NamedTuple):
+    """A program of a page, and what the page says that it prints."""
+
+    program: str
+    output: str
+
+
+def blocks_of(page: Path) -> list[Block]:
+    fences = re.findall(r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [Block(program, output) for program, output in fences]
+
+
+def prose_of(page: Path) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def anchors_of(page: Path) -> set[str]:
+    """What GitHub and the site call the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", prose_of(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def commands_of(page: Path) -> list[str]:
+    """The command lines of a page, without comments; those that are joined by ``&&`` each for itself."""
+    lines = [line for match in CONSOLE.finditer(page.read_text()) for line in (match[1] or match[2]).splitlines()]
+    commands = [part.strip() for line in lines for part in line.partition(" # ")[0].split("&&")]
+    return [command for command in commands if re.match(r"(tfbus|pip install) ", command)]
+
+
+PROGRAMS = [
+    pytest.param(page, block, id=f"{page.stem}-{number}")
+    for page in PAGES
+    for number, block in enumerate(blocks_of(page))
+]
+COMMANDS = [pytest.param(command, id=f"{page.stem}-{command}") for page in PAGES for command in commands_of(page)]
+
+
+@pytest.mark.parametrize(("page", "block"), PROGRAMS)
+def test_every_program_prints_what_the_page_says(page: Path, block: Block, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(compile(block.program, page.name, "exec"), {"__name__": "__main__"})
+    output = capsys.readouterr().out
+    assert output
+    if block.output:
+        assert output == block.output
+
+
+def test_every_page_that_teaches_has_a_program_and_names_a_demo() -> None:
+    for page in PAGES:
+        if page.stem in ("index", "README", "changelog", "contributing"):
+            continue
+        assert blocks_of(page), page.name
+        assert re.search(r"^## Run it\n\n(?:.*\n)*.*\]\(\.\./\w+\.py\)", page.read_text(), re.MULTILINE), page.name
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_link_leads_to_a_file_and_to_a_heading_in_it(page: Path) -> None:
+    for link in re.findall(r"\]\(([^)\s]+)\)", prose_of(page)):
+        if link.startswith("https://"):
+            continue
+        path, _, anchor = link.partition("#")
+        file = page.parent / path if path else page
+        assert file.exists(), link
+        assert not anchor or anchor in anchors_of(file), link
+
+
+def test_every_demo_and_every_page_is_named_by_the_readme_or_the_guide() -> None:
+    linked = {
+        (page.parent / link.partition("#")[0]).resolve()
+        for page in PAGES
+        for link in re.findall(r"\]\(([^)\s]+)\)", prose_of(page))
+    }
+    missing = {path for path in (ROOT / "demos").iterdir() if path.is_file()} - linked
+    assert not missing
+    listed = re.findall(r"^([\w/]+)$", (GUIDE / "index.md").read_text(), re.MULTILINE)
+    assert {f"{name}.md" for name in listed if "/" not in name} == {page.name for page in PAGES[1:]} - {"index.md"}
+
+
+def test_the_urls_of_the_package_lead_to_pages_that_are_here() -> None:
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    for name, url in urls.items():
+        assert url.startswith(urls["Source"])
+        path = url.partition("/blob/main/")[2]
+        assert not path or (ROOT / path).is_file(), name
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_can_be_typed(command: str) -> None:
+    words = shlex.split(command)
+    if words[0] == "tfbus":
+        app.parse_args(words[1:], exit_on_error=False, print_error=False)
+        return
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    wanted = re.findall(r"\[(.*)\]", command)
+    assert set(",".join(wanted).split(",")) - {""} <= extras.keys()
+
+
+def test_every_public_name_is_on_one_page_of_the_reference() -> None:
+    directives = r"^\.\. auto(?:class|exception|function|data):: ([\w.]+)\.(\w+)"
+    listed = [found for page in REFERENCE for found in re.findall(directives, page.read_text(), re.MULTILINE)]
+    documented = [id(getattr(importlib.import_module(path), name)) for path, name in listed]
+    assert len(documented) == len(set(documented))
+    for path in PUBLIC:
+        module = importlib.import_module(path)
+        own = [
+            name
+            for name, thing in vars(module).items()
+            if not name.startswith("_") and getattr(thing, "__module__", None) == path and callable(thing)
+        ]
+        for name in getattr(module, "__all__", own):
+            assert id(getattr(module, name)) in documented, f"{path}.{name} is on no page of the reference"
