@@ -7,8 +7,8 @@ An async test runs on asyncio in the default suite, and on asyncio with uvloop a
 is marked `every_loop` runs on all three in the default suite.
 
 A test of hypothesis is in both suites: with a few examples, always the same, in the default one; with more examples in
-the thorough one, new ones at each run unless the variable `CI` is set. ``--hypothesis-profile=default`` or ``=thorough``
-chooses otherwise.
+the thorough one, new ones at each run unless the variable `CI` is set. ``--hypothesis-profile`` chooses otherwise:
+``default`` or ``thorough``.
 
 Folders are tested by as many processes as there are cores, at most four, and single files by one. ``-n`` chooses
 otherwise. Ctrl-C and ``--pdb`` work as ever.
