@@ -1,25 +1,100 @@
-"""Every async test runs on asyncio, on asyncio with uvloop, and on trio; no example of hypothesis has a deadline."""
+"""How the tests run: two suites, three event loops, two profiles of hypothesis.
+
+``pytest`` runs the default suite. ``pytest -m thorough`` runs the rest: the slow tests, which are marked `thorough`.
+``pytest -m ""`` runs both. A test that is named (``pytest file.py::test``) runs, marked or not.
+
+An async test runs on asyncio in the default suite, and on asyncio with uvloop and on trio in the thorough one. One that
+is marked `every_loop` runs on all three in the default suite.
+
+A test of hypothesis is in both suites: with a few examples, always the same, in the default one; with more examples in
+the thorough one, new ones at each run unless the variable `CI` is set. ``--hypothesis-profile`` chooses otherwise:
+``default`` or ``thorough``.
+
+Folders are tested by as many processes as there are cores, at most four, and single files by one. ``-n`` chooses
+otherwise. Ctrl-C and ``--pdb`` work as ever.
+"""
 
 import os
+import shutil
+import signal
+import tempfile
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import anyio
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, configuration, is_hypothesis_test, settings
 
-# The same examples for every change that is to land; new ones wherever else the tests run.
-settings.register_profile("tfbus", deadline=None, derandomize="CI" in os.environ)
-settings.load_profile("tfbus")
+import tfbus
 
 T = TypeVar("T")
 Backend = tuple[str, dict[str, Any]]
 
+ASYNCIO: Backend = ("asyncio", {})
 BACKENDS = [
-    pytest.param(("asyncio", {}), id="asyncio"),
+    pytest.param(ASYNCIO, id="asyncio"),
     pytest.param(("asyncio", {"use_uvloop": True}), id="uvloop"),
     pytest.param(("trio", {}), id="trio"),
 ]
+DEFAULT_SUITE = "not thorough"
+"""The expression of marks that pyproject.toml gives."""
+
+EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("default", EXAMPLES, max_examples=25, derandomize=True)
+settings.register_profile("thorough", EXAMPLES, max_examples=100, derandomize="CI" in os.environ)
+
+
+def is_default_suite(config: pytest.Config) -> bool:
+    return bool(config.option.markexpr == DEFAULT_SUITE)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if is_default_suite(config) and all("::" in argument for argument in config.args):
+        config.option.markexpr = ""
+    settings.load_profile("default" if is_default_suite(config) else "thorough")
+    keep_tables_of_hypothesis_elsewhere(config)
+    hear_ctrl_c()
+
+
+def keep_tables_of_hypothesis_elsewhere(config: pytest.Config) -> None:
+    """Have hypothesis write to a temporary folder what it would write to the checkout."""
+    tables = Path(tempfile.mkdtemp(prefix="tfbus-hypothesis-"))
+    configuration.set_hypothesis_home_dir(tables)
+    config.add_cleanup(lambda: shutil.rmtree(tables, ignore_errors=True))
+
+
+def hear_ctrl_c() -> None:
+    """Undo that a script's background job, and each process that it starts, ignores Ctrl-C."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_report_header(config: pytest.Config) -> list[str]:
+    suite = "default; -m thorough runs the rest" if is_default_suite(config) else f"-m {config.option.markexpr!r}"
+    return [f"suite: {suite}", f"tfbus: {Path(tfbus.__file__).parent}"]
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    if all(Path(argument.partition("::")[0]).is_file() for argument in config.args):
+        return 0
+    return min(os.cpu_count() or 1, 4)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark what the thorough suite has beside the tests that are marked in their files."""
+    for item in items:
+        more_examples = not is_default_suite(config) and is_hypothesis_test(getattr(item, "obj", None))
+        if more_examples or is_on_another_loop(item):
+            item.add_marker("thorough")
+
+
+def is_on_another_loop(item: pytest.Item) -> bool:
+    """Whether an item runs a test on a loop that is not for the default suite."""
+    parameters = item.callspec.params if hasattr(item, "callspec") else {}
+    every_loop = item.get_closest_marker("every_loop") is not None
+    return not every_loop and parameters.get("anyio_backend", ASYNCIO) != ASYNCIO
 
 
 @pytest.fixture(params=BACKENDS)

@@ -114,7 +114,7 @@ TEXT = b"Dear diary,\ntoday I have driven a robot.\n"
     [
         (b"", "empty", "the file is empty"),
         (TEXT, "foreign", "it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)"),
-        (gzip.compress(TEXT * 100), "foreign", "it is no recording"),
+        (gzip.compress(TEXT * 100, mtime=0), "foreign", "it is no recording"),
         (bytes(range(256)) * 100, "foreign", "it is no recording"),
         (b"\0" * 10_000, "foreign", "it is no recording"),
         (b"\x89MCAP0\r\n", "truncated", "ends before its first message"),
