@@ -34,8 +34,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "cli": ("__init__", "links", "recording"),
 }
 
-SANS_IO = {"stamps", "errors", "events", "frames", "registration", "statistics", "_log", "geometry", "data", "tf_message"}
-SANS_IO |= {"tree", "waiting"}
+SANS_IO = {*GROUND, "geometry", "data", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
 EFFECTS = {"anyio", "asyncio", "sniffio", "socket", "threading", "time", "trio"}
 ALLOWED_EFFECTS = {"tree.forest": {"threading"}}
 
@@ -54,7 +53,7 @@ NEVER_LOADED = {*EXTRAS, "hypothesis", "starlette", "uvicorn"}
 
 
 def module_name(path: Path) -> str:
-    """The name of a module inside the package; a room's door has the name of the room, the package's is ``__init__``."""
+    """The name of a module inside the package. A door has the name of its room, that of the package is ``__init__``."""
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
 
 
