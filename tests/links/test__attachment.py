@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from support.allocations import peak_of
 
-from tfbus.links.attachment import (
+from tfbus.links._attachment import (
     MAX_BYTES,
     MAX_ENTRIES,
     VERSION,
