@@ -14,10 +14,10 @@ from tfbus.links._attachment import (
     Attachment,
     Entry,
     PublishedBatch,
-    RemovedFrame,
     pack,
     unpack,
 )
+from tfbus.links._outbox import RemovedFrame
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 ONE, OTHER = b"0123456789abcdef", b"another origin !"

@@ -17,8 +17,8 @@ from support.wires import End, size_of
 from tfbus import Buffer, Bus, BusClosedError, FrameAdded, PeerLost, PeerRejected, SimulatedClock, TransformStamped
 from tfbus.bus._ownership import OnConflict
 from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
-from tfbus.links._entries import RemovedFrame
 from tfbus.links._message import Message
+from tfbus.links._outbox import RemovedFrame
 from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence

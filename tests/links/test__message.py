@@ -8,9 +8,10 @@ from support.samples import moving, static
 
 from tfbus import SECOND, InvalidTransformError, TransformStamped
 from tfbus.links._attachment import MAX_ENTRIES, PublishedBatch, pack, unpack
-from tfbus.links._entries import OutgoingBatch, ReceivedBatch, RemovedFrame
+from tfbus.links._carrier import SendReport
+from tfbus.links._inbox import ReceivedBatch
 from tfbus.links._message import FULL_MESSAGE, MAX_BYTES, Message, MessageWriter, message_to_keep, read_message
-from tfbus.links._send_report import SendReport
+from tfbus.links._outbox import OutgoingBatch, RemovedFrame
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"

@@ -25,7 +25,7 @@ from support.wires import (
 
 from tfbus import Buffer, Bus, BusClosedError, PeerLost, SimulatedClock, TransformStamped
 from tfbus.bus.event_stream import EventStream
-from tfbus.links._entries import Turn
+from tfbus.links._outbox import Turn
 from tfbus.links._relay import relay_of
 
 Step = tuple[str, int, int, list[int]]

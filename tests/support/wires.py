@@ -6,13 +6,14 @@ from types import TracebackType
 from typing import Any
 
 from tfbus import Bus, SimulatedClock, TransformStamped
+from tfbus.links._carrier import SendReport
 from tfbus.links._endpoint import Endpoint
-from tfbus.links._entries import ReceivedMessage, Turn
+from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, message_to_keep, read_message
+from tfbus.links._outbox import Turn
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links._relay import relay_of
-from tfbus.links._send_report import SendReport
 
 Batch = tuple[TransformStamped, ...]
 Packet = Message | Presence

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 
-from tfbus.links._entries import RemovedFrame
+from tfbus.links._outbox import RemovedFrame
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 VERSION = 1

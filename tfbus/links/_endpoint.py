@@ -79,8 +79,10 @@ class Endpoint:
         self._relay.detach(self.outbox)
 
     def send(self) -> None:
-        """Hand to the carrier all that has gathered in the outbox."""
-        self._carrier.send(self.outbox.flush())
+        """Hand to the carrier all that has gathered in the outbox, if there is anything."""
+        turn = self.outbox.flush()
+        if turn.entries or turn.statics:
+            self._carrier.send(turn)
 
     def handle(self, item: Received) -> None:
         """Handle one item that the carrier has received; nothing in it makes this raise."""

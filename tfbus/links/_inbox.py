@@ -1,15 +1,66 @@
 """The inbox of a link: it publishes on the bus what peers have sent, within the limits of each peer."""
 
 from collections.abc import Collection
+from dataclasses import dataclass, field
 
 from tfbus.bus.bus import Bus
-from tfbus.links._entries import ReceivedBatch, ReceivedMessage
-from tfbus.links._outbox import Outbox
+from tfbus.errors import InvalidTransformError
+from tfbus.links._outbox import Outbox, RemovedFrame
 from tfbus.links._peers import MAX_AUTHORITIES, Peer, Peers
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.links._relay import Relay
 
 _LARGEST_GAP = 2**32
+
+
+class ReceivedBatch:
+    """Samples of one batch, as they came in.
+
+    Attributes
+    ----------
+    samples : list of ReceivedTransform
+        Their provenance is not set yet.
+    authorities : collection of str
+        The authorities that the batch names; a peer may name only so many.
+    origin : bytes or None
+        The bus on which the batch was published first, 16 bytes; None if the sender knows no buses, as ROS.
+    sequence : int
+        The batch's number on that bus; without an origin it is not used.
+    """
+
+    __slots__ = ("authorities", "origin", "samples", "sequence")
+
+    def __init__(
+        self,
+        samples: list[ReceivedTransform],
+        authorities: Collection[str],
+        origin: bytes | None = None,
+        sequence: int = 0,
+    ) -> None:
+        self.samples = samples
+        self.authorities = authorities
+        self.origin = origin
+        self.sequence = sequence
+
+
+@dataclass(slots=True)
+class ReceivedMessage:
+    """One message of a peer, decoded.
+
+    Attributes
+    ----------
+    entries : list of ReceivedBatch or RemovedFrame
+        In the order in which it happened.
+    number : int
+        The sender numbers its live messages 1, 2, 3, so that gaps are noticed; 0 for a message without a number: one
+        that was kept for late joiners, or one of a sender that does not number.
+    errors : list of InvalidTransformError
+        One for each sample that was refused; `entries` has the others.
+    """
+
+    entries: list[ReceivedBatch | RemovedFrame]
+    number: int = 0
+    errors: list[InvalidTransformError] = field(default_factory=list)
 
 
 class Inbox:

@@ -10,9 +10,10 @@ from itertools import groupby
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._attachment import PublishedBatch, pack, unpack
-from tfbus.links._entries import OutgoingBatch, ReceivedBatch, ReceivedMessage, RemovedFrame
+from tfbus.links._carrier import SendReport
+from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
+from tfbus.links._outbox import OutgoingBatch, RemovedFrame
 from tfbus.links._provenance import ReceivedTransform
-from tfbus.links._send_report import SendReport
 from tfbus.tf_message import decode, encode, refusal
 
 FULL_MESSAGE = 5_000

@@ -1,8 +1,59 @@
 """The outbox of a link: what is published and removed gathers in it until the turn of the event loop ends."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 
-from tfbus.links._entries import OutgoingBatch, RemovedFrame, Turn
+from tfbus.geometry.stamped import TransformStamped
+
+
+class OutgoingBatch:
+    """Samples of one batch and one origin, as they go out.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which the batch was published first, 16 bytes.
+    sequence : int
+        The batch's number on that bus.
+    samples : sequence of TransformStamped
+    """
+
+    __slots__ = ("origin", "samples", "sequence")
+
+    def __init__(self, origin: bytes, sequence: int, samples: Sequence[TransformStamped]) -> None:
+        self.origin = origin
+        self.sequence = sequence
+        self.samples = samples
+
+
+@dataclass(frozen=True, slots=True)
+class RemovedFrame:
+    """A tombstone: a frame was removed, by the batch number `sequence` of the bus `origin`.
+
+    With `lost`, the sender has lost the peer that brought the frame, so only what the sender itself brought is removed.
+    """
+
+    origin: bytes
+    sequence: int
+    frame: str
+    lost: bool = False
+
+
+@dataclass(slots=True)
+class Turn:
+    """All that one turn of the event loop has published and removed.
+
+    Attributes
+    ----------
+    entries : list of OutgoingBatch or RemovedFrame
+        In the order in which it happened.
+    statics : dict of str to OutgoingBatch, RemovedFrame or None
+        The static frames whose state for late joiners has changed: the newest sample of each as a batch of its own, its
+        tombstone, or None if the frame is not to be kept any more.
+    """
+
+    entries: list[OutgoingBatch | RemovedFrame]
+    statics: dict[str, OutgoingBatch | RemovedFrame | None]
 
 
 class Outbox:

@@ -18,8 +18,7 @@ from uuid import uuid4
 from tfbus.bus.bus import Bus
 from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.links._entries import OutgoingBatch, RemovedFrame
-from tfbus.links._outbox import Outbox
+from tfbus.links._outbox import Outbox, OutgoingBatch, RemovedFrame
 from tfbus.links._peers import Peer, next_age
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.registration import Registration

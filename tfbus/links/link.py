@@ -14,10 +14,9 @@ from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
 from tfbus.bus.sample_queue import check_capacity
 from tfbus.errors import BusClosedError
-from tfbus.links._carrier import Carrier
+from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._endpoint import Endpoint
 from tfbus.links._receive_queue import Received, ReceiveQueue
-from tfbus.links._send_report import SendReport
 from tfbus.registration import Registration
 from tfbus.statistics import LinkStatistics
 

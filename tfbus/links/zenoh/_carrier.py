@@ -9,10 +9,11 @@ import anyio
 import anyio.to_thread
 import zenoh
 
-from tfbus.links._entries import OutgoingBatch, ReceivedMessage, RemovedFrame, Turn
+from tfbus.links._carrier import SendReport
+from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, message_to_keep, read_message
+from tfbus.links._outbox import OutgoingBatch, RemovedFrame, Turn
 from tfbus.links._receive_queue import Received
-from tfbus.links._send_report import SendReport
 from tfbus.links.zenoh._session import ZenohSession
 
 _STATICS_PER_CALL = 100
