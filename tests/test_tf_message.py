@@ -18,7 +18,7 @@ from support.samples import moving
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped
 from tfbus.geometry.rows import IDENTITY, Row
-from tfbus.tf_message import LEAST_SIZE, MAX_NAME, MalformedMessageError, decode, encode, refusal
+from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, encode, refusal
 
 MESSAGE = "tf2_msgs/msg/TFMessage"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -396,7 +396,7 @@ def test_the_least_message_of_many_transforms_is_long_enough() -> None:
     """Nothing that is counted can be smaller, so a count that does not fit is a lie."""
     for count in range(1, 5):
         payload = message_of(*[Part(b"", b"")] * count)
-        assert len(payload) == 4 + 8 + count * LEAST_SIZE
+        assert len(payload) == 4 + 8 + count * MIN_SIZE
         assert [error.reason for error in decode(payload).errors] == ["frame name"] * count
 
 
@@ -441,7 +441,7 @@ def check(payload: bytes) -> None:
         assert error.reason in {"truncated", "oversized", "encoding", "text"}
         return
     assert samples.count(None) == len(errors)
-    assert len(samples) * LEAST_SIZE <= len(payload)
+    assert len(samples) * MIN_SIZE <= len(payload)
     for sample in samples:
         if sample is not None:
             assert refusal(sample) is None

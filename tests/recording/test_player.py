@@ -30,10 +30,10 @@ from tfbus import (
     RecordingError,
     SimulatedClock,
 )
+from tfbus.bus.sample_queue import TimedBatch
 from tfbus.geometry.stamped import Batch
 from tfbus.recording import Player, Recorder, load
-from tfbus.recording._write_queue import Entry
-from tfbus.recording.formats.mcap_output import McapOutput
+from tfbus.recording.formats._mcap_output import McapOutput
 
 pytestmark = pytest.mark.anyio
 
@@ -46,7 +46,7 @@ AS_FAST = math.inf
 START = 1_700_000_000 * SECOND
 
 
-def written(path: Path, *entries: Entry) -> Path:
+def written(path: Path, *entries: TimedBatch) -> Path:
     """A recording with batches at log times."""
     with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write(entries)
@@ -54,7 +54,7 @@ def written(path: Path, *entries: Entry) -> Path:
     return path
 
 
-def drive(seconds: Iterable[float], authority: str = "odometry") -> list[Entry]:
+def drive(seconds: Iterable[float], authority: str = "odometry") -> list[TimedBatch]:
     """A child that is at t m at t s, recorded as it was sent."""
     stamps = [START + round(time * SECOND) for time in seconds]
     return [(stamp, (moving("map", "base", stamp, (stamp - START) / SECOND, authority),)) for stamp in stamps]
@@ -86,7 +86,7 @@ class Heard:
     """The batches that come over a bus, with the clock's time."""
 
     def __init__(self, bus: Bus) -> None:
-        self.entries: list[Entry] = []
+        self.entries: list[TimedBatch] = []
         self._bus = bus
         self._registration = bus.subscribe(self._hear)
         self.arrived = anyio.Event()
@@ -653,7 +653,7 @@ def test_whenever_it_is_made_to_seek_it_goes_on_from_there(
     """Against a model: a list, in which the n-th message that is heard makes it jump."""
     entries = drive(times)
     path = written(tmp_path / "run.mcap", *entries)
-    expected: list[Entry] = []
+    expected: list[TimedBatch] = []
     at = 0
     while at < len(entries):
         expected.append(entries[at])

@@ -17,14 +17,14 @@ from support.samples import moving, static
 from support.strategies import samples
 
 from tfbus import Transform, TransformStamped
-from tfbus.recording._write_queue import Entry
+from tfbus.bus.sample_queue import TimedBatch
 from tfbus.recording.formats._channels import TYPE_HASH
-from tfbus.recording.formats.mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, McapOutput
+from tfbus.recording.formats._mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, McapOutput
 from tfbus.stamps import SECOND
 from tfbus.tf_message import decode
 
 
-def written(path: Path, *entries: Entry) -> McapOutput:
+def written(path: Path, *entries: TimedBatch) -> McapOutput:
     with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write(entries)
         output.finish()
