@@ -16,7 +16,7 @@ from support import strategies as some
 from support.allocations import peak_of
 from support.samples import moving
 
-from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped
+from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped, tf_message
 from tfbus.geometry.rows import IDENTITY, Row
 from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, encode, refusal
 
@@ -478,7 +478,19 @@ def test_a_damaged_message_does_no_harm(little_endian: bool, wanted: list[Part],
 # Memory, and what is remembered.
 
 
-def test_names_by_the_thousand_are_not_remembered_for_ever() -> None:
+def test_no_cache_of_names_grows_without_bound() -> None:
+    # Names of 80 bytes fit in a cache, those of 400 do not.
+    for name in ("frame {}", "a" * 80 + "{}", "🦾" * 100 + "{}"):
+        samples = [moving("map", name.format(number), 0) for number in range(3_000)]
+        assert decode(encode(samples)).samples == samples
+        assert decode(encode(samples), bare_names=True).samples == samples
+        for cache in (tf_message._pieces, tf_message._names, tf_message._bare_names):
+            assert len(cache) <= 2_048
+            assert all(len("".join(key[:2]).encode()) < 256 for key in tf_message._pieces)
+
+
+@pytest.mark.thorough
+def test_the_memory_for_thousands_of_names_is_released() -> None:
     for name in ("frame {}", "a" * 100 + "{}", "🦾" * 200 + "{}"):
         tracemalloc.start()
         try:

@@ -285,6 +285,7 @@ def test_without_its_extra_reading_names_it() -> None:
     assert done.stdout == 'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"\n'
 
 
+@pytest.mark.thorough
 def test_what_it_reads_does_not_hang_on_pythons_asserts() -> None:
     """The parser checks with ``assert``, which ``python -O`` leaves out."""
     script = (
