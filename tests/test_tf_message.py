@@ -16,9 +16,9 @@ from support import strategies as some
 from support.allocations import peak_of
 from support.samples import moving
 
-from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped
+from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped, tf_message
 from tfbus.geometry.rows import IDENTITY, Row
-from tfbus.tf_message import LEAST_SIZE, MAX_NAME, MalformedMessageError, decode, encode, refusal
+from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, encode, refusal
 
 MESSAGE = "tf2_msgs/msg/TFMessage"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -396,7 +396,7 @@ def test_the_least_message_of_many_transforms_is_long_enough() -> None:
     """Nothing that is counted can be smaller, so a count that does not fit is a lie."""
     for count in range(1, 5):
         payload = message_of(*[Part(b"", b"")] * count)
-        assert len(payload) == 4 + 8 + count * LEAST_SIZE
+        assert len(payload) == 4 + 8 + count * MIN_SIZE
         assert [error.reason for error in decode(payload).errors] == ["frame name"] * count
 
 
@@ -441,7 +441,7 @@ def check(payload: bytes) -> None:
         assert error.reason in {"truncated", "oversized", "encoding", "text"}
         return
     assert samples.count(None) == len(errors)
-    assert len(samples) * LEAST_SIZE <= len(payload)
+    assert len(samples) * MIN_SIZE <= len(payload)
     for sample in samples:
         if sample is not None:
             assert refusal(sample) is None
@@ -478,7 +478,19 @@ def test_a_damaged_message_does_no_harm(little_endian: bool, wanted: list[Part],
 # Memory, and what is remembered.
 
 
-def test_names_by_the_thousand_are_not_remembered_for_ever() -> None:
+def test_no_cache_of_names_grows_without_bound() -> None:
+    # Names of 80 bytes fit in a cache, those of 400 do not.
+    for name in ("frame {}", "a" * 80 + "{}", "🦾" * 100 + "{}"):
+        samples = [moving("map", name.format(number), 0) for number in range(3_000)]
+        assert decode(encode(samples)).samples == samples
+        assert decode(encode(samples), bare_names=True).samples == samples
+        for cache in (tf_message._pieces, tf_message._names, tf_message._bare_names):
+            assert len(cache) <= 2_048
+            assert all(len("".join(key[:2]).encode()) < 256 for key in tf_message._pieces)
+
+
+@pytest.mark.thorough
+def test_the_memory_for_thousands_of_names_is_released() -> None:
     for name in ("frame {}", "a" * 100 + "{}", "🦾" * 200 + "{}"):
         tracemalloc.start()
         try:

@@ -1,4 +1,4 @@
-"""For tests of programs that use tfbus: simulated time that runs by itself, and a comparison that explains itself."""
+"""Helpers for the tests of programs that use tfbus: simulated time, and the comparison of transforms."""
 
 from collections.abc import Awaitable, Callable
 from typing import TypeVar
@@ -13,25 +13,25 @@ T = TypeVar("T")
 
 
 async def simulate(clock: SimulatedClock, function: Callable[[], Awaitable[T]], *, limit: float = 3600.0) -> T:
-    """Run an async function while simulated time passes as fast as it can.
+    """Run an async function while simulated time passes as fast as possible.
 
     Parameters
     ----------
     clock : SimulatedClock
-        Driven until the function has ended, and by nobody else meanwhile.
+        Advanced until the function has ended; nothing else may advance it meanwhile.
     function : async callable
         Without arguments; use `functools.partial` to pass some.
     limit : float
-        The most simulated s that it may take.
+        The greatest duration in simulated s.
 
     Returns
     -------
-    What the function returns; what it raises comes out as it is, without an `ExceptionGroup`.
+    The result of the function. An exception of the function is raised as it is, without an `ExceptionGroup`.
 
     Raises
     ------
     TimeoutError
-        If the function has not ended after `limit`: the usual reason is that it waits for what nobody sends.
+        If the function has not ended after `limit`, usually because it waits for data that are never sent.
     """
     result: list[T] = []
     error: list[Exception] = []
@@ -61,12 +61,12 @@ def assert_close(
     translation_tolerance: float = 1e-9,
     rotation_tolerance: float = 1e-9,
 ) -> None:
-    """Assert that two transforms are close, or say how far they are apart.
+    """Assert that two transforms are close; the `AssertionError` has their distance and angle.
 
     Parameters
     ----------
     actual, expected : Transform or TransformStamped
-        Of the latter only the transform is compared.
+        Of samples, only the transforms are compared.
     translation_tolerance : float
         Greatest distance in m.
     rotation_tolerance : float

@@ -1,21 +1,21 @@
 """Transforms as the bytes of a ROS 2 ``tf2_msgs/msg/TFMessage``, and back.
 
-The message is ``geometry_msgs/msg/TransformStamped[] transforms``. One of them, with the place of each part where both
-names are empty::
+The message is ``geometry_msgs/msg/TransformStamped[] transforms``. The layout of one of them, with the offsets for two
+empty names::
 
     0  header.stamp       int32 sec, uint32 nanosec
     8  header.frame_id    string: uint32 length, UTF-8, NUL
    16  child_frame_id     string
    24  transform          float64 translation x, y, z, rotation x, y, z, w
 
-The encoding is plain CDR, version 1: a header of four bytes, of which the second tells the byte order and the last two
-are options (OMG DDSI-RTPS 2.5, section 10); then each number at a multiple of its own size, counted from the end of the
+The encoding is plain CDR, version 1: a header of four bytes, of which the second is the byte order and the last two are
+options (OMG DDSI-RTPS 2.5, section 10); then each number at a multiple of its own size, counted from the end of the
 header, and each string with a length that counts its NUL (OMG DDS-XTYPES 1.3, section 7.4.1). Because float64 comes
 last, every transform ends at a multiple of 8.
 
-The same few names come again in each message, so what two of them are in bytes, with lengths and padding, is remembered
-as one piece: nothing is left to check in a piece that is known. Whatever is not plainly good goes through `Transform`
-and `TransformStamped`, so that it is refused just as they do it.
+The same few names are in every message. So the bytes of two names, with lengths and padding, are cached as one piece,
+and a cached piece needs no checks. A transform that may be invalid is built with `Transform` and `TransformStamped`, so
+that it is refused with their errors.
 """
 
 import math
@@ -31,24 +31,25 @@ from tfbus.geometry.transform import Transform
 from tfbus.stamps import SECOND, format_stamp
 
 MAX_NAME: Final = 1_024
-"""The longest frame name that is sent or taken, in bytes of UTF-8."""
-LEAST_SIZE: Final = 80
-"""The fewest bytes of a transform: a stamp of 8, two empty names of 4 + 1 with 3 of padding, and 7 numbers of 8."""
+"""The length of the longest accepted frame name, in bytes of UTF-8."""
+MIN_SIZE: Final = 80
+"""The size of the shortest transform in bytes: a stamp of 8, two empty names of 5 padded to 8, and 7 numbers of 8."""
 
 SampleT = TypeVar("SampleT", bound=TransformStamped)
 Tag = tuple[str, bool]
+"""The authority and the static flag of a sample, which the message does not hold."""
 
 
 class MalformedMessageError(ValueError):
-    """A payload that is no message of transforms; nothing of it was taken.
+    """A payload that is no valid message of transforms; none of its transforms was accepted.
 
     Attributes
     ----------
     reason : str
         One word to count by: ``"truncated"``, ``"oversized"``, ``"encoding"``, ``"text"`` (a string without its NUL) or
-        ``"tags"``; a link has some more for what goes beside a message.
+        ``"tags"``; links have further reasons for the data that they send along with a message.
     detail : str
-        What was found.
+        The fault in the payload.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
@@ -61,16 +62,16 @@ class MalformedMessageError(ValueError):
 
 
 class Decoded(NamedTuple, Generic[SampleT]):
-    """What a message holds."""
+    """The samples and errors of a message."""
 
     samples: list[SampleT | None]
-    """One for each transform, in order; None if it was refused."""
+    """A sample for each transform, in order; None for a refused one."""
     errors: list[InvalidTransformError]
-    """Why, one for each that was refused, in order; with its authority, and its frames as far as they can be read."""
+    """An error for each refused transform, in order; with its authority, and with its frames if they are readable."""
 
 
 class _Layout:
-    """The numbers of a message in one byte order."""
+    """The structs of a message in one byte order."""
 
     def __init__(self, order: str) -> None:
         self.size = struct.Struct(f"{order}I")
@@ -84,28 +85,28 @@ _HEADER = b"\x00\x01\x00\x00"
 _STAMP = struct.Struct("<iI")
 
 _SHOWN = 40
-_REMEMBERED = 2_048
-_REMEMBERED_SIZE = 256
+_MAX_CACHED = 2_048
+_MAX_CACHED_SIZE = 256
 _pieces: dict[tuple[str, str, bool], bytes] = {}
 _names: dict[bytes, tuple[str, str]] = {}
-_bared_names: dict[bytes, tuple[str, str]] = {}
+_bare_names: dict[bytes, tuple[str, str]] = {}
 
 
-def _remember(memory: dict[Any, Any], key: object, value: object, size: int) -> None:
-    # Strangers choose the names: long ones are not kept, and a full memory starts anew.
-    if size <= _REMEMBERED_SIZE:
-        if len(memory) >= _REMEMBERED:
-            memory.clear()
-        memory[key] = value
+def _cache(cache: dict[Any, Any], key: object, value: object, size: int) -> None:
+    # Peers choose the names: long ones are not cached, and a full cache is emptied.
+    if size <= _MAX_CACHED_SIZE:
+        if len(cache) >= _MAX_CACHED:
+            cache.clear()
+        cache[key] = value
 
 
 def encode(samples: Sequence[TransformStamped]) -> bytes:
-    """A message of some samples, in little endian CDR with its header; it has no authorities and no static flags.
+    """Encode samples as a little endian CDR message with its header, without authorities and static flags.
 
     Raises
     ------
     InvalidTransformError
-        If `refusal` has something against a sample; the first one counts.
+        The `refusal` of the first sample that a message cannot hold.
     """
     pack_stamp, pack_numbers, piece_of = _STAMP.pack, _LITTLE_ENDIAN.numbers.pack, _pieces.get
     parts = [_HEADER, _LITTLE_ENDIAN.size.pack(len(samples))]
@@ -132,17 +133,17 @@ def _piece(parent: str, child: str, first: bool) -> bytes:
         if len(text) > MAX_NAME:
             raise ValueError
         piece += bytes(-len(piece) % 4) + _LITTLE_ENDIAN.size.pack(len(text) + 1) + text + b"\0"
-    # Only in front of the first transform there is the count.
+    # The count in front of the first transform shifts its alignment by 4.
     piece += bytes(-(len(piece) + 4 * first) % 8)
-    _remember(_pieces, (parent, child, first), piece, len(piece))
+    _cache(_pieces, (parent, child, first), piece, len(piece))
     return piece
 
 
 def refusal(sample: TransformStamped) -> InvalidTransformError | None:
-    """Why a sample cannot be in a message, or None if it can.
+    """The error for a sample that a message cannot hold; None for others.
 
     The reason is ``"stamp"`` before December 1901 and after January 2038, because ROS has 32 bits for the seconds, and
-    ``"frame name"`` for a name that is longer than `MAX_NAME` or has no UTF-8, as half of a surrogate pair.
+    ``"frame name"`` for a name that is longer than `MAX_NAME` or has no UTF-8, such as half of a surrogate pair.
     """
     parent, child, stamp, _, authority, _ = sample._fields
     reason, why = "frame name", ""
@@ -178,30 +179,29 @@ def decode(
     kind: type[Any] = TransformStamped,
     bare_names: bool = False,
 ) -> Decoded[Any]:
-    """The samples of a message, in either byte order.
+    """Decode the samples of a message in either byte order.
 
     Parameters
     ----------
     payload : bytes or memoryview
-        With its header. Zeros behind it, up to three, are padding.
+        The message with its header. Up to three zeros after it are padding.
     tags : iterable of (str, bool), optional
-        What the message does not hold: authority and static of each transform; ``("", False)`` if left out.
+        Authority and static flag of each transform, which the message does not hold; by default ``("", False)``.
     kind : type, optional
-        What to make: `TransformStamped`, or a subclass whose further slots the caller fills.
+        The type of the samples: `TransformStamped`, or a subclass whose further slots the caller fills.
     bare_names : bool, optional
-        Take leading slashes off the names, as for recordings of ROS 1.
+        Remove leading slashes from the names, as for recordings of ROS 1.
 
     Raises
     ------
     MalformedMessageError
-        If the payload is no such message, or there is not one tag for each transform. Bytes raise nothing else, and
-        what is allocated is in proportion to their number, whatever they claim.
+        If the payload is no such message, or there is not one tag for each transform. No payload raises another error,
+        and the memory used is proportional to the size of the payload, whatever counts and lengths it contains.
 
     Notes
     -----
-    A transform is refused, and the others are not, for what `Transform` and `TransformStamped` refuse, for a name that
-    is longer than `MAX_NAME` or not UTF-8 (``"frame name"``), and for a stamp with a second or more of nanoseconds
-    (``"stamp"``).
+    A single transform is refused for anything that `Transform` and `TransformStamped` refuse, for a name that is longer
+    than `MAX_NAME` or not UTF-8 (``"frame name"``), and for a stamp with a second or more of nanoseconds (``"stamp"``).
     """
     body = bytes(payload)
     layout = _LAYOUTS.get(body[:2])
@@ -211,7 +211,7 @@ def decode(
         raise MalformedMessageError("encoding", f"it is not plain CDR, its header is {body[:4].hex(' ')}")
     body = body[4:]
     (count,) = layout.size.unpack_from(body)
-    if count and 8 + count * LEAST_SIZE > len(body):
+    if count and 8 + count * MIN_SIZE > len(body):
         raise MalformedMessageError("truncated", f"{len(body)} bytes cannot hold {count} transforms")
     try:
         decoded, end = _transforms(body, layout, _as_tags(tags, count), kind, bare_names)
@@ -234,10 +234,10 @@ def _as_tags(tags: Iterable[Tag] | None, count: int) -> Iterable[Tag]:
 def _transforms(
     body: bytes, layout: _Layout, tags: Iterable[Tag], kind: type[Any], bare_names: bool
 ) -> tuple[Decoded[Any], int]:
-    """What a message holds, and where it ends; `struct.error` if it would go on behind the end of the body."""
+    """The transforms of a message, and the offset of its end; `struct.error` if that is beyond the end of the body."""
     head, size, numbers = layout.head.unpack_from, layout.size.unpack_from, layout.numbers.unpack_from
-    memory = _bared_names if bare_names else _names
-    names_of, make = memory.get, cast(Any, kind.__new__)
+    cache = _bare_names if bare_names else _names
+    names_of, make = cache.get, cast(Any, kind.__new__)
     samples: list[Any] = []
     errors: list[InvalidTransformError] = []
     at = 4
@@ -246,7 +246,7 @@ def _transforms(
         middle = at + 12 + length + 3 & -4
         (length,) = size(body, middle)
         end = middle + 4 + length + 7 & -8
-        # Before the names are cut out, because it fails where a length is wrong.
+        # Before the names are sliced, because this fails if a length is wrong.
         row = x, y, z, i, j, k, w = numbers(body, end)
         piece = body[at + 8 : end]
         at = end + 56
@@ -254,11 +254,11 @@ def _transforms(
         unit: Row | None = row
         if not -ROUNDING <= i * i + j * j + k * k + w * w - 1.0 <= ROUNDING:
             unit = _normalised(row)
-        # A number that is not finite makes NaN of zero.
+        # Zero times a number that is not finite is NaN.
         if names is not None and nanoseconds < SECOND and unit is not None and (x + y + z) * 0.0 == 0.0:
             fields = *names, seconds * SECOND + nanoseconds, unit, *tag
         else:
-            parent, child = (_name(text, bare_names) for text in _texts(piece, layout))
+            parent, child = (_name(text, bare_names) for text in _split_names(piece, layout))
             try:
                 fields = _checked(parent, child, seconds, nanoseconds, row, tag)
             except InvalidTransformError as error:
@@ -266,7 +266,7 @@ def _transforms(
                 errors.append(error.with_traceback(None))
                 samples.append(None)
                 continue
-            _remember(memory, piece, fields[:2], len(piece))
+            _cache(cache, piece, fields[:2], len(piece))
         sample = make(kind)
         sample._fields = fields
         samples.append(sample)
@@ -282,8 +282,8 @@ def _normalised(row: Row) -> Row | None:
     return x, y, z, i / norm, j / norm, k / norm, w / norm
 
 
-def _texts(piece: bytes, layout: _Layout) -> Iterator[bytes]:
-    """The two strings of a piece, without their NUL."""
+def _split_names(piece: bytes, layout: _Layout) -> Iterator[bytes]:
+    """The two strings of a piece without the NUL at their ends."""
     at = 0
     for _ in range(2):
         (length,) = layout.size.unpack_from(piece, at)
@@ -295,7 +295,7 @@ def _texts(piece: bytes, layout: _Layout) -> Iterator[bytes]:
 
 
 def _name(text: bytes, bare: bool) -> str | None:
-    """The name that a text is; None for what cannot be one."""
+    """Decode a frame name; None if it is too long or not UTF-8."""
     if len(text) > MAX_NAME:
         return None
     try:
@@ -306,7 +306,7 @@ def _name(text: bytes, bare: bool) -> str | None:
 
 
 def _checked(parent: str | None, child: str | None, seconds: int, nanoseconds: int, row: Row, tag: Tag) -> Fields:
-    """The fields of a sample, or what is wrong with them."""
+    """The fields of a valid sample; raises `InvalidTransformError` for an invalid one."""
     if parent is None or child is None:
         raise InvalidTransformError(f"a frame name must be UTF-8 of at most {MAX_NAME} bytes", reason="frame name")
     if nanoseconds >= SECOND:

@@ -7,8 +7,6 @@ from typing import Any
 
 import anyio
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
 from support.samples import moving, static, x_of
 
@@ -30,11 +28,8 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
-from tfbus.frames import Prefix, as_prefix
 
 pytestmark = pytest.mark.anyio
-
-names = st.text("ab/_", min_size=1, max_size=6).filter(lambda name: not name.startswith("/"))
 
 
 def at_x(x: float) -> Transform:
@@ -51,53 +46,6 @@ def two_robots(start: int = 0) -> tuple[SimulatedClock, Bus, list[TransformBroad
         broadcaster.send("map", "base", at_x(x), at=SECOND)
         broadcaster.send_static("base", "arm", at_x(0.5))
     return clock, bus, broadcasters, buffers
-
-
-# Names
-
-
-def test_a_name_gets_the_prefix_as_it_is_unless_it_is_shared() -> None:
-    prefix = Prefix("robot1/", {"map", "earth"})
-    assert [prefix.on_bus(name) for name in ("base", "map", "earth", "robot2/base")] == [
-        "robot1/base",
-        "map",
-        "earth",
-        "robot1/robot2/base",
-    ]
-    assert Prefix("r1_").on_bus("base") == "r1_base"
-
-
-@given(names, st.sets(names, max_size=3), names)
-def test_a_local_name_comes_back_from_the_bus(text: str, shared: set[str], name: str) -> None:
-    assume(not any(other.startswith(text) for other in shared))
-    prefix = Prefix(text, shared)
-    assert prefix.local(prefix.on_bus(name)) == name
-
-
-def test_somebody_elses_frame_is_not_taken_for_a_shared_one() -> None:
-    prefix = Prefix("robot1/", {"map"})
-    assert [prefix.local(name) for name in ("map", "robot1/map", "robot1/", "robot1//a", "robot2/a")] == [
-        "map",
-        "/robot1/map",
-        "/robot1/",
-        "/robot1//a",
-        "/robot2/a",
-    ]
-
-
-@given(names, st.sets(names, max_size=3), names)
-def test_what_has_no_local_name_is_told_with_a_slash_so_that_it_cannot_be_taken_for_one(
-    text: str, shared: set[str], name: str
-) -> None:
-    assume(not any(other.startswith(text) for other in shared))
-    prefix = Prefix(text, shared)
-    local = prefix.local(name)
-    assert local == f"/{name}" if local.startswith("/") else prefix.on_bus(local) == name
-
-
-@pytest.mark.parametrize("name", ["", "/base", "//"])
-def test_what_cannot_name_a_frame_is_left_for_others_to_refuse(name: str) -> None:
-    assert Prefix("robot1/").on_bus(name) == name
 
 
 @pytest.mark.parametrize(
@@ -119,17 +67,6 @@ def test_a_bad_prefix_is_refused(make: Callable[..., object], prefix: Any, share
     with pytest.raises(error):
         make(bus, prefix=prefix, shared=shared)
     assert bus.statistics().buffers == ()
-
-
-@pytest.mark.parametrize("shared", [{"map"}, "map", "", ["map", "earth"], iter(["map"]), 5])
-def test_shared_names_without_a_prefix_are_refused(shared: Any) -> None:
-    with pytest.raises(TypeError):
-        as_prefix(None, shared)
-
-
-@pytest.mark.parametrize("shared", [(), set(), iter([])])
-def test_no_prefix_and_nothing_shared_is_no_prefix(shared: Any) -> None:
-    assert as_prefix(None, shared) is None
 
 
 @pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])

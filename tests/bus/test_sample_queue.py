@@ -64,7 +64,18 @@ def test_static_samples_that_are_sent_again_and_again_do_not_fill_the_queue() ->
         queue.put((static("map", "a", stamp=time),))
     assert len(queue) <= 11
     assert emptied(queue)[-1] == (static("map", "a", stamp=999),)
-    assert queue.dropped == 0
+    assert (queue.dropped, queue.conflated, len(queue)) == (0, 0, 0)
+
+
+def test_a_static_sample_that_outlived_its_batch_is_removed_with_its_frame_only() -> None:
+    queue = SampleQueue(1, "drop_oldest")
+    queue.put((static("map", "a"), static("map", "b"), moving("map", "c", 1)))
+    queue.put((moving("map", "c", 2),))
+    assert len(queue) == 3
+    queue.discard_moving()
+    queue.forget("a")
+    assert (len(queue), queue.dropped) == (1, 2)
+    assert emptied(queue) == [(static("map", "b"),)]
 
 
 def test_conflate_keeps_the_newest_sample_of_each_child_and_gives_all_as_one_batch() -> None:

@@ -2,7 +2,6 @@ import copy
 import math
 import pickle
 from collections.abc import Sequence
-from decimal import Decimal, localcontext
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from support.strategies import angles, rotations, small_angles, transforms, unit
 from transforms3d import affines, axangles, euler, quaternions
 
 from tfbus import InvalidTransformError, Transform, TransformError
-from tfbus.geometry.rows import Columns, Quaternion, Vector, compose, invert, rotate
+from tfbus.geometry.rows import Quaternion, Vector
 
 HALF = math.sqrt(0.5)
 QUARTER_TURN_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)
@@ -263,65 +262,22 @@ def test_a_matrix_is_a_new_one_each_time() -> None:
 BAD_NUMBERS = [math.nan, math.inf, -math.inf]
 
 
-@pytest.mark.parametrize("bad", BAD_NUMBERS)
-@pytest.mark.parametrize("at", range(7))
-def test_a_number_that_is_not_finite_is_refused_wherever_it_stands(at: int, bad: float) -> None:
-    row = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
-    row[at] = bad
-    with pytest.raises(InvalidTransformError) as caught:
-        Transform(row[:3], row[3:])
-    assert caught.value.reason == "not finite"
-    assert ("translation" if at < 3 else "rotation") in str(caught.value)
-
-
-@pytest.mark.parametrize("tiny", [0, 0.0, -0.0, 5e-324, 1e-200])
-def test_the_zero_quaternion_is_refused(tiny: float) -> None:
-    with pytest.raises(InvalidTransformError) as caught:
-        Transform(rotation=(0, 0, tiny, 0))
-    assert caught.value.reason == "zero quaternion"
-
-
-@pytest.mark.parametrize("norm", [0.9899, 1.0101, 1e-100, 0.5, 2.0, 1e200])
-def test_a_norm_that_is_off_by_more_than_one_percent_is_refused(norm: float) -> None:
-    with pytest.raises(InvalidTransformError) as caught:
-        Transform(rotation=[part * norm for part in (0.5, -0.5, 0.5, 0.5)])
-    assert caught.value.reason == "not a unit quaternion"
-
-
-@given(rotations(), st.floats(0.9901, 1.0099))
-def test_a_norm_within_one_percent_is_normalised_and_the_sign_stays(q: Quaternion, norm: float) -> None:
-    assert Transform(rotation=[part * norm for part in q]).rotation == pytest.approx(q, rel=1e-15, abs=1e-15)
-
-
-@given(rotations(), st.floats(0.9901, 1.0099))
-def test_what_was_normalised_once_is_left_as_it_is(q: Quaternion, norm: float) -> None:
-    once = Transform(rotation=[part * norm for part in q])
-    assert Transform(rotation=once.rotation).rotation == once.rotation
-
-
 @pytest.mark.parametrize(
-    ("arguments", "shape"),
+    ("arguments", "reason", "text"),
     [
-        (((1, 2),), r"\(2,\)"),
-        (((1, 2, 3, 4),), r"\(4,\)"),
-        (((),), r"\(0,\)"),
-        (((0, 0, 0), (0, 0, 1)), r"\(3,\)"),
-        ((np.zeros((3, 1)),), r"\(3, 1\)"),
-        (((0, 0, 0), np.eye(4)), r"\(4, 4\)"),
-        ((np.zeros((2, 3)),), r"\(2, 3\)"),
+        (((0, math.nan, 0),), "not finite", "translation"),
+        (((1, 2),), "wrong length", "translation"),
+        (((0, 0, 0), (0, 0, 0, math.inf)), "not finite", "rotation"),
+        (((0, 0, 0), (0, 0, 0, 0)), "zero quaternion", "rotation"),
+        (((0, 0, 0), (0, 0, 0, 2)), "not a unit quaternion", "rotation"),
     ],
 )
-def test_the_wrong_number_of_numbers_is_refused_with_the_shape(arguments: tuple[Any, ...], shape: str) -> None:
-    with pytest.raises(InvalidTransformError, match=shape) as caught:
+def test_both_parts_are_checked_and_the_error_names_the_part(
+    arguments: tuple[Any, ...], reason: str, text: str
+) -> None:
+    with pytest.raises(InvalidTransformError, match=text) as caught:
         Transform(*arguments)
-    assert caught.value.reason == "wrong length"
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("bad", [None, 1.0, "123", b"123", {1, 2, 3}, ("1", "2", "3"), (None, 0, 0), (1j, 0, 0)])
-def test_what_is_not_numbers_at_all_is_a_type_error(bad: Any) -> None:
-    with pytest.raises(TypeError):
-        Transform(bad)
+    assert caught.value.reason == reason
 
 
 SHEARED = np.eye(4)
@@ -379,48 +335,6 @@ def test_what_is_refused_is_a_value_error_and_one_of_ours() -> None:
 # Interpolation
 
 
-def exact_slerp(a: Quaternion, b: Quaternion, bits: Sequence[bool]) -> list[Decimal]:
-    """Slerp at a binary fraction in 50 digits: the middle of an arc is the normalised sum of its ends."""
-
-    def unit(q: Sequence[Decimal]) -> list[Decimal]:
-        norm = sum(part * part for part in q).sqrt()  # type: ignore[union-attr]
-        return [part / norm for part in q]
-
-    low, high = unit([Decimal(part) for part in a]), unit([Decimal(part) for part in b])
-    if sum(p * q for p, q in zip(low, high, strict=True)) < 0:
-        high = [-part for part in high]
-    for bit in bits:
-        middle = unit([p + q for p, q in zip(low, high, strict=True)])
-        low, high = (middle, high) if bit else (low, middle)
-    return low
-
-
-@given(
-    rotations(),
-    unit_vectors(),
-    st.one_of(
-        st.floats(-9.0, math.log10(3.0)).map(lambda exponent: 10.0**exponent),
-        st.floats(0.0, 3.0),
-        st.floats(-9.0, -1.0).map(lambda exponent: math.pi - 10.0**exponent),
-    ),
-    st.booleans(),
-    st.lists(st.booleans(), min_size=1, max_size=20),
-)
-def test_slerp_is_right_to_a_billionth_of_a_rad_at_every_angle(
-    start: Quaternion, axis: Vector, angle: float, flipped: bool, bits: list[bool]
-) -> None:
-    a = Transform(rotation=start)
-    b = a @ Transform.from_axis_angle(axis, angle)
-    if flipped:
-        b = Transform(rotation=[-part for part in b.rotation])
-    fraction = sum(bit / 2.0**place for place, bit in enumerate(bits, 1))
-    found = a.interpolate(b, fraction).rotation
-    with localcontext(prec=50):
-        expected = exact_slerp(a.rotation, b.rotation, bits)
-        chord = sum((Decimal(p) - q) ** 2 for p, q in zip(found, expected, strict=True)).sqrt()  # type: ignore[union-attr]
-    assert 2.0 * float(chord) <= 1e-12
-
-
 @given(transforms(), transforms(), st.floats(0.0, 1.0))
 def test_interpolation_moves_on_the_chord_and_turns_about_one_axis(a: Transform, b: Transform, fraction: float) -> None:
     t = a.interpolate(b, fraction)
@@ -460,13 +374,6 @@ def test_from_170_to_190_degrees_is_over_180(sign: float) -> None:
     b = Transform(rotation=[sign * part for part in rotation(math.radians(-170.0))])
     assert_same(a.interpolate(b, 0.5), Transform(rotation=(0.0, 0.0, 1.0, 0.0)))
     assert_same(a.interpolate(b, 0.25), Transform(rotation=rotation(math.radians(175.0))))
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_half_a_turn_goes_the_way_the_sign_of_the_second_says(sign: float) -> None:
-    about_x = Transform(rotation=(sign, 0.0, 0.0, 0.0))
-    middle = Transform.identity().interpolate(about_x, 0.5)
-    assert middle.rotation == pytest.approx((sign * HALF, 0.0, 0.0, HALF), abs=1e-15)
 
 
 @pytest.mark.parametrize("fraction", [-1e-12, 1.0 + 1e-12, math.nan, math.inf, -math.inf])
@@ -629,58 +536,13 @@ def test_the_parts_are_tuples_of_plain_floats() -> None:
     assert {type(part) for part in (*t.translation, *t.rotation, *t.as_wxyz(), *t.as_rpy())} == {float}
 
 
-@pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
-@given(a=transforms())
-def test_a_transform_pickles(protocol: int, a: Transform) -> None:
-    assert pickle.loads(pickle.dumps(a, protocol)) == a
-
-
-@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy])
-def test_a_transform_copies(duplicate: Any) -> None:
-    assert duplicate(Transform((1, 2, 3), QUARTER_TURN_ABOUT_Z)) == Transform((1, 2, 3), QUARTER_TURN_ABOUT_Z)
+def test_a_transform_pickles_and_copies() -> None:
+    t = Transform((1, 2, 3), QUARTER_TURN_ABOUT_Z)
+    for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
+        assert pickle.loads(pickle.dumps(t, protocol)) == t
+    assert copy.copy(t) == copy.deepcopy(t) == t
 
 
 @given(transforms())
 def test_the_repr_makes_the_same_transform(a: Transform) -> None:
     assert eval(repr(a), {"Transform": Transform}) == a
-
-
-def test_an_integer_beyond_every_float_is_not_finite() -> None:
-    with pytest.raises(InvalidTransformError, match="not finite"):
-        Transform((10**400, 0, 0))
-
-
-# Columns: many rows at once
-
-
-def columns_of(many: list[Transform]) -> Columns:
-    x, y, z, qx, qy, qz, qw = np.array([(*t.translation, *t.rotation) for t in many]).T
-    return x, y, z, qx, qy, qz, qw
-
-
-def rows_of(columns: Columns) -> list[list[float]]:
-    rows: list[list[float]] = np.array(columns).T.tolist()
-    return rows
-
-
-@given(st.lists(st.tuples(transforms(), transforms()), min_size=1, max_size=4))
-def test_columns_compose_and_invert_to_the_bit_as_their_rows_do(both: list[tuple[Transform, Transform]]) -> None:
-    a, b = columns_of([one for one, _ in both]), columns_of([other for _, other in both])
-    products = [one @ other for one, other in both]
-    assert rows_of(compose(a, b)) == rows_of(columns_of(products))
-    assert rows_of(invert(a)) == rows_of(columns_of([one.inverse() for one, _ in both]))
-
-
-@given(transforms(), st.lists(transforms(), min_size=1, max_size=4))
-def test_a_row_composes_with_columns_from_either_side(one: Transform, many: list[Transform]) -> None:
-    row: Columns = (*one.translation, *one.rotation)
-    columns = columns_of(many)
-    assert rows_of(compose(row, columns)) == rows_of(columns_of([one @ other for other in many]))
-    assert rows_of(compose(columns, row)) == rows_of(columns_of([other @ one for other in many]))
-
-
-@given(st.lists(st.tuples(rotations(), vectors()), min_size=1, max_size=4))
-def test_columns_of_vectors_are_turned_to_the_bit_as_each(both: list[tuple[Quaternion, Vector]]) -> None:
-    turns, points = np.array([turn for turn, _ in both]).T, np.array([point for _, point in both]).T
-    found = np.array(rotate((*turns,), *points)).T.tolist()
-    assert found == [list(rotate(turn, *point)) for turn, point in both]

@@ -3,111 +3,106 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import any_samples, moving, static
 
-from tfbus import TransformStamped
-from tfbus.recording._write_queue import Backlog
+from tfbus import QueueStatistics, TransformStamped
+from tfbus.recording._write_queue import WriteQueue
 
 
-def sizes(backlog: Backlog, size: int) -> list[int]:
-    return [len(batch) for _, batch in backlog.take(size)]
+def slice_sizes(queue: WriteQueue, size: int) -> list[int]:
+    return [len(batch) for _, batch in queue.get_slice(size)]
 
 
-def test_what_was_put_comes_out_in_order_with_its_time() -> None:
-    backlog = Backlog(10)
+def test_batches_come_out_in_order_with_their_times() -> None:
+    queue = WriteQueue(10)
     batches = [(moving("map", "a", 1),), (moving("map", "b", 2), static("map", "c"))]
-    assert [backlog.put(7 + at, batch) for at, batch in enumerate(batches)] == [0, 0]
-    assert len(backlog) == 3
-    assert backlog.take(10) == [(7, batches[0]), (8, batches[1])]
-    assert len(backlog) == 0
-    assert backlog.take(10) == []
+    for published, batch in enumerate(batches, 7):
+        queue.put(batch, published)
+    assert len(queue) == 3
+    assert queue.get_slice(10) == [(7, batches[0]), (8, batches[1])]
+    assert len(queue) == 0
+    assert queue.get_slice(10) == []
 
 
-def test_whole_batches_are_taken_as_far_as_they_fit_and_one_at_least() -> None:
-    backlog = Backlog(100)
+def test_a_slice_has_at_least_one_batch_and_otherwise_no_more_samples_than_its_size() -> None:
+    queue = WriteQueue(100)
     for size in (2, 3, 9, 1):
-        backlog.put(0, tuple(moving("map", "a", stamp) for stamp in range(size)))
-    assert sizes(backlog, 5) == [2, 3]
-    assert sizes(backlog, 5) == [9]
-    assert sizes(backlog, 5) == [1]
+        queue.put(tuple(moving("map", "a", stamp) for stamp in range(size)), 0)
+    assert [slice_sizes(queue, 5) for _ in range(3)] == [[2, 3], [9], [1]]
 
 
-def test_the_oldest_batches_give_way_as_a_whole() -> None:
-    backlog = Backlog(4)
-    assert backlog.put(0, (moving("map", "a", 1), moving("map", "b", 1))) == 0
-    assert backlog.put(1, (moving("map", "a", 2), moving("map", "b", 2))) == 0
-    assert backlog.put(2, (moving("map", "a", 3),)) == 2
-    assert backlog.dropped == 2
-    assert [received for received, _ in backlog.take(10)] == [1, 2]
-
-
-def test_a_batch_that_is_larger_than_the_capacity_stays_while_it_is_the_newest() -> None:
-    backlog = Backlog(1)
-    large = tuple(moving("map", "a", stamp) for stamp in range(5))
-    assert backlog.put(0, large) == 0
-    assert backlog.put(1, (moving("map", "a", 9),)) == 5
+def test_the_oldest_batches_are_dropped_whole() -> None:
+    queue = WriteQueue(4)
+    for published in range(2):
+        queue.put((moving("map", "a", published), moving("map", "b", published)), published)
+    assert queue.dropped == 0
+    queue.put((moving("map", "a", 3),), 2)
+    assert queue.dropped == 2
+    assert [published for published, _ in queue.get_slice(10)] == [1, 2]
 
 
 def test_static_samples_of_dropped_batches_come_first_with_their_own_times() -> None:
-    backlog = Backlog(1)
-    backlog.put(0, (static("map", "a"), moving("map", "b", 1)))
-    backlog.put(1, (static("map", "c"), moving("map", "b", 2)))
-    backlog.put(2, (moving("map", "b", 3),))
-    assert len(backlog) == 3
-    assert backlog.take(10) == [
+    queue = WriteQueue(1)
+    queue.put((static("map", "a"), moving("map", "b", 1)), 0)
+    queue.put((static("map", "c"), moving("map", "b", 2)), 1)
+    queue.put((moving("map", "b", 3),), 2)
+    assert len(queue) == 3
+    assert queue.get_slice(10) == [
         (0, (static("map", "a"),)),
         (1, (static("map", "c"),)),
         (2, (moving("map", "b", 3),)),
     ]
 
 
-def test_batches_of_static_samples_alone_are_bounded_too() -> None:
-    backlog = Backlog(3)
+def test_batches_of_static_samples_alone_are_bounded_and_the_replaced_ones_are_counted() -> None:
+    queue = WriteQueue(3)
     for number in range(1_000):
-        assert backlog.put(number, (static("map", f"s{number % 2}", x=float(number)),)) == 0
-    assert len(backlog) == 5
-    assert backlog.conflated == 995
-    assert [sample.transform.translation[0] for _, (sample,) in backlog.take(10)] == [995, 996, 997, 998, 999]
+        queue.put((static("map", f"s{number % 2}", x=float(number)),), number)
+    assert queue.statistics("recording") == QueueStatistics("recording", "drop_oldest", 3, 5, 0, 995)
+    assert [sample.transform.translation[0] for _, (sample,) in queue.get_slice(10)] == [995, 996, 997, 998, 999]
 
 
-def test_what_is_cleared_counts_as_dropped() -> None:
-    backlog = Backlog(1)
-    backlog.put(0, (static("map", "a"), moving("map", "b", 1)))
-    backlog.put(1, (static("map", "c"), moving("map", "b", 2)))
-    backlog.clear()
-    assert (len(backlog), backlog.dropped) == (0, 4)
-    assert backlog.put(2, (moving("map", "b", 3),)) == 0
+def test_cleared_samples_count_as_dropped() -> None:
+    queue = WriteQueue(1)
+    queue.put((static("map", "a"), moving("map", "b", 1)), 0)
+    queue.put((static("map", "c"), moving("map", "b", 2)), 1)
+    queue.clear()
+    assert (len(queue), queue.dropped, queue.get_slice(10)) == (0, 4, [])
+    queue.put((moving("map", "b", 3),), 2)
+    assert (len(queue), queue.dropped) == (1, 4)
 
 
 @pytest.mark.parametrize("capacity", [0, -1])
-def test_there_is_room_for_one_at_least(capacity: int) -> None:
+def test_a_capacity_below_one_is_refused(capacity: int) -> None:
     with pytest.raises(ValueError, match="at least 1"):
-        Backlog(capacity)
+        WriteQueue(capacity)
 
 
 steps = st.lists(st.lists(any_samples("abc", 3), min_size=1, max_size=5) | st.integers(1, 8), max_size=40)
 
 
+def count_moving(samples: list[TransformStamped]) -> int:
+    return sum(not sample.static for sample in samples)
+
+
 @given(steps, st.integers(1, 6))
-def test_the_books_balance_and_no_static_sample_is_lost(
+def test_every_sample_is_read_or_counted_and_the_newest_static_ones_are_read(
     steps: list[list[TransformStamped] | int], capacity: int
 ) -> None:
-    backlog = Backlog(capacity)
+    queue = WriteQueue(capacity)
     put: list[TransformStamped] = []
-    taken: list[tuple[int, TransformStamped]] = []
+    read: list[tuple[int, TransformStamped]] = []
     for now, step in enumerate(steps):
         if isinstance(step, int):
-            taken += [(received, sample) for received, batch in backlog.take(step) for sample in batch]
+            read += [(published, sample) for published, batch in queue.get_slice(step) for sample in batch]
         else:
-            backlog.put(now, tuple(step))
+            queue.put(tuple(step), now)
             put += step
-    # Within the bound, but for one batch that is too large by itself.
-    assert sum(not sample.static for sample in put) - backlog.dropped - sum(
-        not sample.static for _, sample in taken
-    ) <= max(capacity, 5)
-    while entries := backlog.take(3):
-        taken += [(received, sample) for received, batch in entries for sample in batch]
-    assert len(put) == len(taken) + backlog.dropped + backlog.conflated
-    assert backlog.dropped <= sum(not sample.static for sample in put)
-    received = [received for received, _ in taken]
-    assert received == sorted(received)
+    # Within the capacity, except for a single batch that is larger.
+    assert count_moving(put) - queue.dropped - count_moving([sample for _, sample in read]) <= max(capacity, 5)
+    while batches := queue.get_slice(3):
+        read += [(published, sample) for published, batch in batches for sample in batch]
+    assert len(put) == len(read) + queue.dropped + queue.conflated
+    assert queue.dropped <= count_moving(put)
+    times = [published for published, _ in read]
+    assert times == sorted(times)
     newest = {sample.child: sample for sample in put if sample.static}
-    assert {sample.child: sample for _, sample in taken if sample.static} == newest
+    assert {sample.child: sample for _, sample in read if sample.static} == newest

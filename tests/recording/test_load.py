@@ -72,6 +72,7 @@ def test_a_recording_answers_what_tf2_did_in_every_format(tmp_path: Path, kind: 
     assert problems == WRONG_IN_SMALL
 
 
+@pytest.mark.thorough
 def test_the_kth_transform_of_a_turtle_is_its_kth_pose() -> None:
     path = real("turtlesim.bag")
     tree = load(path)

@@ -171,7 +171,7 @@ def answers(tree: TransformTree, stamps: range) -> list[str]:
     return found
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=25)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.lists(any_samples("abcd", 5), min_size=1, max_size=4), max_size=12))
 def test_a_loaded_recording_gives_the_answers_that_the_buffer_gave(
     run: Run, tmp_path: Path, batches: list[list[TransformStamped]]
@@ -234,30 +234,33 @@ async def test_a_little_is_in_the_file_soon_without_being_asked_for(tmp_path: Pa
             await until(lambda: recorder.statistics().samples == 1)
 
 
-async def test_a_hundred_thousand_samples_flat_out_are_recorded_or_counted(tmp_path: Path) -> None:
+async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         bus.publish(static("map", "rig"))
-        async with Recorder(bus, path, capacity=20_000) as recorder:
-            for stamp in range(100_000):
+        async with Recorder(bus, path, capacity=4_000) as recorder:
+            for stamp in range(20_000):
                 # Nothing is awaited, so nothing can be written.
-                bus.publish((moving("map", "a", stamp),) if stamp % 10_000 else (static("map", f"s{stamp}"),))
+                bus.publish((moving("map", "a", stamp),) if stamp % 2_000 else (static("map", f"s{stamp}"),))
             statistics = recorder.statistics()
-            assert (statistics.samples, offered(statistics)) == (0, 100_001)
-            # The newest 20,000 batches, two of them static, and the nine static samples from before.
-            assert statistics.queue.pending == 20_009
+            assert (statistics.samples, offered(statistics)) == (0, 20_001)
+            # The newest 4,000 batches, two of them static, and the nine static samples from before.
+            assert statistics.queue.pending == 4_009
             assert recorder.bus is bus
         statistics = recorder.statistics()
         bus.close()
         told = [event async for event in events if isinstance(event, RecordingDropped)]
     assert statistics.queue.pending == 0
-    assert statistics.queue.dropped == 100_001 - 20_009
-    assert statistics.samples == 20_009 == sum(len(batch) for _, batch in recorded(path))
+    assert statistics.queue.dropped == 20_001 - 4_009
+    assert statistics.samples == 4_009 == sum(len(batch) for _, batch in recorded(path))
     assert told == [RecordingDropped(0, str(path), 1)]
     kept = [sample for _, batch in recorded(path) for sample in batch]
-    assert {sample.child for sample in kept if sample.static} == {"rig", *(f"s{k}0000" for k in range(1, 10)), "s0"}
+    assert {sample.child for sample in kept if sample.static} == {
+        "rig",
+        *(f"s{2_000 * number}" for number in range(10)),
+    }
     assert [sample.stamp for sample in kept if not sample.static] == [
-        stamp for stamp in range(80_000, 100_000) if stamp % 10_000
+        stamp for stamp in range(16_000, 20_000) if stamp % 2_000
     ]
 
 
@@ -278,18 +281,18 @@ async def test_each_time_that_the_disk_falls_behind_is_told_once(tmp_path: Path)
 async def test_a_disk_that_hangs_holds_up_nobody(pipe: Pipe) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         async with Recorder(bus, pipe.path, capacity=100, overwrite=True) as recorder:
-            for sample in noise(20_000):
+            for sample in noise(5_000):
                 bus.publish(sample)
                 if sample.stamp % 50 == 0:
                     await settle()
             await until(lambda: recorder.statistics().queue.dropped > 0)
-            assert offered(recorder.statistics()) == 20_000
+            assert offered(recorder.statistics()) == 5_000
             assert recorder.error is None
             pipe.drain()
         statistics = recorder.statistics()
         bus.close()
         assert RecordingDropped in [type(event) async for event in events]
-    assert offered(statistics) == 20_000
+    assert offered(statistics) == 5_000
     assert statistics.samples == pipe.messages()
 
 
@@ -299,11 +302,11 @@ async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_
     async def record(bus: Bus) -> None:
         async with Recorder(bus, pipe.path, overwrite=True) as recorder:
             recorders.append(recorder)
-            for sample in noise(20_000):
+            for sample in noise(6_000):
                 bus.publish(sample)
             await until(lambda: recorder.statistics().samples > 0)
             # Far from all, for nobody empties the pipe.
-            assert recorder.statistics().queue.pending > 10_000
+            assert recorder.statistics().queue.pending > 2_000
             tasks.cancel_scope.cancel()
             pipe.drain()
             await anyio.sleep_forever()
@@ -314,8 +317,8 @@ async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_
         # It hears of nothing any more.
         bus.publish(moving("map", "a", 1))
     (recorder,) = recorders
-    assert offered(recorder.statistics()) == recorder.statistics().samples == 20_000
-    assert pipe.messages() == 20_000
+    assert offered(recorder.statistics()) == recorder.statistics().samples == 6_000
+    assert pipe.messages() == 6_000
 
 
 async def test_what_the_body_raises_leaves_as_it_is_with_a_whole_file(tmp_path: Path) -> None:
@@ -391,6 +394,7 @@ anyio.run(main, backend=sys.argv[2])
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path: Path, backend: str) -> None:
     path = tmp_path / "run.mcap"
@@ -431,6 +435,7 @@ anyio.run(main, backend=sys.argv[2])
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 @pytest.mark.parametrize("lines", [1, 3])
 def test_after_sigkill_everything_but_the_last_moment_can_be_read(tmp_path: Path, backend: str, lines: int) -> None:
@@ -452,6 +457,7 @@ def test_after_sigkill_everything_but_the_last_moment_can_be_read(tmp_path: Path
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, backend: str) -> None:
     path = tmp_path / "run.mcap"

@@ -156,7 +156,9 @@ def test_what_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
     assert raised.value.reason == "unreadable"
 
 
-@pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
+@pytest.mark.parametrize(
+    "package", ["mcap", *(pytest.param(name, marks=pytest.mark.thorough) for name in ("rosbags", "zstandard"))]
+)
 def test_without_its_extra_a_recording_says_which_it_is(package: str) -> None:
     program = (
         f"import sys; sys.modules[{package!r}] = None\n"

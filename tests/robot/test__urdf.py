@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tfbus import InvalidRobotError, Joint, Mimic, Transform
-from tfbus.robot._urdf import DEPTH, read_urdf
+from tfbus.robot._urdf import MAX_DEPTH, read_urdf
 
 LINKS = '<link name="a"/><link name="b"/>'
 
@@ -254,13 +254,13 @@ def test_a_document_that_may_define_entities_is_not_read(text: str) -> None:
 
 
 def test_ten_megabytes_of_nesting_end_at_the_hundredth_element() -> None:
-    assert problem("<robot>" * 1_500_000) == f"its elements are nested more than {DEPTH} deep"
+    assert problem("<robot>" * 1_500_000) == f"its elements are nested more than {MAX_DEPTH} deep"
 
 
 def test_elements_may_be_nested_as_deep_as_the_limit() -> None:
-    deep = DEPTH - 1
+    deep = MAX_DEPTH - 1
     assert read_urdf(robot('<link name="a"/>', "<x>" * deep, "</x>" * deep)).links == ("a",)
-    assert "nested" in problem(robot("<x>" * DEPTH, "</x>" * DEPTH))
+    assert "nested" in problem(robot("<x>" * MAX_DEPTH, "</x>" * MAX_DEPTH))
 
 
 def test_a_name_of_several_lines_makes_an_error_of_one() -> None:
@@ -285,6 +285,7 @@ def test_without_its_extra_reading_names_it() -> None:
     assert done.stdout == 'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"\n'
 
 
+@pytest.mark.thorough
 def test_what_it_reads_does_not_hang_on_pythons_asserts() -> None:
     """The parser checks with ``assert``, which ``python -O`` leaves out."""
     script = (

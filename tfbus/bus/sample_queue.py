@@ -9,6 +9,9 @@ from tfbus.statistics import QueueStatistics
 
 Overflow = Literal["conflate", "drop_oldest"]
 
+TimedBatch = tuple[int, Batch]
+"""The instant at which a batch was published, in ns, and the batch."""
+
 
 def check_capacity(capacity: object, name: str = "capacity") -> None:
     """Raise `TypeError` or `ValueError` unless something can hold that many; `name` is for the error."""
@@ -48,22 +51,34 @@ class SampleQueue:
         self.overflow: Overflow = overflow
         self.dropped = 0
         self.conflated = 0
+        # With "conflate", the newest sample of each child; with "drop_oldest", batches and the static samples of those
+        # that were dropped.
         self._newest: dict[str, TransformStamped] = {}
-        self._batches: deque[Batch] = deque()
+        self._batches: deque[TimedBatch] = deque()
+        self._kept: dict[str, tuple[int, TransformStamped]] = {}
+        self._size = 0
         self._moving = 0
 
     def __len__(self) -> int:
-        return len(self._newest) + sum(map(len, self._batches))
+        return len(self._newest) + len(self._kept) + self._size
 
-    def put(self, batch: Batch) -> None:
-        """Add a batch, dropping what does not fit."""
+    def put(self, batch: Batch, published: int = 0) -> None:
+        """Add a batch, dropping what does not fit.
+
+        Parameters
+        ----------
+        batch : tuple of TransformStamped
+        published : int
+            The instant of its publication in ns; only subclasses read it.
+        """
         if self.overflow == "conflate":
             for sample in batch:
                 self._conflate(sample)
             if self._moving > self.capacity:
                 self._drop_children()
         else:
-            self._batches.append(batch)
+            self._batches.append((published, batch))
+            self._size += len(batch)
             self._moving += sum(not sample.static for sample in batch)
             while max(self._moving, len(self._batches)) > self.capacity and len(self._batches) > 1:
                 self._drop_batch()
@@ -73,20 +88,24 @@ class SampleQueue:
         if self._newest:
             batch = tuple(self._newest.values())
             self._newest.clear()
+            self._moving -= sum(not sample.static for sample in batch)
+        elif self._kept:
+            batch = tuple(sample for _, sample in self._kept.values())
+            self._kept.clear()
         elif self._batches:
-            batch = self._batches.popleft()
+            _, batch = self._pop_batch()
         else:
             return None
-        self._moving -= sum(not sample.static for sample in batch)
         return batch
 
     def forget(self, child: str) -> None:
         """Take out every sample of a frame that has been removed; moving ones count as dropped."""
+        self._kept.pop(child, None)
         pending = self._newest.pop(child, None)
         if pending is not None and not pending.static:
             self._moving -= 1
             self.dropped += 1
-        if any(sample.child == child for batch in self._batches for sample in batch):
+        if any(sample.child == child for _, batch in self._batches for sample in batch):
             before = self._moving
             self._keep_only(lambda sample: sample.child != child)
             self.dropped += before - self._moving
@@ -121,20 +140,28 @@ class SampleQueue:
             self.dropped += 1
 
     def _drop_batch(self) -> None:
-        batch = self._batches.popleft()
-        lost = 0
+        before = self._moving
+        published, batch = self._pop_batch()
+        self.dropped += before - self._moving
         for sample in batch:
             if sample.static:
-                self._newest.pop(sample.child, None)
-                self._newest[sample.child] = sample
-            else:
-                lost += 1
-        self._moving -= lost
-        self.dropped += lost
+                self._keep_static(published, sample)
+
+    def _pop_batch(self) -> TimedBatch:
+        published, batch = self._batches.popleft()
+        self._size -= len(batch)
+        self._moving -= sum(not sample.static for sample in batch)
+        return published, batch
+
+    def _keep_static(self, published: int, sample: TransformStamped) -> None:
+        # Behind the others, so that the order is that of publication.
+        self._kept.pop(sample.child, None)
+        self._kept[sample.child] = published, sample
 
     def _keep_only(self, wanted: Callable[[TransformStamped], bool]) -> None:
         self._newest = {child: sample for child, sample in self._newest.items() if wanted(sample)}
-        kept = (tuple(filter(wanted, batch)) for batch in self._batches)
-        self._batches = deque(batch for batch in kept if batch)
+        filtered = ((published, tuple(filter(wanted, batch))) for published, batch in self._batches)
+        self._batches = deque((published, batch) for published, batch in filtered if batch)
+        self._size = sum(len(batch) for _, batch in self._batches)
         self._moving = sum(not sample.static for sample in self._newest.values())
-        self._moving += sum(not sample.static for batch in self._batches for sample in batch)
+        self._moving += sum(not sample.static for _, batch in self._batches for sample in batch)

@@ -1,4 +1,4 @@
-"""Arrays that stamped data hold, checked."""
+"""Checks and pickling of the arrays in stamped data."""
 
 from collections.abc import Callable
 from dataclasses import fields
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 
 def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
-    """An array of floats: floats of any size stay as they are, uncopied; integers become float64.
+    """An array of floats: an array of floats is not copied, integers become float64.
 
     Raises
     ------
@@ -26,12 +26,12 @@ def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
 
 
 def as_points(value: npt.ArrayLike) -> npt.NDArray[Any]:
-    """Points as an array of shape (n, 3), as `as_floats`.
+    """Points as an array of shape (n, 3) of floats, converted by `as_floats`.
 
     Raises
     ------
     ValueError
-        If it has another shape. The message has it.
+        If the shape is another. The message has the shape.
     TypeError
         If they are not numbers.
     """
@@ -41,8 +41,8 @@ def as_points(value: npt.ArrayLike) -> npt.NDArray[Any]:
     return array
 
 
-class Rebuilt:
-    """A dataclass that is copied and unpickled by building it again, for a pickled array comes back writable."""
+class CopiedByFields:
+    """A base of dataclasses: copies and unpickled objects are built from the fields, so that arrays are read-only."""
 
     __slots__ = ()
 

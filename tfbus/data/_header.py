@@ -1,31 +1,20 @@
-"""What all stamped data have in common: a frame, a stamp, and the checks of both."""
+"""Checks of the frame, the stamp and the values of stamped data."""
 
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from tfbus.data.dispatch import Stamped
 from tfbus.frames import check_frame
 from tfbus.geometry.rows import Vector
 from tfbus.geometry.transform import Transform
-from tfbus.stamps import LATEST, Latest, as_stamp
-
-
-class Stamped(Protocol):
-    """Anything with a frame and a stamp."""
-
-    @property
-    def frame(self) -> str:
-        """The frame that the data are in."""
-
-    @property
-    def stamp(self) -> int | Latest:
-        """ns, or `LATEST`."""
+from tfbus.stamps import LATEST, as_stamp
 
 
 def check_header(data: Stamped) -> None:
-    """Check frame and stamp of a frozen dataclass that is being built; its stamp becomes a plain ``int``.
+    """Check the frame and the stamp of a frozen dataclass under construction; the stamp becomes a plain ``int``.
 
     Raises
     ------

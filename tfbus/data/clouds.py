@@ -1,4 +1,4 @@
-"""Many points at once."""
+"""`PointCloud`, many points at once."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data._arrays import Rebuilt, as_points
+from tfbus.data._arrays import CopiedByFields, as_points
 from tfbus.data._header import check_header
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.geometry.read_only import read_only
@@ -17,10 +17,10 @@ from tfbus.stamps import Latest, as_stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PointCloud(Rebuilt):
-    """Points that a sensor saw, each perhaps at an instant of its own. Equal only to itself.
+class PointCloud(CopiedByFields):
+    """Points of a sensor, optionally with an instant of each. Equal only to itself.
 
-    The arrays are held as read-only views and not copied: whoever owns them must not change them any more.
+    The arrays are held as read-only views and not copied: their owner must not change them any more.
 
     Parameters
     ----------
@@ -32,12 +32,12 @@ class PointCloud(Rebuilt):
     stamps : integer array of shape (n,), optional
         The instant of each point, in ns, as int64.
     fields : mapping of str to array of shape (n, ...), optional
-        What else is known of each point, such as its intensity; carried along unchanged.
+        Further values of each point, such as its intensity; a transform does not change them.
 
     Raises
     ------
     ValueError
-        If a shape is wrong. The message has it.
+        If a shape is wrong. The message has the shape.
     TypeError
         If points are not numbers, or stamps not integers: convert seconds with `from_seconds`.
 

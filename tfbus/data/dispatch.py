@@ -1,10 +1,22 @@
-"""`do_transform`, which moves data of any registered type into another frame."""
+"""`do_transform`, which transforms data of any registered type into another frame."""
 
 from functools import singledispatch
-from typing import Any
+from typing import Any, Protocol
 
-from tfbus.data._header import Stamped
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.stamps import Latest
+
+
+class Stamped(Protocol):
+    """Any object with a frame and a stamp."""
+
+    @property
+    def frame(self) -> str:
+        """The frame of the data."""
+
+    @property
+    def stamp(self) -> int | Latest:
+        """ns, or `LATEST`."""
 
 
 def check_registered(data: object) -> None:
@@ -17,37 +29,37 @@ def check_registered(data: object) -> None:
 
 @singledispatch
 def do_transform(data: Any, transform: TransformStamped) -> Any:  # noqa: ARG001 - the registered functions use it
-    """`data` in the target frame of `transform`, with its stamp.
+    """Transform `data` into the target frame of `transform`; the result has the stamp of `transform`.
 
     Parameters
     ----------
     data : any type of `tfbus.data` but LaserScan, or a registered type
-        A subclass that is not registered itself comes back as its base class.
+        A subclass that is not registered itself is transformed as its base class.
     transform : TransformStamped
         From the frame of `data` into the target.
 
     Returns
     -------
     same type as `data`
-        New data; the given ones are not changed.
+        New data; `data` are not changed.
 
     Raises
     ------
     TypeError
         If the type is not registered. The message says how to register it.
     ValueError
-        If the data are not in the frame that the transform is from.
+        If the frame of the data is not the source frame of the transform.
     """
     check_registered(data)
 
 
 def moved_header(data: Stamped, transform: TransformStamped) -> tuple[str, int]:
-    """Frame and stamp that `data` have once `transform` has moved them.
+    """The frame and the stamp of `data` after the transform.
 
     Raises
     ------
     ValueError
-        If the data are not in the frame that the transform is from.
+        If the frame of the data is not the source frame of the transform.
     """
     if data.frame != transform.child:
         raise ValueError(f"the data are in frame {data.frame!r}, but the transform is from {transform.child!r}")

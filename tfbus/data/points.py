@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from tfbus.data._arrays import Rebuilt, as_points
+from tfbus.data._arrays import CopiedByFields, as_points
 from tfbus.data._header import as_triple, check_header, check_pose
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.geometry.read_only import locked
@@ -25,7 +25,7 @@ class PointStamped:
     stamp : int or LATEST
         ns.
     point : sequence of 3 floats
-        (x, y, z) in m. NaN is allowed: it is what a sensor sends for "nothing there".
+        (x, y, z) in m. NaN is allowed: sensors send it for a missing point.
     """
 
     frame: str
@@ -39,7 +39,7 @@ class PointStamped:
 
 @dataclass(frozen=True, slots=True)
 class Vector3Stamped:
-    """A direction with a length, such as a velocity or a normal: a transform turns it and does not shift it.
+    """A direction with a length, such as a velocity or a normal: a transform rotates it but does not translate it.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Vector3Stamped:
     stamp : int or LATEST
         ns.
     vector : sequence of 3 floats
-        (x, y, z) in whatever unit; it stays.
+        (x, y, z) in any unit.
     """
 
     frame: str
@@ -69,7 +69,7 @@ class QuaternionStamped:
     stamp : int or LATEST
         ns.
     quaternion : sequence of 4 floats
-        Unit quaternion (x, y, z, w): turns directions of the oriented body into `frame`. A norm within 1 % of one is
+        Unit quaternion (x, y, z, w): rotates directions of the oriented body into `frame`. A norm within 1 % of one is
         normalised; the sign stays as given.
     """
 
@@ -105,7 +105,7 @@ class PoseStamped:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Polygon(Rebuilt):
+class Polygon(CopiedByFields):
     """The corners of an area, in order; the last one is joined to the first. Equal only to itself.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Scans of a planar laser, and the points that they saw."""
+"""`LaserScan`, a scan of a planar laser."""
 
 import math
 from dataclasses import dataclass, field
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data._arrays import Rebuilt, as_floats
+from tfbus.data._arrays import CopiedByFields, as_floats
 from tfbus.data._header import check_header
 from tfbus.data.clouds import PointCloud
 from tfbus.geometry.read_only import read_only
@@ -15,12 +15,12 @@ from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LaserScan(Rebuilt):
+class LaserScan(CopiedByFields):
     """One sweep of a planar laser, with the fields of sensor_msgs/LaserScan. Equal only to itself.
 
     Ray i goes in the plane z = 0 of `frame` at the angle ``angle_min + i * angle_increment``, counterclockwise from x
-    as seen from +z, at the instant ``stamp + i * time_increment``. A scan cannot be told in another frame, but
-    `to_points` can. The arrays are held as read-only views and not copied: whoever owns them must not change them.
+    as seen from +z, at the instant ``stamp + i * time_increment``. A scan cannot be transformed, but the cloud that
+    `to_points` gives can. The arrays are held as read-only views and not copied: their owner must not change them.
 
     Parameters
     ----------
@@ -28,20 +28,20 @@ class LaserScan(Rebuilt):
     stamp : int or LATEST
         ns, of the first ray.
     ranges : array of shape (n,)
-        In m. Floats keep their dtype, integers become float64. NaN, infinity, and what is outside the limits, is no
-        point.
+        In m. Floats keep their dtype, integers become float64. NaN, infinity and ranges outside the limits are no
+        points.
     angle_min, angle_increment : float
         In rad; the increment is negative for a laser that sweeps clockwise.
     angle_max : float, optional
-        In rad, of the last ray. It is not used: drivers round it differently. None computes it.
+        In rad, of the last ray; by default computed. It is not used, because drivers round it differently.
     time_increment : float
         From ray to ray, in s.
     scan_time : float
         From scan to scan, in s. It is not used.
     range_min, range_max : float
-        The limits of a range that counts, in m, themselves included.
+        The limits of a valid range in m, inclusive.
     intensities : array of shape (n,), optional
-        In the units of the device. An empty one is none, as in the message.
+        In the units of the device. An empty array becomes None, as in the message.
 
     Raises
     ------
@@ -49,7 +49,7 @@ class LaserScan(Rebuilt):
         If lengths differ, an angle or the time increment is not finite, all rays have the same angle, the limits are
         the wrong way round, or the last ray is beyond stamps of 64 bits.
     TypeError
-        If something is not a number.
+        If a value is not a number.
     """
 
     frame: str
@@ -96,17 +96,17 @@ class LaserScan(Rebuilt):
             as_stamp(self.stamp + sweep)
 
     def to_points(self) -> PointCloud:
-        """What the rays hit, as a new cloud in the same frame, with the same stamp.
+        """Convert to a cloud of the points that the rays hit, with the same frame and stamp.
 
         Returns
         -------
         PointCloud
-            Points of shape (m, 3), in the dtype of the ranges, of the m rays whose range counts. `stamps` are those of
-            the rays; None where the scan's is `LATEST`. The field "index" has the index of each ray in the scan, and
-            "intensities" what the scan has of them; both are named as in laser_geometry.
+            Points of shape (m, 3), in the dtype of the ranges, of the m rays with a valid range. `stamps` are those of
+            the rays; None if the stamp of the scan is `LATEST`. The field "index" has the index of each ray in the
+            scan, and "intensities" those of the scan, if any; both are named as in laser_geometry.
         """
         ranges = self.ranges
-        # Rounded as the ranges were, so that one at a limit counts; a limit beyond all floats of that size is infinite.
+        # Rounded as the ranges are, so that a range at a limit is valid; too large a limit becomes infinite.
         with np.errstate(over="ignore"):
             low, high = np.array((self.range_min, self.range_max)).astype(ranges.dtype)
         index = np.flatnonzero(np.isfinite(ranges) & (ranges >= low) & (ranges <= high))

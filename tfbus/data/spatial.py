@@ -1,4 +1,4 @@
-"""Six numbers at once, three of translation and three of rotation: uncertain poses, velocities, and forces."""
+"""Data with a linear and an angular part: poses with covariance, twists and wrenches."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data._arrays import Rebuilt, as_floats
+from tfbus.data._arrays import CopiedByFields, as_floats
 from tfbus.data._header import as_triple, check_header, check_pose
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.geometry.read_only import locked
@@ -17,8 +17,8 @@ from tfbus.stamps import Latest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseWithCovarianceStamped(Rebuilt):
-    """A pose and how uncertain it is. Equal only to itself.
+class PoseWithCovarianceStamped(CopiedByFields):
+    """A pose and its covariance. Equal only to itself.
 
     Parameters
     ----------
@@ -34,9 +34,9 @@ class PoseWithCovarianceStamped(Rebuilt):
 
     Notes
     -----
-    A transform turns both sides, S -> diag(R, R) S diag(R, R)^T, as tf2_geometry_msgs does: the error is one of the
-    pose's own origin, so that no lever arm couples its halves, and the transform counts as certain. NaN stays in its
-    own 3x3 block. A -1 for "unknown" is turned like any number: look at it before.
+    A transform rotates both sides, S -> diag(R, R) S diag(R, R)^T, as tf2_geometry_msgs does: the error is that of the
+    pose's own origin, so no lever arm couples its halves, and the transform has no error of its own. NaN stays in its
+    3x3 block. A -1 for "unknown" is rotated like any number: check for it before.
     """
 
     frame: str
@@ -55,7 +55,7 @@ class PoseWithCovarianceStamped(Rebuilt):
 
 @dataclass(frozen=True, slots=True)
 class TwistStamped:
-    """How a body moves, told at the origin of a frame that is fixed to it.
+    """The velocity of a body at the origin of a frame that is fixed to it.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ class TwistStamped:
 
     Notes
     -----
-    A transform tells the same motion at the origin of another frame, and assumes that this one is fixed to the same
-    body: with R and t of target_from_source, angular' = R angular and linear' = R linear + t x angular'. This is the
+    A transform gives the same motion at the origin of another frame, which it assumes to be fixed to the same body:
+    with R and t of target_from_source, angular' = R angular and linear' = R linear + t x angular'. This is the
     adjoint map of Lynch and Park, "Modern Robotics", 2017, section 3.3.2, who write the angular part first.
 
     Of the answers of `TransformTree.twist`, only one with ``expressed_in=frame`` is such a twist. Any other, as by
@@ -91,7 +91,7 @@ class TwistStamped:
 
 @dataclass(frozen=True, slots=True)
 class WrenchStamped:
-    """A force and a torque on a body, told at the origin of a frame.
+    """A force on a body, and its torque about the origin of a frame.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class WrenchStamped:
 
     Notes
     -----
-    A transform tells the same load at the origin of another frame: with R and t of target_from_source,
+    A transform gives the same load at the origin of another frame: with R and t of target_from_source,
     force' = R force and torque' = R torque + t x force'. This is the adjoint map of Lynch and Park, "Modern Robotics",
     2017, section 3.4, who write the torque first; tf2 does the same in C++, and leaves out the lever arm in Python.
     """
@@ -145,7 +145,7 @@ def _(data: WrenchStamped, transform: TransformStamped) -> WrenchStamped:
 
 
 def _shifted(moment: Vector, line: Vector, target_from_source: Transform) -> tuple[Vector, Vector]:
-    """A moment about the origin and the vector it belongs to, turned, and taken about the target's origin."""
+    """Rotate a line vector and its moment into the target, and take the moment about the target's origin."""
     turn = target_from_source.rotation
     tx, ty, tz = target_from_source.translation
     x, y, z = rotate(turn, *line)

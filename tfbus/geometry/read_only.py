@@ -1,4 +1,4 @@
-"""Arrays that are not to be written to."""
+"""Arrays that cannot be written to."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """A read-only view of an array whose owner keeps it, or the array itself if nobody can write to it as it is."""
+    """A read-only view of an array that its owner may still write to; a read-only array is returned as it is."""
     if not array.flags.writeable:
         return array
     view = array.view()
@@ -16,9 +16,8 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def locked(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """An array of numbers that nobody else has, for good: it and what is cut out of it cannot be made writable again.
+    """An array of numbers that nobody can make writable again, nor any view of it; the caller gives up the original.
 
-    To lock the array itself is not enough: whoever owns the memory may unlock it, or still write to it where the array
-    is a view.
+    Clearing the array's own ``writeable`` flag is not enough: the owner of the memory can set it again.
     """
     return np.asarray(array.data.toreadonly())

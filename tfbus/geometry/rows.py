@@ -15,28 +15,18 @@ import numpy.typing as npt
 from tfbus.errors import InvalidTransformError
 
 Vector: TypeAlias = tuple[float, float, float]
-
-
 Quaternion: TypeAlias = tuple[float, float, float, float]
-
-
 Numbers: TypeAlias = Sequence[float] | npt.NDArray[Any]
-
-
 Row: TypeAlias = tuple[float, float, float, float, float, float, float]
 
-
 NORM_TOLERANCE = 0.01
-
-
+"""How far the norm of a quaternion may be from one to be accepted, and normalised."""
 ROUNDING = 1e-15
-
-
+"""How far the squared norm of a quaternion may be from one to be left as it is."""
 IDENTITY: Row = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
-
 Columns: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]
-"""Rows side by side: each number an array, or a float where all rows have the same."""
+"""Many rows as seven columns: each an array, or a float if all rows have the same number there."""
 
 
 @overload
@@ -163,7 +153,7 @@ def as_rotation(value: object, name: str) -> Quaternion:
 
 
 def as_floats(value: object, length: int, name: str) -> tuple[float, ...]:
-    """So many finite numbers as a tuple of floats; the errors are those of `as_vector`."""
+    """`length` finite numbers as a tuple of floats; raises the errors of `as_vector`."""
     if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
         raise TypeError(f"{name} must be {length} numbers, not {value!r}")
     if len(value) != length or (isinstance(value, np.ndarray) and value.ndim != 1):

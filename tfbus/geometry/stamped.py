@@ -1,4 +1,4 @@
-"""One sample: where a frame was, seen from its parent, at an instant."""
+"""`TransformStamped`, a transform between two frames at an instant, and batches of such samples."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -13,7 +13,7 @@ Fields = tuple[str, str, int, Row, str, bool]
 
 
 class TransformStamped:
-    """A transform with its two frames and its stamp: what is published, and what a lookup answers. Immutable.
+    """A transform with its two frames and its stamp: a published sample, or the answer of a lookup. Immutable.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ class TransformStamped:
         Nanoseconds.
     transform : Transform
     authority : str
-        Who says so; shown in errors and tools.
+        The sender; shown in errors and tools.
     static : bool
         Whether it holds at every stamp. An answer is static when its whole path is.
 
@@ -92,7 +92,7 @@ class TransformStamped:
 
     @property
     def authority(self) -> str:
-        """Who said so; empty in an answer."""
+        """The sender; empty in an answer."""
         return self._fields[4]
 
     @property
@@ -102,16 +102,16 @@ class TransformStamped:
 
     @property
     def extrapolated_by(self) -> int:
-        """How far an answer is from a sample that stood in for its stamp, in ns; never more than the policy allows."""
+        """The time in ns from an extrapolated answer to the sample it was taken from; within the policy's limit."""
         return 0
 
     @property
     def gap(self) -> int | None:
-        """How far two samples are apart that an answer was interpolated between, in ns; None without a policy."""
+        """The time in ns between the samples that an answer was interpolated from; None without a policy."""
         return None
 
     def replace(self, **changes: Any) -> "TransformStamped":
-        """A copy with some fields changed, checked again."""
+        """A copy with some fields changed; all fields are checked again."""
         parent, child, stamp, row, authority, static = self._fields
         fields = {
             "parent": parent,
@@ -140,20 +140,20 @@ class TransformStamped:
 
 
 class QualifiedTransform(TransformStamped):
-    """The answer of a lookup that was given a policy: it says what was done."""
+    """The answer of a lookup with a policy, with the extrapolation and the gap that it used."""
 
-    __slots__ = ("_done",)
-    _done: tuple[int, int]
+    __slots__ = ("_policy_use",)
+    _policy_use: tuple[int, int]
 
     @property
     def extrapolated_by(self) -> int:
-        """How far the stamp is from the sample that stood in for it, in ns, on the edge where that is furthest."""
-        return self._done[0]
+        """The time in ns from the stamp to the sample that was used in its place, on the edge where it is longest."""
+        return self._policy_use[0]
 
     @property
     def gap(self) -> int:
-        """How far two samples are apart that were interpolated between, in ns, on the edge where that is furthest."""
-        return self._done[1]
+        """The time in ns between two samples that were interpolated, on the edge where it is longest."""
+        return self._policy_use[1]
 
     def __str__(self) -> str:
         held = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
@@ -161,7 +161,7 @@ class QualifiedTransform(TransformStamped):
 
 
 def answer_of(target: str, source: str, stamp: int, row: Row, static: bool) -> TransformStamped:
-    """A lookup's answer, of parts that are known to be good; nothing is checked."""
+    """The answer of a lookup, made of valid parts; nothing is checked."""
     sample = TransformStamped.__new__(TransformStamped)
     sample._fields = target, source, stamp, row, "", static
     return sample
@@ -170,24 +170,24 @@ def answer_of(target: str, source: str, stamp: int, row: Row, static: bool) -> T
 def qualified_answer(
     target: str, source: str, stamp: int, row: Row, static: bool, extrapolated_by: int, gap: int
 ) -> QualifiedTransform:
-    """As `answer_of`, with what a policy did."""
+    """As `answer_of`, with the extrapolation and the gap that a policy allowed."""
     sample = QualifiedTransform.__new__(QualifiedTransform)
     sample._fields = target, source, stamp, row, "", static
-    sample._done = extrapolated_by, gap
+    sample._policy_use = extrapolated_by, gap
     return sample
 
 
 def renamed(answer: TransformStamped, target: str, source: str) -> TransformStamped:
-    """An answer under other names of its two frames."""
-    twin = type(answer).__new__(type(answer))
-    twin._fields = target, source, *answer._fields[2:]
-    if isinstance(answer, QualifiedTransform) and isinstance(twin, QualifiedTransform):
-        twin._done = answer._done
-    return twin
+    """An answer with other names for its two frames."""
+    copy = type(answer).__new__(type(answer))
+    copy._fields = target, source, *answer._fields[2:]
+    if isinstance(answer, QualifiedTransform) and isinstance(copy, QualifiedTransform):
+        copy._policy_use = answer._policy_use
+    return copy
 
 
 Batch = tuple[TransformStamped, ...]
-"""Samples that belong together: they are seen all or not at all."""
+"""Samples that were published together: a subscriber sees all of them or none."""
 
 
 def as_batch(samples: TransformStamped | Iterable[TransformStamped]) -> Batch:
@@ -196,7 +196,7 @@ def as_batch(samples: TransformStamped | Iterable[TransformStamped]) -> Batch:
     Raises
     ------
     TypeError
-        If something in it is not a `TransformStamped`. The message names it.
+        If an element is not a `TransformStamped`. The message shows it.
     """
     if isinstance(samples, TransformStamped):
         return (samples,)

@@ -1,10 +1,10 @@
-"""Rigid transforms.
+"""`Transform`, a rigid transform.
 
 A `Transform` maps points of one frame into another: ``p_target = target_from_source.apply(p_source)``, and equal
 neighbours cancel in ``map_from_base @ base_from_lidar``. Quaternions are ``(x, y, z, w)``; transforms3d, which does the
 conversions, has ``w`` first, so every crossing says ``wxyz``.
 
-Inside, a transform is one tuple of seven floats, a row; `tfbus.geometry.rows` has the arithmetic.
+A transform holds one tuple of seven floats, a row; `tfbus.geometry.rows` has the arithmetic.
 """
 
 import math
@@ -47,7 +47,7 @@ class Transform:
     Raises
     ------
     InvalidTransformError
-        If a number is not finite, a length is wrong, or the norm is further off.
+        If a number is not finite, a length is wrong, or the norm is off by more than 1 %.
 
     Examples
     --------
@@ -81,8 +81,8 @@ class Transform:
     def from_matrix(cls, matrix: npt.ArrayLike) -> "Transform":
         """From a homogeneous matrix of shape (4, 4).
 
-        The rotation part is projected on the nearest rotation (Bar-Itzhack 2000, as done by transforms3d) when it is
-        within 1 % of one.
+        A rotation part within 1 % of a rotation is projected on the nearest one (Bar-Itzhack 2000, as done by
+        transforms3d).
 
         Raises
         ------
@@ -138,9 +138,9 @@ class Transform:
     def as_rpy(self) -> Vector:
         """Roll, pitch, yaw in rad about the fixed axes x, y, z; at a pitch of 90 degrees yaw is 0.
 
-        Sum and difference of roll and yaw are read straight from the quaternion (Bernardes and Viollet, "Quaternion to
-        Euler angles conversion", PLoS ONE 17(11), 2022): on the way over a matrix, which transforms3d takes, rounding
-        costs up to half a rad within 1e-8 rad of that pitch.
+        Sum and difference of roll and yaw are computed from the quaternion (Bernardes and Viollet, "Quaternion to
+        Euler angles conversion", PLoS ONE 17(11), 2022): computed from a matrix, as in transforms3d, they are
+        wrong by up to half a rad within 1e-8 rad of that pitch.
         """
         x, y, z, w = self.rotation
         low, high = math.hypot(x + z, w - y), math.hypot(x - z, w + y)
@@ -156,7 +156,7 @@ class Transform:
     def as_axis_angle(self) -> tuple[Vector, float]:
         """Unit axis and angle in rad, from 0 to pi; the axis of no rotation is (1, 0, 0).
 
-        The angle is taken from ``atan2``: ``acos``, which transforms3d uses, loses half the digits near the identity.
+        The angle comes from ``atan2``: ``acos``, which transforms3d uses, loses half the digits near the identity.
         """
         x, y, z, w = self.rotation
         sine = math.hypot(x, y, z)
@@ -186,12 +186,12 @@ class Transform:
     @overload
     def apply(self, points: Sequence[float]) -> Vector: ...
     def apply(self, points: Sequence[float] | npt.NDArray[Any]) -> Vector | npt.NDArray[Any]:
-        """Points of the source frame, in the target frame.
+        """Map points of the source frame into the target frame.
 
         Parameters
         ----------
         points : sequence of 3 floats, or array of shape (..., 3)
-            In m. Arrays of float32 stay float32; integers become float64. What is not finite stays so, or NaN.
+            In m. Arrays of float32 stay float32; integers become float64. Numbers that are not finite stay so.
 
         Returns
         -------
@@ -236,7 +236,7 @@ class Transform:
     def is_close(
         self, other: "Transform", *, translation_tolerance: float = 1e-9, rotation_tolerance: float = 1e-9
     ) -> bool:
-        """Whether the two move any point to nearly the same place: rotations are compared up to sign.
+        """Whether the transforms are equal within tolerances; quaternions are compared up to their sign.
 
         Parameters
         ----------
@@ -260,7 +260,7 @@ class Transform:
 
 
 def from_row(row: Row) -> Transform:
-    """The transform of a row that is known to be good; nothing is checked."""
+    """The transform of a valid row; nothing is checked."""
     transform = Transform.__new__(Transform)
     transform._row = row
     return transform

@@ -1,7 +1,7 @@
-"""Many transforms at once.
+"""`TransformArray`, many transforms at once.
 
-Inside are seven columns, ``tx, ty, tz, qx, qy, qz, qw``, each an array over the transforms. The kernels of
-`tfbus.geometry` take columns as they take the seven floats of a row, so there is one source of each formula.
+It holds seven columns, ``tx, ty, tz, qx, qy, qz, qw``, each an array over the transforms. The functions of
+`tfbus.geometry.rows` take columns as well as the seven floats of a row, so each formula is written once.
 """
 
 from collections.abc import Iterator
@@ -46,9 +46,9 @@ class TransformArray:
     """
 
     __array_ufunc__ = None
-    __slots__ = ("_columns", "_done")
+    __slots__ = ("_columns", "_policy_use")
     _columns: Floats
-    _done: Integers | None
+    _policy_use: Integers | None
 
     def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike) -> None:
         moves = np.asarray(translations, np.float64)
@@ -71,7 +71,7 @@ class TransformArray:
             )
         norms[np.abs(squares - 1.0) <= ROUNDING] = 1.0
         self._columns = locked(np.vstack((moves.T, turns.T / norms)))
-        self._done = None
+        self._policy_use = None
 
     @property
     def translations(self) -> Floats:
@@ -85,21 +85,21 @@ class TransformArray:
 
     @property
     def valid(self) -> npt.NDArray[np.bool_]:
-        """Whether each is a transform, not NaN: a new array of shape (n,)."""
+        """Whether each is a transform and not NaN: a new array of shape (n,)."""
         return np.asarray(np.isfinite(self._columns).all(axis=0))
 
     @property
     def extrapolated_by(self) -> Integers:
-        """As `TransformStamped.extrapolated_by`, of each: a read-only array of shape (n,) in ns."""
-        return locked(np.zeros(len(self), np.int64)) if self._done is None else self._done[0]
+        """`TransformStamped.extrapolated_by` of each transform: a read-only array of shape (n,) in ns."""
+        return locked(np.zeros(len(self), np.int64)) if self._policy_use is None else self._policy_use[0]
 
     @property
     def gap(self) -> Integers | None:
-        """As `TransformStamped.gap`, of each: a read-only array of shape (n,) in ns; None without a policy.
+        """`TransformStamped.gap` of each transform: a read-only array of shape (n,) in ns; None without a policy.
 
-        A gap of more than 2^63 - 1 ns is told as that.
+        A gap of more than 2^63 - 1 ns is given as 2^63 - 1.
         """
-        return None if self._done is None else self._done[1]
+        return None if self._policy_use is None else self._policy_use[1]
 
     def matrices(self) -> Floats:
         """New homogeneous matrices of shape (n, 4, 4)."""
@@ -138,11 +138,11 @@ class TransformArray:
         return moved
 
     def inverse(self) -> "TransformArray":
-        """The transforms that undo these; what a policy did is not carried over."""
+        """The inverse of each transform, without `extrapolated_by` and `gap`."""
         return from_columns(np.stack(invert((*self._columns,))))
 
     def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
-        """Each composed with one of `other`, or all with the same; what a policy did is not carried over."""
+        """Compose with `other` one by one, or all with the same transform, without `extrapolated_by` and `gap`."""
         columns = _columns_of(other, len(self))
         return NotImplemented if columns is None else from_columns(np.stack(compose((*self._columns,), columns)))
 
@@ -158,14 +158,14 @@ class TransformArray:
     @overload
     def __getitem__(self, index: slice | list[int] | list[bool] | npt.NDArray[Any]) -> "TransformArray": ...
     def __getitem__(self, index: Any) -> "Transform | TransformArray":
-        """One transform, or those of a slice, or of a mask or indices in a list or an array.
+        """One transform, or those selected by a slice, a mask or indices in a list or an array.
 
         Raises
         ------
         IndexError
-            If there is none at the index, or it is anything else, such as a tuple.
+            If the index is out of range, or of another kind, such as a tuple.
         InvalidTransformError
-            If the one that is asked for is NaN.
+            If the selected transform is NaN.
         """
         try:
             columns = None if isinstance(index, tuple) else self._columns[:, index]
@@ -177,7 +177,7 @@ class TransformArray:
                 "list or an array"
             )
         if columns.ndim == 2:
-            return from_columns(columns, None if self._done is None else self._done[:, index])
+            return from_columns(columns, None if self._policy_use is None else self._policy_use[:, index])
         x, y, z, qx, qy, qz, qw = columns.tolist()
         if x != x:
             raise InvalidTransformError(f"transform {index} is NaN: it has no value", reason="not finite")
@@ -190,27 +190,32 @@ class TransformArray:
         return f"<TransformArray of {len(self)}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return from_columns, (self._columns, self._done)
+        return from_columns, (self._columns, self._policy_use)
 
 
 def from_rows(rows: list[Row]) -> TransformArray:
-    """The transforms of rows that are known to be good."""
+    """The transforms of valid rows."""
     return from_columns(np.array(rows).T if rows else np.empty((7, 0)))
 
 
-def from_columns(columns: Floats, done: Integers | None = None) -> TransformArray:
-    """The transforms of an array of shape (7, n) that is known to be good, with what a policy did, of shape (2, n).
+def from_columns(columns: Floats, policy_use: Integers | None = None) -> TransformArray:
+    """The transforms of valid columns, without a copy.
 
-    The arrays belong to the transforms from now on.
+    Parameters
+    ----------
+    columns : array of shape (7, n)
+        Must not be changed from now on.
+    policy_use : integer array of shape (2, n), optional
+        `extrapolated_by` and `gap` of each transform, in ns; must not be changed either.
     """
     transforms = TransformArray.__new__(TransformArray)
     transforms._columns = locked(columns)
-    transforms._done = None if done is None else locked(done)
+    transforms._policy_use = None if policy_use is None else locked(policy_use)
     return transforms
 
 
 def move(columns: Columns, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
-    """Points, given and returned by coordinate, each moved by its own transform."""
+    """Map points by coordinate, each with its own transform."""
     x, y, z = rotate(columns[3:], x, y, z)
     return columns[0] + x, columns[1] + y, columns[2] + z
 

@@ -1,4 +1,9 @@
-"""Recordings: written by a `Recorder`, read offline, and played into a bus."""
+"""Recordings of transforms in files.
+
+A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Player` publishes a recording on a bus.
+`load` reads a whole recording into a `tfbus.TransformTree`, `summarise` lists its frames and problems, and
+`open_recording` gives its messages one after the other. The file formats are in `tfbus.recording.formats`.
+"""
 
 from tfbus.errors import RecordingError
 from tfbus.recording.load import load

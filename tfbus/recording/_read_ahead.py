@@ -1,4 +1,4 @@
-"""Reading a recording while what was read before is being used."""
+"""A worker thread that reads blocks of a recording before the event loop needs them."""
 
 import math
 from collections.abc import Generator, Iterator
@@ -19,20 +19,19 @@ Block = list[RecordedMessage]
 
 
 class ReadAhead:
-    """The messages of a recording in blocks: ``async with ReadAhead(...) as blocks: async for block in blocks``.
-
-    A worker thread reads them.
+    """Reads messages in a worker thread: ``async with ReadAhead(...) as blocks: async for block in blocks``.
 
     Parameters
     ----------
     messages : iterator of RecordedMessage
-        Of a recording that is not closed before the ``async with`` has ended; a generator is closed at its end.
+        The messages of a recording, which must stay open until the ``async with`` has ended. A generator is closed at
+        that end.
     ahead : int
-        How many blocks are read before they are asked for. With 0, nothing goes on behind the back of who uses a block.
+        How many blocks the thread reads before they are requested. With 0 it only reads while the iterating task waits.
 
     Notes
     -----
-    What reading raises, such as an `OSError`, comes out of the iteration behind what could be read.
+    An error of reading, such as an `OSError`, is raised by the iteration after the last block that could be read.
     """
 
     def __init__(self, messages: Iterator[RecordedMessage], ahead: int) -> None:
@@ -43,7 +42,7 @@ class ReadAhead:
         self._receive: anyio.streams.memory.MemoryObjectReceiveStream[Block]
 
     async def __aenter__(self) -> "ReadAhead":
-        # Never more than what is wanted.
+        # The semaphore bounds it: nothing is read that is not wanted.
         send, self._receive = anyio.create_memory_object_stream[Block](math.inf)
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._read, send)
@@ -78,7 +77,7 @@ class ReadAhead:
                 block: Block = []
                 try:
                     await anyio.to_thread.run_sync(block.extend, islice(self._messages, _BLOCK), limiter=thread)
-                except Exception as error:  # noqa: BLE001 - who iterates raises it
+                except Exception as error:  # noqa: BLE001 - the iteration raises it
                     self._error = error
                 if not block:
                     return

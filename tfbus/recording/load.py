@@ -1,4 +1,4 @@
-"""A whole recording in a tree, for analysis without an event loop."""
+"""`load`, which reads a whole recording into a tree, for analysis without an event loop."""
 
 import logging
 import os
@@ -18,19 +18,20 @@ def load(
     *,
     problems: Counter[str] | None = None,
 ) -> TransformTree:
-    """A tree with all transforms of a recording, or of a part of it, however old they are.
+    """Read all transforms of a recording, or of a part of it, into a tree that keeps them all.
 
-    Transforms that are wrong, or would close a loop of parents, are left out and counted, as is what is lost of a
-    damaged file.
+    Invalid transforms, and those that would close a loop of parents, are left out and counted, as are the damaged parts
+    of a file.
 
     Parameters
     ----------
     path : str or path-like
         As `open_recording`.
     since, until : int, optional
-        The first and the last log time, in ns. What was static before `since` is in the tree as well.
+        The first and the last log time, in ns. Static transforms from before `since` are in the tree as well.
     problems : Counter, optional
-        Where to count what was left out, by reason. If there is none, it is logged as a warning.
+        Gets the number of transforms and messages that were left out, by reason. Without it, they are logged as a
+        warning.
 
     Returns
     -------
@@ -40,7 +41,7 @@ def load(
     Raises
     ------
     RecordingError
-        If it cannot be read at all.
+        If the recording cannot be read at all.
     """
     counted: Counter[str] = Counter() if problems is None else problems
     tree = TransformTree(keep=None)
@@ -53,21 +54,21 @@ def load(
 
 
 def fill(tree: TransformTree, messages: Iterable[RecordedMessage], problems: Counter[str]) -> None:
-    """Put the samples of some messages into a tree; what is wrong with them is counted by reason."""
+    """Insert the samples of some messages into a tree, and count by reason those that are left out."""
     for _, batch, errors in messages:
         if errors:
             problems.update(error.reason for error in errors)
-        tree.commit(sift(tree.forest.frames, batch, problems))
+        tree.commit(without_loops(tree.forest.frames, batch, problems))
     tree.forest.forget_changes()
 
 
-def sift(edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str]) -> Batch:
-    """The batch without the samples that would close a loop of parents; those are counted.
+def without_loops(edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str]) -> Batch:
+    """Return the batch without the samples that would close a loop of parents, and count those.
 
     Parameters
     ----------
     edges : mapping of child to its newest edge
-        Each with a sample, as long as nothing is ever removed.
+        Every edge has a sample, because nothing is ever removed from a recording.
     batch : tuple of TransformStamped
     problems : Counter
     """
@@ -78,5 +79,5 @@ def sift(edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str]) 
             accepted, refused = admit(edges, batch)
             problems.update(error.reason for error in refused)
             return accepted
-    # Nearly always: no other parent, so no new loop.
+    # The usual case: no child has got another parent, so there is no new loop.
     return batch

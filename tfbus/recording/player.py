@@ -1,4 +1,4 @@
-"""Playing a recording into a bus."""
+"""`Player`, which publishes a recording on a bus."""
 
 import math
 import os
@@ -18,50 +18,51 @@ from tfbus.stamps import as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCKS_AHEAD = 2
 _STEP = 0.02
-_LEAST_STEP = 1e-9
-_MOST_STEP = 1e9
+_MIN_STEP = 1e-9
+_MAX_STEP = 1e9
 
 
 class Player:
-    """Publishes what a recording holds, at the pace at which it was recorded or another: ``await player.play()``.
+    """Publishes the samples of a recording at the recorded pace or another: ``await player.play()``.
 
-    Stamps and authorities are as they were recorded, frame names without leading slashes. What the bus refuses, such as
-    a loop of parents, it counts.
+    Stamps and authorities are the recorded ones; leading slashes are removed from frame names. The bus counts the
+    samples that it refuses, such as a loop of parents.
 
-    On a bus with a `SimulatedClock` the recording drives that clock: it jumps to the beginning, and then goes from the
-    log time of one message to that of the next, so timed tasks run as they did while it was recorded, at whatever
-    rate. Nobody else may advance it meanwhile. To begin again or to seek back is a jump back of the clock.
+    On a bus with a `SimulatedClock` the player drives that clock: the clock jumps to the beginning of the recording and
+    then advances from the log time of one message to that of the next, so timed tasks run as they did during the
+    recording, at any rate. No other task may advance the clock meanwhile. Beginning again and seeking back are jumps
+    back of the clock.
 
-    On any other clock the stamps lie in the past, so ``max_age=`` refuses them. There, to begin again or to seek back
-    removes the moving frames that were played, because the buffers would take nothing older than what they have.
+    On any other clock the stamps lie in the past, so ``max_age=`` refuses them. There, beginning again and seeking back
+    remove the moving frames that were played, because the buffers would refuse samples older than those they have.
 
     Parameters
     ----------
     bus : Bus
     path : str or path
-        A recording of ROS 1 (``.bag``) or ROS 2 (``.db3``, ``.mcap``), or our own; one that was never finished, too.
+        A recording of ROS 1 (``.bag``), of ROS 2 (``.db3``, ``.mcap``) or of a `Recorder`, finished or not.
     rate : float
-        How many times as fast as it was recorded; `math.inf` for as fast as can be.
+        The pace, as a multiple of the recorded one; `math.inf` plays as fast as possible.
     loop : bool
         Whether to begin again at the end, for ever.
     since, until : int, optional
-        The first and the last log time, in ns. What was static before comes first.
+        The first and the last log time, in ns. The static transforms from before are played first.
 
     Attributes
     ----------
     bus : Bus
     path : str
     start, end : int or None
-        The log times, in ns, from which to which it plays; None until `play` has opened the recording, or if it is
-        empty.
+        The first and the last log time of what is played, in ns; None until `play` has opened the recording, and for an
+        empty recording.
     position : int or None
         The log time of the last message that was played, in ns.
     played : int
-        Samples that were handed to the bus.
+        Samples that were passed to the bus.
     passes : int
         How many times the end has been reached.
     bad : Counter
-        What is wrong in the recording, by reason, as far as it was played.
+        Invalid transforms and damaged messages met so far, by reason.
 
     Raises
     ------
@@ -99,27 +100,27 @@ class Player:
         self.bad: Counter[str] = Counter()
         self._simulated = bus.clock if isinstance(bus.clock, SimulatedClock) else None
         self._playing = False
-        self._sought: int | None = None
+        self._seek_target: int | None = None
         self._pause: anyio.CancelScope | None = None
-        self._moving: dict[str, None] = {}
+        self._moving_frames: dict[str, None] = {}
         self._origin = 0
         self._origin_time = 0.0
 
     async def play(self) -> None:
         """Play to the end, or for ever; to stop it, cancel it.
 
-        What of the recording is damaged is left out and counted in `bad`.
+        Damaged parts of the recording are left out and counted in `bad`.
 
         Raises
         ------
         RecordingError
-            If it cannot be read at all.
+            If the recording cannot be read at all.
         OSError
-            If it cannot be read any further.
+            If the recording cannot be read any further.
         BusClosedError
             If the bus is closed.
         RuntimeError
-            If it is playing already, or somebody else advances the simulated clock.
+            If this player is playing already, or another task advances the simulated clock.
         """
         if self._playing:
             raise RuntimeError("the recording is being played already")
@@ -131,15 +132,18 @@ class Player:
             self._playing = False
 
     def seek(self, stamp: int) -> None:
-        """Go on from another log time, in ns; if it does not play, begin there. What was static by then comes first."""
-        self._sought = as_stamp(stamp)
+        """Continue from another log time, in ns; a player that does not play will begin there.
+
+        The static transforms from before that time are played first.
+        """
+        self._seek_target = as_stamp(stamp)
         if self._pause is not None:
             self._pause.cancel()
 
     def _open(self) -> Recording:
         recording = open_recording(self.path)
         try:
-            # Where there is no index, only reading all of the file tells these.
+            # In the worker thread: without an index, these read the whole file.
             self.start = recording.start if self._since is None else self._since
             self.end = recording.end if self._until is None else self._until
         except BaseException:
@@ -149,32 +153,32 @@ class Player:
 
     async def _play(self, recording: Recording) -> None:
         while True:
-            sought, self._sought = self._sought, None
-            since = self._since if sought is None else sought
-            before = self.played
-            # Time stands still for a thread only if nothing else goes on meanwhile.
+            seek_target, self._seek_target = self._seek_target, None
+            since = self._since if seek_target is None else seek_target
+            played_before = self.played
+            # Simulated time may only advance while no thread is reading.
             ahead = _BLOCKS_AHEAD if self._simulated is None else 0
             async with ReadAhead(recording.messages(since, self._until), ahead) as blocks:
                 await self._play_once(blocks, since)
             if self._simulated is not None:
-                # Whoever waited for the last samples has them before the clock jumps.
+                # Lookups that waited for the last samples get them before the clock jumps.
                 await self._simulated.advance(0.0)
-            if self._sought is not None:
+            if self._seek_target is not None:
                 continue
             self.passes += 1
-            # What is empty from its beginning would be played over and over without ever waiting.
-            if not self.loop or (sought is None and self.played == before):
+            # Looping over an empty range would never wait, and block the event loop.
+            if not self.loop or (seek_target is None and self.played == played_before):
                 return
 
     async def _play_once(self, blocks: ReadAhead, since: int | None) -> None:
-        begun = False
+        started = False
         async for block in blocks:
             for message in block:
-                if not begun:
-                    begun = True
+                if not started:
+                    started = True
                     self._begin(message.received if since is None else since)
-                await self._reach(message.received)
-                if self._sought is not None:
+                await self._wait_for(message.received)
+                if self._seek_target is not None:
                     return
                 self._publish(message)
 
@@ -185,27 +189,27 @@ class Player:
             if stamp != self._simulated.now():
                 self._simulated.set(stamp)
         elif self.position is not None and stamp < self.position:
-            for frame in self._moving:
+            for frame in self._moving_frames:
                 with suppress(UnknownFrameError):
                     self.bus.remove_frame(frame)
-            self._moving.clear()
+            self._moving_frames.clear()
 
-    async def _reach(self, stamp: int) -> None:
-        """Wait until a log time is due, or somebody seeks."""
+    async def _wait_for(self, stamp: int) -> None:
+        """Wait until a log time is due, or until `seek` is called."""
         clock = self._simulated
         if clock is None:
             await self._sleep_until_due(stamp)
             return
-        # In steps, or a clock that is watched would stand still between two messages.
-        longest = from_seconds(min(max(_STEP * self.rate, _LEAST_STEP), _MOST_STEP))
+        # In steps, so that timed tasks also run between two messages.
+        longest = from_seconds(min(max(_STEP * self.rate, _MIN_STEP), _MAX_STEP))
         while True:
             step = max(0, min(stamp - clock.now(), longest))
             if self.rate != math.inf:
                 await self._sleep_until_due(clock.now() + step)
-            if self._sought is not None:
+            if self._seek_target is not None:
                 return
             await clock.advance(to_seconds(step))
-            if self._sought is not None or clock.now() >= stamp:
+            if self._seek_target is not None or clock.now() >= stamp:
                 return
 
     async def _sleep_until_due(self, stamp: int) -> None:
@@ -224,6 +228,6 @@ class Player:
         if self._simulated is None:
             for sample in message.batch:
                 if sample.static:
-                    self._moving.pop(sample.child, None)
+                    self._moving_frames.pop(sample.child, None)
                 else:
-                    self._moving[sample.child] = None
+                    self._moving_frames[sample.child] = None

@@ -1,14 +1,15 @@
-"""Writing what goes over a bus to a file.
+"""`Recorder`, which writes the samples of a bus to a file.
 
-The subscriber only appends to a queue. One task hands what has gathered to a worker thread, in slices so short that the
-event loop never waits long for the interpreter. That task cannot be cancelled: it ends when the recorder is left, after
-the last sample and the index.
+The subscriber only appends to a queue. One task passes the queued batches to a worker thread, in slices so short that
+the event loop never waits long for the interpreter. That task cannot be cancelled: it ends when the ``async with`` of
+the recorder ends, after the last sample and the index are written.
 """
 
 import logging
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from types import TracebackType
 from typing import TypeVar
@@ -22,57 +23,57 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
 from tfbus.events import RecordingDropped, RecordingFailed
 from tfbus.geometry.stamped import Batch
-from tfbus.recording._write_queue import Backlog
-from tfbus.recording.formats.mcap_output import McapOutput
+from tfbus.recording._write_queue import WriteQueue
+from tfbus.recording.formats._mcap_output import McapOutput
 from tfbus.registration import Registration
 from tfbus.statistics import RecorderStatistics
 
 ResultT = TypeVar("ResultT")
 
-_GATHERING = 0.05
+_WRITE_PERIOD = 0.05
 _FLUSH_PERIOD = 0.5
 _SLICE = 4_096
 
 
 class Recorder:
-    """Records a bus: ``async with Recorder(bus, "run.mcap")``, from the static samples that are latched until the end.
+    """Records all samples of a bus: ``async with Recorder(bus, "run.mcap")``. The latched static samples come first.
 
     The file is MCAP as ROS 2 writes it, with the topics ``/tf`` and ``/tf_static``, so any tool that knows these can
-    read it; `tfbus.recording.load` and `Player` also find the authorities in it. Writing goes on in a worker thread and
-    never holds up who publishes. What is older than about half a second can be read even if the process is killed.
+    read it; `tfbus.recording.load` and `Player` also find the authorities in it. A worker thread writes, and publishers
+    never wait for it. If the process is killed, only the last half second or so is lost.
 
     Parameters
     ----------
     bus : Bus
     path : str or path
     capacity : int
-        How many moving samples may wait for the disk. If there are more, the oldest are dropped, which is a
-        `RecordingDropped` event whenever it begins; static samples are not.
+        How many moving samples may wait for the disk. Beyond that the oldest are dropped, and a `RecordingDropped`
+        event says so each time that dropping begins; static samples are never dropped.
     overwrite : bool
-        Whether a file that is there already may be lost.
+        Whether to replace an existing file.
 
     Attributes
     ----------
     bus : Bus
     path : str
     error : Exception or None
-        What ended the recording early.
+        The error that ended the recording early.
 
     Raises
     ------
     ValueError, TypeError
-        If `capacity` is less than one or no integer.
+        If `capacity` is less than one, or no integer.
 
     Notes
     -----
-    To enter it raises the `OSError` of a file that cannot be made, `FileExistsError` for one that is there already,
-    `ImportError` if the extra is missing, and `BusClosedError` if the bus is closed. From then on a disk that is full
-    or fails is a `RecordingFailed` event, kept in `error` and logged, and raised nowhere: the body goes on, and the
-    file holds what was written until then.
+    Entering raises the `OSError` of a file that cannot be created, `FileExistsError` for a file that exists,
+    `ImportError` if the extra is missing, and `BusClosedError` if the bus is closed. After that, a disk that is full or
+    fails causes a `RecordingFailed` event; the error is kept in `error` and logged, but raised nowhere: the body goes
+    on, and the file holds all that was written before.
 
-    To leave it waits for the disk, also when the body is cancelled. A batch is recorded under the time at which it was
-    published, on the bus's clock. The format has nothing for a frame that is removed, nor for a clock that jumps back:
-    programs that sort a recording by its times mix what was before the jump with what came after.
+    Leaving waits for the disk, also when the body is cancelled. The log time of a batch is the time of its publication
+    on the bus's clock. The format cannot express that a frame was removed, nor that the clock jumped back: programs
+    that sort a recording by its log times mix the samples from before the jump with those from after it.
     """
 
     def __init__(
@@ -82,16 +83,16 @@ class Recorder:
         self.path = os.fspath(path)
         self.error: Exception | None = None
         self._overwrite = overwrite
-        self._backlog = Backlog(capacity)
+        self._queue = WriteQueue(capacity)
         self._registration: Registration | None = None
         self._tasks: anyio.abc.TaskGroup
         self._output: McapOutput | None = None
-        self._handed = 0
-        self._behind = False
+        self._submitted = 0
+        self._dropping = False
         self._ended = False
         self._flushes: list[anyio.Event] = []
         self._arrived: anyio.Event
-        self._hurry: anyio.Event
+        self._urgent: anyio.Event
         self._threads: anyio.CapacityLimiter
 
     def statistics(self) -> RecorderStatistics:
@@ -101,15 +102,18 @@ class Recorder:
         if output is not None:
             samples, messages, unattributed = output.samples, output.messages, output.unattributed
             refused = dict(output.refused)
-        in_hand = self._handed - samples - sum(refused.values())
-        failed = self.error is not None
-        queue = self._backlog.statistics(0 if failed else in_hand, in_hand if failed else 0)
+        unwritten = self._submitted - samples - sum(refused.values())
+        queue = self._queue.statistics("recording")
+        if self.error is None:
+            queue = replace(queue, pending=queue.pending + unwritten)
+        else:
+            queue = replace(queue, dropped=queue.dropped + unwritten)
         return RecorderStatistics(samples, messages, unattributed, refused, queue)
 
     async def flush(self) -> None:
-        """Wait until what has been published so far is in the file, or the recording has ended.
+        """Wait until all samples published so far are in the file, or until the recording has ended.
 
-        A program that publishes as fast as it can, such as a simulation, gives the disk time with this.
+        A program that publishes as fast as it can, such as a simulation, calls this to let the disk keep up.
         """
         self._check_entered()
         if self.error is not None or self._ended:
@@ -118,15 +122,15 @@ class Recorder:
         flushed = anyio.Event()
         self._flushes.append(flushed)
         self._arrived.set()
-        self._hurry.set()
+        self._urgent.set()
         await flushed.wait()
 
     async def __aenter__(self) -> "Recorder":
         if self._registration is not None:
             raise RuntimeError("a recorder is entered once: make another one")
         self._arrived = anyio.Event()
-        self._hurry = anyio.Event()
-        self._registration = self.bus.subscribe(self._take)
+        self._urgent = anyio.Event()
+        self._registration = self.bus.subscribe(self._enqueue)
         self._tasks = await anyio.create_task_group().__aenter__()
         opened = anyio.Event()
         failures: list[Exception] = []
@@ -151,19 +155,20 @@ class Recorder:
         self._registration.close()
         self._ended = True
         self._arrived.set()
-        self._hurry.set()
+        self._urgent.set()
         await close_task_group(self._tasks)
 
     def _check_entered(self) -> None:
         if self._registration is None:
             raise RuntimeError("enter the recorder first: async with Recorder(...) as recorder")
 
-    def _take(self, batch: Batch) -> None:
+    def _enqueue(self, batch: Batch) -> None:
         now = self.bus.clock.now()
-        lost = self._backlog.put(now, batch)
-        if lost and not self._behind:
-            self._behind = True
-            self.bus._announce(RecordingDropped(now, self.path, self._backlog.dropped))
+        dropped_before = self._queue.dropped
+        self._queue.put(batch, now)
+        if self._queue.dropped > dropped_before and not self._dropping:
+            self._dropping = True
+            self.bus._announce(RecordingDropped(now, self.path, self._queue.dropped))
         self._arrived.set()
 
     async def _work(self, opened: anyio.Event, failures: list[Exception]) -> None:
@@ -171,7 +176,7 @@ class Recorder:
             self._threads = anyio.CapacityLimiter(1)
             try:
                 output = self._output = await self._in_thread(lambda: McapOutput(self.path, self._overwrite))
-            except Exception as error:  # noqa: BLE001 - it is raised where the recorder is entered
+            except Exception as error:  # noqa: BLE001 - `__aenter__` raises it
                 failures.append(error)
                 return
             finally:
@@ -182,7 +187,7 @@ class Recorder:
                 self._fail(error)
             finally:
                 _set_all(self._flushes)
-                # Also when Ctrl-C has hit this very task, as it can on trio.
+                # Also when KeyboardInterrupt was raised in this very task, as trio may do.
                 await self._finish(output)
 
     async def _finish(self, output: McapOutput) -> None:
@@ -192,17 +197,17 @@ class Recorder:
             self._fail(error)
 
     async def _write(self, output: McapOutput) -> None:
-        """Write what comes, until the recorder is left and nothing is pending."""
+        """Write queued batches until the recorder has ended and nothing is pending."""
         flush_due = 0.0
-        while self._backlog or not self._ended:
-            if not (self._backlog or self._flushes or self._ended):
-                self._behind = False
+        while len(self._queue) or not self._ended:
+            if not (len(self._queue) or self._flushes or self._ended):
+                self._dropping = False
                 self._arrived = anyio.Event()
                 with anyio.move_on_after(_FLUSH_PERIOD if output.buffered else math.inf):
                     await self._arrived.wait()
-            with anyio.move_on_after(0.0 if self._flushes or self._ended else _GATHERING):
-                self._hurry = anyio.Event()
-                await self._hurry.wait()
+            with anyio.move_on_after(0.0 if self._flushes or self._ended else _WRITE_PERIOD):
+                self._urgent = anyio.Event()
+                await self._urgent.wait()
             flushes, self._flushes = self._flushes, []
             flush = bool(flushes) or anyio.current_time() >= flush_due
             try:
@@ -213,15 +218,15 @@ class Recorder:
                 flush_due = anyio.current_time() + _FLUSH_PERIOD
 
     async def _write_pending(self, output: McapOutput, flush: bool) -> None:
-        # What comes meanwhile is for the next time, lest whoever waits for a flush waits for ever.
-        pending = len(self._backlog)
+        # Only what is pending now, or a flush could last for ever on a busy bus.
+        pending = len(self._queue)
         while True:
-            entries = self._backlog.take(_SLICE)
-            size = sum(len(batch) for _, batch in entries)
+            batches = self._queue.get_slice(_SLICE)
+            size = sum(len(batch) for _, batch in batches)
             pending -= size
-            self._handed += size
-            done = pending <= 0 or not entries
-            await self._in_thread(partial(output.write, entries, flush and done))
+            self._submitted += size
+            done = pending <= 0 or not batches
+            await self._in_thread(partial(output.write, batches, flush and done))
             if done:
                 return
 
@@ -232,7 +237,7 @@ class Recorder:
         self.error = error
         if self._registration is not None:
             self._registration.close()
-        self._backlog.clear()
+        self._queue.clear()
         logging.getLogger("tfbus").warning("the recording %s has ended early", self.path, exc_info=error)
         self.bus._announce(RecordingFailed(self.bus.clock.now(), self.path, error))
 

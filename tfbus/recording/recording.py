@@ -1,4 +1,4 @@
-"""Recordings of transforms, read from files of ROS 1, of ROS 2 and of our own: message after message, by log time."""
+"""`open_recording`, which reads the transforms of a file of ROS 1, ROS 2 or tfbus message by message, by log time."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -8,47 +8,47 @@ from typing import Final, NamedTuple, Self
 
 from tfbus.errors import InvalidTransformError, RecordingError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.recording.formats.storage import Channel, Storage, Stored
+from tfbus.recording.formats._storage import Channel, Storage, StoredMessage
 from tfbus.tf_message import Decoded, MalformedMessageError
 
 _FIRST_BYTES: Final = 16
 
 
 class RecordedMessage(NamedTuple):
-    """What one message of a recording holds."""
+    """The transforms of one message of a recording."""
 
     received: int
-    """Its log time, in ns: when it was recorded, not a stamp."""
+    """The log time in ns: the time of recording, not a stamp."""
     batch: Batch
-    """Its good transforms."""
+    """The valid transforms."""
     errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """Why the others were refused; or what part of the file is lost here (``reason="damaged"``)."""
+    """Why the other transforms were refused; with ``reason="damaged"``, which part of the file is lost here."""
 
 
 class Recording:
-    """An open recording; made by `open_recording`, and to be closed: it is a ``with`` of its own.
+    """An open recording, as `open_recording` gives it; close it, or use it in a ``with``.
 
     Parameters
     ----------
     path : Path
     storage : Storage
-    samples_of : callable
-        Gives what a stored message holds.
+    decode_payload : callable
+        Gives the samples and errors of a stored message.
 
     Attributes
     ----------
     path : Path
     finished : bool
-        Whether its writer came to an end. What it wrote last may be missing if not.
+        Whether the writer finished the file. If not, the last messages may be missing.
     """
 
     def __init__(
-        self, path: Path, storage: Storage, samples_of: Callable[[Channel, bytes], Decoded[TransformStamped]]
+        self, path: Path, storage: Storage, decode_payload: Callable[[Channel, bytes], Decoded[TransformStamped]]
     ) -> None:
         self.path = path
         self.finished = storage.finished
         self._storage: Storage | None = storage
-        self._samples_of = samples_of
+        self._decode = decode_payload
 
     @property
     def start(self) -> int | None:
@@ -62,14 +62,14 @@ class Recording:
 
     @property
     def count(self) -> int | None:
-        """How many messages of transforms there are; None if only reading all of it would tell."""
+        """The number of messages with transforms; None if only reading the whole file would tell."""
         return self._opened.count
 
     def messages(self, since: int | None = None, until: int | None = None) -> Iterator[RecordedMessage]:
-        """The messages on ``/tf`` and ``/tf_static``, in the order of their log times.
+        """Iterate over the messages on ``/tf`` and ``/tf_static``, in the order of their log times.
 
-        Damage is no error here: it is among the `errors` of a message, and the reading goes on behind it. Of a file
-        without an index, because its writer was killed, the order is that of the file.
+        Damage raises nothing: it is reported in the `errors` of a message, and reading continues behind it. A file that
+        has no index, because its writer was killed, is read in the order of the file.
 
         Parameters
         ----------
@@ -82,7 +82,7 @@ class Recording:
         ValueError
             If the recording is closed.
         OSError
-            If the file cannot be read any more.
+            If the file can no longer be read.
         """
         return self._messages(self._opened, since, until)
 
@@ -91,25 +91,25 @@ class Recording:
             latched: dict[str, TransformStamped] = {}
             for stored in storage.messages(None, since - 1, only_static=True):
                 for sample in self._message(stored).batch:
-                    # The order is that of the newest ones.
+                    # In the order of the samples that stay.
                     latched.pop(sample.child, None)
                     latched[sample.child] = sample
             for sample in latched.values():
                 yield RecordedMessage(since, (sample,), ())
         yield from map(self._message, storage.messages(since, until))
 
-    def _message(self, stored: Stored) -> RecordedMessage:
+    def _message(self, stored: StoredMessage) -> RecordedMessage:
         received, channel, payload = stored
         if isinstance(channel, MalformedMessageError):
             return RecordedMessage(received, (), (channel,))
         try:
-            samples, errors = self._samples_of(channel, payload)
+            samples, errors = self._decode(channel, payload)
         except MalformedMessageError as error:
             return RecordedMessage(received, (), (error,))
         return RecordedMessage(received, tuple(filter(None, samples)), tuple(errors))
 
     def close(self) -> None:
-        """Close the file; a second time does nothing."""
+        """Close the file; closing again does nothing."""
         storage, self._storage = self._storage, None
         if storage is not None:
             storage.close()
@@ -130,9 +130,9 @@ class Recording:
 
 
 def open_recording(path: str | os.PathLike[str]) -> Recording:
-    """A recording of ROS 1 (``.bag``) or ROS 2 (a folder, ``.db3``, ``.mcap``), finished or, but for bags, not.
+    """Open a recording of ROS 1 (``.bag``) or ROS 2 (a folder, ``.db3``, ``.mcap``).
 
-    Which one it is, is told by how it begins, not by its name.
+    The first bytes of the file decide which format it has, not its name. All formats but bags may be unfinished.
 
     Parameters
     ----------
@@ -141,44 +141,44 @@ def open_recording(path: str | os.PathLike[str]) -> Recording:
     Raises
     ------
     RecordingError
-        If it is missing or empty, cannot be read, was cut off before its first message, or is no recording; or if the
-        packages that read it are missing.
+        If the file is missing or empty, cannot be read, was cut off before its first message, or is no recording; or if
+        the packages that read it are not installed.
     """
-    place = Path(path)
+    file = Path(path)
     try:
-        from tfbus.recording.formats.payload import samples_of
+        from tfbus.recording.formats._payload import decode_payload
 
-        return Recording(place, _storage(place, folders=True), samples_of)
+        return Recording(file, _open_storage(file, folders=True), decode_payload)
     except ImportError as error:
-        why = f'to read it, tfbus needs some packages more: pip install "tfbus[bag]" ({error})'
-        raise RecordingError(why, path=str(place), reason="missing extra") from error
+        problem = f'to read it, tfbus needs some packages more: pip install "tfbus[bag]" ({error})'
+        raise RecordingError(problem, path=str(file), reason="missing extra") from error
     except FileNotFoundError as error:
-        raise RecordingError("there is no such file", path=str(place), reason="missing") from error
+        raise RecordingError("there is no such file", path=str(file), reason="missing") from error
     except OSError as error:
         raise RecordingError(
-            f"it cannot be read: {error.strerror or error}", path=str(place), reason="unreadable"
+            f"it cannot be read: {error.strerror or error}", path=str(file), reason="unreadable"
         ) from error
 
 
-def _storage(path: Path, folders: bool = False) -> Storage:
+def _open_storage(path: Path, folders: bool = False) -> Storage:
     if folders and path.is_dir():
-        from tfbus.recording.formats.folder import FolderStorage
+        from tfbus.recording.formats._folder import FolderStorage
 
-        return FolderStorage(path, _storage)
+        return FolderStorage(path, _open_storage)
     with path.open("rb") as file:
         first = file.read(_FIRST_BYTES)
     if not first:
         raise RecordingError("the file is empty", path=str(path), reason="empty")
-    from tfbus.recording.formats import mcap, ros1, sqlite
+    from tfbus.recording.formats import _mcap, _ros1, _sqlite
 
     formats: list[tuple[bytes, Callable[[Path], Storage]]] = [
-        (mcap.MAGIC, mcap.McapStorage),
-        (sqlite.MAGIC, sqlite.SqliteStorage),
-        (ros1.MAGIC, ros1.Ros1Storage),
+        (_mcap.MAGIC, _mcap.McapStorage),
+        (_sqlite.MAGIC, _sqlite.SqliteStorage),
+        (_ros1.MAGIC, _ros1.Ros1Storage),
     ]
-    for magic, kind in formats:
+    for magic, storage in formats:
         if first.startswith(magic):
-            return kind(path)
+            return storage(path)
         if magic.startswith(first):
             raise RecordingError(f"the file ends after {len(first)} bytes", path=str(path), reason="truncated")
     raise RecordingError("it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)", path=str(path), reason="foreign")

@@ -1,6 +1,6 @@
-"""What there is in a recording: each frame's parents, rate, gaps and senders, and what is wrong with the file.
+"""`summarise`, which lists the parents, rates, gaps and authorities of all frames in a recording, and its problems.
 
-The recording is read once and not kept: what stays in memory is one stamp, 8 bytes, for each moving transform.
+The recording is read once and not kept: only one stamp, 8 bytes, of each moving transform stays in memory.
 """
 
 from array import array
@@ -12,30 +12,30 @@ from pathlib import Path
 import numpy as np
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.recording.load import sift
+from tfbus.recording.load import without_loops
 from tfbus.recording.recording import RecordedMessage, Recording
 from tfbus.stamps import SECOND
 
 
 @dataclass(frozen=True, slots=True)
 class FrameSummary:
-    """What a recording tells of one frame; None where there are too few moving samples to tell.
+    """The summary of one frame of a recording; values that need more moving samples than there are, are None.
 
     Parameters
     ----------
     frame : str
     parents : tuple of str
-        Every parent that it had, in the order in which they first came.
+        All parents of the frame, in the order of their first samples.
     static, moving : int
-        How many samples of each kind there are.
+        The number of samples of each kind.
     oldest, newest : int or None
         The stamps of the moving samples, in ns.
     rate : float or None
-        Different stamps per second, over the span.
+        The number of different stamps per second, over the span.
     longest_gap : float or None
-        The longest time between two stamps that follow each other, in s.
+        The longest time between two successive stamps, in s.
     authorities : tuple of str
-        Everybody who sent samples of it, in the order in which they first came; without those that give no name.
+        The authorities that sent samples of the frame, in the order of their first samples; without the empty one.
     """
 
     frame: str
@@ -55,13 +55,13 @@ class FrameSummary:
 
     @property
     def span(self) -> float | None:
-        """From the oldest to the newest stamp, in s."""
+        """The time from the oldest to the newest stamp, in s."""
         return None if self.oldest is None or self.newest is None else (self.newest - self.oldest) / SECOND
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingSummary:
-    """What there is in a recording.
+    """The summary of a recording.
 
     Parameters
     ----------
@@ -71,13 +71,13 @@ class RecordingSummary:
     start, end : int or None
         The log times of the first and the last message on any topic, in ns; None if there is none.
     messages, transforms : int
-        How many messages on ``/tf`` and ``/tf_static`` there are, and how many good transforms in them.
+        The number of messages on ``/tf`` and ``/tf_static``, and of the valid transforms in them.
     frames : tuple of FrameSummary
         Every frame that has a parent, sorted by name.
     roots : tuple of str
-        The frames that have none, sorted.
+        The frames that have no parent, sorted.
     problems : mapping of str to int
-        How many transforms or messages were left out, by reason.
+        The number of transforms and messages that were left out, by reason.
     """
 
     path: Path
@@ -92,18 +92,18 @@ class RecordingSummary:
 
     @property
     def duration(self) -> float | None:
-        """From the first to the last log time, in s."""
+        """The time from the first to the last log time, in s."""
         return None if self.start is None or self.end is None else (self.end - self.start) / SECOND
 
 
 def summarise(recording: Recording, messages: Iterable[RecordedMessage] | None = None) -> RecordingSummary:
-    """What there is in a recording.
+    """Read a recording and summarise it.
 
     Parameters
     ----------
     recording : Recording
     messages : iterable of RecordedMessage, optional
-        Its messages, if somebody wants to see them go by; by default all of them.
+        The messages to read, such as an iterator that shows the progress; by default, all messages of the recording.
     """
     frames: dict[str, _Frame] = {}
     problems: Counter[str] = Counter()
@@ -112,12 +112,12 @@ def summarise(recording: Recording, messages: Iterable[RecordedMessage] | None =
         count += 1
         if errors:
             problems.update(error.reason for error in errors)
-        for sample in sift(frames, batch, problems):
+        for sample in without_loops(frames, batch, problems):
             child = sample.child
             frame = frames.get(child)
             if frame is None:
                 frame = frames[child] = _Frame(child)
-            frame.add(sample)
+            frame.count(sample)
     parents = {parent for frame in frames.values() for parent in frame.parents}
     return RecordingSummary(
         recording.path,
@@ -133,7 +133,7 @@ def summarise(recording: Recording, messages: Iterable[RecordedMessage] | None =
 
 
 class _Frame:
-    """What is gathered of one frame; its newest edge, as `tfbus.bus._topology` wants to know it."""
+    """The counts of one frame, and its newest edge, as `tfbus.tree.cycles.NewestEdge` describes it."""
 
     def __init__(self, frame: str) -> None:
         self.frame = frame
@@ -146,8 +146,8 @@ class _Frame:
         self.static_count = 0
         self.stamps = array("q")
 
-    def add(self, sample: TransformStamped) -> None:
-        """Take note of a sample."""
+    def count(self, sample: TransformStamped) -> None:
+        """Count a sample."""
         parent, _, stamp, _, authority, static = sample._fields
         if static:
             self.static_count += 1
@@ -163,7 +163,7 @@ class _Frame:
             self.authorities[authority] = None
 
     def summary(self) -> FrameSummary:
-        """What was gathered."""
+        """The summary of all samples so far."""
         stamps = np.unique(np.array(self.stamps, np.int64))
         several = len(stamps) > 1
         oldest, newest = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)

@@ -1,8 +1,8 @@
 """Reading URDF, the description of a robot as links and joints.
 
-urdf-parser-py knows what the elements mean, but complains on standard error of whatever it does not know, and stops at
-the legacy transmissions of real robots. So it gets only what it knows, element by element; the tree of the elements is
-built here, and safely: files come from anywhere.
+urdf-parser-py interprets the elements, but prints a complaint to standard error for each unknown one, and fails at the
+legacy transmissions of real robots. So this module passes it one element at a time, reduced to the parts that it knows.
+The XML itself is parsed here, with limits, because files may come from untrusted sources.
 """
 
 import os
@@ -17,11 +17,11 @@ from tfbus.errors import InvalidRobotError, InvalidTransformError
 from tfbus.geometry.transform import Transform
 from tfbus.robot.joint import Joint, Mimic, element
 
-DEPTH = 100
-"""How deep elements may be nested; in URDF it is less than ten."""
+MAX_DEPTH = 100
+"""The deepest accepted nesting of elements; URDF needs less than ten."""
 
-READ = ("link", "joint", "material")
-KNOWN = {
+READ_ELEMENTS = ("link", "joint", "material")
+KNOWN_PARTS = {
     "robot": "name version",
     "link": "name, inertial visual collision",
     "joint": "name type, origin axis parent child limit dynamics safety_controller calibration mimic",
@@ -48,17 +48,17 @@ KNOWN = {
     "color": "rgba",
     "texture": "filename",
 }
-"""The attributes of each element, and after a comma the elements in it, that urdf-parser-py reads."""
+"""The attributes of each element that urdf-parser-py reads, and after a comma the elements inside of it."""
 
-REPEATED = {"visual", "collision"}
-NEEDED = {"parent": "link", "child": "link", "axis": "xyz", "mass": "value"}
-"""Attributes whose absence urdf-parser-py does not notice."""
+REPEATABLE = {"visual", "collision"}
+REQUIRED_ATTRIBUTES = {"parent": "link", "child": "link", "axis": "xyz", "mass": "value"}
+"""Attributes that must be there, although urdf-parser-py does not check it."""
 
-XACRO = {"arg", "attribute", "call", "element", "if", "include", "insert_block", "macro", "property", "unless"}
+XACRO_TAGS = {"arg", "attribute", "call", "element", "if", "include", "insert_block", "macro", "property", "unless"}
 
 
 class Urdf(NamedTuple):
-    """What a URDF says of links and joints, in the order of the file."""
+    """The links and joints of a URDF, in the order of the file."""
 
     name: str
     links: tuple[str, ...]
@@ -66,17 +66,17 @@ class Urdf(NamedTuple):
 
 
 def read_urdf(source: str | os.PathLike[str]) -> Urdf:
-    """The links and joints of a URDF.
+    """Read the links and joints of a URDF.
 
     Parameters
     ----------
     source : str or path
-        The text itself, if it is a string with a ``<`` in it; else where the file is.
+        The text itself if it is a string with a ``<`` in it, otherwise the path of the file.
 
     Raises
     ------
     InvalidRobotError
-        If it is not XML, not URDF, or an element is malformed. The message names the element.
+        If the source is not XML or not URDF, or an element is malformed. The message names the element.
     OSError
         If the file cannot be read.
     ImportError
@@ -87,25 +87,25 @@ def read_urdf(source: str | os.PathLike[str]) -> Urdf:
     except ImportError as error:
         raise ImportError('to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"') from error
     text = source if isinstance(source, str) and "<" in source else Path(source).read_bytes()
-    robot = _parsed(text)
+    robot = _parse(text)
     if robot.tag != "robot":
         raise InvalidRobotError(f"a URDF is a <robot>, but this is a <{robot.tag}>")
     _check_expanded(robot)
-    name = _understood(urdf, robot, element("robot", robot.get("name"))).name
+    name = _interpret(urdf, robot, element("robot", robot.get("name"))).name
     links, joints = [], []
-    for part, place in _parts(robot):
+    for part, label in _parts(robot):
         if part.tag == "material" and part.find("color") is None and part.find("texture") is None:
-            raise InvalidRobotError("it has neither a color nor a texture", element=place)
-        found = _understood(urdf, part, place)
+            raise InvalidRobotError("it has neither a color nor a texture", element=label)
+        found = _interpret(urdf, part, label)
         if part.tag == "link":
             links.append(found.name)
         elif part.tag == "joint":
-            joints.append(_joint(found, place))
+            joints.append(_joint(found, label))
     return Urdf(name, tuple(links), tuple(joints))
 
 
-def _parsed(text: str | bytes) -> Element:
-    """The root of a document; the namespace that an unprefixed name may have is taken off."""
+def _parse(text: str | bytes) -> Element:
+    """Parse a document, and return its root without the namespace of unprefixed names."""
     parser = ET.XMLParser(target=_Builder())
     try:
         parser.feed(text)
@@ -121,7 +121,7 @@ def _parsed(text: str | bytes) -> Element:
 
 
 class _Builder(ET.TreeBuilder):
-    """Builds the tree, but not one that is there to do harm."""
+    """Builds the tree of elements, and refuses deep nesting and a document type, which can exhaust the memory."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -129,8 +129,8 @@ class _Builder(ET.TreeBuilder):
 
     def start(self, tag: Any, attrs: Any, /) -> Element:
         self._depth += 1
-        if self._depth > DEPTH:
-            raise InvalidRobotError(f"its elements are nested more than {DEPTH} deep")
+        if self._depth > MAX_DEPTH:
+            raise InvalidRobotError(f"its elements are nested more than {MAX_DEPTH} deep")
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> Element:
@@ -142,15 +142,15 @@ class _Builder(ET.TreeBuilder):
 
 
 def _check_expanded(robot: Element) -> None:
-    """Raise `InvalidRobotError` for what xacro has yet to work on.
+    """Raise `InvalidRobotError` if the file still needs xacro.
 
-    Calls of macros that xacro did not know stay in some real files as elements of the robot: those do no harm.
+    Some real files contain calls of unknown macros as elements of the robot; those are ignored.
     """
     for part in robot:
-        read = part.tag in READ
+        read = part.tag in READ_ELEMENTS
         for node in part.iter() if read else (part,):
             namespace, _, tag = node.tag.rpartition("}")
-            if "xacro" in namespace and (read or tag in XACRO):
+            if "xacro" in namespace and (read or tag in XACRO_TAGS):
                 raise InvalidRobotError(
                     "this is still to be expanded: run xacro on the file first",
                     element=element(f"xacro:{tag}", node.get("name")),
@@ -164,53 +164,53 @@ def _check_expanded(robot: Element) -> None:
 
 
 def _parts(robot: Element) -> Iterator[tuple[Element, str]]:
-    """The elements of a robot that are read, and how errors call each; without a name they are counted."""
+    """The elements of a robot that are read, each with its label for errors; those without a name are numbered."""
     seen: Counter[str] = Counter()
     for part in robot:
-        if part.tag in READ:
+        if part.tag in READ_ELEMENTS:
             seen[part.tag] += 1
             name = part.get("name")
             yield part, element(part.tag, name) + (f" number {seen[part.tag]}" if name is None else "")
 
 
-def _understood(parser: Any, part: Element, place: str) -> Any:
-    """What urdf-parser-py makes of one element."""
-    known = _known(part, place)
+def _interpret(parser: Any, part: Element, label: str) -> Any:
+    """Interpret one element with urdf-parser-py."""
+    known = _reduce(part, label)
     path = parser.xmlr.Path(part.tag)
     try:
         return getattr(parser, part.tag.capitalize()).from_xml(known, path)
-    except Exception as error:  # noqa: BLE001 - it raises plain ones
-        # Its own errors tell where they were, but on several lines.
+    except Exception as error:  # noqa: BLE001 - urdf-parser-py raises plain Exceptions
+        # Errors of urdf-parser-py have the path of the element, but span several lines.
         where = str(getattr(error, "path", path)).removeprefix(str(path)).strip("/")
         text = " ".join(str(getattr(error, "e", error)).split()) or type(error).__name__
-        raise InvalidRobotError(f"{where}: {text}" if where else text, element=place) from None
+        raise InvalidRobotError(f"{where}: {text}" if where else text, element=label) from None
 
 
-def _known(node: Element, place: str) -> Element:
-    """A copy of an element with those parts alone that urdf-parser-py knows; of all others it would complain."""
-    attributes, _, inside = (names.split() for names in KNOWN[node.tag].partition(","))
-    if NEEDED.get(node.tag, "") not in ("", *node.attrib):
-        raise InvalidRobotError(f"<{node.tag}> has no {NEEDED[node.tag]}", element=place)
+def _reduce(node: Element, label: str) -> Element:
+    """A copy of an element with only the parts that urdf-parser-py knows."""
+    attributes, _, inside = (names.split() for names in KNOWN_PARTS[node.tag].partition(","))
+    if REQUIRED_ATTRIBUTES.get(node.tag, "") not in ("", *node.attrib):
+        raise InvalidRobotError(f"<{node.tag}> has no {REQUIRED_ATTRIBUTES[node.tag]}", element=label)
     copy = Element(node.tag, {name: value for name, value in node.attrib.items() if name in attributes})
     for child in node:
         shape = child.find("geometry/*")
-        # Other programs know other shapes, such as capsules; how a link looks is not for us to judge.
-        if child.tag not in inside or (shape is not None and shape.tag not in KNOWN):
+        # Some programs have more shapes, such as capsules; the shape of a link does not matter here.
+        if child.tag not in inside or (shape is not None and shape.tag not in KNOWN_PARTS):
             continue
-        if child.tag not in REPEATED and copy.find(child.tag) is not None:
-            raise InvalidRobotError(f"there is more than one <{child.tag}>", element=place)
-        copy.append(_known(child, place))
+        if child.tag not in REPEATABLE and copy.find(child.tag) is not None:
+            raise InvalidRobotError(f"there is more than one <{child.tag}>", element=label)
+        copy.append(_reduce(child, label))
     return copy
 
 
-def _joint(found: Any, place: str) -> Joint:
-    """A joint of urdf-parser-py as one of ours."""
+def _joint(found: Any, label: str) -> Joint:
+    """Convert a joint of urdf-parser-py to a `Joint`."""
     origin = Transform()
     if found.origin is not None:
         try:
             origin = Transform.from_xyz_rpy(found.origin.xyz, found.origin.rpy)
         except InvalidTransformError as error:
-            raise InvalidRobotError(f"origin: {error}", element=place) from None
+            raise InvalidRobotError(f"origin: {error}", element=label) from None
     mimic = None
     if found.mimic is not None:
         multiplier, offset = found.mimic.multiplier, found.mimic.offset

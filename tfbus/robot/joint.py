@@ -1,4 +1,4 @@
-"""Joints: how one link of a robot moves against another."""
+"""`Joint`, the motion of one link of a robot relative to another."""
 
 import math
 from collections.abc import Sequence
@@ -27,34 +27,34 @@ class Mimic:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """Joins a child link to its parent, as URDF has it.
+    """A joint between a parent link and a child link, as in URDF.
 
     Parameters
     ----------
     name : str
     kind : {"fixed", "revolute", "continuous", "prismatic", "planar", "floating"}
     parent, child : str
-        Links, which are the names of their frames.
+        The links, whose names are those of their frames.
     origin : Transform
-        Where the child is, seen from the parent, when the joint is at zero.
+        The pose of the child in the parent at position zero.
     axis : sequence of 3 floats
-        What a joint turns about, slides along, or what its plane is normal to, in the coordinates of the child at zero.
-        Any length but zero; it is made one. Fixed and floating joints have none that counts.
+        The axis of rotation, the direction of sliding, or the normal of the plane, in the coordinates of the child at
+        position zero. Any length but zero; it is normalised. Fixed and floating joints ignore it.
     lower, upper : float, optional
-        The positions between which it is meant to stay, in rad or m. They are reported on, never enforced.
+        The limits of the position, in rad or m. Violations are reported, never prevented.
     mimic : Mimic, optional
-        The joint that it follows where it is given no position of its own.
+        The joint that this one follows when it has no position of its own.
 
     Raises
     ------
     InvalidRobotError
-        If the kind is none of these, the axis is zero or not finite, or a limit or the mimic is not a number.
+        If the kind is unknown, the axis is zero or not finite, or a limit or a number of the mimic is NaN.
 
     Notes
     -----
-    A planar joint has the coordinates x and y in m and an angle in rad about the axis. URDF leaves open where its x and
-    y point: here they are those of the child at zero, turned on the shortest way that takes z to the axis; so for the
-    usual axis z they are just x and y.
+    A planar joint has the coordinates x and y in m and an angle in rad about the axis. URDF does not define the
+    directions of x and y: here they are those of the child at position zero, rotated by the shortest rotation that
+    takes z to the axis. So for the usual axis z they are just x and y.
     """
 
     name: str
@@ -66,9 +66,9 @@ class Joint:
     lower: float | None = None
     upper: float | None = None
     mimic: Mimic | None = None
-    # Of the quaternion at an angle, what is multiplied by the sine of its half; the direction in the parent's frame.
-    _swing: Quaternion = field(init=False, repr=False, compare=False)
-    _slide: Vector = field(init=False, repr=False, compare=False)
+    # The part of the rotation that is multiplied by the sine of half the angle; the axis in the parent's frame.
+    _sine_part: Quaternion = field(init=False, repr=False, compare=False)
+    _axis_in_parent: Vector = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -80,47 +80,48 @@ class Joint:
         object.__setattr__(self, "axis", axis)
         x, y, z = axis
         turn = (0.0, 0.0, 0.0, *self.origin.rotation)
-        object.__setattr__(self, "_swing", compose(turn, (0.0, 0.0, 0.0, x, y, z, 0.0))[3:])
-        object.__setattr__(self, "_slide", rotate(self.origin.rotation, x, y, z))
+        object.__setattr__(self, "_sine_part", compose(turn, (0.0, 0.0, 0.0, x, y, z, 0.0))[3:])
+        object.__setattr__(self, "_axis_in_parent", rotate(self.origin.rotation, x, y, z))
 
     @property
     def element(self) -> str:
-        """How errors call it: ``<joint name="elbow">``."""
+        """The label of the joint in errors: ``<joint name="elbow">``."""
         return element("joint", self.name)
 
     @property
     def zero(self) -> Position:
-        """The position at which the child is at the joint's origin."""
+        """The position in which the pose of the child is the joint's origin."""
         if self.kind == "planar":
             return 0.0, 0.0, 0.0
         return Transform() if self.kind == "floating" else 0.0
 
     def transform(self, position: Position = 0.0) -> Transform:
-        """Where the child is, seen from the parent.
+        """The pose of the child in the parent.
 
         Parameters
         ----------
         position : float, sequence of floats, or Transform
             rad for a revolute or continuous joint, m for a prismatic one; (x, y, angle) for a planar one;
-            (x, y, z, qx, qy, qz, qw) or a transform for a floating one. A fixed joint takes no notice of it.
+            (x, y, z, qx, qy, qz, qw) or a transform for a floating one. A fixed joint ignores it.
 
         Raises
         ------
         InvalidTransformError
-            If it is not finite, has a wrong length, or holds no unit quaternion. The message has the joint's name.
+            If the position is not finite, has a wrong length, or holds no unit quaternion. The message has the joint's
+            name.
         TypeError
-            If it is of a type that such a joint has no use for.
+            If the position has a type that the kind of joint does not accept.
         """
         return from_row(self.row(position))
 
     def row(self, position: Position) -> Row:
-        """As `transform`, as a row: for those who need many."""
+        """The row of `transform`; faster for many joints."""
         kind = self.kind
         x, y, z, i, j, k, w = self.origin._row
         if kind == "revolute" or kind == "continuous":
             half = 0.5 * self.number(position)
             sine, cosine = math.sin(half), math.cos(half)
-            a, b, c, d = self._swing
+            a, b, c, d = self._sine_part
             return (
                 x,
                 y,
@@ -134,7 +135,7 @@ class Joint:
             return self.origin._row
         if kind == "prismatic":
             length = self.number(position)
-            a, b, c = self._slide
+            a, b, c = self._axis_in_parent
             row = (x + length * a, y + length * b, z + length * c, i, j, k, w)
         else:
             row = compose(self.origin._row, self._planar(position) if kind == "planar" else self._floating(position))
@@ -143,7 +144,7 @@ class Joint:
         return row
 
     def number(self, position: Position) -> float:
-        """A position that is to be one finite number.
+        """Convert a position to one finite number.
 
         Raises
         ------
@@ -174,7 +175,7 @@ class Joint:
         if isinstance(position, Transform):
             return position._row
         try:
-            numbers = tuple(position)  # type: ignore[arg-type]  # what cannot be one is told below
+            numbers = tuple(position)  # type: ignore[arg-type]  # the TypeError is caught below
             return Transform(numbers[:3], numbers[3:])._row
         except TypeError:
             raise TypeError(
@@ -208,7 +209,7 @@ class Joint:
 
 
 def element(tag: str, name: str | None) -> str:
-    """An element of a robot's description as errors show it, in one line."""
+    """The label of a URDF element in errors, on one line."""
     if name is None:
         return f"<{tag}>"
     quoted = repr(name)[1:-1].replace('"', '\\"')
@@ -216,9 +217,9 @@ def element(tag: str, name: str | None) -> str:
 
 
 def _from_z(axis: Vector) -> Quaternion:
-    """The shortest rotation that takes z to a unit vector; of all half turns to -z, that about x."""
+    """The shortest rotation that takes z to a unit vector; for -z, the half turn about x."""
     x, y, z = axis
-    # Near -z, where 1 + z has no digits left, the rest of the length has them all.
+    # Near -z, 1 + z would lose its digits; x and y keep theirs.
     w = 1.0 + z if z > 0.0 else (x * x + y * y) / (1.0 - z)
     norm = math.hypot(x, y, w)
     return (-y / norm, x / norm, 0.0, w / norm) if norm else (1.0, 0.0, 0.0, 0.0)

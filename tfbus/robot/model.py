@@ -1,4 +1,4 @@
-"""A robot as a tree of links and joints, and the transforms that the positions of its joints give."""
+"""`RobotModel`, a robot as a tree of links and joints."""
 
 import os
 from collections import Counter
@@ -15,7 +15,7 @@ from tfbus.robot.joint import Joint, Position, element
 
 @dataclass(frozen=True, slots=True)
 class LimitViolation:
-    """A joint that is where it is not meant to be; rad or m."""
+    """A joint whose position is outside of its limits; in rad or m."""
 
     joint: str
     position: float
@@ -30,26 +30,26 @@ class LimitViolation:
 
 @dataclass(frozen=True, slots=True)
 class RobotModel:
-    """Links joined by joints to one tree: plain data, from a URDF or made by hand.
+    """A tree of links and joints: plain data, from a URDF or built by hand.
 
     Parameters
     ----------
     name : str
     links : sequence of str
-        The names of the links, which are those of their frames.
+        The names of the links, which are also those of their frames.
     joints : sequence of Joint
 
     Attributes
     ----------
     root : str
-        The link that has no parent.
+        The link without a parent.
 
     Raises
     ------
     InvalidRobotError
-        If a name is there twice or cannot be that of a frame, a joint has a link that is not there, a link two parents,
-        the links form a loop or have several roots, or a joint mimics one that is not there, itself over others, or one
-        that has not one number for a position. The message names the element.
+        If a name occurs twice or is no frame name, a joint has an unknown link, a link has two parents, the links form
+        a loop or have several roots, or a joint mimics an unknown joint, itself over others, or a joint whose position
+        is not one number. The message names the element.
 
     Examples
     --------
@@ -69,18 +69,18 @@ class RobotModel:
     _names: frozenset[str] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        def put(name: str, value: object) -> None:
+        def set_field(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
-        put("links", tuple(self.links))
-        put("joints", tuple(self.joints))
+        set_field("links", tuple(self.links))
+        set_field("joints", tuple(self.joints))
         _check_links(self)
-        put("root", _root(self))
+        set_field("root", _root(self))
         ordered = _leaders_first(self.joints)
         named = {joint.name: joint for joint in ordered}
         leaders = {joint.mimic.joint for joint in ordered if joint.mimic is not None}
-        put("_fixed", tuple(joint for joint in self.joints if joint.kind == "fixed"))
-        put(
+        set_field("_fixed", tuple(joint for joint in self.joints if joint.kind == "fixed"))
+        set_field(
             "_resolved",
             tuple(
                 (joint, named[joint.mimic.joint] if joint.mimic else None)
@@ -88,25 +88,25 @@ class RobotModel:
                 if joint.kind != "fixed" or joint.name in leaders
             ),
         )
-        put("_names", frozenset(named))
+        set_field("_names", frozenset(named))
 
     @classmethod
     def from_urdf(cls, source: str | os.PathLike[str]) -> "RobotModel":
-        """From a URDF file, or its text.
+        """Read a URDF file, or its text.
 
-        Elements that have nothing to do with links, joints and materials are passed over, such as ``<transmission>``
-        and ``<gazebo>``. Needs ``pip install "tfbus[urdf]"``.
+        Elements other than links, joints and materials are ignored, such as ``<transmission>`` and ``<gazebo>``. Needs
+        ``pip install "tfbus[urdf]"``.
 
         Parameters
         ----------
         source : str or path
-            The text itself, if it is a string with a ``<`` in it; else where the file is.
+            The text itself if it is a string with a ``<`` in it, otherwise the path of the file.
 
         Raises
         ------
         InvalidRobotError
-            If it is not XML, not URDF or not expanded yet by xacro, an element is malformed, or the elements do not
-            make a robot. The message names the element.
+            If the source is not XML, not URDF or not yet expanded by xacro, an element is malformed, or the elements
+            do not form a robot. The message names the element.
         OSError
             If the file cannot be read.
         ImportError
@@ -118,33 +118,32 @@ class RobotModel:
     def transforms(
         self, positions: Mapping[str, Position], stamp: int, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
-        """Where each link is, seen from its parent.
+        """The transforms of all links, each in its parent.
 
         Parameters
         ----------
         positions : mapping of str to float, sequence of floats, or Transform
-            By name of joint, as `Joint.transform` takes them. A moving joint without one is left out, unless it mimics
-            one that has one. Positions of fixed joints, and of names that are not there, count for nothing: see
-            `unknown_joints`.
+            By name of joint, as `Joint.transform` takes them. A moving joint without a position is left out, unless it
+            mimics a joint that has one. Positions of fixed and of unknown joints are ignored: see `unknown_joints`.
         stamp : int
             ns.
         authority : str
-            Who says so.
+            The sender.
         prefix : str
             Put before the names of all frames, such as ``"robot1/"``.
 
         Returns
         -------
         list of TransformStamped
-            First those of the fixed joints, which are static, then those of the moving ones.
+            First the static ones of the fixed joints, then those of the moving joints.
 
         Raises
         ------
         InvalidTransformError
             If a position is not finite, has a wrong length or holds no unit quaternion, or the prefix or the stamp is
-            bad. The message has the name of the joint.
+            invalid. The message has the name of the joint.
         TypeError
-            If a position is of a type that its joint has no use for.
+            If a position has a type that its joint does not accept.
         """
         return [
             *self.fixed_transforms(stamp, authority, prefix),
@@ -152,7 +151,7 @@ class RobotModel:
         ]
 
     def fixed_transforms(self, stamp: int, authority: str = "", prefix: str = "") -> list[TransformStamped]:
-        """Those of `transforms` that are static."""
+        """The static ones of `transforms`."""
         return [
             TransformStamped(prefix + joint.parent, prefix + joint.child, stamp, joint.origin, authority, static=True)
             for joint in self._fixed
@@ -161,7 +160,7 @@ class RobotModel:
     def moving_transforms(
         self, positions: Mapping[str, Position], stamp: int, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
-        """Those of `transforms` that are not static."""
+        """The moving ones of `transforms`."""
         return [
             TransformStamped(
                 prefix + joint.parent, prefix + joint.child, stamp, from_row(joint.row(position)), authority
@@ -170,12 +169,12 @@ class RobotModel:
         ]
 
     def resolve(self, positions: Mapping[str, Position]) -> list[tuple[Joint, Position]]:
-        """The moving joints that `positions` move, each with its position: its own, or the one that mimicking gives.
+        """Pair each moving joint that has a position, or mimics a joint that has one, with its position.
 
         Raises
         ------
         InvalidTransformError, TypeError
-            If a position that another joint mimics is not one finite number.
+            If the position of a mimicked joint is not one finite number.
         """
         found: dict[str, Position] = {}
         moving = []
@@ -193,7 +192,7 @@ class RobotModel:
         return moving
 
     def violations(self, positions: Mapping[str, Position]) -> list[LimitViolation]:
-        """The joints that `positions` take beyond their limits, mimicking ones included.
+        """The joints whose positions are outside of their limits, including those that mimic another.
 
         Raises
         ------
@@ -211,16 +210,16 @@ class RobotModel:
         return found
 
     def unknown_joints(self, names: Iterable[str]) -> list[str]:
-        """Those of some names that no joint has."""
+        """The given names that no joint has."""
         return [name for name in names if name not in self._names]
 
     def zeros(self) -> dict[str, Position]:
-        """Positions that put every moving joint at its origin; without those that mimic another."""
+        """The zero position of every moving joint, without those that mimic another."""
         return {joint.name: joint.zero for joint in self.joints if joint.kind != "fixed" and joint.mimic is None}
 
 
 def _check_links(model: RobotModel) -> None:
-    """Raise `InvalidRobotError` for a name that is there twice, or cannot be that of a frame."""
+    """Raise `InvalidRobotError` for a name that occurs twice, or is no frame name."""
     robot = element("robot", model.name)
     if not model.links:
         raise InvalidRobotError("it has no links", element=robot)
@@ -234,7 +233,7 @@ def _check_links(model: RobotModel) -> None:
 
 
 def _root(model: RobotModel) -> str:
-    """The link without a parent; `InvalidRobotError` unless all links hang on one."""
+    """The link without a parent; raises `InvalidRobotError` unless the links form one tree."""
     above: dict[str, Joint] = {}
     known = set(model.links)
     for joint in model.joints:
@@ -248,10 +247,10 @@ def _root(model: RobotModel) -> str:
                 element=joint.element,
             )
         above[joint.child] = joint
-    good: set[str] = set()
+    in_tree: set[str] = set()
     for link in model.links:
         climbed: dict[str, Joint] = {}
-        while link in above and link not in good:
+        while link in above and link not in in_tree:
             if link in climbed:
                 names = list(climbed)
                 loop = [*names[names.index(link) :], link]
@@ -259,7 +258,7 @@ def _root(model: RobotModel) -> str:
                 raise InvalidRobotError(f"the links {text} form a loop", element=above[link].element)
             climbed[link] = above[link]
             link = above[link].parent
-        good.update(climbed)
+        in_tree.update(climbed)
     roots = [link for link in model.links if link not in above]
     if len(roots) > 1:
         raise InvalidRobotError(
@@ -269,7 +268,7 @@ def _root(model: RobotModel) -> str:
 
 
 def _leaders_first(joints: Sequence[Joint]) -> list[Joint]:
-    """The joints, each behind the one that it mimics; `InvalidRobotError` where that cannot be."""
+    """Order the joints so that each comes after the one that it mimics; raises `InvalidRobotError` if that fails."""
     named = {joint.name: joint for joint in joints}
     ordered: dict[str, Joint] = {}
     for joint in joints:
@@ -285,10 +284,10 @@ def _leaders_first(joints: Sequence[Joint]) -> list[Joint]:
             leader = named.get(joint.mimic.joint)
             if leader is None:
                 raise InvalidRobotError(f"it mimics {joint.mimic.joint!r}, which is not there", element=joint.element)
-            for one in (joint, leader):
-                if one.kind in ("planar", "floating"):
+            for each in (joint, leader):
+                if each.kind in ("planar", "floating"):
                     raise InvalidRobotError(
-                        f"it mimics {leader.name!r}, but {one.name!r} is {one.kind}: only one number can be mimicked",
+                        f"it mimics {leader.name!r}, but {each.name!r} is {each.kind}: only one number can be mimicked",
                         element=joint.element,
                     )
             joint = leader

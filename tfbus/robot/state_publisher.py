@@ -1,4 +1,4 @@
-"""Publishing a robot: its fixed joints once, and the moving ones with each message of their positions."""
+"""`RobotStatePublisher`, which sends a robot's fixed joints once, and its moving joints with each state."""
 
 import logging
 from collections import Counter
@@ -16,19 +16,19 @@ from tfbus.statistics import RobotStatistics
 
 
 class RobotStatePublisher:
-    """Turns positions of joints into transforms on a bus.
+    """Publishes the transforms of a robot for given positions of its joints.
 
-    Making one sends the fixed joints, as statics: the bus latches them, so whoever joins later gets them too.
+    The constructor publishes the fixed joints as static samples, which the bus latches for later subscribers.
 
     Parameters
     ----------
     bus : Bus
     model : RobotModel
     prefix : str
-        What the bus has before the names of this robot's frames, such as ``"robot1/"``, so that several robots with
-        the same frames can share a bus. The names of joints are without it.
+        Put before the names of this robot's frames, such as ``"robot1/"``, so that several robots with the same frames
+        can share a bus. The names of joints have no prefix.
     authority : str
-        Who says so: shown in errors and tools.
+        The sender: shown in errors and tools.
 
     Raises
     ------
@@ -52,23 +52,23 @@ class RobotStatePublisher:
         bus.publish(model.fixed_transforms(bus.clock.now(), authority, prefix))
 
     def publish(self, positions: Mapping[str, Position], stamp: int | None = None) -> None:
-        """Send where the moving joints are, as one batch.
+        """Publish the transforms of the moving joints as one batch.
 
-        Joints that are not in `positions`, and mimic none that is, are left out: they stay where they were last. Names
-        that the robot does not have, and positions beyond the limits, are counted and logged once; nothing is clamped.
+        Joints without a position of their own or of the joint that they mimic are left out. Unknown joints, and
+        positions outside of the limits, are counted and logged once; nothing is clamped.
 
         Parameters
         ----------
         positions : mapping of str to float, sequence of floats, or Transform
             By name of joint, as `Joint.transform` takes them.
         stamp : int, optional
-            When the joints were there, in ns; by default the clock's now.
+            The instant of the positions, in ns; by default the clock's now.
 
         Raises
         ------
         InvalidTransformError
-            If a position is not finite, has a wrong length or holds no unit quaternion, the stamp is bad, or the bus
-            refuses a frame. Nothing is sent.
+            If a position is not finite, has a wrong length or holds no unit quaternion, the stamp is invalid, or the
+            bus refuses a frame. Nothing is sent.
         BusClosedError, TypeError
         """
         stamp = self.bus.clock.now() if stamp is None else stamp
@@ -84,12 +84,12 @@ class RobotStatePublisher:
     def publish_state(
         self, names: Sequence[str], positions: Sequence[float] | npt.NDArray[np.floating], stamp: int | None = None
     ) -> None:
-        """As `publish`, with names and positions side by side, as ROS has them in a ``JointState``.
+        """Publish as `publish` does, with parallel sequences as in a ``JointState`` of ROS.
 
         Raises
         ------
         ValueError
-            If there are not as many positions as names, or a name is there twice.
+            If there are not as many positions as names, or a name occurs twice.
         InvalidTransformError, BusClosedError, TypeError
             As `publish`.
         """

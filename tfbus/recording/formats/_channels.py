@@ -1,32 +1,32 @@
-"""Which channel of an MCAP file a message goes to: its topic, and who said what is in it.
+"""The channels of an MCAP file, one for each topic and authority.
 
-A transform of ROS has no authority. So each authority has a channel of its own, as has each way in which the samples of
-one message are shared among several; the channel's metadata tell it, under a key that other tools ignore.
+A transform of ROS has no authority. So each authority has a channel of its own, and so has each sequence of authorities
+within one message. The metadata of the channel hold them, under a key that other tools ignore.
 """
 
 import json
 from collections.abc import Callable, Sequence
 
-from tfbus.recording.formats.storage import AUTHORITIES
+from tfbus.recording.formats._storage import AUTHORITIES
 
 MAX_CHANNELS = 1_000
 MAX_SHARED_CHANNELS = 500
 _MAX_RUNS = 32
 
 Runs = Sequence[tuple[str, int]]
-"""Authorities, and how many samples in a row are from each."""
+"""Pairs of an authority and the number of successive samples that it sent."""
 
 TYPE_HASH = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
-"""What ROS 2 calls this very definition of ``tf2_msgs/msg/TFMessage`` (REP 2016)."""
+"""The type hash of ``tf2_msgs/msg/TFMessage`` in ROS 2 (REP 2016)."""
 
 
 class Channels:
-    """Finds channels by topic and authorities, and registers them when they are wanted first; a bounded number.
+    """A bounded number of channels by topic and authorities, registered at their first use.
 
     Parameters
     ----------
     register : callable
-        Adds a channel with a topic and metadata to the file, and gives its number.
+        Adds a channel with a topic and metadata to the file, and returns its number.
     """
 
     def __init__(self, register: Callable[[str, dict[str, str]], int]) -> None:
@@ -34,7 +34,7 @@ class Channels:
         self._known: dict[tuple[str, tuple[tuple[str, int], ...]], int] = {}
 
     def find(self, topic: str, runs: Runs) -> int | None:
-        """The channel of a message; None if there are too many to make another one."""
+        """The channel of a message; None if the limit of channels is reached."""
         # A single authority stands for a message of any length.
         key = tuple(runs) if len(runs) > 1 else ((runs[0][0], 1),)
         if not any(authority for authority, _ in key):
@@ -45,7 +45,7 @@ class Channels:
         return known
 
     def anonymous(self, topic: str) -> int:
-        """The channel of what has no authority."""
+        """The channel of messages without an authority."""
         known = self._known.get((topic, ()))
         return self._register(topic, ()) if known is None else known
 
@@ -66,13 +66,13 @@ class Channels:
 
 
 def _quality_of_service(static: bool) -> str:
-    """What the broadcasters of tf2 offer: reliable, the last 100; or, for static transforms, latched."""
-    forever = "{sec: 9223372036, nsec: 854775807}"
+    """The profile of tf2's broadcasters: reliable with a depth of 100, or latched for static transforms."""
+    infinite = "{sec: 9223372036, nsec: 854775807}"
     keep_last, reliable, automatic = 1, 1, 1
     depth, durability = (1, 1) if static else (100, 2)
     return (
         f"- history: {keep_last}\n  depth: {depth}\n  reliability: {reliable}\n  durability: {durability}\n"
-        f"  deadline: {forever}\n  lifespan: {forever}\n"
-        f"  liveliness: {automatic}\n  liveliness_lease_duration: {forever}\n"
+        f"  deadline: {infinite}\n  lifespan: {infinite}\n"
+        f"  liveliness: {automatic}\n  liveliness_lease_duration: {infinite}\n"
         "  avoid_ros_namespace_conventions: false"
     )

@@ -1,4 +1,4 @@
-"""SQLite files of ROS 2, finished or not."""
+"""Reading SQLite files of ROS 2, finished or not."""
 
 import sqlite3
 from collections.abc import Iterator
@@ -7,7 +7,7 @@ from typing import Final
 from urllib.parse import quote
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats.storage import Channel, Stored, channel_of, lost
+from tfbus.recording.formats._storage import Channel, StoredMessage, channel_of, lost_message
 
 MAGIC: Final = b"SQLite format 3\0"
 
@@ -15,7 +15,7 @@ _DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 
 
 class SqliteStorage:
-    """One SQLite file; `Storage` says what it tells.
+    """A `Storage` of one SQLite file.
 
     Parameters
     ----------
@@ -24,22 +24,22 @@ class SqliteStorage:
     Attributes
     ----------
     finished : bool
-        Whether there is no write-ahead log beside it, as its writer leaves behind if it is killed.
+        Whether there is no write-ahead log beside the file; a writer that is killed leaves one.
 
     Raises
     ------
     RecordingError
-        If it is damaged, or no recording.
+        If the file is damaged, or no recording.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         log = path.with_name(f"{path.name}-wal")
         self.finished = not (log.exists() and log.stat().st_size)
-        # Where there is no log, SQLite would make an empty one beside the recording.
-        how = "immutable=1" if self.finished else "mode=ro"
+        # Without "immutable", SQLite would create an empty log beside the recording.
+        mode = "immutable=1" if self.finished else "mode=ro"
         try:
-            self._file = sqlite3.connect(f"file:{quote(str(path))}?{how}", uri=True, check_same_thread=False)
+            self._file = sqlite3.connect(f"file:{quote(str(path))}?{mode}", uri=True, check_same_thread=False)
             try:
                 self._read()
             except BaseException:
@@ -61,27 +61,30 @@ class SqliteStorage:
         self.start: int | None
         self.end: int | None
         self.start, self.end = self._file.execute(ends).fetchone()
-        count = f"SELECT COUNT(*) FROM messages WHERE topic_id IN ({self._marks(self._channels)})"
+        count = f"SELECT COUNT(*) FROM messages WHERE topic_id IN ({self._placeholders(self._channels)})"
         self.count: int | None = self._file.execute(count, [*self._channels]).fetchone()[0]
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[Stored]:
-        """As `Storage` has it."""
-        wanted = {number: its for number, its in self._channels.items() if its.static or not only_static}
+    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[StoredMessage]:
+        """Iterate over messages, as `Storage.messages`."""
+        wanted = {number: channel for number, channel in self._channels.items() if channel.static or not only_static}
         limits = [("timestamp >= ?", since), ("timestamp <= ?", until)]
-        asked = [f"topic_id IN ({self._marks(wanted)})", *(text for text, limit in limits if limit is not None)]
+        conditions = [
+            f"topic_id IN ({self._placeholders(wanted)})",
+            *(text for text, limit in limits if limit is not None),
+        ]
         values = [*wanted, *(limit for _, limit in limits if limit is not None)]
-        query = f"SELECT timestamp, topic_id, CAST(data AS BLOB) FROM messages WHERE {' AND '.join(asked)}"
+        query = f"SELECT timestamp, topic_id, CAST(data AS BLOB) FROM messages WHERE {' AND '.join(conditions)}"
         now = self.start or 0
         try:
             for now, number, payload in self._file.execute(f"{query} ORDER BY timestamp, id", values):
                 yield now, wanted[number], payload or b""
         except _DAMAGE as error:
-            yield lost(now, f"nothing more can be read: {error}")
+            yield lost_message(now, f"nothing more can be read: {error}")
 
     @staticmethod
-    def _marks(channels: dict[int, Channel]) -> str:
+    def _placeholders(channels: dict[int, Channel]) -> str:
         return ", ".join("?" * len(channels))

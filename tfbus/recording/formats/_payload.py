@@ -1,4 +1,4 @@
-"""The samples of a stored message, whatever it is wrapped in."""
+"""Decoding stored messages: plain CDR, CDR compressed by Zstandard, and ROS 1."""
 
 from functools import cache
 from typing import Final, Literal
@@ -9,15 +9,15 @@ from rosbags.typesys.store import Typestore
 from zstandard import ZstdDecompressor, ZstdError
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import Decoded, MalformedMessageError, decode
 
 _COMPRESSED: Final = b"\x28\xb5\x2f\xfd"
-"""How Zstandard begins (RFC 8878, section 3.1.1); a message in CDR begins with a zero."""
+"""The first bytes of Zstandard data (RFC 8878, section 3.1.1); a message in CDR begins with a zero."""
 
 
-def samples_of(channel: Channel, payload: bytes) -> Decoded[TransformStamped]:
-    """What a message holds, with authorities and without leading slashes.
+def decode_payload(channel: Channel, payload: bytes) -> Decoded[TransformStamped]:
+    """Decode the samples of a message, with the authorities of its channel and without leading slashes.
 
     Raises
     ------
@@ -26,7 +26,7 @@ def samples_of(channel: Channel, payload: bytes) -> Decoded[TransformStamped]:
     if channel.ros1:
         payload = _as_cdr(payload)
     elif payload[:4] == _COMPRESSED:
-        payload = _decompressed(payload)
+        payload = _decompress(payload)
     order: Literal["little", "big"] = "little" if payload[1:2] == b"\1" else "big"
     count = int.from_bytes(payload[4:8], order)
     return decode(payload, channel.tags(count), bare_names=True)
@@ -44,7 +44,7 @@ def _types() -> Typestore:
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
-def _decompressed(payload: bytes) -> bytes:
+def _decompress(payload: bytes) -> bytes:
     try:
         return ZstdDecompressor().decompress(payload)
     except ZstdError as error:

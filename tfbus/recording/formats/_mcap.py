@@ -1,11 +1,11 @@
-"""MCAP files: ours, those of ROS 2 and of Foxglove, finished or not.
+"""Reading MCAP files of tfbus, ROS 2 and Foxglove, finished or not.
 
-A finished file tells at its end where each chunk is and what is in it, so that only what is needed is read, by log
-time. A file whose writer was killed, or whose index fails its checksum, is read from its beginning, as far as it goes.
-A chunk that fails its checksum is left out and told, and the reading goes on behind it.
+A finished file has an index of its chunks at its end, so only the needed chunks are read, by log time. A file whose
+writer was killed, or whose index fails its checksum, is read from its beginning, as far as possible. A chunk that fails
+its checksum is left out and reported, and reading continues behind it.
 
-Records are read by the package `mcap`. What is taken apart here is which records follow each other, and the messages in
-a chunk (MCAP's specification, sections "Records" and "Message"): an object for each message takes ten times as long.
+The package `mcap` parses the records. This module only splits a file into records and a chunk into messages (MCAP's
+specification, sections "Records" and "Message"): to build an object for each message would take ten times as long.
 """
 
 import struct
@@ -27,13 +27,13 @@ from mcap.stream_reader import get_chunk_data_stream
 from zstandard import ZstdError
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats.storage import Channel, Stored, channel_of, lost
+from tfbus.recording.formats._storage import Channel, StoredMessage, channel_of, lost_message
 from tfbus.stamps import STAMP_MAX
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
 _DAMAGE = (McapError, struct.error, ValueError, LookupError, OverflowError, MemoryError, RuntimeError, ZstdError)
-"""What damaged bytes make `mcap` and its decompressors raise."""
+"""The errors that `mcap` and its decompressors raise for damaged bytes."""
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -50,7 +50,7 @@ _READ: dict[int, Callable[[ReadDataStream], records.McapRecord]] = {
 
 
 class McapStorage:
-    """One MCAP file; `Storage` says what it tells.
+    """A `Storage` of one MCAP file.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ class McapStorage:
     Raises
     ------
     RecordingError
-        If the file ends before its first message and was never finished.
+        If the file is unfinished and ends before its first message.
     OSError
     """
 
@@ -75,7 +75,7 @@ class McapStorage:
             raise RecordingError("the file ends before its first message", path=str(path), reason="truncated")
 
     def close(self) -> None:
-        """Nothing: the file is open only while messages are read."""
+        """Do nothing: the file is open only while messages are read."""
 
     @property
     def start(self) -> int | None:
@@ -89,29 +89,27 @@ class McapStorage:
 
     @property
     def count(self) -> int | None:
-        """How many messages of transforms there are, if the index tells."""
+        """The number of messages with transforms, if there is an index."""
         if self._statistics is None:
             return None
         counts = self._statistics.channel_message_counts
         return sum(counts.get(number, 0) for number, channel in self._channels.items() if channel is not None)
 
-    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[Stored]:
-        """As `Storage` has it; without an index, in the order of the file."""
+    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[StoredMessage]:
+        """Iterate over messages, as `Storage.messages`; without an index, in the order of the file."""
         low = 0 if since is None else since
         high = STAMP_MAX if until is None else until
         now = low
         for stored in self._by_index(low, high, only_static) if self._chunks else self._in_sequence(low):
             received, channel, _ = stored
             if received > STAMP_MAX:
-                received, channel, _ = stored = lost(now, f"a message has the log time {received} ns")
+                received, channel, _ = stored = lost_message(now, f"a message has the log time {received} ns")
             now = max(now, received)
             if low <= received <= high and (not only_static or (isinstance(channel, Channel) and channel.static)):
                 yield stored
 
-    # What the file tells without its messages
-
     def _read_index(self) -> bool:
-        """Read what stands behind the messages, and say whether the file was finished."""
+        """Read the index behind the messages, and return whether the file was finished."""
         with self._path.open("rb") as file:
             if self._size < len(MAGIC) + _FOOTER.size:
                 return False
@@ -122,18 +120,18 @@ class McapStorage:
                 return False
             file.seek(min(start, self._size))
             index = file.read()
-        # The checksum is over all of it up to itself.
+        # The checksum covers the index up to the checksum itself.
         if start and checksum in (0, zlib.crc32(index[: -len(MAGIC) - 4])):
             with suppress(*_DAMAGE):
-                self._learn_index(list(_records(BytesIO(index), len(index))))
+                self._use_index(list(_records(BytesIO(index), len(index))))
         return True
 
-    def _learn_index(self, index: list[records.McapRecord]) -> None:
+    def _use_index(self, index: list[records.McapRecord]) -> None:
         for record in index:
-            self._learn(record)
+            self._register(record)
         statistics = next((record for record in index if isinstance(record, records.Statistics)), None)
         kinds = {record.schema_id for record in index if isinstance(record, records.Channel)} - {0}
-        # A writer may leave out of its index what it has said before.
+        # A writer may leave schemas and channels out of its index; then the index is of no use.
         if (
             statistics is not None
             and statistics.channel_message_counts.keys() <= self._channels.keys()
@@ -143,7 +141,7 @@ class McapStorage:
             chunks = [record for record in index if isinstance(record, records.ChunkIndex)]
             self._chunks = sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
 
-    def _learn(self, record: records.McapRecord) -> None:
+    def _register(self, record: records.McapRecord) -> None:
         if isinstance(record, records.Schema):
             self._schemas[record.id] = record.name
         elif isinstance(record, records.Channel):
@@ -154,14 +152,14 @@ class McapStorage:
     @cached_property
     def _span(self) -> tuple[int, int] | None:
         if self._statistics is None:
-            ends = list(self._log_times())
-            return (min(first for first, _ in ends), max(last for _, last in ends)) if ends else None
+            spans = list(self._log_times())
+            return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
         if not self._statistics.message_count:
             return None
         return self._statistics.message_start_time, self._statistics.message_end_time
 
     def _log_times(self) -> Iterator[tuple[int, int]]:
-        """The first and the last log time of each chunk, and those of messages in none, as far as the file goes."""
+        """First and last log time of each chunk and of each message outside of chunks, as far as the file is good."""
         with self._path.open("rb") as file, suppress(*_DAMAGE):
             file.seek(len(MAGIC))
             for record in _records(file, self._size):
@@ -170,11 +168,13 @@ class McapStorage:
                 elif isinstance(record, records.Chunk) and (record.message_end_time or self._in_chunk(record)):
                     yield record.message_start_time, record.message_end_time
 
-    # Messages
-
-    def _by_index(self, low: int, high: int, only_static: bool) -> Iterator[Stored]:
-        """The messages of the chunks that may have some in the range; where chunks overlap, in the right order."""
-        wanted = {number for number, its in self._channels.items() if its and (its.static or not only_static)}
+    def _by_index(self, low: int, high: int, only_static: bool) -> Iterator[StoredMessage]:
+        """Messages of all chunks that overlap the range, in the order of their log times even if the chunks overlap."""
+        wanted = {
+            number
+            for number, channel in self._channels.items()
+            if channel is not None and (channel.static or not only_static)
+        }
         chunks = [
             chunk
             for chunk in self._chunks
@@ -183,58 +183,62 @@ class McapStorage:
             and not (chunk.message_index_offsets and wanted.isdisjoint(chunk.message_index_offsets))
         ]
         starts = [*(chunk.message_start_time for chunk in chunks), 2**64]
-        ahead: list[tuple[int, int, Stored]] = []
+        waiting: list[tuple[int, int, StoredMessage]] = []
         with self._path.open("rb") as file:
             for chunk, following in zip(chunks, starts[1:], strict=True):
-                ahead += [(stored[0], chunk.chunk_start_offset, stored) for stored in self._at(file, chunk, low)]
-                # At one log time, in the order of the file.
-                ahead.sort(key=itemgetter(0, 1))
-                ready = bisect_left(ahead, following, key=itemgetter(0))
-                yield from map(itemgetter(2), ahead[:ready])
-                del ahead[:ready]
+                waiting += [
+                    (stored[0], chunk.chunk_start_offset, stored) for stored in self._read_chunk(file, chunk, low)
+                ]
+                # Messages of the same log time stay in the order of the file.
+                waiting.sort(key=itemgetter(0, 1))
+                ready = bisect_left(waiting, following, key=itemgetter(0))
+                yield from map(itemgetter(2), waiting[:ready])
+                del waiting[:ready]
 
-    def _at(self, file: IO[bytes], index: records.ChunkIndex, low: int) -> list[Stored]:
-        """The messages of a chunk that the index tells of."""
+    def _read_chunk(self, file: IO[bytes], index: records.ChunkIndex, low: int) -> list[StoredMessage]:
+        """The messages of a chunk in the index."""
         if index.chunk_start_offset + index.chunk_length <= self._size:
             file.seek(index.chunk_start_offset)
             with suppress(*_DAMAGE):
                 for chunk in _records(BytesIO(file.read(index.chunk_length)), index.chunk_length):
                     if isinstance(chunk, records.Chunk):
                         return self._in_chunk(chunk)
-        return [lost(max(index.message_start_time, low), f"the chunk at byte {index.chunk_start_offset} is damaged")]
+        return [
+            lost_message(max(index.message_start_time, low), f"the chunk at byte {index.chunk_start_offset} is damaged")
+        ]
 
-    def _in_sequence(self, low: int) -> Iterator[Stored]:
-        """All messages as they come, up to where the file is torn; what is lost before `low` is told at it."""
+    def _in_sequence(self, low: int) -> Iterator[StoredMessage]:
+        """All messages in the order of the file, up to its end or damage; damage before `low` is reported at `low`."""
         now = low
         with self._path.open("rb") as file:
             file.seek(len(MAGIC))
             try:
                 for record in _records(file, self._size):
-                    found: list[Stored] = []
+                    found: list[StoredMessage] = []
                     if isinstance(record, records.Chunk):
                         try:
                             found = self._in_chunk(record)
                         except _DAMAGE:
-                            found = [lost(now, f"the chunk before byte {file.tell()} is damaged")]
+                            found = [lost_message(now, f"the chunk before byte {file.tell()} is damaged")]
                     elif isinstance(record, records.Message):
                         channel = self._channels.get(record.channel_id)
                         found = [] if channel is None else [(record.log_time, channel, record.data)]
                     else:
-                        self._learn(record)
+                        self._register(record)
                     for stored in found:
                         now = max(now, stored[0])
                         yield stored
             except EndOfFile:
                 if self.finished:
-                    yield lost(now, "a record goes on behind the end of the file")
+                    yield lost_message(now, "a record goes on behind the end of the file")
             except _DAMAGE:
-                yield lost(now, f"nothing can be read from byte {file.tell()} on")
+                yield lost_message(now, f"nothing can be read from byte {file.tell()} on")
 
-    def _in_chunk(self, chunk: records.Chunk) -> list[Stored]:
+    def _in_chunk(self, chunk: records.Chunk) -> list[StoredMessage]:
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
         data = stream.read(length)
         channels = self._channels
-        found: list[Stored] = []
+        found: list[StoredMessage] = []
         at = 0
         while at < length:
             opcode, size = _RECORD.unpack_from(data, at)
@@ -246,17 +250,17 @@ class McapStorage:
                 if channel is not None:
                     found.append((received, channel, data[start + _MESSAGE.size : at]))
             elif opcode in _READ:
-                self._learn(_READ[opcode](ReadDataStream(BytesIO(data[start:at]))))
+                self._register(_READ[opcode](ReadDataStream(BytesIO(data[start:at]))))
         return found
 
 
 def _records(file: IO[bytes], size: int) -> Iterator[records.McapRecord]:
-    """The records from here on, up to the footer; those that nobody here needs are left out.
+    """The records from the current position to the footer, without the kinds that are not needed here.
 
     Raises
     ------
     EndOfFile
-        If the file, which is `size` bytes long, ends before the footer.
+        If the file of `size` bytes ends before the footer.
     """
     while True:
         head = file.read(_RECORD.size)

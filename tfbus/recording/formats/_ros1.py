@@ -8,13 +8,13 @@ from rosbags.interfaces import ConnectionExtRosbag1
 from rosbags.rosbag1 import Reader
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats.storage import Channel, Stored, channel_of, lost
+from tfbus.recording.formats._storage import Channel, StoredMessage, channel_of, lost_message
 
 MAGIC: Final = b"#ROSBAG V"
 
 
 class Ros1Storage:
-    """One bag; `Storage` says what it tells.
+    """A `Storage` of one bag.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ class Ros1Storage:
     Raises
     ------
     RecordingError
-        If it is damaged, or its index is missing because its writer was killed.
+        If the bag is damaged, or has no index because its writer was killed.
     """
 
     finished: Final = True
@@ -32,7 +32,7 @@ class Ros1Storage:
         self._reader = Reader(path)
         try:
             self._reader.open()
-        # Besides its own errors, rosbags raises whatever damaged bytes lead to.
+        # For damaged bytes, rosbags raises more than its own errors.
         except Exception as error:
             raise RecordingError(
                 f"it cannot be read as a bag of ROS 1: {error}", path=str(path), reason="damaged"
@@ -44,17 +44,17 @@ class Ros1Storage:
         self._channels: dict[int, Channel] = {number: channel for number, channel in found.items() if channel}
         times = self._reader.chunk_infos
         self.start = min((chunk.start_time for chunk in times if chunk.connection_counts), default=None)
-        # rosbags tells the first instant behind the last message.
+        # The end that rosbags gives is 1 ns after the last message.
         self.end = max((chunk.end_time - 1 for chunk in times if chunk.connection_counts), default=None)
-        self.count = sum(its.msgcount for its in self._reader.connections if its.id in self._channels)
+        self.count = sum(each.msgcount for each in self._reader.connections if each.id in self._channels)
 
     def close(self) -> None:
         """Close the file."""
         self._reader.close()
 
-    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[Stored]:
-        """As `Storage` has it."""
-        wanted = {number: its for number, its in self._channels.items() if its.static or not only_static}
+    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[StoredMessage]:
+        """Iterate over messages, as `Storage.messages`."""
+        wanted = {number: channel for number, channel in self._channels.items() if channel.static or not only_static}
         connections = [connection for connection in self._reader.connections if connection.id in wanted]
         if not connections:
             return
@@ -63,8 +63,8 @@ class Ros1Storage:
         try:
             for connection, now, payload in self._reader.messages(connections, since, stop):
                 yield now, wanted[connection.id], payload
-        except Exception as error:  # noqa: BLE001 - as in opening
-            yield lost(now, f"nothing more can be read: {error}")
+        except Exception as error:  # noqa: BLE001 - damaged bytes, as in opening
+            yield lost_message(now, f"nothing more can be read: {error}")
 
 
 def _metadata(extension: object) -> dict[str, str]:

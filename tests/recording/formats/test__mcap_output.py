@@ -17,14 +17,14 @@ from support.samples import moving, static
 from support.strategies import samples
 
 from tfbus import Transform, TransformStamped
-from tfbus.recording._write_queue import Entry
+from tfbus.bus.sample_queue import TimedBatch
 from tfbus.recording.formats._channels import TYPE_HASH
-from tfbus.recording.formats.mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, McapOutput
+from tfbus.recording.formats._mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, McapOutput
 from tfbus.stamps import SECOND
 from tfbus.tf_message import decode
 
 
-def written(path: Path, *entries: Entry) -> McapOutput:
+def written(path: Path, *entries: TimedBatch) -> McapOutput:
     with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write(entries)
         output.finish()
@@ -212,9 +212,13 @@ def test_what_counts_as_written_can_be_read_at_any_moment(tmp_path: Path) -> Non
 def test_a_new_channel_that_ends_a_chunk_counts_nothing_too_early(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with closing(McapOutput(str(path), overwrite=False)) as output:
+        counted = 0
         for k in range(400):
             output.write([(k, (moving("map", "a", k, authority=f"a{k}"),))])
-            assert output.samples <= readable(path)
+            if output.samples > counted:
+                counted = output.samples
+                assert counted <= readable(path)
+        assert counted > 0
 
 
 def test_a_file_that_is_there_is_kept_unless_it_may_be_lost(tmp_path: Path) -> None:

@@ -10,16 +10,16 @@ from typing import Final
 from zstandard import ZstdDecompressor, ZstdError
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats.storage import Storage, Stored, lost
+from tfbus.recording.formats._storage import Storage, StoredMessage, lost_message
 
 SUFFIXES: Final = (".mcap", ".db3")
 COMPRESSED: Final = ".zstd"
 
 
 class FolderStorage:
-    """All files of a folder as one; `Storage` says what it tells.
+    """A `Storage` of all recordings in one folder.
 
-    Which files there are, the folder itself says: ``metadata.yaml`` is missing where the writer was killed.
+    It lists the folder and does not read ``metadata.yaml``, which is missing if the writer was killed.
 
     Parameters
     ----------
@@ -30,17 +30,17 @@ class FolderStorage:
     Raises
     ------
     RecordingError
-        If there are no files of a recording, or not one of them can be read.
+        If the folder has no files of a recording, or none of them can be read.
     """
 
     def __init__(self, path: Path, open_file: Callable[[Path], Storage]) -> None:
-        self._unpacked = TemporaryDirectory(prefix="tfbus-")
+        self._decompressed = TemporaryDirectory(prefix="tfbus-")
         self._files: list[Storage] = []
         self._refused: list[RecordingError] = []
         try:
             for file in sorted(path.iterdir()):
                 if Path(file.name.removesuffix(COMPRESSED)).suffix in SUFFIXES:
-                    self._add(file, open_file)
+                    self._open(file, open_file)
             if not self._files and self._refused:
                 raise self._refused[0]
             if not self._files:
@@ -52,20 +52,20 @@ class FolderStorage:
             raise
         self.finished = not self._refused and all(file.finished for file in self._files)
 
-    def _add(self, path: Path, open_file: Callable[[Path], Storage]) -> None:
+    def _open(self, path: Path, open_file: Callable[[Path], Storage]) -> None:
         try:
-            self._files.append(open_file(self._unpack(path) if path.suffix == COMPRESSED else path))
+            self._files.append(open_file(self._decompress(path) if path.suffix == COMPRESSED else path))
         except RecordingError as error:
             self._refused.append(error)
 
-    def _unpack(self, path: Path) -> Path:
-        unpacked = Path(self._unpacked.name, path.stem)
+    def _decompress(self, path: Path) -> Path:
+        decompressed = Path(self._decompressed.name, path.stem)
         try:
-            with path.open("rb") as source, unpacked.open("wb") as target:
+            with path.open("rb") as source, decompressed.open("wb") as target:
                 ZstdDecompressor().copy_stream(source, target)
         except ZstdError as error:
             raise RecordingError(f"it cannot be decompressed: {error}", path=str(path), reason="damaged") from error
-        return unpacked
+        return decompressed
 
     @property
     def start(self) -> int | None:
@@ -79,19 +79,19 @@ class FolderStorage:
 
     @property
     def count(self) -> int | None:
-        """How many messages of transforms there are, if every file tells."""
+        """The number of messages with transforms, if all files know theirs."""
         counts = [file.count for file in self._files]
         return None if None in counts else sum(count for count in counts if count is not None)
 
     def close(self) -> None:
-        """Close the files, and remove what was unpacked."""
+        """Close the files, and remove the decompressed copies."""
         for file in self._files:
             file.close()
-        self._unpacked.cleanup()
+        self._decompressed.cleanup()
 
-    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[Stored]:
-        """As `Storage` has it."""
+    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[StoredMessage]:
+        """Iterate over the messages of all files, as `Storage.messages`."""
         now = (self.start or 0) if since is None else since
         for error in self._refused:
-            yield lost(now, str(error))
-        yield from heapq.merge(*(its.messages(since, until, only_static) for its in self._files), key=itemgetter(0))
+            yield lost_message(now, str(error))
+        yield from heapq.merge(*(file.messages(since, until, only_static) for file in self._files), key=itemgetter(0))

@@ -1,7 +1,7 @@
-"""A recording that is being written: an MCAP file as `ros2 bag record` makes it, in small chunks.
+"""Writing an MCAP file as `ros2 bag record` does, in small chunks.
 
-Every write goes to the operating system at once and a chunk is complete in itself, so what was flushed can be read
-whatever happens to the process. Everything here blocks.
+Every write goes to the operating system at once, and each chunk is complete in itself. So flushed samples can be read
+even if the process is killed. All functions block.
 """
 
 import os
@@ -12,9 +12,9 @@ from io import FileIO
 from itertools import groupby
 from typing import Any, cast
 
+from tfbus.bus.sample_queue import TimedBatch
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.recording._write_queue import Entry
 from tfbus.recording.formats._channels import Channels
 from tfbus.tf_message import encode, refusal
 
@@ -40,29 +40,29 @@ _PAUSE = 1e-5
 
 
 class McapOutput:
-    """Takes batches; for one thread at a time.
+    """Writes batches to a new MCAP file; for one thread at a time.
 
     Parameters
     ----------
     path : str
     overwrite : bool
-        Whether a file that is there already may be lost.
+        Whether to replace an existing file.
 
     Attributes
     ----------
     samples, messages : int
-        What has left this process.
+        Samples and messages that the operating system has.
     buffered : int
-        Samples in the chunk that is being filled.
+        Samples in the unfinished chunk.
     unattributed : int
-        Samples that were written without their authority.
+        Samples written without their authority.
     refused : Counter
         Samples that a message cannot hold, by reason.
 
     Raises
     ------
     OSError
-        If the file cannot be made; `FileExistsError` if it is there already.
+        If the file cannot be created; `FileExistsError` if it exists.
     ImportError
         If the extra is missing.
     """
@@ -80,7 +80,7 @@ class McapOutput:
         self._buffered_messages = 0
         self._file = _UnbufferedFile(path, overwrite)
         try:
-            # Not all of its functions have types.
+            # Not all functions of the writer have types.
             self._writer = writer = cast(Any, Writer(cast(Any, self._file), CHUNK_SIZE))
             writer.start(profile="ros2", library="tfbus")
             # As ROS 2 Humble has it: newer ones then read the profiles as numbers too, and older ones know no other.
@@ -92,32 +92,33 @@ class McapOutput:
         self._channels = Channels(lambda topic, metadata: writer.register_channel(topic, "cdr", schema, metadata))
         self._written = self._file.size
 
-    def write(self, entries: Iterable[Entry], flush: bool = False) -> None:
-        """Add batches; of each, the static samples become one message, and the moving ones another.
+    def write(self, batches: Iterable[TimedBatch], flush: bool = False) -> None:
+        """Write batches: the static samples of a batch become one message, its moving samples another.
 
         Parameters
         ----------
-        entries : iterable of (int, Batch)
+        batches : iterable of (int, Batch)
+            Log times in ns, and batches.
         flush : bool
-            Whether to end the chunk, so that all of it is in the file.
+            Whether to end the chunk, so that all samples are in the file.
 
         Raises
         ------
         OSError
-            If the disk does not take it; then there is nothing left but to `close`.
+            If the disk fails; then the file can only be closed.
         """
-        pieces = ((received, samples) for received, batch in entries for samples in _by_kind(batch))
-        for number, (received, samples) in enumerate(pieces, 1):
+        messages = ((received, samples) for received, batch in batches for samples in _by_kind(batch))
+        for number, (received, samples) in enumerate(messages, 1):
             self._write("/tf_static" if samples[0].static else "/tf", received, samples)
             if number % _BURST == 0:
-                # Another thread would else get the interpreter only when this one has had it for 5 ms.
+                # Let the event loop run: without a pause, this thread would hold the interpreter for 5 ms.
                 time.sleep(_PAUSE)
         if flush:
             self._writer.flush()
             self._count_written()
 
     def finish(self) -> None:
-        """Write the index, and close.
+        """Write the index, and close the file.
 
         Raises
         ------
@@ -128,7 +129,7 @@ class McapOutput:
             self._writer.finish()
 
     def close(self) -> None:
-        """Leave the file as it is, without an index."""
+        """Close the file without an index."""
         self._file.close()
 
     def _write(self, topic: str, received: int, samples: Sequence[TransformStamped]) -> None:
@@ -152,7 +153,7 @@ class McapOutput:
             self.unattributed += len(samples)
         # The format has no time before 1970.
         log_time = max(0, received)
-        # To register the channel may have ended the chunk.
+        # Registering the channel may have ended the chunk.
         self._count_written()
         self.buffered += len(samples)
         self._buffered_messages += 1
@@ -178,12 +179,12 @@ def _by_kind(batch: Batch) -> Iterable[Sequence[TransformStamped]]:
     moving = [sample for sample in batch if not sample.static]
     if {sample.child for sample in statics}.isdisjoint(sample.child for sample in moving):
         return [samples for samples in (statics, moving) if samples]
-    # The last kind of a child is the one that it has.
+    # A child of both kinds: keep the order, because its last kind wins.
     return [list(run) for _, run in groupby(batch, lambda sample: sample.static)]
 
 
 class _UnbufferedFile:
-    """What the writer needs of a file: each write goes to the operating system, and is complete."""
+    """A file for the writer, each write of which is complete and goes to the operating system at once."""
 
     def __init__(self, path: str, overwrite: bool) -> None:
         self.size = 0

@@ -1,6 +1,6 @@
 import pytest
 
-from tfbus.recording.formats.storage import Channel, channel_of
+from tfbus.recording.formats._storage import Channel, channel_of
 
 TF = "tf2_msgs/msg/TFMessage"
 
