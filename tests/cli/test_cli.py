@@ -1,117 +1,184 @@
-"""The command as a user runs it: in a process of its own."""
+"""The command as a whole: its exit statuses, help texts, missing extras and closed pipes."""
 
+import os
 import re
-import signal
 import subprocess
 import sys
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
-import anyio
 import pytest
+from support.commands import Command, check_wrong_call
+from support.processes import new_domain
+from support.programs import PATIENCE, TFBUS
+from support.recorded import SMALL, write_mcap
+from support.samples import moving
 
-from tfbus import SimulatedClock
-from tfbus.cli import tutorial
+from tfbus.cli import app
+from tfbus.cli.arguments import UsageError
+from tfbus.cli.domain import LinkOptions
 
-TFBUS = str(Path(sys.executable).with_name("tfbus"))
-BACKENDS = ["asyncio", "trio"]
-SIMULATED = "".join(
-    f"[ INFO] {second}.000000000: base_laser: (1.00, 0.20. 0.00) -----> base_link: (1.10, 0.20, 0.20) "
-    f"at time {second - 1}.99\n"
-    for second in range(1, 11)
-)
-
-
-def tfbus(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([TFBUS, *arguments], capture_output=True, text=True, timeout=60, check=False)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_simulated_demo_prints_ten_lines_that_are_known_to_the_byte(backend: str) -> None:
-    done = tfbus("demo", "--simulated", "--duration", "10", "--backend", backend)
-    assert (done.stdout, done.stderr, done.returncode) == (SIMULATED, "", 0)
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_the_simulated_demo_is_the_same_twenty_times_out_of_twenty(backend: str) -> None:
-    for _ in range(20):
-        lines: list[str] = []
-        anyio.run(partial(tutorial.run, SimulatedClock(), duration=10.0, output=lines.append), backend=backend)
-        assert "".join(f"{line}\n" for line in lines) == SIMULATED
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("time", ["--simulated", "--duration=inf"])
-def test_ctrl_c_ends_the_demo_with_status_130_and_no_traceback(backend: str, time: str) -> None:
-    command = [TFBUS, "demo", "--listen-rate", "20", "--backend", backend, time]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        first = process.stdout.readline()
-        process.send_signal(signal.SIGINT)
-        output, errors = process.communicate(timeout=30)
-    assert first.startswith("[ INFO] ")
-    assert process.returncode == 130
-    assert errors == ""
-    assert all(line.startswith("[ INFO] ") for line in output.splitlines())
-
-
-def test_on_the_system_clock_the_lines_carry_the_systems_time() -> None:
-    done = tfbus("demo", "--duration", "0.3", "--listen-rate", "10")
-    stamps = [int(seconds) for seconds in re.findall(r"^\[ INFO\] (\d+)\.\d{9}: ", done.stdout, re.MULTILINE)]
-    assert len(stamps) == 3
-    assert stamps[0] > 1_700_000_000
-    assert done.returncode == 0
-
-
-def test_without_a_broadcaster_the_error_lines_go_to_standard_output() -> None:
-    done = tfbus("demo", "--simulated", "--duration", "2", "--no-broadcaster")
-    assert done.returncode == 0
-    assert done.stderr == ""
-    assert done.stdout.count("[ERROR] ") == 2
-    assert "frame 'base_link' is not known" in done.stdout
+LINK = ("--domain STR", "--listen STR...", "--connect STR...", "--backend CHOICE")
+URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("command", "options"),
     [
-        ("demo", "--rate", "0"),
-        ("demo", "--rate", "inf"),
-        ("demo", "--listen-rate=-1"),
-        ("demo", "--duration", "nan"),
-        ("demo", "--backend", "curio"),
-        ("demo", "--no-such-option"),
-        ("no-such-command",),
+        ("broadcast", ("--rate FLOAT", *LINK)),
+        ("demo", ("--duration", "--rate", "--listen-rate", "--backend", "--simulated", "--no-broadcaster")),
+        ("echo", ("TARGET", "SOURCE", "--rate FLOAT", "--max-age FLOAT", "--json", *LINK)),
+        ("info", ("FILE", "--json")),
+        ("listen", ("--rate FLOAT", *LINK)),
+        ("play", ("FILE", "--rate FLOAT", "--loop", "--from SECONDS", "--to SECONDS", *LINK)),
+        ("query", ("FILE", "TARGET", "SOURCE", "--at SECONDS", "--every SECONDS", "--csv", "--json")),
+        ("record", ("FILE", "--duration FLOAT", "--overwrite", *LINK)),
+        ("robot", ("FILE", "POSITION", "--tree", "--rate FLOAT", "--prefix STR", *LINK)),
+        ("static", ("PARENT", "CHILD", "--xyz", "--rpy", "--quaternion", "--authority STR", *LINK)),
+        ("tree", ("--duration FLOAT", "--watch", "--rate FLOAT", "--dot PATH", "--json", *LINK)),
     ],
 )
-def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(arguments: tuple[str, ...]) -> None:
-    done = tfbus(*arguments)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert re.fullmatch(r"tfbus: .+\n", done.stderr)
+def test_the_help_of_a_command_has_an_example_and_every_option(
+    command: str, options: Sequence[str], tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    done = tfbus(command, "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"Example: tfbus {command}" in done.stdout
+    for option in options:
+        assert re.search(rf"[│*] +{re.escape(option)}\b|{re.escape(option)} ", done.stdout), option
+    # Neither `--no-json` nor `--empty-listen`: those that cyclopts adds by itself mean nothing here.
+    assert re.findall(r"--(?:no|empty)-\w+", done.stdout) == (["--no-broadcaster"] if command == "demo" else [])
+    assert "default: False" not in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 80
 
 
-def test_help_shows_every_option_and_an_example() -> None:
-    done = tfbus("demo", "--help")
-    assert done.returncode == 0
-    for option in ("--duration", "--rate", "--listen-rate", "--backend", "--simulated", "--no-broadcaster"):
-        assert option in done.stdout
-    assert "Example: tfbus demo" in done.stdout
+def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
+    done = tfbus("--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    commands = ["broadcast", "demo", "echo", "info", "listen", "play", "query", "record", "robot", "static", "tree"]
+    assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands
 
 
-def test_a_reader_that_has_had_enough_is_no_traceback() -> None:
-    command = [TFBUS, "demo", "--simulated"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stderr is not None
-        process.stdout.readline()
-        process.stdout.close()
-        errors = process.stderr.read()
-        process.wait(timeout=30)
-    assert errors == ""
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("no-such-command",), "no-such-command"),
+        (("tree", "--no-such-option"), "--no-such-option"),
+        (("tree", "surplus"), "surplus"),
+        (("info",), "FILE"),
+        (("info", SMALL, SMALL), str(SMALL)),
+        (("echo", "map"), "SOURCE"),
+        (("demo", "--rate", "0"), "--rate"),
+        (("demo", "--listen-rate=-1"), "--listen-rate"),
+        (("record", "a.mcap", "--duration", "-1"), "--duration"),
+        (("listen", "--backend", "curio"), "--backend"),
+        (("broadcast", "--listen", "rubbish"), "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
+        (("listen", "--connect", "rubbish"), "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
+        (("static", "map", "odom", "--domain", "a b"), "a domain is made of letters"),
+    ],
+)
+def test_a_usage_error_is_one_line_on_standard_error_and_status_2(
+    arguments: Sequence[object], why: str, tfbus: Command
+) -> None:
+    check_wrong_call(tfbus(*arguments), why)
 
 
-def test_without_its_extra_the_command_names_it() -> None:
-    hidden = "import sys; sys.modules['cyclopts'] = None; import tfbus.cli"
-    done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=False)
-    assert done.stderr == 'tfbus: the command needs some packages more: pip install "tfbus[cli]"\n'
-    assert done.returncode == 1
+def test_several_errors_at_once_are_a_line_each(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ExceptionGroup("two tasks", [UsageError("one"), UsageError("two")])
+
+    monkeypatch.setattr(LinkOptions, "run", fail)
+    done = tfbus("tree")
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "tfbus: one\ntfbus: two\n")
+
+
+def test_ctrl_c_is_status_130_and_silent(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(LinkOptions, "run", interrupt)
+    done = tfbus("tree")
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+@pytest.mark.thorough
+def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("map", "Straße", 1)])])
+    done = subprocess.run(
+        [TFBUS, "info", str(path)],
+        capture_output=True,
+        timeout=PATIENCE,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        check=True,
+    )
+    assert rb"Stra\xdfe" in done.stdout
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("package", "arguments", "status", "message"),
+    [
+        ("cyclopts", (), 1, 'the command needs some packages more: pip install "tfbus[cli]"'),
+        ("zenoh", ("listen",), 2, 'joining a domain needs a package more: pip install "tfbus[cli,zenoh]"'),
+        (
+            "mcap.writer",
+            ("record", "run.mcap", "--domain", new_domain()),
+            2,
+            'to record needs a package more: pip install "tfbus[bag]"',
+        ),
+        (
+            "urdf_parser_py",
+            ("robot", str(URDF), "--tree"),
+            2,
+            'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"',
+        ),
+    ],
+)
+def test_a_missing_extra_is_named(
+    package: str, arguments: Sequence[str], status: int, message: str, tmp_path: Path
+) -> None:
+    hidden = f"import sys; sys.modules[{package!r}] = None; from tfbus.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", hidden, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", f"tfbus: {message}\n")
+
+
+@pytest.mark.thorough
+def test_a_reader_that_closes_the_pipe_ends_the_command_silently(tmp_path: Path) -> None:
+    long = "name_" * 100
+    samples = [moving("a", f"{long}{number}", 1) for number in range(500)]
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)])
+    # Unbuffered, Python would not report what the pipe did not take.
+    environment = {**os.environ, "PYTHONUNBUFFERED": ""}
+    for command in (("demo", "--simulated"), ("info", str(path))):
+        pipe = subprocess.PIPE
+        with subprocess.Popen([TFBUS, *command], stdout=pipe, stderr=pipe, env=environment) as process:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            # Both go on to print more than fits into a pipe.
+            assert process.stdout.readline() != b""
+            process.stdout.close()
+            errors = process.stderr.read()
+            status = process.wait(PATIENCE)
+        assert (command[0], status, errors) == (command[0], 0, b"")
+
+
+@pytest.mark.thorough
+def test_an_optional_package_is_imported_only_by_the_command_that_needs_it() -> None:
+    script = "import sys, tfbus.cli; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
+    assert "tfbus" in loaded
+    assert set(loaded) & {"zenoh", "rich", "trio", "mcap", "rosbags", "lxml"} == set()
+
+
+def test_every_command_has_a_module_of_its_name() -> None:
+    folder = Path(sys.modules["tfbus.cli.commands"].__path__[0])
+    modules = {path.stem for path in folder.glob("*.py")} - {"__init__"}
+    assert {name for name in app if not name.startswith("-")} == modules

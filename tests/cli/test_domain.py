@@ -1,65 +1,59 @@
-"""What all commands that join a domain have in common."""
-
 import errno
 import os
+import re
+import signal
 import socket
-import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
 import anyio
+import anyio.lowlevel
 import pytest
+from support.commands import START, Command, check_wrong_call
 from support.processes import new_domain
 from support.programs import Program
+from support.samples import static
 
-from tfbus import Bus
-from tfbus.cli import main
-from tfbus.cli.domain import LinkOptions, UnusableError
+from tfbus import Bus, SimulatedClock, from_seconds
+from tfbus.cli.arguments import UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.testing import simulate
 
-COMMANDS = {"broadcast": (), "listen": (), "static": ("map", "odom"), "echo": ("map", "odom"), "tree": ()}
-
-Call = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    """The command, in this process: its status, output and errors."""
-
-    def call_it(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["tfbus", *arguments])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, *capsys.readouterr()
-
-    return call_it
+BACKENDS = ["asyncio", "trio"]
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_an_example_and_says_how_others_are_reached(command: str, call: Call) -> None:
-    status, output, errors = call(command, "--help")
-    assert (status, errors) == (0, "")
-    assert f"Example: tfbus {command}" in output
-    for option in ("--domain", "--listen", "--connect", "--backend"):
-        assert option in output
-    assert "--empty" not in output
+def join(options: LinkOptions) -> None:
+    """Join a domain and leave it again."""
+
+    async def stay_for_a_moment(_: Bus) -> None:
+        await anyio.lowlevel.checkpoint()
+
+    options.run(stay_for_a_moment)
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        (("--listen", "rubbish"), "an address is like tcp/192.168.1.5:7447, not 'rubbish'"),
-        (("--domain", "a b"), "a domain is made of letters"),
-    ],
-)
-def test_what_cannot_be_used_is_one_line_and_status_2(
-    command: str, options: tuple[str, ...], why: str, call: Call
-) -> None:
-    status, output, errors = call(command, *COMMANDS[command], *options)
-    assert (status, output) == (2, "")
-    (line,) = errors.splitlines()
-    assert line.startswith(f"tfbus: {why}")
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_programs_of_a_domain_hear_each_other_and_return_their_results(backend: str) -> None:
+    options = LinkOptions(new_domain(), backend=backend)  # type: ignore[arg-type]
+
+    async def meet(bus: Bus) -> str:
+        arrived = anyio.Event()
+        with Bus() as other, bus.subscribe(lambda _: arrived.set()):
+            async with options.join(other):
+                other.publish(static("map", "odom"))
+                await arrived.wait()
+        return "met"
+
+    assert options.run(meet) == "met"
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_ctrl_c_ends_a_program(backend: str) -> None:
+    async def interrupt(_: Bus) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        await anyio.sleep_forever()
+
+    with pytest.raises(KeyboardInterrupt):
+        LinkOptions(new_domain(), backend=backend).run(interrupt)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -81,14 +75,9 @@ def test_what_cannot_be_used_is_one_line_and_status_2(
         "tcp/::1:7447",
     ],
 )
-def test_an_address_that_can_never_be_reached_is_refused_and_not_tried_for_ever(address: str) -> None:
-    async def join() -> None:
-        with Bus() as bus:
-            async with LinkOptions(new_domain(), connect=(address,)).open(bus):
-                raise AssertionError("joined")
-
-    with pytest.raises(UnusableError, match="an address is like"):
-        anyio.run(join)
+def test_an_address_that_no_program_can_have_is_a_usage_error(address: str) -> None:
+    with pytest.raises(UsageError, match=f"an address is like tcp/.+, not {re.escape(repr(address))}"):
+        join(LinkOptions(new_domain(), connect=(address,)))
 
 
 @pytest.mark.parametrize(
@@ -103,36 +92,76 @@ def test_an_address_that_can_never_be_reached_is_refused_and_not_tried_for_ever(
         "ws/127.0.0.1:1",
     ],
 )
-def test_an_address_of_any_protocol_may_be_given_with_its_settings(address: str) -> None:
-    entered = []
-
-    async def join() -> None:
-        with Bus() as bus:
-            async with LinkOptions(new_domain(), connect=(address,)).open(bus):
-                entered.append(True)
-
-    anyio.run(join)
-    assert entered
+def test_an_address_of_any_protocol_is_tried_in_the_background(address: str) -> None:
+    join(LinkOptions(new_domain(), connect=(address,)))
 
 
-@pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_an_address_in_use_is_one_line(backend: str, call: Call) -> None:
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_an_address_in_use_is_a_usage_error(backend: str, tfbus: Command) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"tcp/127.0.0.1:{server.getsockname()[1]}"
-        asked = call("tree", "--listen", address, "--backend", backend)
-    assert asked == (2, "", f"tfbus: cannot listen at {address}: {os.strerror(errno.EADDRINUSE)}\n")
+        done = tfbus("tree", "--listen", address, "--backend", backend)
+    check_wrong_call(done, f"cannot listen at {address}: {os.strerror(errno.EADDRINUSE)}")
 
 
-def test_a_program_ends_although_it_was_interrupted_twice() -> None:
-    # Process managers pass on a Ctrl-C that has come to all already, and asyncio makes a cancel of each.
-    script = """
+def test_a_domain_that_cannot_exist_is_a_usage_error() -> None:
+    with pytest.raises(UsageError, match="a domain is made of letters"):
+        join(LinkOptions("a b"))
+
+
+def test_without_its_extra_joining_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tfbus.links.zenoh", None)
+    with pytest.raises(UsageError, match=re.escape('needs a package more: pip install "tfbus[cli,zenoh]"')):
+        join(DEFAULT_LINK)
+
+
+async def publish_soon(bus: Bus) -> None:
+    await bus.clock.sleep(0.9)
+    bus.publish(static("map", "odom"))
+
+
+async def publish_late(bus: Bus) -> None:
+    await bus.clock.sleep(60.0)
+    bus.publish(static("map", "odom"))
+
+
+@pytest.mark.parametrize(
+    ("publish", "seconds", "notice"),
+    [
+        (publish_soon, 0.9, ""),
+        (publish_late, 60, "waiting for transforms on domain 'yard' …\n"),
+    ],
+)
+def test_waiting_for_the_first_transform_is_announced_once_if_it_takes_more_than_a_second(
+    publish: Callable[[Bus], Awaitable[None]], seconds: float, notice: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def wait() -> int:
+        clock = SimulatedClock(START)
+
+        async def wait_beside_publisher() -> int:
+            with Bus(clock) as bus:
+                async with anyio.create_task_group() as tasks:
+                    tasks.start_soon(publish, bus)
+                    await LinkOptions("yard").first_transform(bus)
+                return clock.now()
+
+        return await simulate(clock, wait_beside_publisher)
+
+    assert anyio.run(wait) == START + from_seconds(seconds)
+    assert capsys.readouterr() == ("", notice)
+
+
+@pytest.mark.thorough
+def test_leaving_a_domain_survives_being_cancelled_twice() -> None:
+    # Process managers repeat a Ctrl-C that all processes have had already, and asyncio makes a cancel of each.
+    script = f"""
 import asyncio
 from tfbus import Bus
-from tfbus.cli.link import LinkOptions
+from tfbus.cli.domain import LinkOptions
 
 async def join(joined):
     with Bus() as bus:
-        async with LinkOptions("%s", listen=("tcp/127.0.0.1:0",)).open(bus):
+        async with LinkOptions("{new_domain()}", listen=("tcp/127.0.0.1:0",)).join(bus):
             joined.set()
             await asyncio.sleep(1e9)
 
@@ -150,27 +179,6 @@ async def main():
 asyncio.run(main())
 print("done")
 """
-    with Program(sys.executable, "-c", script % new_domain()) as program:
+    with Program(sys.executable, "-c", script) as program:
         assert program.wait() == 0
     assert (program.output.text, program.errors.text) == ("done\n", "")
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_without_its_extra_a_command_names_it(command: str) -> None:
-    hidden = "import sys; sys.modules['zenoh'] = None; from tfbus.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", hidden, command, *COMMANDS[command]],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.stderr == 'tfbus: joining a domain needs a package more: pip install "tfbus[cli,zenoh]"\n'
-    assert (done.returncode, done.stdout) == (2, "")
-
-
-def test_nothing_is_imported_before_a_command_needs_it() -> None:
-    script = "import sys, tfbus.cli; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
-    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
-    assert "tfbus" in loaded
-    assert set(loaded) & {"zenoh", "rich", "trio", "mcap", "rosbags", "lxml"} == set()

@@ -1,43 +1,107 @@
-"""Commands as a user types them, without a process for each."""
+"""Runs ``tfbus`` in the process of the test."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from typing import Any
 
+import anyio
+import anyio.lowlevel
 import pytest
 
+from tfbus import SECOND, Bus, Clock, SimulatedClock
 from tfbus.cli import main
+from tfbus.cli.domain import LinkOptions
+from tfbus.testing import simulate
+
+START = 100 * SECOND
+"""The stamp at which `Command.on_domain` begins, in ns."""
+
+OtherPrograms = Callable[[Bus], Awaitable[object]]
 
 
 @dataclass(frozen=True)
 class Done:
-    """What a command has left, as `subprocess.CompletedProcess` names it."""
+    """The exit status and the output of a command, with the names of `subprocess.CompletedProcess`."""
 
     returncode: int
     stdout: str
     stderr: str
 
 
-Command = Callable[..., Done]
+class Command:
+    """Calls ``tfbus`` with the arguments that a user would type."""
 
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        self._monkeypatch = monkeypatch
+        self._capsys = capsys
 
-def command(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs a command of ``tfbus`` in this process."""
-
-    def run(*arguments: object) -> Done:
-        monkeypatch.setattr(sys, "argv", ["tfbus", name, *map(str, arguments)])
+    def __call__(self, *arguments: object) -> Done:
+        """Run the command to its end."""
+        self._monkeypatch.setattr(sys, "argv", ["tfbus", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
             main()
         assert isinstance(ended.value.code, int)
-        return Done(ended.value.code, *capsys.readouterr())
+        return Done(ended.value.code, *self._capsys.readouterr())
 
-    return run
+    def on_domain(self, others: OtherPrograms, *arguments: object, clock: Clock | None = None) -> Done:
+        """Run a command that joins a domain on a bus of this process, which no link connects to others.
+
+        Parameters
+        ----------
+        others : async callable
+            Takes the bus and plays the other programs of the domain; begins before the command, and ends it as Ctrl-C
+            does.
+        arguments
+        clock : Clock, optional
+            By default a `SimulatedClock` that begins at `START` and goes on by itself.
+        """
+
+        def run(options: LinkOptions, program: Callable[[Bus], Awaitable[Any]]) -> Any:
+            results = anyio.run(_run_beside, program, others, clock, backend=options.backend)
+            if not results:
+                raise KeyboardInterrupt
+            return results[0]
+
+        with self._monkeypatch.context() as patch:
+            patch.setattr(LinkOptions, "run", run)
+            return self(*arguments)
+
+
+async def _run_beside(
+    program: Callable[[Bus], Awaitable[Any]], others: OtherPrograms, clock: Clock | None
+) -> list[Any]:
+    """Run a program until its own end or that of the others; the list holds its result if it has ended itself."""
+    bus_clock = SimulatedClock(START) if clock is None else clock
+
+    async def run_both() -> list[Any]:
+        results = []
+        with Bus(bus_clock) as bus:
+            async with anyio.create_task_group() as tasks:
+
+                async def run_others() -> None:
+                    await others(bus)
+                    tasks.cancel_scope.cancel()
+
+                tasks.start_soon(run_others)
+                # Trio shuffles the tasks that are due: after two checkpoints, the others have run to their first wait.
+                await anyio.lowlevel.checkpoint()
+                await anyio.lowlevel.checkpoint()
+                results.append(await program(bus))
+                tasks.cancel_scope.cancel()
+        return results
+
+    return await (simulate(bus_clock, run_both) if isinstance(bus_clock, SimulatedClock) else run_both())
+
+
+async def nobody(_: Bus) -> None:
+    """The other programs of a domain without any."""
+    await anyio.sleep_forever()
 
 
 def check_wrong_call(done: Done, why: str) -> None:
-    """A command that was called wrongly says so in one line, with `why` in it, and does nothing."""
-    assert done.returncode == 2
-    assert done.stdout == ""
+    """Check that a usage error is one line on standard error with `why` in it, and exit status 2."""
+    assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith("tfbus: ")
     assert why in line

@@ -1,4 +1,4 @@
-"""Programs as a user runs them, each in a process of its own; a test waits for what they print."""
+"""Programs as a user runs them, each in a process of its own; a test waits for the lines that they print."""
 
 import re
 import signal
@@ -14,16 +14,16 @@ from support.processes import free_ports
 
 TFBUS = str(Path(sys.executable).with_name("tfbus"))
 PATIENCE = 30.0
-"""How long a test waits, in s, for what should come at once."""
+"""How long a test waits for a line or for the end of a program, in s."""
 
 
 def free_address() -> str:
-    """An address on the loopback where nobody listens."""
+    """An address on the loopback at which no program listens."""
     return f"tcp/127.0.0.1:{free_ports(1)[0]}"
 
 
 class Lines:
-    """What comes out of a process."""
+    """The lines that a process prints to one of its streams."""
 
     def __init__(self, file: IO[str]) -> None:
         self._file = file
@@ -36,27 +36,28 @@ class Lines:
 
     @property
     def text(self) -> str:
-        """All of it so far."""
+        """All output so far."""
         with self._changed:
             return "".join(self._lines)
 
     def expect(self, pattern: str) -> str:
-        """The next line, behind those that were expected before, that has the pattern in it; waits for it."""
+        """Wait for the next line that contains the pattern, after those that were expected before."""
         with self._changed:
             while True:
                 while self._read < len(self._lines):
                     self._read += 1
                     if re.search(pattern, self._lines[self._read - 1]):
                         return self._lines[self._read - 1].rstrip("\n")
-                came = not self._ended and self._changed.wait(PATIENCE)
-                assert came or self._read < len(self._lines), f"no {pattern!r} in {''.join(self._lines)!r}"
+                arrived = not self._ended and self._changed.wait(PATIENCE)
+                assert arrived or self._read < len(self._lines), f"no {pattern!r} in {''.join(self._lines)!r}"
 
     def skip(self) -> None:
-        """Expect only what comes from now on."""
+        """Ignore the lines that have been printed by now."""
         with self._changed:
             self._read = len(self._lines)
 
     def join(self) -> None:
+        """Wait for the end of the stream."""
         self._reader.join()
 
     def _follow(self) -> None:
@@ -70,7 +71,7 @@ class Lines:
 
 
 class Program:
-    """A process; it is killed at the end of the ``with``, unless it has ended."""
+    """A process that is killed at the end of the ``with``, unless it has ended before."""
 
     def __init__(self, *command: str | Path, environment: Mapping[str, str] | None = None) -> None:
         self.process = subprocess.Popen(
@@ -82,12 +83,12 @@ class Program:
         self.errors = Lines(self.process.stderr)
 
     def end(self, number: int = signal.SIGINT) -> int:
-        """Send a signal and wait for the end; its status, and all output has come."""
+        """Send a signal, by default that of Ctrl-C, and wait for the end; returns the exit status."""
         self.process.send_signal(number)
         return self.wait()
 
     def wait(self) -> int:
-        """Wait for the end; its status, and all output has come."""
+        """Wait for the end of the process and of its output; returns the exit status."""
         status = self.process.wait(PATIENCE)
         self.output.join()
         self.errors.join()
@@ -105,6 +106,6 @@ class Program:
             self.errors.join()
 
 
-def tfbus(*arguments: str) -> Program:
-    """The command."""
+def start_tfbus(*arguments: str) -> Program:
+    """Start the command ``tfbus``."""
     return Program(TFBUS, *arguments)

@@ -1,40 +1,40 @@
-"""The options of every command that joins a domain."""
+"""Joining a domain: the options that say how, and the program that runs on the joined bus."""
 
 import os
-import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli.options import Backend
-from tfbus.cli.running import run
+from tfbus.cli._event_loop import run
+from tfbus.cli.arguments import Backend, UsageError
+from tfbus.cli.output import say
 
-_SOON = 1.0
+T = TypeVar("T")
 
-
-class UnusableError(Exception):
-    """What the command was told to use cannot be used; one line, and status 2."""
+_SILENCE_BEFORE_NOTICE = 1.0
+"""s."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
 class LinkOptions:
-    """How a command reaches others.
+    """The options of a command that joins a domain.
 
     Parameters
     ----------
     domain
         Only programs of the same domain hear each other.
     listen
-        Where to listen, as tcp/192.168.1.5:7447; may be given several times. Without any address, programs on this
-        machine find each other by themselves.
+        Listen at this address, such as tcp/192.168.1.5:7447; may be given several times. Without any address, programs
+        on this machine find each other by themselves.
     connect
-        Where others listen; may be given several times. Programs without an address are at tcp/127.0.0.1:17447.
+        Connect to a program that listens at this address; may be given several times. Programs without an address
+        listen at tcp/127.0.0.1:17447.
     backend
         The event loop to run on.
     """
@@ -44,50 +44,63 @@ class LinkOptions:
     connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     backend: Backend = "asyncio"
 
+    def run(self, program: Callable[[Bus], Awaitable[T]]) -> T:
+        """Run a program on a bus that has joined the domain, until its end or Ctrl-C.
+
+        Returns
+        -------
+        The result of the program.
+
+        Raises
+        ------
+        UsageError
+            If the domain cannot be joined.
+        KeyboardInterrupt
+            After everything has ended, if Ctrl-C was pressed.
+        """
+
+        async def join_and_run() -> T:
+            with Bus() as bus:
+                async with self.join(bus):
+                    return await program(bus)
+
+        return run(join_and_run, self.backend)
+
     @asynccontextmanager
-    async def open(self, bus: Bus) -> AsyncIterator[None]:
-        """The link, to be entered; whatever keeps it from being there is an `UnusableError`."""
+    async def join(self, bus: Bus) -> AsyncIterator[None]:
+        """Link a bus to the domain for the body of an ``async with``.
+
+        Raises
+        ------
+        UsageError
+            If an option is not valid, an address cannot be listened at, or the extra is missing.
+        """
         try:
             from tfbus.links.zenoh import ZenohLink
         except ImportError:
-            raise UnusableError('joining a domain needs a package more: pip install "tfbus[cli,zenoh]"') from None
+            raise UsageError('joining a domain needs a package more: pip install "tfbus[cli,zenoh]"') from None
         async with AsyncExitStack() as stack:
             try:
                 link = ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None)
                 await stack.enter_async_context(link)
             except ValueError as error:
-                raise UnusableError(str(error)) from None
+                raise UsageError(str(error)) from None
             except OSError as error:
                 where = " or ".join(self.listen) or "the loopback"
                 why = os.strerror(error.errno) if error.errno else error
-                raise UnusableError(f"cannot listen at {where}: {why}") from None
+                raise UsageError(f"cannot listen at {where}: {why}") from None
             yield
 
-    def run(self, program: Callable[[Bus], Awaitable[object]]) -> None:
-        """Run a program on a bus that has joined the domain, on the event loop that was chosen. See `running.run`."""
-
-        async def join_and_run() -> None:
-            with Bus() as bus:
-                async with self.open(bus):
-                    await program(bus)
-
-        run(join_and_run, self.backend)
-
     async def first_transform(self, bus: Bus) -> None:
-        """Return when something has been published on the bus; say so if that takes more than a moment."""
+        """Wait until something is published on the bus, with a notice if that takes more than a second."""
         arrived = anyio.Event()
         with bus.subscribe(lambda _: arrived.set()):
-            with bus.clock.move_on_after(_SOON):
+            with bus.clock.move_on_after(_SILENCE_BEFORE_NOTICE):
                 await arrived.wait()
                 return
             say(f"waiting for transforms on domain {self.domain!r} …")
             await arrived.wait()
 
 
-LOCAL = LinkOptions()
-"""What holds where nothing is said."""
-
-
-def say(line: str) -> None:
-    """Print a line for people, which is not what was asked."""
-    print(line, file=sys.stderr, flush=True)
+DEFAULT_LINK = LinkOptions()
+"""The options of a command line that gives none."""

@@ -1,33 +1,41 @@
-"""The first of the tutorial's two programs."""
-
-import json
 import signal
 
 import pytest
+from support.commands import START, Command
 from support.processes import new_domain
-from support.programs import free_address, tfbus
+from support.programs import start_tfbus
+
+from tfbus import SECOND, Bus, Transform, TransformStamped
 
 
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_others_get_what_it_says_it_sends_until_ctrl_c(backend: str) -> None:
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
-    with tfbus("broadcast", "--rate", "20", "--listen", address, *options) as broadcaster:
-        with tfbus("tree", "--json", "--connect", address, *options) as tree:
-            assert tree.wait() == 0
-        assert broadcaster.end() == 130
-    frames = json.loads(tree.output.text)["frames"]
-    assert set(frames) == {"base_link", "base_laser"}
-    assert frames["base_laser"]["authority"] == "robot_tf_publisher"
-    assert frames["base_laser"]["rate"] == pytest.approx(20, rel=0.5)
-    assert broadcaster.errors.text == (
-        f"broadcasting 'base_laser' in 'base_link' at 20 Hz on domain '{domain}', until Ctrl-C\n"
-    )
-    assert broadcaster.output.text == ""
+def test_it_sends_the_transform_of_the_laser_at_its_rate_until_ctrl_c(tfbus: Command, backend: str) -> None:
+    received: list[TransformStamped] = []
+
+    async def listen(bus: Bus) -> None:
+        with bus.subscribe(received.extend):
+            await bus.clock.sleep(0.21)
+
+    done = tfbus.on_domain(listen, "broadcast", "--rate", "20", "--domain", "yard", "--backend", backend)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "broadcasting 'base_laser' in 'base_link' at 20 Hz on domain 'yard', until Ctrl-C\n"
+    laser = Transform((0.1, 0.0, 0.2))
+    assert received == [
+        TransformStamped("base_link", "base_laser", START + tick * SECOND // 20, laser, "robot_tf_publisher")
+        for tick in range(5)
+    ]
 
 
-def test_terminating_it_ends_it_at_once_and_without_a_word() -> None:
-    with tfbus("broadcast", "--domain", new_domain()) as broadcaster:
+def test_by_default_it_sends_a_hundred_times_a_second(tfbus: Command) -> None:
+    async def wait(bus: Bus) -> None:
+        await bus.clock.sleep(0.1)
+
+    assert " at 100 Hz on domain 'tf'" in tfbus.on_domain(wait, "broadcast").stderr
+
+
+@pytest.mark.thorough
+def test_a_termination_ends_it_at_once_and_silently() -> None:
+    with start_tfbus("broadcast", "--domain", new_domain()) as broadcaster:
         greeting = broadcaster.errors.expect("broadcasting")
         assert broadcaster.end(signal.SIGTERM) == -signal.SIGTERM
     assert broadcaster.errors.text == f"{greeting}\n"

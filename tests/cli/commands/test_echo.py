@@ -4,11 +4,12 @@ import subprocess
 from collections.abc import Sequence
 
 import pytest
-from support.commands import check_wrong_call, command
+from support.commands import Command, check_wrong_call
 from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, free_address, tfbus
+from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
+from support.samples import moving, static
 
-from tfbus import SECOND, Transform, TransformStamped, from_seconds
+from tfbus import SECOND, Bus, Transform, TransformStamped, from_seconds
 from tfbus.cli.commands.echo import describe, to_json
 
 MOVING = TransformStamped(
@@ -27,14 +28,14 @@ def test_a_transform_is_printed_as_by_tf2_echo_with_its_age_and_both_frames() ->
     ]
 
 
-def test_a_stamp_has_nine_decimals_also_before_the_beginning_of_time() -> None:
+def test_a_negative_stamp_has_nine_decimals_too() -> None:
     assert describe(MOVING.replace(stamp=from_seconds(-1.5)), 0).startswith("At -1.500000000 s, age 1.5 s: ")
 
 
 def test_a_static_transform_has_no_stamp_and_no_age() -> None:
-    static = MOVING.replace(static=True)
-    assert describe(static, 0).startswith("At any time: 'base_link' in 'map'\n")
-    assert json.loads(to_json(static, 0))["age"] is None
+    sample = MOVING.replace(static=True)
+    assert describe(sample, 0).startswith("At any time: 'base_link' in 'map'\n")
+    assert json.loads(to_json(sample, 0))["age"] is None
 
 
 def test_json_has_the_stamp_as_an_integer_and_the_age_in_seconds() -> None:
@@ -52,55 +53,81 @@ def test_json_has_the_stamp_as_an_integer_and_the_age_in_seconds() -> None:
 
 
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_it_says_once_what_is_missing_and_prints_as_soon_as_nothing_is(backend: str) -> None:
+def test_it_says_once_what_is_missing_and_prints_as_soon_as_nothing_is(tfbus: Command, backend: str) -> None:
+    async def publish(bus: Bus) -> None:
+        # At 102 s, one of the two frames appears; at 105.25 s, the other one.
+        await bus.clock.sleep(2.0)
+        bus.publish(moving("base", "laser", bus.clock.now(), 1.0))
+        await bus.clock.sleep(3.25)
+        bus.publish(static("base", "camera", 3.0))
+        await bus.clock.sleep(5.0)
+
+    options = ("--json", "--max-age", "4", "--rate", "2", "--domain", "yard", "--backend", backend)
+    done = tfbus.on_domain(publish, "echo", "camera", "laser", *options)
+    assert done.returncode == 130
+    assert done.stderr.splitlines() == [
+        "waiting for transforms on domain 'yard' …",
+        "waiting for 'laser' in 'camera': frame 'camera' is not known",
+        "waiting for 'laser' in 'camera': frame 'laser': asked for 103.500 s, newest sample is 102.000 s (1.5 s short)",
+    ]
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    # From 106 s on, the sample of 102 s is older than 4 s: the lookup of 106.5 s fails a second later.
+    assert [answer["age"] for answer in answers] == [3.25, 3.5, 4.0]
+    assert {(answer["stamp"], *answer["translation"]) for answer in answers} == {(102 * SECOND, -2.0, 0.0, 0.0)}
+
+
+def test_a_missing_transform_is_reported_again_after_it_was_there(tfbus: Command) -> None:
+    async def publish(bus: Bus) -> None:
+        await bus.clock.sleep(0.5)
+        for _ in range(2):
+            bus.publish(moving("base", "laser", bus.clock.now()))
+            await bus.clock.sleep(4.9)
+
+    done = tfbus.on_domain(publish, "echo", "base", "laser", "--max-age", "0.5")
+    # Those of 101.5 s and 106.5 s are the first lookups that fail, a second later; the next ones fail silently.
+    assert [line.partition(" (")[0] for line in done.stderr.splitlines()] == [
+        "waiting for 'laser' in 'base': frame 'laser': asked for 102.000 s, newest sample is 100.500 s",
+        "waiting for 'laser' in 'base': frame 'laser': asked for 107.000 s, newest sample is 105.400 s",
+    ]
+
+
+def test_a_static_transform_is_printed_again_and_again(tfbus: Command) -> None:
+    async def publish(bus: Bus) -> None:
+        bus.publish(static("base_link", "laser"))
+        await bus.clock.sleep(2.5)
+
+    done = tfbus.on_domain(publish, "echo", "laser", "base_link")
+    assert done.stdout.splitlines()[::5] == ["At any time: 'base_link' in 'laser'"] * 3
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_it_prints_what_programs_on_the_domain_send_and_notices_their_death(backend: str) -> None:
     domain, address = new_domain(), free_address()
     options = ("--domain", domain, "--backend", backend)
-    with tfbus("echo", "camera", "base_laser", "--rate", "10", "--json", "--listen", address, *options) as echo:
+    to_echo = ("--connect", address, *options)
+    limits = ("--rate", "5", "--max-age", "0.5")
+    with start_tfbus("echo", "camera", "base_laser", *limits, "--listen", address, *options) as echo:
         waiting = echo.errors.expect("waiting")
-        with tfbus("broadcast", "--connect", address, *options):
+        with start_tfbus("static", "base_link", "camera", "--xyz", "0", "0", "1", *to_echo):
             missing = echo.errors.expect("waiting")
-            with tfbus("static", "base_link", "camera", "--xyz", "0", "0", "1", "--connect", address, *options):
-                answers = [json.loads(echo.output.expect("")) for _ in range(3)]
+            with start_tfbus("broadcast", *to_echo) as broadcaster:
+                echo.output.expect(r"^At \d+\.\d{9} s, age .* ms: 'base_laser' in 'camera'$")
+                assert echo.output.expect("Translation") == "- Translation: [0.100000, 0.000000, -0.800000] m"
+                broadcaster.end(signal.SIGKILL)
+            assert "from 'robot_tf_publisher'" in echo.errors.expect("waiting for 'base_laser' in 'camera': frame")
         assert echo.end() == 130
     assert waiting == f"waiting for transforms on domain '{domain}' …"
-    assert missing == "waiting for 'base_laser' in 'camera': frame 'camera' is not known"
-    assert echo.errors.text == f"{waiting}\n{missing}\n"
-    assert [answer["translation"] for answer in answers] == [[0.1, 0.0, -0.8]] * 3
-    stamps = [answer["stamp"] for answer in answers]
-    assert stamps == sorted(stamps)
+    assert missing == "waiting for 'base_laser' in 'camera': frame 'base_laser' is not known"
+    assert len(echo.errors.text.splitlines()) == 3
 
 
-def test_a_dead_broadcaster_is_told_where_there_is_an_age_limit_and_forgiven_when_it_is_back() -> None:
-    options = ("--domain", new_domain())
-    with tfbus("broadcast", *options) as broadcaster:
-        broadcaster.errors.expect("broadcasting")
-        with tfbus("echo", "base_link", "base_laser", "--rate", "5", "--max-age", "0.5", *options) as echo:
-            echo.output.expect(r"^At \d+\.\d{9} s, age .* ms: 'base_laser' in 'base_link'$")
-            broadcaster.end(signal.SIGKILL)
-            assert "from 'robot_tf_publisher'" in echo.errors.expect("waiting for 'base_laser' in 'base_link': frame")
-            echo.output.skip()
-            with tfbus("broadcast", *options):
-                echo.output.expect("^At")
-            echo.errors.expect("waiting for 'base_laser' in 'base_link': frame")
-    # Once for each time, although it was asked five times a second.
-    assert echo.errors.text.count("waiting for 'base_laser'") == 2
-
-
-def test_a_static_path_is_printed_again_and_again() -> None:
-    options = ("--domain", new_domain())
-    with (
-        tfbus("static", "base_link", "laser", *options),
-        tfbus("echo", "laser", "base_link", "--rate", "20", *options) as echo,
-    ):
-        for _ in range(3):
-            echo.output.expect("^At any time: 'base_link' in 'laser'$")
-
-
-def test_a_reader_that_has_had_enough_is_no_traceback() -> None:
+@pytest.mark.thorough
+def test_a_reader_that_closes_the_pipe_ends_it_silently() -> None:
     options = ("--domain", new_domain())
     command = [TFBUS, "echo", "laser", "base_link", "--rate", "50", *options]
     with (
-        tfbus("static", "base_link", "laser", *options),
+        start_tfbus("static", "base_link", "laser", *options),
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as echo,
     ):
         assert echo.stdout is not None
@@ -122,6 +149,6 @@ def test_a_reader_that_has_had_enough_is_no_traceback() -> None:
     ],
 )
 def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
-    arguments: Sequence[str], why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: Sequence[str], why: str, tfbus: Command
 ) -> None:
-    check_wrong_call(command("echo", monkeypatch, capsys)(*arguments), why)
+    check_wrong_call(tfbus("echo", *arguments), why)

@@ -1,102 +1,173 @@
+import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
+import anyio
 import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
+from support.commands import Command, check_wrong_call, nobody
 from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, Program, free_address, tfbus
+from support.programs import TFBUS, Program, free_address, start_tfbus
 from support.recorded import messages_in
+from support.samples import moving, static
 
-from tfbus import TransformStamped
+from tfbus import Bus, RecordingDropped, RecordingFailed, SystemClock, TransformStamped
+from tfbus.cli.commands.record import print_summary
 from tfbus.recording import open_recording
+from tfbus.statistics import QueueStatistics, RecorderStatistics
 
 BACKENDS = ["asyncio", "trio"]
 
 
+def recorder_statistics(
+    samples: int, dropped: int = 0, conflated: int = 0, unattributed: int = 0
+) -> RecorderStatistics:
+    queue = QueueStatistics("recorder", "drop_oldest", 1, 0, dropped, conflated)
+    return RecorderStatistics(samples, 1, unattributed, {}, queue)
+
+
 def samples_in(path: Path) -> list[TransformStamped]:
-    """All that a finished recording holds."""
+    """All samples of a finished recording."""
     with open_recording(path) as recording:
         assert recording.finished
     return [sample for message in messages_in(path) for sample in message.batch]
 
 
+async def until_recording() -> None:
+    """Wait until the command listens for signals, which would otherwise end the test."""
+    while signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # noqa: ASYNC110 - nothing announces it
+        await anyio.sleep(0.001)
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_it_records_a_domain_until_it_is_told_to_stop(
-    tmp_path: Path, backend: str, number: signal.Signals, status: int
+def test_it_records_what_is_published_until_a_signal_comes(
+    tmp_path: Path, tfbus: Command, backend: str, number: signal.Signals, status: int
 ) -> None:
     path = tmp_path / "run.mcap"
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
-    with tfbus("record", str(path), "--listen", address, *options) as recorder:
-        assert recorder.errors.expect("recording") == f"recording domain '{domain}' to {path}"
-        with (
-            tfbus("static", "base_link", "camera", "--xyz", "0", "0", "1", "--connect", address, *options) as static,
-            tfbus("broadcast", "--connect", address, *options) as broadcaster,
-        ):
-            broadcaster.errors.expect("broadcasting")
-            static.errors.expect("")
-            # So that something has been heard of both.
-            with tfbus("echo", "camera", "base_laser", "--rate", "10", "--connect", address, *options) as echo:
-                for _ in range(3):
-                    echo.output.expect("^At ")
-        assert recorder.end(number) == status
-        assert "Traceback" not in recorder.errors.text
-        assert recorder.output.text == ""
-    samples = samples_in(path)
-    assert recorder.errors.text.splitlines()[-1] == f"{len(samples):,} samples in {path}"
-    moving = [sample for sample in samples if not sample.static]
-    assert {(sample.parent, sample.child) for sample in samples if sample.static} == {("base_link", "camera")}
-    assert {(sample.child, sample.authority) for sample in moving} == {("base_laser", "robot_tf_publisher")}
-    assert len(moving) > 10
+    latched, laser = static("base_link", "camera", authority="me"), moving("base_link", "laser", 1, authority="driver")
+
+    async def publish(bus: Bus) -> None:
+        bus.publish(latched)
+        await until_recording()
+        bus.publish(laser)
+        os.kill(os.getpid(), number)
+        await anyio.sleep_forever()
+
+    done = tfbus.on_domain(publish, "record", path, "--domain", "yard", "--backend", backend, clock=SystemClock())
+    assert (done.returncode, done.stdout) == (status, "")
+    assert done.stderr == f"recording domain 'yard' to {path}\n2 samples in {path}\n"
+    assert samples_in(path) == [latched, laser]
     with AnyReader([path]) as reader:
         assert {connection.msgtype for connection in reader.connections} == {"tf2_msgs/msg/TFMessage"}
     with path.open("rb") as file:
-        assert sum(1 for _ in make_reader(file).iter_messages()) == len(messages_in(path))
+        assert sum(1 for _ in make_reader(file).iter_messages()) == 2
 
 
-def test_it_ends_by_itself_when_the_time_is_up_and_says_what_it_waits_for(tmp_path: Path) -> None:
+def test_it_ends_when_the_duration_is_over(tmp_path: Path, tfbus: Command) -> None:
     path = tmp_path / "run.mcap"
-    with tfbus("record", str(path), "--duration", "1.5", "--domain", new_domain()) as recorder:
-        assert recorder.wait() == 0
-    first, waiting, last = recorder.errors.text.splitlines()
-    assert first.startswith("recording domain")
-    assert waiting.startswith("waiting for transforms on domain")
-    assert last == f"0 samples in {path}"
+    done = tfbus.on_domain(nobody, "record", path, "--duration", "0", "--domain", "yard", clock=SystemClock())
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr == f"recording domain 'yard' to {path}\n0 samples in {path}\n"
     assert samples_in(path) == []
 
 
-def test_a_file_that_is_there_is_kept_unless_it_may_be_lost(tmp_path: Path) -> None:
+def test_samples_that_ros_cannot_hold_are_counted(tmp_path: Path, tfbus: Command) -> None:
+    async def publish(bus: Bus) -> None:
+        bus.publish([static("base", "\udcff"), static("base", "laser")])
+        await anyio.sleep_forever()
+
+    done = tfbus.on_domain(publish, "record", tmp_path / "run.mcap", "--duration", "0", clock=SystemClock())
+    assert done.returncode == 0
+    *_, count, warning = done.stderr.splitlines()
+    assert count.startswith("1 samples in ")
+    assert warning.startswith("tfbus: left out, as ROS cannot hold them: 1 x ")
+
+
+@pytest.mark.parametrize(
+    ("statistics", "lines"),
+    [
+        (recorder_statistics(samples=1_234), ["1,234 samples in run.mcap"]),
+        (
+            recorder_statistics(samples=5, dropped=1_000, conflated=2),
+            ["5 samples in run.mcap", "tfbus: 1,002 samples were lost, because the disk was too slow or failed"],
+        ),
+        (
+            recorder_statistics(samples=5, unattributed=1),
+            ["5 samples in run.mcap", "tfbus: 1 samples are recorded without their authority: too many of them"],
+        ),
+    ],
+)
+def test_the_summary_warns_of_lost_samples_and_lost_authorities(
+    statistics: RecorderStatistics, lines: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    print_summary(Path("run.mcap"), statistics)
+    assert capsys.readouterr() == ("", "".join(f"{line}\n" for line in lines))
+
+
+def test_lost_samples_are_warned_of_and_a_failure_ends_it(tmp_path: Path, tfbus: Command) -> None:
+    async def fail(bus: Bus) -> None:
+        await until_recording()
+        bus._announce(RecordingDropped(bus.clock.now(), "run.mcap", 3))
+        await anyio.wait_all_tasks_blocked()
+        bus._announce(RecordingFailed(bus.clock.now(), "run.mcap", OSError("the disk is full")))
+        await anyio.sleep_forever()
+
+    done = tfbus.on_domain(fail, "record", tmp_path / "run.mcap", clock=SystemClock())
+    assert done.stderr.splitlines()[1] == "tfbus: the disk is too slow: samples are lost, 3 so far"
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_it_records_what_programs_on_the_domain_send(tmp_path: Path, backend: str) -> None:
+    path = tmp_path / "run.mcap"
+    domain, address = new_domain(), free_address()
+    options = ("--domain", domain, "--backend", backend)
+    with start_tfbus("record", str(path), "--listen", address, *options) as recorder:
+        recorder.errors.expect("recording")
+        with (
+            start_tfbus("static", "base_link", "camera", "--xyz", "0", "0", "1", "--connect", address, *options),
+            start_tfbus("broadcast", "--connect", address, *options),
+            start_tfbus("echo", "camera", "base_laser", "--rate", "10", "--connect", address, *options) as echo,
+        ):
+            for _ in range(3):
+                echo.output.expect("^At ")
+        assert recorder.end() == 130
+    samples = samples_in(path)
+    assert recorder.output.text == ""
+    assert recorder.errors.text.splitlines()[-1] == f"{len(samples):,} samples in {path}"
+    assert {(sample.parent, sample.child) for sample in samples if sample.static} == {("base_link", "camera")}
+    authorities = {(sample.child, sample.authority) for sample in samples if not sample.static}
+    assert authorities == {("base_laser", "robot_tf_publisher")}
+
+
+def test_an_existing_file_is_kept_unless_it_may_be_overwritten(tmp_path: Path, tfbus: Command) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
-    command = ("record", str(path), "--duration", "0", "--domain", new_domain())
-    with tfbus(*command) as recorder:
-        assert recorder.wait() == 2
-    assert recorder.errors.text == f"tfbus: {path} is there already: take another name, or give --overwrite\n"
+    command = ("record", path, "--duration", "0")
+    done = tfbus.on_domain(nobody, *command, clock=SystemClock())
+    check_wrong_call(done, f"{path} is there already: take another name, or give --overwrite")
     assert path.read_text() == "precious"
-    with tfbus(*command, "--overwrite") as recorder:
-        assert recorder.wait() == 0
+    assert tfbus.on_domain(nobody, *command, "--overwrite", clock=SystemClock()).returncode == 0
     assert samples_in(path) == []
 
 
-def test_a_file_that_cannot_be_made_is_one_line_and_status_2(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_written_is_one_line_and_status_2(tmp_path: Path, tfbus: Command) -> None:
     path = tmp_path / "nowhere" / "run.mcap"
-    with tfbus("record", str(path), "--domain", new_domain()) as recorder:
-        assert recorder.wait() == 2
-    assert recorder.errors.text == f"tfbus: cannot write {path}: No such file or directory\n"
+    done = tfbus.on_domain(nobody, "record", path, clock=SystemClock())
+    check_wrong_call(done, f"cannot write {path}: No such file or directory")
 
 
+@pytest.mark.thorough
 def test_a_full_disk_ends_it_with_status_1_and_what_there_was_room_for(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     domain, address = new_domain(), free_address()
-    # In blocks of 512 bytes or of a KiB.
+    # `ulimit` counts blocks of 512 bytes or of a KiB.
     limited = f'ulimit -f 8; exec "{TFBUS}" record "{path}" --domain {domain} --listen {address}'
     with Program("sh", "-c", limited) as recorder:
         recorder.errors.expect("recording")
-        with tfbus("broadcast", "--rate", "1000", "--domain", domain, "--connect", address):
+        with start_tfbus("broadcast", "--rate", "1000", "--domain", domain, "--connect", address):
             assert recorder.wait() == 1
     lines = recorder.errors.text.splitlines()
     assert lines[-1].startswith("tfbus: the recording has ended early: [Errno ")
@@ -104,27 +175,3 @@ def test_a_full_disk_ends_it_with_status_1_and_what_there_was_room_for(tmp_path:
     written = int(lines[-3].partition(" ")[0].replace(",", ""))
     assert lines[-3] == f"{written:,} samples in {path}"
     assert len([sample for message in messages_in(path) for sample in message.batch]) >= written > 0
-
-
-@pytest.mark.parametrize("arguments", [(), ("a.mcap", "--duration", "-1"), ("a.mcap", "--backend", "curio")])
-def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(tmp_path: Path, arguments: tuple[str, ...]) -> None:
-    done = subprocess.run(
-        [TFBUS, "record", *arguments], capture_output=True, text=True, timeout=PATIENCE, cwd=tmp_path, check=False
-    )
-    assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1)
-    assert done.stderr.startswith("tfbus: ")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_help_shows_an_example_and_every_option() -> None:
-    done = subprocess.run([TFBUS, "record", "--help"], capture_output=True, text=True, timeout=PATIENCE, check=True)
-    assert "Example: tfbus record" in done.stdout
-    for option in ("--duration", "--overwrite", "--domain", "--listen", "--connect", "--backend"):
-        assert option in done.stdout
-
-
-def test_without_its_extra_it_names_it(tmp_path: Path) -> None:
-    hidden = "import sys; sys.modules['mcap.writer'] = None; from tfbus.cli import main; main()"
-    command = [sys.executable, "-c", hidden, "record", str(tmp_path / "run.mcap"), "--domain", new_domain()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
-    assert (done.returncode, done.stderr) == (2, 'tfbus: to record needs a package more: pip install "tfbus[bag]"\n')

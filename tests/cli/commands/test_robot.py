@@ -1,26 +1,16 @@
-"""``tfbus robot`` as a user runs it: in a process of its own."""
-
+import json
 import math
 import re
-import signal
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 
-import anyio
 import pytest
-from cyclopts import CycloptsError
 from support import pr2
+from support.commands import START, Command, check_wrong_call
+from support.processes import new_domain
+from support.programs import free_address, start_tfbus
 
-from tfbus import Buffer, Bus, SystemClock
-from tfbus.cli import app
-from tfbus.cli.domain import UnusableError
-from tfbus.links.zenoh import ZenohLink
-
-TFBUS = str(Path(sys.executable).with_name("tfbus"))
-PATIENCE = 60.0
+from tfbus import SECOND, Buffer, Bus, TransformStamped
 
 CRANE = """<?xml version="1.0"?>
 <robot name="crane">
@@ -72,66 +62,44 @@ def crane(tmp_path: Path) -> str:
     return str(path)
 
 
-@pytest.fixture
-def address() -> Iterator[str]:
-    """Of a socket; its path is short, as the system wants it."""
-    with tempfile.TemporaryDirectory() as folder:
-        yield f"unixsock-stream/{folder}/s"
+@pytest.mark.parametrize(
+    ("arguments", "shown"),
+    [
+        ((), AT_ZERO),
+        (("swing=-0.25", "rope=3", "wheels=1,-2,0.5", "wind=1,2,3,1,0,0,0", "--prefix", "r1/"), MOVED),
+        # A position of its own takes the place of that of the joint which it mimics.
+        (
+            ("rope=3", "follow=2"),
+            AT_ZERO.replace("0 m, mimics rope", "2 m").replace("prismatic  0 m", "prismatic  3 m"),
+        ),
+        (("swing=-0",), AT_ZERO),
+    ],
+)
+def test_the_tree_has_frames_joints_types_and_positions(
+    crane: str, arguments: Sequence[str], shown: str, tfbus: Command
+) -> None:
+    done = tfbus("robot", crane, *arguments, "--tree")
+    assert (done.returncode, done.stdout, done.stderr) == (0, shown, "")
 
 
-def call(*arguments: str) -> None:
-    """The command in this process: for what needs no other."""
-    app(["robot", *arguments], exit_on_error=False, print_error=False, result_action="return_value")
-
-
-def refused(*arguments: str) -> str:
-    """Why the command does not even begin."""
-    with pytest.raises((CycloptsError, UnusableError)) as caught:
-        call(*arguments)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-def tfbus(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([TFBUS, "robot", *arguments], capture_output=True, text=True, timeout=PATIENCE, check=False)
-
-
-def test_the_tree_shows_frames_joints_types_and_positions_at_zero(crane: str) -> None:
-    done = tfbus(crane, "--tree")
-    assert (done.stdout, done.stderr, done.returncode) == (AT_ZERO, "", 0)
-
-
-def test_the_tree_shows_the_positions_and_the_prefix_that_it_was_given(crane: str) -> None:
-    pairs = ("swing=-0.25", "rope=3", "wheels=1,-2,0.5", "wind=1,2,3,1,0,0,0")
-    done = tfbus(crane, *pairs, "--tree", "--prefix", "r1/")
-    assert (done.stdout, done.stderr, done.returncode) == (MOVED, "", 0)
-
-
-def test_a_joint_that_mimics_may_be_given_a_position_of_its_own(crane: str, capsys: pytest.CaptureFixture[str]) -> None:
-    call(crane, "rope=3", "follow=2", "--tree")
-    assert "── shadow    follow  prismatic  2 m\n" in capsys.readouterr().out
-
-
-def test_the_name_of_a_joint_may_have_an_equals_sign_and_minus_zero_is_zero(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("old", "new", "arguments", "line"),
+    [
+        ('name="swing"', 'name="s=w"', ("s=w=1",), "├── boom      s=w     revolute   1 rad"),
+        # What mimics a joint that cannot move has no position.
+        ('name="rope" type="prismatic"', 'name="rope" type="fixed"', (), "├── shadow    follow  prismatic"),
+    ],
+)
+def test_the_tree_of_an_odd_robot(
+    tmp_path: Path, old: str, new: str, arguments: Sequence[str], line: str, tfbus: Command
 ) -> None:
     path = tmp_path / "odd.urdf"
-    path.write_text(CRANE.replace('name="swing"', 'name="s=w"'))
-    call(str(path), "s=w=-0", "--tree")
-    assert "├── boom      s=w     revolute   0 rad\n" in capsys.readouterr().out
+    path.write_text(CRANE.replace(old, new))
+    assert line in tfbus("robot", path, *arguments, "--tree").stdout.splitlines()
 
 
-def test_a_joint_that_follows_nothing_that_moves_has_no_position(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "frozen.urdf"
-    path.write_text(CRANE.replace('name="rope" type="prismatic"', 'name="rope" type="fixed"'))
-    call(str(path), "--tree")
-    assert "├── shadow    follow  prismatic\n" in capsys.readouterr().out
-
-
-def test_a_position_beyond_the_limits_is_told_on_standard_error_and_used(crane: str) -> None:
-    done = tfbus(crane, "rope=30", "--tree")
+def test_a_position_beyond_the_limits_is_a_warning_and_used(crane: str, tfbus: Command) -> None:
+    done = tfbus("robot", crane, "rope=30", "--tree")
     assert done.stderr.splitlines() == [
         "tfbus: joint 'rope': position 30 is outside its limits, from 0 to 4",
         "tfbus: joint 'follow': position -15 is outside its limits, from -9 to 9",
@@ -140,16 +108,15 @@ def test_a_position_beyond_the_limits_is_told_on_standard_error_and_used(crane: 
     assert done.returncode == 0
 
 
-def test_a_robot_of_one_link_has_a_tree_of_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_robot_of_one_link_has_a_tree_of_one_line(tmp_path: Path, tfbus: Command) -> None:
     path = tmp_path / "stone.urdf"
     path.write_text('<robot name="stone"><link name="stone&#10;"/></robot>')
-    call(str(path), "--tree")
-    assert capsys.readouterr().out == "stone\\n\n"
+    assert tfbus("robot", path, "--tree").stdout == "stone\\n\n"
 
 
 @pr2.needed
-def test_the_tree_of_a_pr2_has_its_83_frames() -> None:
-    done = tfbus(str(pr2.URDF), "--tree")
+def test_the_tree_of_a_pr2_has_its_83_frames(tfbus: Command) -> None:
+    done = tfbus("robot", pr2.URDF, "--tree")
     assert (done.stderr, done.returncode) == ("", 0)
     frames = [re.split(r"  +", line.lstrip("│├└─ "))[0] for line in done.stdout.splitlines()]
     assert len(frames) == 83
@@ -159,7 +126,7 @@ def test_the_tree_of_a_pr2_has_its_83_frames() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "why"),
     [
         (["elbow=1"], "'crane' has no joint 'elbow'"),
         (["ropes=1"], "'crane' has no joint 'ropes', did you mean 'rope'?"),
@@ -182,14 +149,10 @@ def test_the_tree_of_a_pr2_has_its_83_frames() -> None:
         (["--connect", "nowhere"], "an address is like tcp/192.168.1.5:7447, not 'nowhere'"),
     ],
 )
-def test_a_wrong_call_is_told_in_one_line(crane: str, arguments: list[str], message: str) -> None:
-    assert refused(crane, *arguments).startswith(message)
-
-
-def test_a_wrong_call_is_status_2_and_a_line_on_standard_error(crane: str) -> None:
-    done = tfbus(crane, "swing=left")
-    assert (done.stdout, done.returncode) == ("", 2)
-    assert done.stderr == "tfbus: joint 'swing': position 'left' is not a number\n"
+def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
+    crane: str, arguments: Sequence[str], why: str, tfbus: Command
+) -> None:
+    check_wrong_call(tfbus("robot", crane, *arguments), why)
 
 
 @pytest.mark.parametrize(
@@ -208,56 +171,46 @@ def test_a_wrong_call_is_status_2_and_a_line_on_standard_error(crane: str) -> No
         ),
     ],
 )
-def test_a_file_that_cannot_be_used_is_named(tmp_path: Path, content: str | None, message: str) -> None:
+def test_a_file_that_cannot_be_used_is_named(tmp_path: Path, content: str | None, message: str, tfbus: Command) -> None:
     path = tmp_path / "robot.urdf"
     if content is not None:
         path.write_text(content)
-    assert refused(str(path), "--tree").startswith(message.format(path=path))
+    check_wrong_call(tfbus("robot", path, "--tree"), message.format(path=path))
 
 
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_a_robot_is_published_on_the_domain_until_ctrl_c(crane: str, address: str, backend: str) -> None:
-    options = ["--listen", address, "--domain", "yard", "--rate", "50", "--backend", backend]
-    command = [TFBUS, "robot", crane, "swing=0.5", "rope=1.5", *options]
+def test_fixed_joints_are_published_once_and_the_others_at_the_rate(crane: str, backend: str, tfbus: Command) -> None:
+    batches: list[tuple[TransformStamped, ...]] = []
+    hooks: list[tuple[float, ...]] = []
 
-    async def hook() -> tuple[float, float, float]:
-        with Bus() as bus, Buffer(bus) as buffer:
-            async with ZenohLink(bus, "yard", connect=address):
-                await buffer.lookup("boom", "lamp", timeout=PATIENCE)
-                found = await buffer.lookup("base", "hook", timeout=PATIENCE)
-                assert start <= found.stamp <= bus.clock.now()
-                await buffer.lookup("base", "hook", found.stamp + 200_000_000, timeout=PATIENCE)
-                assert {edge.authority for edge in buffer.tree.edges()} == {"robot"}
-                assert [edge.child for edge in buffer.tree.edges() if edge.static] == ["lamp"]
-                return found.transform.translation
+    async def listen(bus: Bus) -> None:
+        with bus.subscribe(batches.append), Buffer(bus) as buffer:
+            await bus.clock.sleep(0.11)
+            hooks.append(buffer.lookup_nowait("r1/base", "r1/hook").transform.translation)
 
-    start = SystemClock().now()
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stderr is not None
-            line = process.stderr.readline()
-            assert line == "publishing 6 frames of 'crane' on domain 'yard' at 50 Hz, until Ctrl-C\n"
-            assert anyio.run(hook) == pytest.approx((2.0 * math.cos(0.5), 2.0 * math.sin(0.5), 3.5))
-        finally:
-            process.send_signal(signal.SIGINT)
-            output, errors = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, output, errors) == (130, "", "")
+    options = ("--prefix", "r1/", "--rate", "20", "--domain", "yard", "--backend", backend)
+    done = tfbus.on_domain(listen, "robot", crane, "swing=0.5", "rope=1.5", *options)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "publishing 6 frames of 'crane' on domain 'yard' at 20 Hz, until Ctrl-C\n"
+    fixed, *moving = batches
+    assert [(sample.parent, sample.child, sample.stamp, sample.static) for sample in fixed] == [
+        ("r1/boom", "r1/lamp", START, True)
+    ]
+    frames = ["r1/boom", "r1/cart", "r1/hook", "r1/kite", "r1/shadow"]
+    assert [sorted(sample.child for sample in batch) for batch in moving] == [frames] * 3
+    stamps = [{sample.stamp for sample in batch} for batch in moving]
+    assert stamps == [{START}, {START + SECOND // 20}, {START + SECOND // 10}]
+    assert {(sample.authority, sample.static) for batch in moving for sample in batch} == {("robot", False)}
+    assert hooks == [pytest.approx((2.0 * math.cos(0.5), 2.0 * math.sin(0.5), 3.5))]
 
 
-def test_without_its_extra_the_command_names_it(crane: str) -> None:
-    hidden = (
-        "import sys; sys.modules['urdf_parser_py'] = None\n"
-        f"sys.argv = ['tfbus', 'robot', {crane!r}, '--tree']\n"
-        "import tfbus.cli; tfbus.cli.main()"
-    )
-    done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=False)
-    assert done.stderr == 'tfbus: to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"\n'
-    assert done.returncode == 2
-
-
-def test_help_shows_every_option_and_an_example() -> None:
-    done = tfbus("--help")
-    assert done.returncode == 0
-    for option in ("FILE", "--tree", "--rate", "--prefix", "--domain", "--listen", "--connect", "--backend"):
-        assert option in done.stdout
-    assert "Example: tfbus robot " in done.stdout
+@pytest.mark.thorough
+def test_other_programs_receive_the_frames_of_the_robot(crane: str) -> None:
+    options = ("--domain", new_domain())
+    address = free_address()
+    with start_tfbus("robot", crane, "rope=1.5", "--listen", address, *options) as robot:
+        with start_tfbus("echo", "base", "lamp", "--json", "--connect", address, *options) as echo:
+            assert json.loads(echo.output.expect("{"))["translation"] == [0.5, 0.0, 5.0]
+        assert robot.end() == 130
+    assert robot.output.text == ""
+    assert len(robot.errors.text.splitlines()) == 1

@@ -10,12 +10,14 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from support.commands import START, Command, check_wrong_call
 from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, Program, free_address, tfbus
+from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
+from support.samples import moving, static
 
-from tfbus import SECOND, Edge
-from tfbus.cli.commands.tree import document, write
-from tfbus.cli.domain import UnusableError
+from tfbus import SECOND, Bus, Edge
+from tfbus.cli.arguments import UsageError
+from tfbus.cli.commands.tree import to_document, write_file
 
 TREE = r"""base_link
 ├── base_laser  \d+\.\d Hz  age .+  span .+  from 'robot_tf_publisher'
@@ -23,10 +25,10 @@ TREE = r"""base_link
 """
 
 
-def test_the_document_has_each_frame_with_its_edge_and_null_for_what_it_does_not_have() -> None:
-    moving = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
-    static = Edge("base_link", "lidar", True, 1, None, None, "")
-    assert document("tf", ["base_link", "lidar", "map"], [moving, static], 5 * SECOND) == {
+def test_the_document_has_each_frame_with_its_edge_and_null_for_missing_values() -> None:
+    odometry = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
+    mount = Edge("base_link", "lidar", True, 1, None, None, "")
+    assert to_document("tf", ["base_link", "lidar", "map"], [odometry, mount], 5 * SECOND) == {
         "domain": "tf",
         "stamp": 5 * SECOND,
         "frames": {
@@ -51,10 +53,10 @@ def test_the_document_has_each_frame_with_its_edge_and_null_for_what_it_does_not
     }
 
 
-def test_a_file_is_replaced_as_a_whole_and_nothing_else_is_left(tmp_path: Path) -> None:
+def test_a_file_is_replaced_as_a_whole_without_leaving_others(tmp_path: Path) -> None:
     path = tmp_path / "frames.dot"
     for text in ("first", "second"):
-        write(path, text)
+        write_file(path, text)
         assert path.read_text() == text
     assert list(tmp_path.iterdir()) == [path]
 
@@ -64,7 +66,7 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
     try:
-        write(pipe, "digraph")
+        write_file(pipe, "digraph")
         assert os.read(reader, 100) == b"digraph"
     finally:
         os.close(reader)
@@ -72,90 +74,111 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["nowhere/frames.dot", "."])
-def test_what_cannot_be_written_is_told_by_its_name(name: str, tmp_path: Path) -> None:
+def test_an_error_names_the_file_that_cannot_be_written(name: str, tmp_path: Path) -> None:
     path = tmp_path / name
-    with pytest.raises(UnusableError, match=re.escape(f"cannot write {path}: ")):
-        write(path, "")
+    with pytest.raises(UsageError, match=re.escape(f"cannot write {path}: ")):
+        write_file(path, "")
+
+
+async def publish(bus: Bus) -> None:
+    """A camera that is static, and after 2 s a laser at 10 Hz; their parent is the base."""
+    bus.publish(static("base", "camera", authority="me"))
+    await bus.clock.sleep(2.0)
+    async for _ in bus.clock.ticks(10.0):
+        bus.publish(moving("base", "laser", bus.clock.now(), authority="driver"))
 
 
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_the_tree_is_shown_as_others_send_it_and_written_for_graphviz(backend: str, tmp_path: Path) -> None:
-    domain, address = new_domain(), free_address()
-    options = ("--domain", domain, "--backend", backend)
+def test_the_tree_is_shown_after_the_duration_and_written_for_graphviz(
+    tfbus: Command, backend: str, tmp_path: Path
+) -> None:
     dot = tmp_path / "frames.dot"
-    with (
-        tfbus("broadcast", "--listen", address, *options) as broadcaster,
-        tfbus("static", "base_link", "camera", "--connect", address, *options) as static,
-    ):
-        broadcaster.errors.expect("broadcasting")
-        static.errors.expect("publishing")
-        with tfbus("tree", "--duration", "1.5", "--dot", str(dot), "--connect", address, *options) as tree:
-            assert tree.wait() == 0
-    assert re.fullmatch(TREE, tree.output.text)
+    done = tfbus.on_domain(publish, "tree", "--duration", "2.45", "--dot", dot, "--backend", backend)
+    assert (done.returncode, done.stderr) == (0, "")
+    # Samples of 102 s to 102.4 s, seen at 102.45 s.
+    assert done.stdout.splitlines() == [
+        "base",
+        "├── camera  static  from 'me'",
+        "└── laser   10.0 Hz  age 50 ms  span 400 ms  from 'driver'",
+    ]
     first, *edges, last = dot.read_text().splitlines()
     assert (first, last) == ("digraph tf {", "}")
-    assert [re.split(r" \[", edge)[0].strip() for edge in edges] == [
-        '"base_link" -> "base_laser"',
-        '"base_link" -> "camera"',
-    ]
+    assert [edge.partition(" [")[0].strip() for edge in edges] == ['"base" -> "camera"', '"base" -> "laser"']
 
 
-def test_where_nothing_comes_it_waits_until_something_does() -> None:
-    domain = new_domain()
-    with tfbus("tree", "--duration", "0", "--domain", domain) as tree:
-        tree.errors.expect("waiting")
-        with tfbus("static", "map", "odom", "--domain", domain):
-            assert tree.wait() == 0
-    assert tree.output.text == "map\n└── odom  static  from 'tfbus static'\n"
-    assert tree.errors.text == f"waiting for transforms on domain '{domain}' …\n"
+def test_by_default_it_listens_for_a_second(tfbus: Command) -> None:
+    done = tfbus.on_domain(publish, "tree", "--json", "--domain", "yard")
+    assert done.returncode == 0
+    document = json.loads(done.stdout)
+    assert (document["domain"], document["stamp"], set(document["frames"])) == (
+        "yard",
+        101 * SECOND,
+        {"base", "camera"},
+    )
+    # For people: an indented document.
+    assert len(done.stdout.splitlines()) > 10
 
 
-def test_ctrl_c_ends_one_that_still_waits() -> None:
-    with tfbus("tree", "--domain", new_domain()) as tree:
-        waiting = tree.errors.expect("waiting")
-        assert tree.end() == 130
-    assert (tree.output.text, tree.errors.text) == ("", f"{waiting}\n")
+def test_it_waits_for_the_first_transform_and_ends_at_ctrl_c(tfbus: Command) -> None:
+    async def wait(bus: Bus) -> None:
+        await bus.clock.sleep(30.0)
+
+    done = tfbus.on_domain(wait, "tree")
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "waiting for transforms on domain 'tf' …\n"
 
 
-def test_a_file_that_cannot_be_written_is_one_line_and_status_2(tmp_path: Path) -> None:
-    options = ("--domain", new_domain())
+def test_watched_it_is_printed_again_and_again(tfbus: Command) -> None:
+    async def publish_for_a_second(bus: Bus) -> None:
+        bus.publish(static("map", "odom"))
+        await bus.clock.sleep(0.75)
+        bus.publish(static("odom", "base"))
+        await bus.clock.sleep(0.5)
+
+    def watch(*options: str) -> str:
+        done = tfbus.on_domain(publish_for_a_second, "tree", "--watch", "--rate", "2", *options)
+        assert (done.returncode, done.stderr) == (130, "")
+        return done.stdout
+
+    before = "map\n└── odom  static\n\n"
+    after = "map\n└── odom      static\n    └── base  static\n\n"
+    assert watch() == before + before + after
+    documents = [json.loads(line) for line in watch("--json").splitlines()]
+    assert [document["stamp"] - START for document in documents] == [0, SECOND // 2, SECOND]
+    assert [len(document["frames"]) for document in documents] == [2, 2, 3]
+
+
+def test_a_file_that_cannot_be_written_is_one_line_and_status_2(tmp_path: Path, tfbus: Command) -> None:
     nowhere = tmp_path / "nowhere" / "frames.dot"
-    with (
-        tfbus("static", "base_link", "camera", *options),
-        tfbus("tree", "--duration", "0", "--dot", str(nowhere), *options) as tree,
-    ):
-        assert tree.wait() == 2
-    assert tree.errors.text == f"tfbus: cannot write {nowhere}: {os.strerror(errno.ENOENT)}\n"
+    check_wrong_call(
+        tfbus.on_domain(publish, "tree", "--dot", nowhere), f"cannot write {nowhere}: {os.strerror(errno.ENOENT)}"
+    )
 
 
-def test_watched_through_a_pipe_it_is_printed_again_and_again_and_what_is_new_is_in_it() -> None:
-    options = ("--domain", new_domain())
-    with (
-        tfbus("static", "map", "odom", *options),
-        tfbus("tree", "--watch", "--rate", "20", *options) as tree,
-        tfbus("tree", "--watch", "--rate", "20", "--json", *options) as lines,
-    ):
-        for _ in range(2):
-            tree.output.expect("^map$")
-            tree.output.expect("^└── odom  static  from 'tfbus static'$")
-            tree.output.expect("^$")
-        assert set(json.loads(lines.output.expect(""))["frames"]) == {"map", "odom"}
-        with tfbus("static", "odom", "base_link", "--authority", "me", *options):
-            tree.output.expect("^    └── base_link  static  from 'me'$")
-            document = json.loads(lines.output.expect("base_link"))
-        assert document["frames"]["base_link"]["parent"] == "odom"
-        assert tree.end() == 130
-    assert "\x1b" not in tree.output.text
+@pytest.mark.thorough
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_it_shows_what_programs_on_the_domain_send(backend: str) -> None:
+    domain, address = new_domain(), free_address()
+    options = ("--domain", domain, "--backend", backend)
+    with start_tfbus("tree", "--duration", "1.5", "--listen", address, *options) as tree:
+        tree.errors.expect("waiting")
+        with (
+            start_tfbus("broadcast", "--connect", address, *options),
+            start_tfbus("static", "base_link", "camera", "--connect", address, *options),
+        ):
+            assert tree.wait() == 0
+    assert re.fullmatch(TREE, tree.output.text)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("environment", "coloured"), [({}, True), ({"NO_COLOR": "1"}, False)])
-def test_on_a_terminal_it_is_redrawn_in_place_and_in_colour_if_that_is_wanted(
+def test_on_a_terminal_it_is_redrawn_in_place_and_in_colour_unless_forbidden(
     environment: Mapping[str, str], coloured: bool
 ) -> None:
     options = ("--domain", new_domain())
     screen, terminal = pty.openpty()
     plain = {name: value for name, value in os.environ.items() if name not in {"NO_COLOR", "FORCE_COLOR"}}
-    with tfbus("static", "map", "odom", *options):
+    with start_tfbus("static", "map", "odom", *options):
         watch = subprocess.Popen(
             [TFBUS, "tree", "--watch", "--rate", "20", *options],
             stdin=terminal,
@@ -167,28 +190,17 @@ def test_on_a_terminal_it_is_redrawn_in_place_and_in_colour_if_that_is_wanted(
         os.close(terminal)
         with watch:
             seen = b""
-            # One line up, to the first of the two.
+            # One line up, to the first of the two lines.
             while seen.count(b"\x1b[1A") < 2:
                 seen += os.read(screen, 4096)
             watch.send_signal(signal.SIGINT)
-            # A terminal whose program has ended says so by an error.
+            # At the end of the program, Linux raises an error.
             with suppress(OSError):
                 while more := os.read(screen, 4096):
                     seen += more
             assert watch.wait(PATIENCE) == 130
         os.close(screen)
     assert (b"\x1b[36m" in seen) is coloured
-    # The cursor is there.
+    # The cursor is shown at the end.
     assert seen.rindex(b"\x1b[?25h") > seen.rindex(b"\x1b[?25l")
     assert b"Traceback" not in seen
-
-
-def test_an_output_that_knows_no_such_letters_gets_others() -> None:
-    domain = new_domain()
-    command = (TFBUS, "tree", "--duration", "0", "--domain", domain)
-    with (
-        tfbus("static", "map", "Straße", "--domain", domain),
-        Program(*command, environment={**os.environ, "PYTHONIOENCODING": "ascii"}) as tree,
-    ):
-        assert tree.wait() == 0
-    assert tree.output.text == "map\n`-- Stra\\xdfe  static  from 'tfbus static'\n"

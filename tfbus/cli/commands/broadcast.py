@@ -2,24 +2,25 @@
 
 from tfbus.bus.bus import Bus
 from tfbus.cli import tutorial
-from tfbus.cli.domain import LOCAL, LinkOptions, say
-from tfbus.cli.options import Rate
+from tfbus.cli.arguments import Rate
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import say
 
 
-def broadcast(*, rate: Rate = 100.0, link: LinkOptions = LOCAL) -> None:
-    """Send where the tutorial's laser is, until Ctrl-C; `tfbus listen` in another terminal hears it.
+def broadcast(*, rate: Rate = 100.0, link: LinkOptions = DEFAULT_LINK) -> None:
+    """Broadcast the transform of the tutorial's laser, until Ctrl-C; `tfbus listen` in another terminal receives it.
 
     Example: tfbus broadcast --rate 50
 
     Parameters
     ----------
     rate
-        How often, in Hz.
+        Broadcasts per second.
     """
 
-    async def send(bus: Bus) -> None:
-        what = f"{tutorial.LASER!r} in {tutorial.BASE!r} at {rate:g} Hz"
-        say(f"broadcasting {what} on domain {link.domain!r}, until Ctrl-C")
+    async def broadcast_laser(bus: Bus) -> None:
+        laser = f"{tutorial.LASER!r} in {tutorial.BASE!r}"
+        say(f"broadcasting {laser} at {rate:g} Hz on domain {link.domain!r}, until Ctrl-C")
         await tutorial.broadcast(bus, rate)
 
-    link.run(send)
+    link.run(broadcast_laser)

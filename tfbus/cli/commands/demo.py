@@ -1,13 +1,11 @@
 """``tfbus demo``."""
 
 from functools import partial
-from typing import Annotated
-
-import anyio
-from cyclopts import Parameter
 
 from tfbus.cli import tutorial
-from tfbus.cli.options import Backend, Duration, Rate
+from tfbus.cli._event_loop import run
+from tfbus.cli.arguments import Backend, Duration, Flag, Rate
+from tfbus.cli.output import print_now
 from tfbus.clock import Clock, SimulatedClock, SystemClock
 
 
@@ -17,7 +15,7 @@ def demo(
     rate: Rate = 100.0,
     listen_rate: Rate = 1.0,
     backend: Backend = "asyncio",
-    simulated: Annotated[bool, Parameter(negative="")] = False,
+    simulated: Flag = False,
     broadcaster: bool = True,
 ) -> None:
     """Run the tutorial's robot: a 100 Hz broadcaster and a 1 Hz listener in one process, until Ctrl-C.
@@ -35,19 +33,18 @@ def demo(
     backend
         The event loop to run on.
     simulated
-        Run on a simulated clock, as fast as can be.
+        Run on a simulated clock, as fast as possible.
     broadcaster
-        Whether anybody sends the transform that the listener needs.
+        Whether to run the broadcaster; without it, the listener says what is missing.
     """
     clock: Clock = SimulatedClock() if simulated else SystemClock()
-    run = partial(
+    robot = partial(
         tutorial.run,
         clock,
         rate=rate,
         listen_rate=listen_rate,
         duration=duration,
         broadcaster=broadcaster,
-        # Piped output would else arrive in blocks of many lines.
-        output=partial(print, flush=True),
+        output=print_now,
     )
-    anyio.run(run, backend=backend)
+    run(robot, backend)

@@ -3,22 +3,22 @@
 import json
 import math
 from collections.abc import Iterable
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli.domain import LOCAL, LinkOptions, UnusableError, say
-from tfbus.cli.instants import seconds
-from tfbus.cli.options import Duration, Rate
+from tfbus.cli.arguments import Duration, JsonFlag, Rate, UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import format_seconds, print_now, say
 from tfbus.errors import MAY_COME, InvalidTransformError, TransformLookupError
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import format_duration, to_seconds
 from tfbus.waiting.waiting_index import blocking_frames
 
-_SOON = 1.0
+_Cause = tuple[type[BaseException], tuple[str, ...]]
+
+_TIMEOUT = 1.0
+"""s; a transform that is only late is not reported as missing."""
 
 
 def echo(
@@ -28,81 +28,82 @@ def echo(
     *,
     rate: Rate = 1.0,
     max_age: Duration = math.inf,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
-    link: LinkOptions = LOCAL,
+    as_json: JsonFlag = False,
+    link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Print where SOURCE is, seen from TARGET, again and again, until Ctrl-C.
+    """Print the transform of SOURCE in TARGET again and again, until Ctrl-C.
 
-    It is the newest transform that can be told, also when nothing new has come, and where all is static. While there
-    is none, standard error says what is missing.
+    Each time it is the newest transform, even if it is static or has not changed. While there is none, standard error
+    says what is missing.
 
     Example: tfbus echo map base_link --rate 10 --json
 
     Parameters
     ----------
     target
-        The frame that the numbers are told in.
+        The frame in which the transform is expressed.
     source
-        The frame that is looked for.
+        The frame whose position and orientation are printed.
     rate
-        How often, in Hz.
+        Lookups per second.
     max_age
-        Count a transform that is older than this many seconds as missing.
+        Treat a transform that is older than this many seconds as missing.
     as_json
         Print one JSON object a line: target, source, stamp (ns), translation (x y z, m), rotation (x y z w), static,
-        and age (s; null where all is static).
+        and age (s; null if static).
     """
     try:
-        for name in (target, source):
-            check_frame(name)
+        for frame in (target, source):
+            check_frame(frame)
     except InvalidTransformError as error:
-        raise UnusableError(str(error)) from None
+        raise UsageError(str(error)) from None
 
     async def print_transforms(bus: Bus) -> None:
-        told: object = None
         with Buffer(bus) as buffer:
             await link.first_transform(bus)
+            reported: _Cause | None = None
             async for _ in bus.clock.ticks(rate):
                 try:
-                    # What has just begun to come is given a moment before anything is called missing.
-                    found = await buffer.lookup(target, source, timeout=_SOON, max_age=max_age)
+                    transform = await buffer.lookup(target, source, timeout=_TIMEOUT, max_age=max_age)
                 except TransformLookupError as error:
                     missing = error.__cause__ or error
-                    key = type(missing), blocking_frames(missing) if isinstance(missing, MAY_COME) else None
-                    if key != told:
+                    cause = _cause(missing)
+                    if cause != reported:
                         say(f"waiting for {source!r} in {target!r}: {missing}")
-                        told = key
+                        reported = cause
                 else:
-                    told = None
-                    print((to_json if as_json else describe)(found, bus.clock.now()), flush=True)
+                    reported = None
+                    print_now((to_json if as_json else describe)(transform, bus.clock.now()))
 
     link.run(print_transforms)
 
 
-def to_json(found: TransformStamped, now: int) -> str:
-    """An answer as one line of JSON."""
+def to_json(sample: TransformStamped, now: int) -> str:
+    """The sample as one line of JSON; its age is counted from `now`, in ns."""
     return json.dumps(
         {
-            "target": found.parent,
-            "source": found.child,
-            "stamp": found.stamp,
-            "translation": found.transform.translation,
-            "rotation": found.transform.rotation,
-            "static": found.static,
-            "age": None if found.static else to_seconds(now - found.stamp),
+            "target": sample.parent,
+            "source": sample.child,
+            "stamp": sample.stamp,
+            "translation": sample.transform.translation,
+            "rotation": sample.transform.rotation,
+            "static": sample.static,
+            "age": None if sample.static else to_seconds(now - sample.stamp),
         }
     )
 
 
-def describe(found: TransformStamped, now: int) -> str:
-    """An answer much as ``tf2_echo`` prints it, with the two frames and the age."""
-    when = "any time" if found.static else f"{seconds(found.stamp)} s, age {format_duration(now - found.stamp)}"
-    angles = found.transform.as_rpy()
+def describe(sample: TransformStamped, now: int) -> str:
+    """The sample in the format of ``tf2_echo``, with both frames and the age at `now`, in ns."""
+    when = (
+        "any time" if sample.static else f"{format_seconds(sample.stamp)} s, age {format_duration(now - sample.stamp)}"
+    )
+    angles = sample.transform.as_rpy()
     return "\n".join(
         (
-            f"At {when}: {found.child!r} in {found.parent!r}",
-            f"- Translation: [{_join(found.transform.translation)}] m",
-            f"- Rotation: in quaternion (xyzw) [{_join(found.transform.rotation)}]",
+            f"At {when}: {sample.child!r} in {sample.parent!r}",
+            f"- Translation: [{_join(sample.transform.translation)}] m",
+            f"- Rotation: in quaternion (xyzw) [{_join(sample.transform.rotation)}]",
             f"            in rpy (rad)          [{_join(angles)}]",
             f"            in rpy (deg)          [{_join(map(math.degrees, angles))}]",
         )
@@ -110,5 +111,9 @@ def describe(found: TransformStamped, now: int) -> str:
 
 
 def _join(numbers: Iterable[float]) -> str:
-    # There is no -0.000000.
-    return ", ".join(f"{round(number, 6) + 0.0:.6f}" for number in numbers)
+    return ", ".join(f"{number:z.6f}" for number in numbers)
+
+
+def _cause(error: BaseException) -> _Cause:
+    """The kind of an error and the frames that it is about; its message differs from one lookup to the next."""
+    return type(error), blocking_frames(error) if isinstance(error, MAY_COME) else ()

@@ -1,18 +1,17 @@
 """``tfbus listen``."""
 
-from functools import partial
-
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.cli import tutorial
-from tfbus.cli.domain import LOCAL, LinkOptions
-from tfbus.cli.options import Rate
+from tfbus.cli.arguments import Rate
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import print_now
 
 
-def listen(*, rate: Rate = 1.0, link: LinkOptions = LOCAL) -> None:
-    """Print where a point of the tutorial's laser is, seen from the base, until Ctrl-C.
+def listen(*, rate: Rate = 1.0, link: LinkOptions = DEFAULT_LINK) -> None:
+    """Print a point of the tutorial's laser in the frame of the base, again and again, until Ctrl-C.
 
-    Start `tfbus broadcast` in another terminal, before or after. While it is missing, lines say what is missing.
+    Start `tfbus broadcast` in another terminal, before or after. Without it, the lines say what is missing.
 
     Example: tfbus listen
 
@@ -25,7 +24,6 @@ def listen(*, rate: Rate = 1.0, link: LinkOptions = LOCAL) -> None:
     async def print_points(bus: Bus) -> None:
         with Buffer(bus) as buffer:
             await link.first_transform(bus)
-            # Piped output would else arrive in blocks of many lines.
-            await tutorial.listen(buffer, rate, output=partial(print, flush=True))
+            await tutorial.listen(buffer, rate, output=print_now)
 
     link.run(print_points)

@@ -5,22 +5,20 @@ import signal
 import sys
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Annotated
 
 import anyio
-from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
 from tfbus.bus.event_stream import EventStream
-from tfbus.cli.commands.info import left_out
-from tfbus.cli.domain import LOCAL, LinkOptions, UnusableError, say
-from tfbus.cli.options import Duration
+from tfbus.cli.arguments import Duration, Flag, UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import format_counts, say, warn
 from tfbus.events import RecordingDropped, RecordingFailed
 from tfbus.recording.recorder import Recorder
 from tfbus.statistics import RecorderStatistics
 
-_FAILED = 1
-_KILLED = 128
+_RECORDING_FAILED = 1
+_ENDED_BY_SIGNAL = 128
 
 
 def record(
@@ -28,73 +26,74 @@ def record(
     /,
     *,
     duration: Duration = math.inf,
-    overwrite: Annotated[bool, Parameter(negative="")] = False,
-    link: LinkOptions = LOCAL,
+    overwrite: Flag = False,
+    link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Record all transforms of a domain to FILE, an MCAP file as ROS 2 and Foxglove read it, until Ctrl-C.
+    """Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.
 
     Example: tfbus record run.mcap --duration 60
 
     Parameters
     ----------
     file
-        The recording that is made.
+        The MCAP file to write.
     duration
         Stop after this many seconds.
     overwrite
-        Whether a file that is there already may be lost.
+        Replace FILE if it exists.
     """
-    status = [0]
 
-    async def record_domain(bus: Bus) -> None:
+    async def record_domain(bus: Bus) -> int:
         recorder = Recorder(bus, file, overwrite=overwrite)
         async with AsyncExitStack() as stack:
             try:
                 await stack.enter_async_context(recorder)
             except FileExistsError:
-                raise UnusableError(f"{file} is there already: take another name, or give --overwrite") from None
+                raise UsageError(f"{file} is there already: take another name, or give --overwrite") from None
             except ImportError as error:
-                raise UnusableError(str(error)) from None
+                raise UsageError(str(error)) from None
             except OSError as error:
-                raise UnusableError(f"cannot write {file}: {error.strerror or error}") from None
+                raise UsageError(f"cannot write {file}: {error.strerror or error}") from None
             say(f"recording domain {link.domain!r} to {file}")
-            status[0] = await _until_stopped(bus, link, duration)
-        for line in _summary(file, recorder.statistics()):
-            say(line)
-        if recorder.error is not None:
-            say(f"tfbus: the recording has ended early: {recorder.error}")
-            status[0] = _FAILED
+            status = await _wait_for_end(bus, link, duration)
+        print_summary(file, recorder.statistics())
+        if recorder.error is None:
+            return status
+        warn(f"the recording has ended early: {recorder.error}")
+        return _RECORDING_FAILED
 
-    link.run(record_domain)
-    if status[0] == _KILLED + signal.SIGINT:
+    status = link.run(record_domain)
+    if status == _ENDED_BY_SIGNAL + signal.SIGINT:
         raise KeyboardInterrupt
-    sys.exit(status[0])
+    sys.exit(status)
 
 
-async def _until_stopped(bus: Bus, link: LinkOptions, duration: float) -> int:
-    """Wait for a signal, the time to be up, or the disk to fail; the exit status that this is."""
+async def _wait_for_end(bus: Bus, link: LinkOptions, duration: float) -> int:
+    """Wait until a signal comes, the duration is over, or the disk fails; return the exit status for it."""
     status = 0
     with bus.events(stale_after=None) as events:
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(link.first_transform, bus)
-            tasks.start_soon(_follow, events, tasks.cancel_scope)
-            with anyio.move_on_after(duration):
-                status = _KILLED + await _signal()
+            tasks.start_soon(_watch_recorder, events, tasks.cancel_scope)
+            with bus.clock.move_on_after(duration):
+                status = _ENDED_BY_SIGNAL + await _wait_for_signal()
             tasks.cancel_scope.cancel()
     return status
 
 
-async def _follow(events: EventStream, scope: anyio.CancelScope) -> None:
+async def _watch_recorder(events: EventStream, scope: anyio.CancelScope) -> None:
+    """Warn of lost samples, and cancel a scope when the recording fails."""
     async for event in events:
         if isinstance(event, RecordingFailed):
             scope.cancel()
         elif isinstance(event, RecordingDropped):
-            say(f"tfbus: the disk is too slow: samples are lost, {event.dropped} so far")
+            warn(f"the disk is too slow: samples are lost, {event.dropped} so far")
 
 
-async def _signal() -> int:
-    """Wait to be told to stop, so that the file is finished; on Windows, Ctrl-C raises by itself."""
+async def _wait_for_signal() -> int:
+    """Wait for Ctrl-C or a termination and return its number, so that the file is finished before the program ends."""
     if sys.platform == "win32":
+        # There, Ctrl-C raises by itself.
         await anyio.sleep_forever()
     with anyio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
         async for number in signals:
@@ -102,15 +101,13 @@ async def _signal() -> int:
     return signal.SIGTERM
 
 
-def _summary(file: Path, statistics: RecorderStatistics) -> list[str]:
-    lines = [f"{statistics.samples:,} samples in {file}"]
+def print_summary(file: Path, statistics: RecorderStatistics) -> None:
+    """Print how many samples were recorded, lost and left out."""
+    say(f"{statistics.samples:,} samples in {file}")
     lost = statistics.queue.dropped + statistics.queue.conflated
-    if lost:
-        lines.append(f"tfbus: {lost:,} samples were lost, because the disk was too slow or failed")
+    if lost > 0:
+        warn(f"{lost:,} samples were lost, because the disk was too slow or failed")
     if statistics.refused:
-        lines.append(f"tfbus: left out, as ROS cannot hold them: {left_out(statistics.refused)}")
-    if statistics.unattributed:
-        lines.append(
-            f"tfbus: {statistics.unattributed:,} samples are recorded without their authority: too many of them"
-        )
-    return lines
+        warn(f"left out, as ROS cannot hold them: {format_counts(statistics.refused)}")
+    if statistics.unattributed > 0:
+        warn(f"{statistics.unattributed:,} samples are recorded without their authority: too many of them")

@@ -1,16 +1,13 @@
 """``tfbus robot``."""
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli.domain import LOCAL, LinkOptions, UnusableError, say
-from tfbus.cli.options import Rate
-from tfbus.cli.printable import printable
+from tfbus.cli.arguments import Flag, Rate, UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import format_numbers, format_transform, printable, say, warn
 from tfbus.errors import InvalidRobotError, InvalidTransformError
 from tfbus.geometry.transform import Transform
 from tfbus.robot.joint import Joint, Position
@@ -25,14 +22,15 @@ def robot(
     file: Path,
     /,
     *position: str,
-    tree: Annotated[bool, Parameter(negative="")] = False,
+    tree: Flag = False,
     rate: Rate = 10.0,
     prefix: str = "",
-    link: LinkOptions = LOCAL,
+    link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Publish a robot, its joints at zero or where they are told to be, until Ctrl-C; or print its frames.
+    """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
 
-    Fixed joints are published once, the others again and again. What is beyond a limit is told, and published as it is.
+    Fixed joints are published once, the others again and again. A position beyond the limits of its joint is reported
+    and published all the same.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
 
@@ -41,26 +39,26 @@ def robot(
     file
         A URDF.
     position
-        As NAME=NUMBER, the position of a joint in rad or m. Of a planar joint it is x,y,angle, of a floating one
+        As NAME=NUMBER, the position of a joint in rad or m; for a planar joint x,y,angle, for a floating one
         x,y,z,qx,qy,qz,qw.
     tree
-        Print the tree of frames with joints and positions, and end.
+        Print the tree of frames with joints and positions, and exit.
     rate
         How often moving joints are published, in Hz.
     prefix
-        Put before the names of all frames, such as robot1/.
+        A prefix for the names of all frames, such as robot1/.
     """
-    model = _model(file)
-    positions = {**model.zeros(), **dict(_positions(model, position))}
+    model = _read_model(file)
+    positions = {**model.zeros(), **_parse_positions(model, position)}
     try:
         count = len(model.transforms(positions, 0, AUTHORITY, prefix))
         violations = model.violations(positions)
     except InvalidTransformError as error:
-        raise UnusableError(str(error)) from None
+        raise UsageError(str(error)) from None
     for violation in violations:
-        say(f"tfbus: {violation}")
+        warn(str(violation))
     if tree:
-        print("\n".join(picture(model, positions, prefix)))
+        print("\n".join(tree_lines(model, positions, prefix)))
         return
 
     async def publish(bus: Bus) -> None:
@@ -72,83 +70,78 @@ def robot(
     link.run(publish)
 
 
-def picture(model: RobotModel, positions: Mapping[str, Position], prefix: str = "") -> Iterator[str]:
-    """The frames of a robot as an indented tree, a line each, with joint, type and position."""
-    above = {joint.child: joint for joint in model.joints}
+def tree_lines(model: RobotModel, positions: Mapping[str, Position], prefix: str = "") -> Iterator[str]:
+    """The tree of frames, one a line, with the name, the type and the position of the joint above each."""
+    joint_above = {joint.child: joint for joint in model.joints}
     resolved = {joint.name: position for joint, position in model.resolve(positions)}
     edges = [Edge(joint.parent, joint.child, joint.kind == "fixed", 0, None, None, "") for joint in model.joints]
     rows = []
     for guides, frame, edge in branches(edges) if edges else [Branch("", model.root, None)]:
-        row = [guides + printable(prefix + frame), "", "", ""]
+        name = kind = position = ""
         if edge is not None:
-            joint = above[frame]
-            row[1:3] = printable(joint.name), joint.kind
+            joint = joint_above[frame]
+            name, kind = printable(joint.name), joint.kind
             if joint.name in resolved:
-                row[3] = _shown(joint, resolved[joint.name])
+                position = _format_position(joint, resolved[joint.name])
                 if joint.mimic is not None and joint.name not in positions:
-                    row[3] += f", mimics {printable(joint.mimic.joint)}"
-        rows.append(row)
+                    position += f", mimics {printable(joint.mimic.joint)}"
+        rows.append((guides + printable(prefix + frame), name, kind, position))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         yield "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
 
 
-def _shown(joint: Joint, position: Position) -> str:
+def _format_position(joint: Joint, position: Position) -> str:
     if isinstance(position, Transform):
-        return f"xyz {_plain(position.translation)} m, rpy {_plain(position.as_rpy())} rad"
+        return format_transform(position)
     if isinstance(position, Sequence):
-        return f"xy {_plain(position[:2])} m, angle {_plain(position[2:])} rad"
-    return f"{_plain([position])} {'m' if joint.kind == 'prismatic' else 'rad'}"
+        return f"xy {format_numbers(position[:2])} m, angle {format_numbers(position[2:])} rad"
+    return f"{format_numbers([position])} {'m' if joint.kind == 'prismatic' else 'rad'}"
 
 
-def _plain(numbers: Iterable[float]) -> str:
-    # Zero is added because there is a -0.
-    return " ".join(f"{number + 0.0:g}" for number in numbers)
-
-
-def _model(file: Path) -> RobotModel:
+def _read_model(file: Path) -> RobotModel:
     try:
         return RobotModel.from_urdf(file)
     except OSError as error:
-        raise UnusableError(f"cannot read {file}: {error.strerror}") from None
+        raise UsageError(f"cannot read {file}: {error.strerror}") from None
     except InvalidRobotError as error:
-        raise UnusableError(f"{file}: {error}") from None
+        raise UsageError(f"{file}: {error}") from None
     except ImportError as error:
-        raise UnusableError(str(error)) from None
+        raise UsageError(str(error)) from None
 
 
-def _positions(model: RobotModel, pairs: Sequence[str]) -> Iterator[tuple[str, Position]]:
-    """What the pairs on the command line say."""
+def _parse_positions(model: RobotModel, assignments: Sequence[str]) -> dict[str, Position]:
+    """The positions by joint from assignments such as ``elbow=0.5``."""
     joints = {joint.name: joint for joint in model.joints}
-    seen = set()
-    for pair in pairs:
-        name, equals, text = pair.rpartition("=")
+    positions: dict[str, Position] = {}
+    for assignment in assignments:
+        name, equals, text = assignment.rpartition("=")
         if not equals:
-            raise UnusableError(f"a position is NAME=NUMBER, such as elbow=0.5, not {pair!r}")
+            raise UsageError(f"a position is NAME=NUMBER, such as elbow=0.5, not {assignment!r}")
         if name not in joints:
             moving = [joint.name for joint in model.joints if joint.kind != "fixed"]
             hint = " or ".join(map(repr, difflib.get_close_matches(name, moving)))
-            raise UnusableError(f"{model.name!r} has no joint {name!r}" + (f", did you mean {hint}?" if hint else ""))
+            raise UsageError(f"{model.name!r} has no joint {name!r}" + (f", did you mean {hint}?" if hint else ""))
         if joints[name].kind == "fixed":
-            raise UnusableError(f"joint {name!r} is fixed and has no position")
-        if name in seen:
-            raise UnusableError(f"joint {name!r} has two positions")
-        seen.add(name)
-        yield name, _position(joints[name], text)
+            raise UsageError(f"joint {name!r} is fixed and has no position")
+        if name in positions:
+            raise UsageError(f"joint {name!r} has two positions")
+        positions[name] = _parse_position(joints[name], text)
+    return positions
 
 
-def _position(joint: Joint, text: str) -> Position:
+def _parse_position(joint: Joint, text: str) -> Position:
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        raise UnusableError(f"joint {joint.name!r}: position {text!r} is not a number") from None
+        raise UsageError(f"joint {joint.name!r}: position {text!r} is not a number") from None
     if joint.kind == "planar":
         return numbers
     if joint.kind == "floating":
         try:
             return Transform(numbers[:3], numbers[3:])
         except InvalidTransformError as error:
-            raise UnusableError(f"joint {joint.name!r}: {error}") from None
+            raise UsageError(f"joint {joint.name!r}: {error}") from None
     if len(numbers) > 1:
-        raise UnusableError(f"joint {joint.name!r}: position {text!r} is not one number")
+        raise UsageError(f"joint {joint.name!r}: position {text!r} is not one number")
     return numbers[0]

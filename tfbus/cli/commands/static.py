@@ -6,7 +6,9 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli.domain import LOCAL, LinkOptions, UnusableError, say
+from tfbus.cli.arguments import UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import format_transform, say
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.rows import Quaternion, Vector
 from tfbus.geometry.stamped import TransformStamped
@@ -23,57 +25,55 @@ def static(
     rpy: Annotated[Vector | None, Parameter(negative="")] = None,
     quaternion: Annotated[Quaternion | None, Parameter(negative="")] = None,
     authority: str = "tfbus static",
-    link: LinkOptions = LOCAL,
+    link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Publish where CHILD is, seen from PARENT, once and for all, for as long as this runs; Ctrl-C ends it.
+    """Publish the static transform of CHILD in PARENT, until Ctrl-C.
 
-    Whoever joins later gets it too. After the end, those who have it keep it, and those who join do not get it.
+    Programs that join later receive it too. After the end, programs that have it keep it; those that join do not get
+    it.
 
     Example: tfbus static base_link base_laser --xyz 0.1 0 0.2 --rpy 0 0 1.5708
 
     Parameters
     ----------
     parent
-        The frame that the numbers are told in.
+        The frame in which the numbers are expressed.
     child
-        The frame that is placed.
+        The frame to place.
     xyz
         The origin of CHILD in PARENT: x y z, in m.
     rpy
-        Its rotation as roll, pitch and yaw about the fixed axes x, y and z of PARENT, in rad.
+        The rotation of CHILD as roll, pitch and yaw about the fixed axes x, y and z of PARENT, in rad.
     quaternion
-        Its rotation as a unit quaternion x y z w.
+        The rotation of CHILD as a unit quaternion x y z w.
     authority
-        Who says so, as shown by tools.
+        The sender that tools show.
     """
     sample = _sample(parent, child, xyz, rpy, quaternion, authority)
 
     async def publish(bus: Bus) -> None:
         bus.publish(sample.replace(stamp=bus.clock.now()))
-        say(f"publishing {child!r} in {parent!r} on domain {link.domain!r}, until Ctrl-C: {describe(sample.transform)}")
+        numbers = format_transform(sample.transform)
+        say(f"publishing {child!r} in {parent!r} on domain {link.domain!r}, until Ctrl-C: {numbers}")
         await anyio.sleep_forever()
 
     link.run(publish)
-
-
-def describe(transform: Transform) -> str:
-    """A transform in a few words, with its units."""
-    xyz, rpy = (" ".join(f"{x:g}" for x in numbers) for numbers in (transform.translation, transform.as_rpy()))
-    return f"xyz {xyz} m, rpy {rpy} rad"
 
 
 def _sample(
     parent: str, child: str, xyz: Vector, rpy: Vector | None, quaternion: Quaternion | None, authority: str
 ) -> TransformStamped:
     if rpy is not None and quaternion is not None:
-        raise UnusableError("--rpy and --quaternion are two ways to say the same: give one of them")
+        raise UsageError("--rpy and --quaternion are two ways to say the same: give one of them")
     try:
-        transform = (
-            Transform(xyz, quaternion) if quaternion is not None else Transform.from_xyz_rpy(xyz, rpy or (0, 0, 0))
-        )
+        if quaternion is not None:
+            transform = Transform(xyz, quaternion)
+        else:
+            transform = Transform.from_xyz_rpy(xyz, (0, 0, 0) if rpy is None else rpy)
         sample = TransformStamped(parent, child, 0, transform, authority, static=True)
     except InvalidTransformError as error:
-        raise UnusableError(str(error)) from None
-    if (unsendable := refusal(sample)) is not None:
-        raise UnusableError(str(unsendable))
+        raise UsageError(str(error)) from None
+    unsendable = refusal(sample)
+    if unsendable is not None:
+        raise UsageError(str(unsendable))
     return sample

@@ -3,14 +3,13 @@
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli.domain import LOCAL, LinkOptions, UnusableError
-from tfbus.cli.options import Duration, Rate
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import print_now
 from tfbus.stamps import to_seconds
 from tfbus.tree.history import Edge
 
@@ -18,90 +17,95 @@ from tfbus.tree.history import Edge
 def tree(
     *,
     duration: Duration = 1.0,
-    watch: Annotated[bool, Parameter(negative="")] = False,
+    watch: Flag = False,
     rate: Rate = 1.0,
     dot: Path | None = None,
-    as_json: Annotated[bool, Parameter(name="--json", negative="")] = False,
-    link: LinkOptions = LOCAL,
+    as_json: JsonFlag = False,
+    link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Show all frames as a tree, with how often each comes, how old its newest sample is, and who sends it.
+    """Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.
 
     Example: tfbus tree --dot frames.dot && dot -Tsvg frames.dot -o frames.svg
 
     Parameters
     ----------
     duration
-        For how many seconds to listen, from the first transform on.
+        How many seconds to listen, from the first transform on.
     watch
-        Show it live until Ctrl-C; where the output is no terminal, print it again and again.
+        Show it live until Ctrl-C; if the output is no terminal, print it again and again.
     rate
-        How often, in Hz, with --watch.
+        Updates per second, with --watch.
     dot
-        Write the tree to this file as well, for Graphviz.
+        Also write the tree to this file, for Graphviz.
     as_json
         Print a JSON document instead, with --watch one a line: for each frame its parent, kind, rate (Hz), age (s),
-        span (s) and authority; null for what it does not have.
+        span (s) and authority; null for a value that the frame does not have.
     """
-    from tfbus.cli.tree_display import TreeDisplay
+    from tfbus.cli._tree_display import TreeDisplay
 
-    async def show(bus: Bus) -> None:
+    async def show_tree(bus: Bus) -> None:
         with Buffer(bus) as buffer, TreeDisplay(live=watch and not as_json) as display:
 
-            def present() -> None:
+            def show_once() -> None:
                 edges, now = buffer.tree.edges(), bus.clock.now()
                 if dot is not None:
-                    write(dot, buffer.tree.to_dot())
+                    write_file(dot, buffer.tree.to_dot())
                 if as_json:
-                    facts = document(link.domain, buffer.tree.frames(), edges, now)
-                    print(json.dumps(facts, indent=None if watch else 2), flush=True)
+                    document = to_document(link.domain, buffer.tree.frames(), edges, now)
+                    print_now(json.dumps(document, indent=None if watch else 2))
                 else:
                     display.show(edges, now)
 
             await link.first_transform(bus)
-            if not watch:
+            if watch:
+                async for _ in bus.clock.ticks(rate):
+                    show_once()
+            else:
                 await bus.clock.sleep(duration)
-                present()
-                return
-            async for _ in bus.clock.ticks(rate):
-                present()
+                show_once()
 
-    link.run(show)
+    link.run(show_tree)
 
 
-def document(domain: str, frames: Iterable[str], edges: Iterable[Edge], now: int) -> dict[str, Any]:
-    """The tree as JSON has it; ages are counted from `now`, in ns."""
-    known = {edge.child: edge for edge in edges}
+def to_document(domain: str, frames: Iterable[str], edges: Iterable[Edge], now: int) -> dict[str, Any]:
+    """The JSON document of the tree; ages are counted from `now`, in ns."""
+    edge_above = {edge.child: edge for edge in edges}
     return {
         "domain": domain,
         "stamp": now,
-        "frames": {frame: _facts(known.get(frame), now) for frame in frames},
+        "frames": {frame: _describe(edge_above.get(frame), now) for frame in frames},
     }
 
 
-def write(path: Path, text: str) -> None:
-    """Put a text into a file, all of it or nothing; a pipe or a device just gets it."""
+def write_file(path: Path, text: str) -> None:
+    """Write a text to a file, all of it or nothing; a pipe or a device is written to directly.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be written.
+    """
     replaceable = path.is_file() or not path.exists()
-    unfinished = path.with_name(f".{path.name}.part") if replaceable else path
+    written = path.with_name(f".{path.name}.part") if replaceable else path
     try:
-        unfinished.write_text(text, encoding="utf-8")
+        written.write_text(text, encoding="utf-8")
         if replaceable:
-            unfinished.replace(path)
+            written.replace(path)
     except OSError as error:
         if replaceable:
-            unfinished.unlink(missing_ok=True)
-        raise UnusableError(f"cannot write {path}: {error.strerror}") from None
+            written.unlink(missing_ok=True)
+        raise UsageError(f"cannot write {path}: {error.strerror}") from None
 
 
-def _facts(edge: Edge | None, now: int) -> dict[str, Any]:
+def _describe(edge: Edge | None, now: int) -> dict[str, Any]:
     if edge is None:
         return {"parent": None, "kind": "root", "rate": None, "age": None, "span": None, "authority": None}
     age = span = None
     if edge.oldest is not None and edge.newest is not None:
         age, span = to_seconds(now - edge.newest), to_seconds(edge.newest - edge.oldest)
-    kind = "static" if edge.static else "moving"
     return {
         "parent": edge.parent,
-        "kind": kind,
+        "kind": "static" if edge.static else "moving",
         "rate": edge.rate,
         "age": age,
         "span": span,

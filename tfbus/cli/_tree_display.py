@@ -1,4 +1,4 @@
-"""A tree of frames on standard output: in colour on a terminal, redrawn in place if it is live."""
+"""The tree of frames on standard output: in colour on a terminal, and redrawn in place there if it is live."""
 
 import sys
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
-from tfbus.cli.printable import printable
+from tfbus.cli.output import printable
 from tfbus.stamps import SECOND
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import branches, facts
@@ -18,12 +18,12 @@ _STYLES = {"rate": "cyan", "age": "green", "span": "dim", "authority": "magenta"
 
 
 class TreeDisplay:
-    """Shows a tree, each time in place of the one before, or below it where the output is no terminal.
+    """Shows a tree once, or again and again: in place on a terminal, otherwise one below the other.
 
     Parameters
     ----------
     live : bool
-        Whether it is shown more than once.
+        Whether the tree is shown more than once.
     """
 
     def __init__(self, live: bool) -> None:
@@ -34,20 +34,20 @@ class TreeDisplay:
             self._live = Live(console=self._console, auto_refresh=False, redirect_stderr=sys.stderr.isatty())
 
     def show(self, edges: Sequence[Edge], now: int) -> None:
-        """Draw the edges as they are at a stamp in ns."""
-        lines = draw(edges, now, ascii_only=self._console.options.ascii_only)
+        """Draw the edges; ages are counted from `now`, in ns."""
+        lines = tree_lines(edges, now, ascii_only=self._console.options.ascii_only)
         if self._live is not None:
             self._live.update(Group(*lines), refresh=True)
             return
         with self._console.capture() as drawn:
             self._console.print(*lines, sep="\n", soft_wrap=True)
-        # Rich itself would end the program when nobody reads any more.
+        # Rich would end the program by itself if the reader has closed the pipe.
         print(drawn.get(), end=self._end, flush=True)
 
     def __enter__(self) -> "TreeDisplay":
         if self._live is not None:
             self._live.start()
-            # A program that is killed could not bring it back.
+            # A killed program could not show it again.
             self._console.show_cursor()
         return self
 
@@ -58,19 +58,18 @@ class TreeDisplay:
             self._live.stop()
 
 
-def draw(edges: Sequence[Edge], now: int, ascii_only: bool = False) -> list[Text]:
-    """The edges as a tree, line by line, with rate, age, span and authority.
-
-    Not a `rich.tree.Tree`, which leaves out the frames that are deeper than a terminal is wide.
+def tree_lines(edges: Sequence[Edge], now: int, ascii_only: bool = False) -> list[Text]:
+    """The styled lines of the tree, one a frame, with rate, age, span and authority.
 
     Parameters
     ----------
     edges : sequence of Edge
     now : int
-        The stamp that ages are counted from, in ns.
+        The stamp from which ages are counted, in ns.
     ascii_only : bool
-        Whether there are no lines to draw with.
+        Whether to draw the branches with ASCII characters.
     """
+    # A `rich.tree.Tree` would leave out the frames that are nested deeper than the terminal is wide.
     rows = []
     for branch in branches(edges):
         guides = branch.guides.translate(_ASCII) if ascii_only else branch.guides

@@ -5,7 +5,7 @@ import anyio
 import anyio.lowlevel
 import pytest
 
-from tfbus.cli.running import run
+from tfbus.cli._event_loop import run
 
 pytestmark = pytest.mark.parametrize("backend", ["asyncio", "trio"])
 
@@ -14,18 +14,15 @@ def press_ctrl_c() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_what_a_command_does_is_done_when_it_returns(backend: str) -> None:
-    done = []
-
-    async def main() -> None:
+def test_the_result_of_the_function_is_returned(backend: str) -> None:
+    async def main() -> str:
         await anyio.lowlevel.checkpoint()
-        done.append(backend)
+        return backend
 
-    run(main, backend)
-    assert done == [backend]
+    assert run(main, backend) == backend
 
 
-def test_ctrl_c_cancels_and_is_raised_when_all_has_ended_in_order_although_it_is_pressed_again(backend: str) -> None:
+def test_ctrl_c_cancels_and_is_raised_after_the_cleanup_even_if_pressed_again(backend: str) -> None:
     ended = []
 
     async def main() -> None:
@@ -44,7 +41,7 @@ def test_ctrl_c_cancels_and_is_raised_when_all_has_ended_in_order_although_it_is
     assert ended == [backend]
 
 
-def test_what_was_done_before_ctrl_c_came_is_no_less_interrupted(backend: str) -> None:
+def test_ctrl_c_is_raised_even_if_the_function_ends_by_itself(backend: str) -> None:
     async def main() -> None:
         with anyio.CancelScope(shield=True):
             press_ctrl_c()
@@ -54,7 +51,7 @@ def test_what_was_done_before_ctrl_c_came_is_no_less_interrupted(backend: str) -
         run(main, backend)
 
 
-def test_an_error_comes_out_as_it_is(backend: str) -> None:
+def test_an_error_is_raised_without_an_exception_group(backend: str) -> None:
     async def main() -> None:
         raise OSError("no")
 
@@ -62,7 +59,7 @@ def test_an_error_comes_out_as_it_is(backend: str) -> None:
         run(main, backend)
 
 
-def test_an_error_at_the_end_is_told_although_ctrl_c_came_first(backend: str) -> None:
+def test_an_error_in_the_cleanup_after_ctrl_c_is_raised(backend: str) -> None:
     async def main() -> None:
         try:
             press_ctrl_c()
@@ -74,7 +71,7 @@ def test_an_error_at_the_end_is_told_although_ctrl_c_came_first(backend: str) ->
         run(main, backend)
 
 
-def test_where_ctrl_c_is_ignored_it_stays_so(backend: str) -> None:
+def test_ctrl_c_stays_ignored_where_it_was_ignored(backend: str) -> None:
     done = []
 
     async def main() -> None:

@@ -1,0 +1,93 @@
+import io
+import sys
+
+import pytest
+
+from tfbus import SECOND, Edge
+from tfbus.cli._tree_display import TreeDisplay, tree_lines
+from tfbus.tree.rendering import describe
+
+MOVING = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
+STATIC = Edge("base_link", "lidar", True, 1, None, None, "")
+SINGLE = Edge("base_link", "arm", False, 1, 3 * SECOND, 3 * SECOND, "driver")
+EDGES = [SINGLE, MOVING, STATIC]
+HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
+
+
+class Terminal(io.StringIO):
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
+
+
+def styles(edges: list[Edge], now: int) -> dict[str, str]:
+    """The style of each styled piece of the tree."""
+    return {
+        line.plain[span.start : span.end]: str(span.style) for line in tree_lines(edges, now) for span in line.spans
+    }
+
+
+def test_the_tree_is_the_one_that_a_buffer_describes() -> None:
+    assert [line.plain for line in tree_lines(EDGES, 5 * SECOND)] == describe(EDGES, 5 * SECOND).split("\n")
+
+
+def test_columns_are_aligned_whatever_the_width_of_the_letters() -> None:
+    wide, narrow = tree_lines(
+        [Edge("map", "雷达", True, 1, None, None, ""), Edge("map", "odom", True, 1, None, None, "")], 0
+    )[1:]
+    assert (wide.plain, narrow.plain) == ("├── 雷达  static", "└── odom  static")
+
+
+def test_deeply_nested_frames_are_shown_in_full(capsys: pytest.CaptureFixture[str]) -> None:
+    chain = [Edge(f"frame{level}", f"frame{level + 1}", True, 1, None, None, "robot") for level in range(50)]
+    with TreeDisplay(live=False) as display:
+        display.show(chain, 0)
+    assert capsys.readouterr().out == describe(chain, 0) + "\n"
+
+
+def test_where_the_output_is_no_terminal_a_live_tree_is_printed_again_below_a_blank_line(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with TreeDisplay(live=True) as display:
+        display.show([STATIC], 0)
+        display.show([STATIC], 0)
+    assert capsys.readouterr().out == 2 * "base_link\n└── lidar  static\n\n"
+
+
+def test_on_a_terminal_a_live_tree_is_redrawn_in_place_with_the_cursor_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with TreeDisplay(live=True) as display:
+        assert terminal.getvalue().endswith(SHOW_CURSOR)
+        display.show([STATIC], 0)
+        display.show([STATIC], 0)
+    shown = terminal.getvalue()
+    assert shown.count("lidar") >= 2
+    # The second drawing begins one line up, at the first of the two lines.
+    assert "\x1b[1A" in shown
+    assert shown.rindex(SHOW_CURSOR) > shown.rindex(HIDE_CURSOR)
+
+
+def test_a_frame_without_a_sample_for_more_than_a_second_is_red() -> None:
+    assert styles([MOVING], 5 * SECOND)["age 1 s"] == "green"
+    assert styles([MOVING], 5 * SECOND + 1)["age 1 s"] == "red"
+
+
+def test_frame_names_cannot_control_the_terminal_or_the_style() -> None:
+    evil = Edge("map", "[red]\x1b[2J\n:smile:", True, 1, None, None, "\x1b]0;title\x07")
+    (_, line) = tree_lines([evil], 0)
+    assert line.plain == "└── [red]\\x1b[2J\\n:smile:  static  from '\\x1b]0;title\\x07'"
+
+
+def test_the_branches_can_be_drawn_in_ascii() -> None:
+    assert [line.plain for line in tree_lines(EDGES, 5 * SECOND, ascii_only=True)][1:] == [
+        "`-- base_link  50.0 Hz  age 1 s  span 2 s  from 'odometry'",
+        "    |-- arm    one sample  age 2 s  span 0 ns  from 'driver'",
+        "    `-- lidar  static",
+    ]
+
+
+def test_an_empty_tree_is_one_line() -> None:
+    assert [line.plain for line in tree_lines([], 0)] == ["(no frames)"]

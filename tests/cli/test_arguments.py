@@ -1,0 +1,106 @@
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from cyclopts import App, CycloptsError
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfbus.cli.arguments import Backend, Duration, Flag, Instant, JsonFlag, Rate, Speed, Step, parse_seconds
+from tfbus.cli.output import format_seconds
+
+LIMIT = 9_223_372_036 * 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("text", "nanoseconds"),
+    [
+        ("0", 0),
+        ("1.5", 1_500_000_000),
+        ("-0.000000001", -1),
+        ("1700000000.123456789", 1_700_000_000_123_456_789),
+        ("1e3", 1_000_000_000_000),
+        (" 2 ", 2_000_000_000),
+        ("1.0000000000", 1_000_000_000),
+    ],
+)
+def test_seconds_are_parsed_exactly(text: str, nanoseconds: int) -> None:
+    assert parse_seconds(text) == nanoseconds
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("noon", "expected seconds"),
+        ("", "expected seconds"),
+        ("nan", "expected seconds"),
+        ("inf", "does not fit"),
+        ("9223372036", "does not fit"),
+        ("-9223372036", "does not fit"),
+        ("1e999999999", "does not fit"),
+        ("0.0000000001", "more than nine decimals"),
+        ("1e-999999999", "more than nine decimals"),
+    ],
+)
+def test_seconds_that_are_no_stamp_are_an_error(text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        parse_seconds(text)
+
+
+@given(nanoseconds=st.integers(1 - LIMIT, LIMIT - 1))
+def test_seconds_that_were_printed_can_be_typed(nanoseconds: int) -> None:
+    assert parse_seconds(format_seconds(nanoseconds)) == nanoseconds
+
+
+def parse(kind: Any, *arguments: str) -> object:
+    """The value of the option ``--option`` of a type."""
+    app = App()
+
+    def command(*, option: object = None) -> object:
+        return option
+
+    command.__annotations__["option"] = kind
+    app.default(command)
+    call: Callable[..., object] = app
+    return call(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "value"),
+    [
+        (Rate, ["--option", "0.5"], 0.5),
+        (Speed, ["--option", "inf"], float("inf")),
+        (Duration, ["--option", "0"], 0.0),
+        (Duration, ["--option", "inf"], float("inf")),
+        (Instant, ["--option=-1.5"], -1_500_000_000),
+        (Step, ["--option", "0.000000001"], 1),
+        (Backend, ["--option", "trio"], "trio"),
+        (Flag, ["--option"], True),
+        (JsonFlag, ["--json"], True),
+    ],
+)
+def test_an_argument_is_converted_to_its_type(kind: Any, arguments: list[str], value: object) -> None:
+    assert parse(kind, *arguments) == value
+
+
+@pytest.mark.parametrize(
+    ("kind", "argument"),
+    [
+        (Rate, "--option=0"),
+        (Rate, "--option=inf"),
+        (Rate, "--option=nan"),
+        (Speed, "--option=0"),
+        (Speed, "--option=nan"),
+        (Duration, "--option=-1"),
+        (Duration, "--option=nan"),
+        (Instant, "--option=noon"),
+        (Step, "--option=0"),
+        (Step, "--option=-1"),
+        (Backend, "--option=curio"),
+        (Flag, "--no-option"),
+        (JsonFlag, "--no-json"),
+    ],
+)
+def test_an_argument_that_its_type_does_not_allow_is_an_error(kind: Any, argument: str) -> None:
+    with pytest.raises(CycloptsError):
+        parse(kind, argument)

@@ -1,0 +1,78 @@
+import io
+import sys
+
+import pytest
+
+from tfbus import Transform
+from tfbus.cli.output import (
+    format_counts,
+    format_numbers,
+    format_seconds,
+    format_transform,
+    print_now,
+    printable,
+    say,
+    track,
+    warn,
+)
+
+
+def test_results_go_to_standard_output_and_everything_else_to_standard_error(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_now("a result")
+    say("a notice")
+    warn("a warning")
+    assert capsys.readouterr() == ("a result\n", "a notice\ntfbus: a warning\n")
+
+
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_lines_leave_a_buffered_stream_at_once(stream: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    received = io.BytesIO()
+    monkeypatch.setattr(sys, stream, io.TextIOWrapper(io.BufferedWriter(received), encoding="utf-8"))  # type: ignore[type-var]
+    (print_now if stream == "stdout" else say)("line")
+    assert received.getvalue() == b"line\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("base_link", "base_link"),
+        ("雷达 é", "雷达 é"),
+        ("\x1b[2J", "\\x1b[2J"),
+        ("a\nb\r\x07", "a\\nb\\r\\x07"),
+        # This character would reverse the direction of the text.
+        ("\u202egpj", "\\u202egpj"),
+    ],
+)
+def test_letters_of_any_alphabet_stay_and_control_characters_are_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown
+
+
+@pytest.mark.parametrize(
+    ("nanoseconds", "text"),
+    [(0, "0.000000000"), (1, "0.000000001"), (-1, "-0.000000001"), (-1_500_000_000, "-1.500000000")],
+)
+def test_seconds_have_nine_decimals(nanoseconds: int, text: str) -> None:
+    assert format_seconds(nanoseconds) == text
+
+
+def test_numbers_have_no_needless_digits_and_no_negative_zero() -> None:
+    assert format_numbers([1.5, -0.25, -0.0, 1 / 3]) == "1.5 -0.25 0 0.333333"
+
+
+def test_a_transform_has_its_units() -> None:
+    transform = Transform.from_xyz_rpy((1.5, 0.0, -0.25), (0.1, -0.2, 0.3))
+    assert format_transform(transform) == "xyz 1.5 0 -0.25 m, rpy 0.1 -0.2 0.3 rad"
+
+
+def test_counts_keep_their_order() -> None:
+    assert format_counts({"not finite": 1_234, "cycle": 1}) == "1,234 x not finite, 1 x cycle"
+    assert format_counts({}) == ""
+
+
+def test_items_are_tracked_without_a_bar_where_standard_error_is_no_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert list(track(iter("abc"), None, "reading")) == ["a", "b", "c"]
+    assert capsys.readouterr() == ("", "")

@@ -1,0 +1,63 @@
+"""What the subcommands print: results, notices, warnings, and values as text for people."""
+
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TypeVar
+
+from tfbus.geometry.transform import Transform
+from tfbus.stamps import SECOND
+
+ItemT = TypeVar("ItemT")
+
+
+def print_now(line: str) -> None:
+    """Print a line of the result at once; through a pipe it would otherwise wait for a block of many lines."""
+    print(line, flush=True)
+
+
+def say(line: str) -> None:
+    """Print a notice to standard error."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def warn(message: str) -> None:
+    """Print a warning or an error to standard error, with the name of the command before it."""
+    say(f"tfbus: {message}")
+
+
+def track(items: Iterable[ItemT], total: int | None, description: str) -> Iterator[ItemT]:
+    """Iterate over the items with a progress bar, if standard error is a terminal."""
+    if not sys.stderr.isatty():
+        yield from items
+        return
+    from tfbus.cli._progress_bar import progress_bar
+
+    with progress_bar() as bar:
+        yield from bar.track(items, total=total, description=description)
+
+
+def printable(text: str) -> str:
+    """Escape the characters of a text that would control a terminal."""
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+
+
+def format_seconds(nanoseconds: int) -> str:
+    """Nanoseconds as seconds with all nine decimals."""
+    whole, rest = divmod(abs(nanoseconds), SECOND)
+    return f"{'-' if nanoseconds < 0 else ''}{whole}.{rest:09d}"
+
+
+def format_numbers(numbers: Iterable[float]) -> str:
+    """Numbers with six digits at most, separated by blanks."""
+    # Adding zero turns -0 into 0.
+    return " ".join(f"{number + 0.0:g}" for number in numbers)
+
+
+def format_transform(transform: Transform) -> str:
+    """A transform in one line: ``xyz 0.1 0 0.2 m, rpy 0 0 1.5708 rad``."""
+    return f"xyz {format_numbers(transform.translation)} m, rpy {format_numbers(transform.as_rpy())} rad"
+
+
+def format_counts(counts: Mapping[str, int]) -> str:
+    """Counts by reason in one line: ``3 x not finite, 1 x cycle``."""
+    return ", ".join(f"{count:,} x {reason}" for reason, count in counts.items())
