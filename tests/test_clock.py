@@ -12,7 +12,7 @@ from support.asking import Asked, driving, settle
 
 from tfbus import SECOND, Buffer, Bus, Clock, ClockResetError, SimulatedClock, SystemClock, from_seconds, to_seconds
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
 Run = Callable[[Callable[[], Awaitable[list[str]]]], list[str]]
 
