@@ -16,7 +16,7 @@ def test_a_key_is_logged_the_first_time_only(caplog: pytest.LogCaptureFixture) -
     assert caplog.records[0].name == "tests.once"
 
 
-def test_what_is_worth_knowing_is_logged_once_too(caplog: pytest.LogCaptureFixture) -> None:
+def test_info_is_logged_once_too(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     once = OnceLogger(LOGGER)
     once.info("key", "first %s", "base")
@@ -58,8 +58,8 @@ def test_memory_is_bounded_and_the_oldest_of_a_thousand_keys_is_forgotten_first(
 
 
 def test_a_key_is_the_first_of_its_kind_until_it_is_forgotten() -> None:
-    once = SeenKeys(remembered=2)
-    assert [once.first(key) for key in "aabb"] == [True, False, True, False]
-    assert once.first("c")
-    assert not once.first("b")
-    assert once.first("a")
+    once = SeenKeys(capacity=2)
+    assert [once.add(key) for key in "aabb"] == [True, False, True, False]
+    assert once.add("c")
+    assert not once.add("b")
+    assert once.add("a")

@@ -24,20 +24,20 @@ def check_frame(name: str, parent: str | None = None, child: str | None = None, 
 
 
 class Prefix:
-    """Which name on the bus each local name stands for.
+    """A map between the local names of a robot and the names on the bus.
 
     Parameters
     ----------
     prefix : str
-        Put before a name as it is: a slash that is to stand between the two belongs to it, as in ``"robot1/"``.
+        Put before each local name. A slash between the two must be part of the prefix, as in ``"robot1/"``.
     shared : iterable of str
-        Names that are the same for everybody, such as ``{"map"}``.
+        Names that are the same for all robots, such as ``{"map"}``.
 
     Raises
     ------
     ValueError
-        If the prefix, or a shared name, is empty or starts with a slash, or a shared name starts with the prefix: then
-        two local names would be one.
+        If the prefix, or a shared name, is empty or starts with a slash; or if a shared name starts with the prefix,
+        because two local names would then be the same on the bus.
     TypeError
         If they are not strings, or `shared` is a single one.
     """
@@ -55,11 +55,11 @@ class Prefix:
                 raise ValueError(f"the shared name {name!r} starts with the prefix {prefix!r}")
 
     def on_bus(self, name: str) -> str:
-        """The name that the bus has for a local one; what cannot name a frame stays, for others to refuse."""
+        """The name on the bus for a local name. An invalid name is returned unchanged, and the bus refuses it."""
         return name if name in self.shared or not is_frame(name) else self.prefix + name
 
     def local(self, name: str) -> str:
-        """The local name for one on the bus; a frame that has none, being somebody else's, gets a leading slash."""
+        """The local name for a name on the bus. A frame of another robot has none and gets a leading slash."""
         if name in self.shared:
             return name
         rest = name.removeprefix(self.prefix)
@@ -72,7 +72,7 @@ def as_prefix(prefix: str | None, shared: Iterable[str]) -> Prefix | None:
     Raises
     ------
     ValueError, TypeError
-        As `Prefix`; and `TypeError` if there are shared names but no prefix that they could do without.
+        As `Prefix`; and `TypeError` if there are shared names but no prefix.
     """
     if prefix is not None:
         return Prefix(prefix, shared)

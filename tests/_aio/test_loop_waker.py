@@ -19,10 +19,10 @@ PATIENCE = 30.0
 
 
 class Door:
-    """A bell, how often it was answered, and an event for the next time."""
+    """A waker, how often it was answered, and an event for the next time."""
 
     def __init__(self) -> None:
-        self.bell = LoopWaker(self._answer)
+        self.waker = LoopWaker(self._answer)
         self.answers = 0
         self.threads: set[int] = set()
         self.opened = anyio.Event()
@@ -34,49 +34,49 @@ class Door:
 
 
 async def test_a_thread_wakes_a_loop_that_has_nothing_else_to_do() -> None:
-    door = Door()
-    assert not door.bell.connected
-    door.bell.connect()
-    assert door.bell.connected
-    for rings in range(1, 4):
-        door.opened = anyio.Event()
+    loop = Door()
+    assert not loop.waker.bound
+    loop.waker.bind()
+    assert loop.waker.bound
+    for requests in range(1, 4):
+        loop.opened = anyio.Event()
         with anyio.fail_after(PATIENCE):
             async with anyio.create_task_group() as tasks:
-                tasks.start_soon(anyio.to_thread.run_sync, door.bell.ring)
-                await door.opened.wait()
-        assert door.answers == rings
-    assert door.threads == {threading.get_ident()}
+                tasks.start_soon(anyio.to_thread.run_sync, loop.waker.wake)
+                await loop.opened.wait()
+        assert loop.answers == requests
+    assert loop.threads == {threading.get_ident()}
 
 
-async def test_it_is_answered_soon_and_not_at_once_and_once_for_many_rings() -> None:
-    door = Door()
-    door.bell.connect()
+async def test_the_callback_runs_soon_and_once_for_many_requests() -> None:
+    loop = Door()
+    loop.waker.bind()
     for _ in range(1_000):
-        door.bell.ring()
-    assert door.answers == 0
+        loop.waker.wake()
+    assert loop.answers == 0
     await settle()
-    assert door.answers == 1
+    assert loop.answers == 1
     await settle()
-    assert door.answers == 1
+    assert loop.answers == 1
 
 
-async def test_what_rings_while_it_is_answered_is_answered_once_more() -> None:
+async def test_a_request_during_the_callback_leads_to_another_call() -> None:
     answers: list[int] = []
 
     def answer() -> None:
         answers.append(len(answers))
         if len(answers) < 5:
-            bell.ring()
-            bell.ring()
+            waker.wake()
+            waker.wake()
 
-    bell = LoopWaker(answer)
-    bell.connect()
-    bell.ring()
+    waker = LoopWaker(answer)
+    waker.bind()
+    waker.wake()
     await settle()
     assert answers == [0, 1, 2, 3, 4]
 
 
-async def test_nothing_that_threads_queue_before_they_ring_is_left_behind() -> None:
+async def test_nothing_that_threads_queue_before_a_request_is_left_behind() -> None:
     queue: list[int] = []
     taken: list[int] = []
     everything = anyio.Event()
@@ -87,13 +87,13 @@ async def test_nothing_that_threads_queue_before_they_ring_is_left_behind() -> N
         if len(taken) == 8_000:
             everything.set()
 
-    bell = LoopWaker(answer)
-    bell.connect()
+    waker = LoopWaker(answer)
+    waker.bind()
 
     def produce() -> None:
         for number in range(2_000):
             queue.append(number)
-            bell.ring()
+            waker.wake()
 
     threads = [threading.Thread(target=produce) for _ in range(4)]
     interval = sys.getswitchinterval()
@@ -102,7 +102,7 @@ async def test_nothing_that_threads_queue_before_they_ring_is_left_behind() -> N
         with anyio.fail_after(PATIENCE):
             for thread in threads:
                 thread.start()
-            # No more rings come that could wake the loop for what it has overlooked.
+            # No more requests come that could wake the loop for what it has overlooked.
             await everything.wait()
     finally:
         sys.setswitchinterval(interval)
@@ -111,90 +111,90 @@ async def test_nothing_that_threads_queue_before_they_ring_is_left_behind() -> N
     assert len(taken) == 8_000
 
 
-def test_a_bell_that_was_never_connected_says_so() -> None:
-    with pytest.raises(RuntimeError, match="connect the doorbell"):
-        LoopWaker(lambda: None).ring()
+def test_an_unbound_waker_raises() -> None:
+    with pytest.raises(RuntimeError, match="bind the waker"):
+        LoopWaker(lambda: None).wake()
 
 
-def test_it_is_connected_on_an_event_loop_only() -> None:
-    door = Door()
+def test_a_waker_is_bound_on_an_event_loop_only() -> None:
+    loop = Door()
     with pytest.raises(RuntimeError):
-        door.bell.connect()
-    assert not door.bell.connected
+        loop.waker.bind()
+    assert not loop.waker.bound
 
 
-@pytest.mark.parametrize("rings", [0, 1])
-def test_every_ring_after_the_end_of_the_loop_says_so(run: Run, rings: int) -> None:
-    door = Door()
+@pytest.mark.parametrize("requests", [0, 1])
+def test_every_request_after_the_end_of_the_loop_raises(run: Run, requests: int) -> None:
+    loop = Door()
 
-    async def leave_with_unanswered_rings() -> None:
-        door.bell.connect()
-        for _ in range(rings):
-            door.bell.ring()
+    async def leave_with_unanswered_requests() -> None:
+        loop.waker.bind()
+        for _ in range(requests):
+            loop.waker.wake()
 
-    run(leave_with_unanswered_rings)
-    answers = door.answers
+    run(leave_with_unanswered_requests)
+    answers = loop.answers
     for _ in range(3):
         with pytest.raises(RuntimeError):
-            door.bell.ring()
-    assert door.answers == answers
+            loop.waker.wake()
+    assert loop.answers == answers
 
 
-@pytest.mark.parametrize("rings", [0, 1])
-def test_a_bell_may_be_connected_again_to_a_loop_that_comes_later(run: Run, rings: int) -> None:
-    door = Door()
+@pytest.mark.parametrize("requests", [0, 1])
+def test_a_waker_may_be_bound_to_a_later_loop(run: Run, requests: int) -> None:
+    loop = Door()
 
-    async def leave_with_unanswered_rings() -> None:
-        door.bell.connect()
-        for _ in range(rings):
-            door.bell.ring()
+    async def leave_with_unanswered_requests() -> None:
+        loop.waker.bind()
+        for _ in range(requests):
+            loop.waker.wake()
 
     async def answer() -> None:
-        door.bell.connect()
-        before = door.answers
-        door.bell.ring()
+        loop.waker.bind()
+        before = loop.answers
+        loop.waker.wake()
         await settle()
-        assert door.answers == before + 1
+        assert loop.answers == before + 1
 
-    run(leave_with_unanswered_rings)
+    run(leave_with_unanswered_requests)
     for _ in range(2):
         run(answer)
 
 
 def test_a_ring_that_an_ended_loop_has_never_answered_is_told_of_at_the_next_and_forgotten_on_another_loop() -> None:
-    door = Door()
+    loop = Door()
 
     async def connect() -> None:
-        door.bell.connect()
+        loop.waker.bind()
 
     for _ in range(2):
-        loop = asyncio.new_event_loop()
-        loop.run_until_complete(connect())
-        door.bell.ring()
-        loop.close()
+        native = asyncio.new_event_loop()
+        native.run_until_complete(connect())
+        loop.waker.wake()
+        native.close()
         for _ in range(2):
             with pytest.raises(RuntimeError):
-                door.bell.ring()
-        assert door.answers == 0
+                loop.waker.wake()
+        assert loop.answers == 0
 
     async def answer() -> None:
-        door.bell.connect()
-        door.bell.ring()
-        await asyncio.wait_for(door.opened.wait(), PATIENCE)
+        loop.waker.bind()
+        loop.waker.wake()
+        await asyncio.wait_for(loop.opened.wait(), PATIENCE)
 
     asyncio.run(answer())
-    assert door.answers == 1
+    assert loop.answers == 1
 
 
 def test_a_thread_that_rings_while_the_loop_ends_is_told_of_it(run: Run) -> None:
-    door = Door()
+    loop = Door()
     begun = threading.Event()
     told: list[Exception] = []
 
     def ring_on() -> None:
         while not told:
             try:
-                door.bell.ring()
+                loop.waker.wake()
             except RuntimeError as error:
                 told.append(error)
             begun.set()
@@ -202,7 +202,7 @@ def test_a_thread_that_rings_while_the_loop_ends_is_told_of_it(run: Run) -> None
     thread = threading.Thread(target=ring_on)
 
     async def serve() -> None:
-        door.bell.connect()
+        loop.waker.bind()
         thread.start()
         assert begun.wait(PATIENCE)
 

@@ -271,9 +271,3 @@ def test_a_closed_bus_can_be_joined_by_nobody() -> None:
     bus.close()
     with pytest.raises(BusClosedError):
         Buffer(bus, prefill=first)
-
-
-def test_the_tree_of_a_buffer_takes_over_nothing_else() -> None:
-    buffer = Buffer(Bus(SimulatedClock()))
-    with pytest.raises(RuntimeError, match="adopt"):
-        buffer.tree.adopt(TransformTree())

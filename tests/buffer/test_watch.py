@@ -718,8 +718,8 @@ async def test_a_closed_buffer_can_be_watched_for_what_it_still_knows(end: str) 
 
 def nothing_is_left(buffer: Buffer) -> bool:
     """Whether no watch is registered, neither for an answer nor for the lack of one."""
-    index = buffer._feed.watching
-    return buffer.pending() == () and len(index) == 0 and index.under == {}
+    index = buffer._live.watching
+    return buffer.pending() == () and len(index) == 0 and index.by_frame == {}
 
 
 async def test_what_the_body_of_the_loop_raises_comes_out_as_it_is() -> None:

@@ -4,35 +4,35 @@ from tfbus import ClockReset, Event, FrameRemoved
 from tfbus.bus._announcer import Announcer
 
 
-class Ears:
-    """A listener that keeps what it is told."""
+class Recorder:
+    """A listener that keeps its events."""
 
     def __init__(self) -> None:
-        self.heard: list[Event] = []
+        self.events: list[Event] = []
 
     def put(self, event: Event) -> None:
-        self.heard.append(event)
+        self.events.append(event)
 
 
-def test_everybody_who_is_in_the_list_at_the_moment_is_told_in_order() -> None:
-    early, late = Ears(), Ears()
-    listeners: deque[Ears] = deque()
+def test_each_event_goes_to_the_listeners_of_the_moment() -> None:
+    early, late = Recorder(), Recorder()
+    listeners: deque[Recorder] = deque()
     announcer = Announcer(lambda: 7, listeners)
-    announcer.tell(FrameRemoved(0, "nobody hears it"))
+    announcer.announce(FrameRemoved(0, "nobody hears it"))
     listeners.append(early)
-    announcer.tell(FrameRemoved(1, "a"))
+    announcer.announce(FrameRemoved(1, "a"))
     listeners.append(late)
-    announcer.tell(ClockReset(2, 9))
+    announcer.announce(ClockReset(2, 9))
     listeners.remove(early)
-    announcer.tell(FrameRemoved(3, "b"))
-    assert early.heard == [FrameRemoved(1, "a"), ClockReset(2, 9)]
-    assert late.heard == [ClockReset(2, 9), FrameRemoved(3, "b")]
+    announcer.announce(FrameRemoved(3, "b"))
+    assert early.events == [FrameRemoved(1, "a"), ClockReset(2, 9)]
+    assert late.events == [ClockReset(2, 9), FrameRemoved(3, "b")]
     assert announcer.now() == 7
 
 
-def test_it_is_false_while_nobody_listens() -> None:
-    listeners: list[Ears] = []
+def test_has_listeners_follows_the_list() -> None:
+    listeners: list[Recorder] = []
     announcer = Announcer(lambda: 0, listeners)
-    assert not announcer
-    listeners.append(Ears())
-    assert announcer
+    assert not announcer.has_listeners
+    listeners.append(Recorder())
+    assert announcer.has_listeners

@@ -156,7 +156,7 @@ def test_a_frame_that_is_handed_to_and_fro_for_ever_pushes_nobody_else_out() -> 
 def test_news_for_the_reader_come_next_and_are_never_dropped() -> None:
     queue = EventQueue(1)
     news = [FrameStale(5, f"frame {number}", 0, "") for number in range(10)]
-    queue.put_news(news)
+    queue.put_staleness(news)
     queue.put(FrameRemoved(6, "frame 1"))
     queue.put(FrameRemoved(7, "frame 2"))
     assert queue.statistics() == QueueStatistics("events", "drop_oldest", capacity=1, pending=11, dropped=1)

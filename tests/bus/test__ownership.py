@@ -12,18 +12,21 @@ POLICIES: list[OnConflict] = ["last", "reject"]
 @dataclass(frozen=True)
 class Known:
     authority: str
+    parent: str = "a"
+    static: bool = False
+    newest: int | None = 0
 
 
 def test_under_last_everybody_may_publish_everything() -> None:
     ownership = Ownership("last")
-    assert not ownership
+    assert not ownership.restricts
     batch = (moving("a", "b", 0, authority="odometry"), moving("a", "b", 1, authority="slam"))
     assert ownership.split(batch, {"b": Known("gps")}) == (batch, [])
 
 
 def test_under_reject_the_first_authority_keeps_the_child() -> None:
     ownership = Ownership("reject")
-    assert ownership
+    assert ownership.restricts
     mine, other = moving("a", "b", 1, authority="odometry"), moving("x", "b", 2, authority="slam")
     allowed, (error,) = ownership.split((other, mine), {"b": Known("odometry")})
     assert allowed == (mine,)
@@ -67,7 +70,7 @@ def test_under_last_nothing_is_remembered() -> None:
     ownership = Ownership("last")
     ownership.remember({"b": Known("odometry")})
     assert not ownership.remembers("b")
-    assert not ownership
+    assert not ownership.restricts
 
 
 @pytest.mark.parametrize(("first", "second"), [("", "slam"), ("slam", "")])
@@ -85,7 +88,7 @@ def test_a_reserved_frame_is_for_one_authority_only_whoever_was_first(policy: On
     known = {"b": Known("odometry")}
     old, new = moving("a", "b", 1, authority="odometry"), moving("a", "b", 1, authority="slam")
     with ownership.reserve("b", "slam"):
-        assert ownership
+        assert ownership.restricts
         assert ownership.reserved_for("b") == "slam"
         allowed, (error,) = ownership.split((old, new), known)
         assert allowed == (new,)
@@ -114,7 +117,7 @@ def test_one_authority_may_reserve_a_frame_twice_and_has_it_until_both_end() -> 
     assert ownership.reserved_for("b") == "slam"
     second.close()
     assert ownership.reserved_for("b") is None
-    assert not ownership
+    assert not ownership.restricts
 
 
 def test_only_a_good_name_and_a_good_authority_can_have_a_reservation() -> None:
@@ -126,7 +129,7 @@ def test_only_a_good_name_and_a_good_authority_can_have_a_reservation() -> None:
         ownership.reserve(7, "slam")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="authority must be a str, not None"):
         ownership.reserve("odom", None)  # type: ignore[arg-type]
-    assert not ownership
+    assert not ownership.restricts
 
 
 def test_a_misspelt_policy_is_refused() -> None:

@@ -14,6 +14,7 @@ LIMIT = 10
 class Known:
     newest: int | None
     authority: str = ""
+    parent: str = "map"
 
     @property
     def static(self) -> bool:
@@ -43,9 +44,9 @@ def test_a_frame_is_stale_once_it_is_more_than_the_limit_behind_and_says_so_once
     world = World()
     world.send("a", 100)
     assert world.staleness.due() == 111
-    assert world.staleness.news(110) == []
-    assert world.staleness.news(111) == [FrameStale(111, "a", 100, "")]
-    assert world.staleness.news(500) == []
+    assert world.staleness.changes(110) == []
+    assert world.staleness.changes(111) == [FrameStale(111, "a", 100, "")]
+    assert world.staleness.changes(500) == []
     assert world.staleness.due() is None
 
 
@@ -53,28 +54,28 @@ def test_samples_that_keep_coming_keep_it_live() -> None:
     world = World()
     for stamp in range(100, 200, 9):
         world.send("a", stamp)
-        assert world.staleness.news(stamp + 9) == []
+        assert world.staleness.changes(stamp + 9) == []
     assert world.staleness.due() == 199 + LIMIT + 1
 
 
 def test_it_is_live_again_when_its_newest_is_not_too_old_any_more() -> None:
     world = World()
     world.send("a", 100)
-    world.staleness.news(200)
+    world.staleness.changes(200)
     assert world.send("a", 189)
-    assert world.staleness.news(200) == [], "newer, but still too old"
+    assert world.staleness.changes(200) == [], "newer, but still too old"
     assert world.send("a", 190)
-    assert world.staleness.news(200) == [FrameLive(200, "a", 190, "")]
+    assert world.staleness.changes(200) == [FrameLive(200, "a", 190, "")]
     assert world.staleness.due() == 201
 
 
 def test_a_late_sample_of_a_stale_frame_is_nothing_new() -> None:
     world = World()
     world.send("a", 100)
-    world.staleness.news(200)
+    world.staleness.changes(200)
     world.send("a", 50)
-    assert world.staleness.news(200) == []
-    assert world.staleness.news(111) == [], "only what arrived is looked at"
+    assert world.staleness.changes(200) == []
+    assert world.staleness.changes(111) == [], "only what arrived is looked at"
 
 
 def test_static_frames_are_never_stale() -> None:
@@ -82,16 +83,16 @@ def test_static_frames_are_never_stale() -> None:
     assert not world.send("a", None)
     world.send("b", 100)
     world.send("b", None)
-    assert world.staleness.news(500) == []
+    assert world.staleness.changes(500) == []
     assert world.staleness.due() is None
 
 
 def test_a_stale_frame_that_becomes_static_is_live() -> None:
     world = World()
     world.send("a", 100)
-    world.staleness.news(200)
+    world.staleness.changes(200)
     assert world.send("a", None)
-    assert world.staleness.news(200) == [FrameLive(200, "a", None, "")]
+    assert world.staleness.changes(200) == [FrameLive(200, "a", None, "")]
 
 
 def test_a_static_frame_that_moves_is_watched_from_its_own_stamp() -> None:
@@ -100,39 +101,39 @@ def test_a_static_frame_that_moves_is_watched_from_its_own_stamp() -> None:
     world.send("a", None)
     assert world.send("a", 50)
     assert world.staleness.due() == 61
-    assert world.staleness.news(61) == [FrameStale(61, "a", 50, "")]
+    assert world.staleness.changes(61) == [FrameStale(61, "a", 50, "")]
 
 
 def test_several_go_stale_in_the_order_of_their_newest_stamps_however_often_they_were_heard() -> None:
     world = World()
     for name, stamp in (("a", 1), ("b", 3), ("c", 3), ("a", 5)):
         world.send(name, stamp)
-    assert [event.frame for event in world.staleness.news(100)] == ["b", "c", "a"]
+    assert [event.frame for event in world.staleness.changes(100)] == ["b", "c", "a"]
 
 
 def test_a_frame_that_was_removed_is_neither_stale_nor_live_and_may_come_back() -> None:
     world = World()
     world.send("a", 100)
     world.remove("a")
-    assert world.staleness.news(200) == []
+    assert world.staleness.changes(200) == []
     world.send("a", 200)
-    world.staleness.news(211)
+    world.staleness.changes(211)
     world.send("a", 211)
     world.remove("a")
     world.send("a", 300)
-    assert world.staleness.news(300) == []
-    assert world.staleness.news(311) == [FrameStale(311, "a", 300, "")]
+    assert world.staleness.changes(300) == []
+    assert world.staleness.changes(311) == [FrameStale(311, "a", 300, "")]
 
 
 def test_after_a_reset_nothing_is_known() -> None:
     world = World()
     world.send("a", 100)
     world.send("b", 100)
-    world.staleness.news(111)
+    world.staleness.changes(111)
     world.send("a", 111)
     world.edges.clear()
     world.staleness.clear()
-    assert (len(world.staleness), world.staleness.due(), world.staleness.news(500)) == (0, None, [])
+    assert (len(world.staleness), world.staleness.due(), world.staleness.changes(500)) == (0, None, [])
 
 
 def test_names_that_come_and_go_while_the_clock_stands_fill_no_memory() -> None:
@@ -142,7 +143,7 @@ def test_names_that_come_and_go_while_the_clock_stands_fill_no_memory() -> None:
         world.send(f"object {number}", 100)
         world.remove(f"object {number}")
     assert len(world.staleness) < 200
-    assert world.staleness.news(111) == [FrameStale(111, "base", 100, "")]
+    assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
 
 
 def test_a_sample_of_a_live_frame_costs_no_entry() -> None:
@@ -174,7 +175,7 @@ def test_what_is_told_adds_up_to_what_is_stale(steps: list[tuple[str, str, int |
         else:
             now += number or 0
             due = world.staleness.due()
-            events = world.staleness.news(now)
+            events = world.staleness.changes(now)
             for event in events:
                 assert (event.frame in told) == isinstance(event, FrameLive)
                 told ^= {event.frame}

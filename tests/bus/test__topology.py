@@ -19,7 +19,7 @@ from tfbus.tree.cycles import admit
 def topology(*batches: Sequence[TransformStamped], on_conflict: OnConflict = "last") -> Topology:
     made = Topology(OnceLogger(logging.getLogger("tfbus")), Ownership(on_conflict), Announcer(lambda: 0))
     for batch in batches:
-        made.take(tuple(batch), "raise")
+        made.accept(tuple(batch), "raise")
     return made
 
 
@@ -52,7 +52,7 @@ def test_an_edge_that_closes_a_loop_is_refused_and_the_error_names_the_whole_loo
     names = [f"frame {number}" for number in range(length)]
     known = topology([moving(parent, child, 0) for parent, child in pairwise(names)])
     with pytest.raises(InvalidTransformError) as caught:
-        known.take((moving(names[-1], names[0], 1, authority="somebody"),), "raise")
+        known.accept((moving(names[-1], names[0], 1, authority="somebody"),), "raise")
     error = caught.value
     assert error.reason == "cycle"
     assert (error.parent, error.child, error.authority) == (names[-1], names[0], "somebody")
@@ -65,20 +65,20 @@ def test_an_edge_that_closes_a_loop_is_refused_and_the_error_names_the_whole_loo
 def test_a_loop_of_static_edges_is_refused_too() -> None:
     known = topology([static("a", "b"), moving("b", "c", 5)])
     with pytest.raises(InvalidTransformError, match="a -> c -> b -> a"):
-        known.take((static("c", "a"),), "raise")
+        known.accept((static("c", "a"),), "raise")
 
 
 def test_one_batch_may_turn_an_edge_round() -> None:
     known = topology([moving("map", "base", 0)])
     batch = (moving("base", "map", 1), moving("world", "base", 1))
-    assert known.take(batch, "raise") == batch
+    assert known.accept(batch, "raise") == batch
     assert known.names() == {"map", "base", "world"}
 
 
 def test_turning_an_edge_round_without_a_new_parent_for_the_other_end_is_a_loop() -> None:
     known = topology([moving("map", "base", 0)])
     with pytest.raises(InvalidTransformError):
-        known.take((moving("base", "map", 1),), "raise")
+        known.accept((moving("base", "map", 1),), "raise")
 
 
 def test_a_loop_inside_one_batch_is_refused() -> None:
@@ -90,27 +90,27 @@ def test_a_loop_inside_one_batch_is_refused() -> None:
 def test_only_the_newest_parents_are_judged() -> None:
     known = topology([moving("map", "base", 10), moving("base", "tool", 10)])
     late = (moving("tool", "base", 5),)
-    assert known.take(late, "raise") == late, "at 5 it is a loop, but the newest parents stay as they were"
+    assert known.accept(late, "raise") == late, "at 5 it is a loop, but the newest parents stay as they were"
     with pytest.raises(InvalidTransformError):
-        known.take((moving("tool", "base", 10),), "raise")
+        known.accept((moving("tool", "base", 10),), "raise")
 
 
 def test_a_static_sample_counts_whatever_its_stamp() -> None:
     known = topology([moving("map", "base", 10), moving("base", "tool", 10)])
     with pytest.raises(InvalidTransformError):
-        known.take((static("tool", "base", stamp=0),), "raise")
+        known.accept((static("tool", "base", stamp=0),), "raise")
 
 
 def test_after_a_static_sample_a_moving_one_of_any_stamp_is_the_newest() -> None:
     known = topology([moving("map", "base", 10), moving("base", "tool", 10)], [static("map", "base")])
     with pytest.raises(InvalidTransformError):
-        known.take((moving("tool", "base", 1),), "raise")
+        known.accept((moving("tool", "base", 1),), "raise")
 
 
 def test_a_refused_batch_leaves_no_trace_but_a_count() -> None:
     known = topology([moving("a", "b", 0)])
     with pytest.raises(InvalidTransformError):
-        known.take((moving("x", "y", 0), static("x", "z"), moving("b", "a", 0)), "raise")
+        known.accept((moving("x", "y", 0), static("x", "z"), moving("b", "a", 0)), "raise")
     assert known.names() == {"a", "b"}
     assert known.latched == {}
     assert known.rejected == {"cycle": 1}
@@ -119,8 +119,8 @@ def test_a_refused_batch_leaves_no_trace_but_a_count() -> None:
 def test_dropping_leaves_out_only_the_offender(caplog: pytest.LogCaptureFixture) -> None:
     known = topology([moving("a", "b", 0)])
     batch = (moving("x", "y", 0), moving("b", "a", 0, authority="bad"), static("x", "z"))
-    assert known.take(batch, "drop") == (batch[0], batch[2])
-    known.take(batch, "drop")
+    assert known.accept(batch, "drop") == (batch[0], batch[2])
+    known.accept(batch, "drop")
     assert known.rejected == {"cycle": 2}
     assert [record.getMessage() for record in caplog.records if "loop" in record.getMessage()] == [
         "dropped a sample: the edge 'b' -> 'a' would close a loop of parents: a -> b -> a"
@@ -141,11 +141,11 @@ def test_a_batch_is_taken_exactly_if_the_newest_parents_after_it_form_a_forest(
         after = newest_parents([*stored, *batch])
         if has_circle(after):
             with pytest.raises(InvalidTransformError) as caught:
-                known.take(tuple(batch), "raise")
+                known.accept(tuple(batch), "raise")
             assert caught.value.loop[0] == caught.value.loop[-1]
             assert all(after[child] == parent for child, parent in pairwise(caught.value.loop))
         else:
-            assert known.take(tuple(batch), "raise") == tuple(batch)
+            assert known.accept(tuple(batch), "raise") == tuple(batch)
             stored += batch
 
 
@@ -157,7 +157,7 @@ def test_what_is_left_after_dropping_is_a_forest_and_nothing_is_dropped_without_
     known = topology()
     stored: list[TransformStamped] = []
     for batch in batches:
-        accepted = known.take(tuple(batch), "drop")
+        accepted = known.accept(tuple(batch), "drop")
         assert not has_circle(newest_parents([*stored, *accepted]))
         assert (accepted == tuple(batch)) == (not has_circle(newest_parents([*stored, *batch])))
         stored += accepted
@@ -183,8 +183,8 @@ def test_a_child_that_moves_is_latched_no_more() -> None:
 def test_a_kind_change_is_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     known = topology()
     for stamp in range(4):
-        known.take((static("a", "b", stamp=stamp, authority="urdf"),), "raise")
-        known.take((moving("a", "b", stamp, authority="urdf"),), "raise")
+        known.accept((static("a", "b", stamp=stamp, authority="urdf"),), "raise")
+        known.accept((moving("a", "b", stamp, authority="urdf"),), "raise")
     assert known.kind_changes == 7
     assert [record.getMessage() for record in caplog.records] == ["frame 'b' is now moving, from 'urdf'"]
 
@@ -192,7 +192,7 @@ def test_a_kind_change_is_counted_and_logged_once(caplog: pytest.LogCaptureFixtu
 def test_two_authorities_on_one_child_are_counted_and_both_named_once(caplog: pytest.LogCaptureFixture) -> None:
     known = topology([moving("a", "b", 0, authority="odometry")])
     for stamp in range(1, 5):
-        known.take((moving("a", "b", stamp, authority=("odometry", "slam")[stamp % 2]),), "raise")
+        known.accept((moving("a", "b", stamp, authority=("odometry", "slam")[stamp % 2]),), "raise")
     assert known.conflicts == 4
     assert [record.getMessage() for record in caplog.records] == [
         "frame 'b' comes from two authorities, 'odometry' and 'slam'"
@@ -202,22 +202,22 @@ def test_two_authorities_on_one_child_are_counted_and_both_named_once(caplog: py
 def test_a_new_parent_is_counted_and_a_late_sample_of_the_old_one_is_not() -> None:
     known = topology([moving("old", "b", 0)], [moving("new", "b", 10)])
     assert known.reparented == 1
-    known.take((moving("old", "b", 5),), "raise")
+    known.accept((moving("old", "b", 5),), "raise")
     assert known.reparented == 1
-    known.take((moving("old", "b", 11),), "raise")
+    known.accept((moving("old", "b", 11),), "raise")
     assert known.reparented == 2
 
 
 def test_more_of_the_same_moves_the_newest_stamp_on() -> None:
     known = topology([moving("map", "base", 0), moving("base", "tool", 0)], [moving("map", "base", 10)])
     batch = (moving("tool", "base", 9),)
-    assert known.take(batch, "raise") == batch, "older than the newest, so it decides nothing"
+    assert known.accept(batch, "raise") == batch, "older than the newest, so it decides nothing"
 
 
 def test_more_of_the_same_that_is_late_does_not_move_the_newest_stamp_back() -> None:
     known = topology([moving("map", "base", 10), moving("base", "tool", 0)], [moving("map", "base", 3)])
     batch = (moving("tool", "base", 9),)
-    assert known.take(batch, "raise") == batch
+    assert known.accept(batch, "raise") == batch
 
 
 def test_a_removed_child_is_forgotten_and_its_own_children_stay() -> None:
@@ -227,7 +227,7 @@ def test_a_removed_child_is_forgotten_and_its_own_children_stay() -> None:
     assert known.names() == {"b", "c"}
     known.remove("never heard of")
     batch = (moving("c", "a", 0),)
-    assert known.take(batch, "raise") == batch
+    assert known.accept(batch, "raise") == batch
 
 
 def test_after_a_clock_reset_only_static_edges_are_known() -> None:
@@ -236,7 +236,7 @@ def test_after_a_clock_reset_only_static_edges_are_known() -> None:
     assert known.names() == {"a", "b"}
     assert len(known) == 1
     batch = (moving("c", "a", 1),)
-    assert known.take(batch, "raise") == batch
+    assert known.accept(batch, "raise") == batch
 
 
 def test_under_reject_a_child_that_a_reset_forgot_can_still_be_removed() -> None:

@@ -15,7 +15,7 @@ from support.strategies import rotations, transforms, vectors
 
 from tfbus import InvalidTransformError, Transform, TransformArray
 from tfbus.geometry.rows import Quaternion, Vector
-from tfbus.tree._lookup_many import FEW
+from tfbus.tree._lookup_many import ONE_BY_ONE
 
 ONE = (0.0, 0.0, 0.0, 1.0)
 HALF_TURN_ABOUT_Z = (0.0, 0.0, 1.0, 0.0)
@@ -139,7 +139,7 @@ OTHERS = [
 @pytest.mark.parametrize("made", DUPLICATES + OTHERS)
 def test_transforms_cannot_be_changed_however_they_were_made(made: Callable[[TransformArray], TransformArray]) -> None:
     tree = tree_of(*over("a", "b", [0, 10, 20]))
-    few, many = (tree.lookup_many("a", "b", [0, 5, 20] * count) for count in (1, FEW))
+    few, many = (tree.lookup_many("a", "b", [0, 5, 20] * count) for count in (1, ONE_BY_ONE))
     lenient = tree.lookup_many("a", "b", [0, 5, 30], tolerance=1.0)
     for steps in map(made, (ahead(0.0, 1.0, 2.0), few, many, lenient)):
         for array in (steps.translations, steps.rotations, steps.extrapolated_by, steps.gap):

@@ -44,9 +44,9 @@ def test_every_error_that_ends_a_wait_has_its_reason(error: TransformError, reas
 def test_drops_are_counted_by_reason_and_told() -> None:
     told: list[tuple[str, DropReason, TransformError | None]] = []
     drops: DroppedMessages[str] = DroppedMessages(lambda *drop: told.append(drop))
-    drops.add("first", "timed out", FUTURE)
-    drops.add("second", "queue full", None)
-    drops.add("third", "timed out", None)
+    drops.drop("first", "timed out", FUTURE)
+    drops.drop("second", "queue full", None)
+    drops.drop("third", "timed out", None)
     assert drops.counts == {"timed out": 2, "queue full": 1}
     assert told == [("first", "timed out", FUTURE), ("second", "queue full", None), ("third", "timed out", None)]
 
@@ -57,7 +57,7 @@ def test_an_exception_of_the_callback_is_counted_and_logged_once(caplog: pytest.
 
     drops: DroppedMessages[str] = DroppedMessages(clumsy)
     for _ in range(3):
-        drops.add("message", "closed", None)
+        drops.drop("message", "closed", None)
     assert (drops.counts, drops.callbacks_failed) == ({"closed": 3}, 3)
     (record,) = caplog.records
     assert (record.name, record.levelno) == ("tfbus", logging.WARNING)
@@ -76,4 +76,4 @@ def test_only_an_exception_of_the_callback_is_isolated() -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        DroppedMessages(impatient).add("message", "closed", None)
+        DroppedMessages(impatient).drop("message", "closed", None)

@@ -32,7 +32,7 @@ def test_one_target_is_answered_by_a_transform_and_several_by_a_tuple() -> None:
     for target, expected in (("map", "map"), (["map"], ("map",)), (("map", "odom"), ("map", "odom"))):
         bus, targets = make(target)
         bus.publish([static("map", "odom"), moving("odom", "laser", 5)])
-        answer = targets.ask("laser", 5)
+        answer = targets.lookup_nowait("laser", 5)
         parents = answer.parent if isinstance(answer, TransformStamped) else tuple(each.parent for each in answer)
         assert parents == expected
 
@@ -40,9 +40,9 @@ def test_one_target_is_answered_by_a_transform_and_several_by_a_tuple() -> None:
 def test_the_frame_itself_is_nothing_to_ask_for() -> None:
     bus, targets = make("laser", tolerance=1.0)
     assert list(targets.questions("laser", 5)) == []
-    assert targets.ask("laser", 5).stamp == 5
+    assert targets.lookup_nowait("laser", 5).stamp == 5
     bus.clock.set(8)  # type: ignore[attr-defined]
-    assert targets.ask("laser", LATEST).stamp == 8
+    assert targets.lookup_nowait("laser", LATEST).stamp == 8
 
 
 def test_a_tolerance_asks_for_the_time_after_the_stamp_and_answers_at_the_stamp() -> None:
@@ -54,7 +54,10 @@ def test_a_tolerance_asks_for_the_time_after_the_stamp_and_answers_at_the_stamp(
     assert isinstance(targets.blocker("laser", 5), FutureExtrapolationError)
     bus.publish(moving("map", "laser", 5 + 2 * SECOND))
     assert targets.blocker("laser", 5) is None
-    assert (targets.ask("laser", 5).stamp, targets.ask("laser", 5).transform.translation[0]) == (5, 1.0)
+    assert (targets.lookup_nowait("laser", 5).stamp, targets.lookup_nowait("laser", 5).transform.translation[0]) == (
+        5,
+        1.0,
+    )
 
 
 def test_what_waiting_cannot_help_is_told_before_what_it_can() -> None:
@@ -68,13 +71,13 @@ def test_the_last_time_what_may_still_come_is_a_timeout_that_names_its_target() 
     bus, targets = make(["odom", "map"])
     bus.publish([moving("odom", "laser", 5), static("map", "door")])
     with pytest.raises(LookupTimeoutError) as caught:
-        targets.ask_for_the_last_time("laser", 5, 3.0)
+        targets.lookup_at_timeout("laser", 5, 3.0)
     assert (caught.value.target, caught.value.source, caught.value.timeout) == ("map", "laser", 3.0)
     assert isinstance(caught.value.__cause__, DisconnectedError)
     with pytest.raises(PastExtrapolationError):
-        targets.ask_for_the_last_time("laser", 4, 3.0)
+        targets.lookup_at_timeout("laser", 4, 3.0)
     bus.publish(static("map", "odom"))
-    assert len(targets.ask_for_the_last_time("laser", 5, 3.0)) == 2
+    assert len(targets.lookup_at_timeout("laser", 5, 3.0)) == 2
 
 
 @pytest.mark.anyio

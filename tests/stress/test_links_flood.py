@@ -10,8 +10,8 @@ import zenoh
 from support.processes import PATIENCE, Crowd, crowd, free_ports, new_domain
 from support.samples import moving
 
-from tfbus.links.attachment import PublishedBatch, pack
-from tfbus.links.outbox import MAX_BYTES
+from tfbus.links._attachment import PublishedBatch, pack
+from tfbus.links._message import MAX_BYTES
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import encode
 

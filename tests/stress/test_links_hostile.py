@@ -14,9 +14,9 @@ from support.processes import PeerProcess as Process
 from support.samples import moving, static
 
 from tfbus import TransformStamped
-from tfbus.links.attachment import PublishedBatch, pack
-from tfbus.links.outbox import MAX_BYTES
-from tfbus.links.peers import MAX_PEERS
+from tfbus.links._attachment import PublishedBatch, pack
+from tfbus.links._message import MAX_BYTES
+from tfbus.links._peers import MAX_PEERS
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import encode
 

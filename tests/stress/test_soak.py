@@ -150,10 +150,10 @@ def check_that_nothing_is_left(crowd: Crowd) -> None:
 def check_that_nobody_waits(buffer: Buffer) -> None:
     assert buffer.pending() == ()
     # Nor of these.
-    feed = buffer._feed
-    assert feed.waiting.blocked == {}
-    assert (len(feed.watching), feed.watching.under) == (0, {})
-    assert feed._at_end == {}
+    live = buffer._live
+    assert live.waiting.by_frame == {}
+    assert (len(live.watching), live.watching.by_frame) == (0, {})
+    assert live._end_callbacks == {}
 
 
 async def soak(seed: int, ending: Ending) -> Crowd:

@@ -42,8 +42,8 @@ def x_of(answer: TransformStamped) -> float:
 
 def nothing_is_left(buffer: Buffer) -> bool:
     """Whether no watch is registered, neither for an answer nor for the lack of one."""
-    index = buffer._feed.watching
-    return buffer.pending() == () and len(index) == 0 and index.under == {}
+    index = buffer._live.watching
+    return buffer.pending() == () and len(index) == 0 and index.by_frame == {}
 
 
 def is_change(last: TransformStamped | None, answer: TransformStamped, threshold: float) -> bool:

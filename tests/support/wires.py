@@ -1,21 +1,24 @@
-"""Links with no network between them: buses joined by wires, on which a test itself lets things come, late or never."""
+"""Links without network and event loop: buses joined by wires, on which a test delivers, delays or loses packets."""
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence, Sized
+from collections.abc import Callable, Collection, Sequence, Sized
 from types import TracebackType
+from typing import Any
 
 from tfbus import Bus, SimulatedClock, TransformStamped
-from tfbus.links.inbox import Inbox
-from tfbus.links.outbox import Message, Outbox
-from tfbus.links.peers import Peers
-from tfbus.links.provenance import ReceivedTransform
-from tfbus.links.relay import join, leave
+from tfbus.links._carrier import SendReport
+from tfbus.links._endpoint import Endpoint
+from tfbus.links._inbox import ReceivedMessage
+from tfbus.links._message import Message, MessageWriter, message_to_keep, read_message
+from tfbus.links._outbox import Turn
+from tfbus.links._provenance import ReceivedTransform
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links._relay import relay_of
 
 Batch = tuple[TransformStamped, ...]
-Packet = Message | bool
-"""A message, or whether its sender is there now."""
+Packet = Message | Presence
 Graph = Sequence[Sequence[int]]
-"""Which buses are in each of several domains."""
+"""The buses of each of several domains, by their numbers."""
 
 PAIR: Graph = [[0, 1]]
 MESH: Graph = [[0, 1, 2, 3]]
@@ -26,67 +29,87 @@ RING_WITH_A_TAIL: Graph = [[0, 1], [1, 2], [2, 0], [0, 3]]
 TWO_BRIDGES: Graph = [[0, 1, 2], [1, 2, 3]]
 
 
+class WireCarrier:
+    """Puts a link's messages on wires, and keeps static frames for late joiners as zenoh's caches do."""
+
+    def __init__(self, id: str, put: Callable[[Message], object]) -> None:  # noqa: A002 - the protocol calls it so
+        self.id = id
+        self.refused: list[Exception] = []
+        self.kept: dict[str, Message] = {}
+        self._put = put
+        self._writer = MessageWriter(SendReport(self.refused.append))
+
+    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
+        """A wire needs no opening."""
+
+    def send(self, turn: Turn) -> None:
+        """Put the live messages on the wires, and behind them what has changed of the static frames."""
+        for live in self._writer.write(turn.entries):
+            self._put(live)
+        for frame, entry in turn.statics.items():
+            if entry is None:
+                self.kept.pop(frame, None)
+            elif (message := message_to_keep(entry)) is not None:
+                self.kept[frame] = message
+                self._put(message)
+
+    def read(self, content: Any) -> ReceivedMessage:
+        return read_message(content.payload, content.attachment)
+
+    def peer_joined(self, peer: str, again: bool) -> None:
+        """`Domain.meet` delivers again what is kept."""
+
+    async def run(self) -> None:
+        """Nothing takes time."""
+
+    async def close(self) -> None:
+        """A wire needs no closing."""
+
+    def drop_tombstones(self) -> None:
+        """Keep no removals any more."""
+        self.kept = {frame: message for frame, message in self.kept.items() if message.samples}
+
+
 class End:
-    """One link of one bus, as `ZenohLink` puts it together, with what zenoh keeps for those who join late."""
+    """One link of one bus."""
 
     def __init__(
-        self, name: str, bus: Bus, frames: Collection[str] | None, max_frames: int = 10_000, drop_lost: bool = False
+        self,
+        name: str,
+        bus: Bus,
+        put: Callable[["End", Message], object],
+        frames: Collection[str] | None,
+        max_frames: int = 10_000,
+        drop_lost: bool = False,
     ) -> None:
         self.id = name
         self.bus = bus
-        self.refused: list[Exception] = []
-        self.reports: list[tuple[str, str]] = []
-        self.losses: list[tuple[str, tuple[str, ...]]] = []
-        self.cache: dict[str, Message] = {}
-        self.outbox = Outbox(frames, lambda: None, self.refused.append)
-        self.peers = Peers(lambda peer, reason, _: self.reports.append((peer, reason)))
-        self.relay = join(bus, self.outbox)
-        self.inbox = Inbox(bus, self.relay, self.outbox, frames, max_frames, self.peers)
-        self._drop_lost = drop_lost
+        self.carrier = WireCarrier(name, lambda message: put(self, message))
+        self.endpoint = Endpoint(
+            bus, name, self.carrier, lambda: None, frames=frames, drop_lost=drop_lost, max_frames=max_frames
+        )
+        self.relay = relay_of(bus)
+        self.endpoint.attach()
 
-    def messages(self) -> Iterator[Message]:
-        """All that goes out now: the live messages, and behind them what has changed of the static frames."""
-        yield from self.outbox.flush()
-        while changes := self.outbox.take_statics(100):
-            for frame, message in changes.items():
-                if message is None:
-                    self.cache.pop(frame, None)
-                else:
-                    self.cache[frame] = message
-                    yield message
-
-    def bury(self) -> None:
-        """Keep no tombstones any more."""
-        self.cache = {frame: message for frame, message in self.cache.items() if message.samples}
-
-    def take_in(self, sender: str, packet: Packet) -> None:
-        if isinstance(packet, Message):
-            self.inbox.receive(sender, packet.payload, packet.attachment)
-        elif packet:
-            peer = self.peers.find(sender)
-            assert peer is not None
-            peer.present = True
-        elif (gone := self.peers.forget(sender)) is not None:
-            self.losses.append((sender, self.relay.lose(gone, self.outbox, self._drop_lost)))
+    def receive(self, sender: str, packet: Packet) -> None:
+        self.endpoint.handle(Received(sender, packet))
 
     def leave(self) -> None:
-        leave(self.bus, self.outbox)
-        for peer in self.peers.forget_all():
-            self.relay.lose(peer, self.outbox, drop=False)
+        self.endpoint.detach()
 
 
 class Wire:
-    """From one end to another: what was sent and has not come yet."""
+    """The way from one end to another, with the packets that were sent and not delivered yet."""
 
     def __init__(self, sender: End, receiver: End) -> None:
         self.sender = sender
         self.receiver = receiver
-        self.packets: deque[Packet] = deque([True, *sender.cache.values()])
+        self.packets: deque[Packet] = deque([Presence.JOINED, *sender.carrier.kept.values()])
 
     def deliver(self, place: int = 0) -> None:
         packet = self.packets[place]
         del self.packets[place]
-        self.receiver.take_in(self.sender.id, packet)
+        self.receiver.receive(self.sender.id, packet)
 
 
 class Domain:
@@ -100,8 +123,8 @@ class Domain:
     def join(
         self, bus: Bus, frames: Collection[str] | None = None, max_frames: int = 10_000, drop_lost: bool = False
     ) -> End:
-        """A new end; what the others have in their caches is on its way to it."""
-        new = End(f"{id(self)} {next(self._names)}", bus, frames, max_frames, drop_lost)
+        """A new end; what the others keep for late joiners is on its way to it."""
+        new = End(f"{id(self)} {next(self._names)}", bus, self._put, frames, max_frames, drop_lost)
         for other in self.ends:
             self.meet(other, new)
         self.ends.append(new)
@@ -113,30 +136,28 @@ class Domain:
             self.wires[pair] = Wire(*pair)
 
     def part(self, one: End, other: End) -> None:
-        """Cut two ends off from each other: what was on its way is lost, and each notices."""
+        """Cut two ends off from each other: packets on their way are lost, and each end notices."""
         for sender, receiver in ((one, other), (other, one)):
             if self.wires.pop((sender, receiver), None):
-                receiver.take_in(sender.id, False)
+                receiver.receive(sender.id, Presence.LEFT)
 
     def kill(self, end: End) -> None:
-        """An end dies; what is on its way from it still comes, and then that it has gone."""
+        """End a peer: its packets on their way still arrive, and behind them that it has gone."""
         self.ends.remove(end)
         for sender, receiver in list(self.wires):
             if sender is end:
-                self.wires[sender, receiver].packets.append(False)
+                self.wires[sender, receiver].packets.append(Presence.LEFT)
             elif receiver is end:
                 del self.wires[sender, receiver]
 
-    def send(self, sender: End) -> None:
-        """The turn of an end's event loop is over."""
-        for message in sender.messages():
-            for wire in self.wires.values():
-                if wire.sender is sender:
-                    wire.packets.append(message)
+    def _put(self, sender: End, message: Message) -> None:
+        for wire in self.wires.values():
+            if wire.sender is sender:
+                wire.packets.append(message)
 
 
 class Network:
-    """Buses in a graph of domains, and what each of them hears, beginning with its own."""
+    """Buses in a graph of domains, and all batches that each of them has heard, its own included."""
 
     def __init__(self, graph: Graph, drop_lost: bool = False) -> None:
         self.buses: list[Bus] = []
@@ -173,18 +194,17 @@ class Network:
 
     @property
     def wires(self) -> list[Wire]:
-        """Those on which something is."""
+        """The wires that hold packets."""
         return [wire for domain in self.domains for wire in domain.wires.values() if wire.packets]
 
     def send(self, bus: Bus) -> None:
-        """The turn of a bus's event loop is over."""
-        for domain in self.domains:
-            for end in domain.ends:
-                if end.bus is bus:
-                    domain.send(end)
+        """End a turn of a bus's event loop."""
+        for end in self.ends:
+            if end.bus is bus:
+                end.endpoint.send()
 
     def settle(self) -> None:
-        """Everything is sent and comes, until nothing moves any more; an echo would go on for ever."""
+        """Send and deliver everything until nothing moves any more; an echo would go on for ever."""
         for _ in range(100):
             for bus in self.buses:
                 self.send(bus)
@@ -196,28 +216,28 @@ class Network:
         raise AssertionError("the network does not come to rest")
 
     def recover(self) -> None:
-        """What receivers have missed of the static frames comes."""
+        """Deliver once more all that is kept for late joiners, as zenoh does for what a receiver has missed."""
         for domain in self.domains:
             for wire in domain.wires.values():
-                wire.packets.extend(wire.sender.cache.values())
+                wire.packets.extend(wire.sender.carrier.kept.values())
         self.settle()
 
     def published(self, member: int) -> list[Batch]:
-        """What a bus has published itself."""
+        """The batches that a bus has published itself."""
         return [batch for batch in self.heard[member] if type(batch[0]) is TransformStamped]
 
     def received(self, member: int, origin: int) -> list[Batch]:
-        """What has come to a bus of those batches that another one has published."""
+        """The batches of another bus that have come to a bus."""
         ends = [end for end in self.ends if end.bus is self.buses[origin]]
         return [
             batch
             for batch in self.heard[member]
-            if isinstance(batch[0], ReceivedTransform) and batch[0]._source.origin == ends[0].relay.origin
+            if isinstance(batch[0], ReceivedTransform) and batch[0]._provenance.origin == ends[0].relay.origin
         ]
 
 
 def size_of(*things: object) -> int:
-    """How many entries all containers in some objects have."""
+    """The number of entries in all containers that some objects have."""
     return sum(len(value) for thing in things for value in vars(thing).values() if isinstance(value, Sized))
 
 

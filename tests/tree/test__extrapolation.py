@@ -35,7 +35,7 @@ def history(samples: Iterable[int] | dict[int, str], keep: int | None = None) ->
     return made
 
 
-def samples_samples_around(edge: FrameHistory, asked: list[int]) -> Samples:
+def samples_around(edge: FrameHistory, asked: list[int]) -> Samples:
     """What is copied for some questions, by the first and the last."""
     return edge.samples_between(min(asked, default=0), max(asked, default=0))
 

@@ -4,6 +4,7 @@ from itertools import product
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.live_trees import live_tree, tree_over
 from support.samples import any_samples, moving, static
 
 from tfbus import (
@@ -25,65 +26,65 @@ from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import Waiter
 
 
-def park(feed: LiveTree, target: str, source: str, at: int, woken: list[str]) -> None:
+def park(live: LiveTree, target: str, source: str, at: int, woken: list[str]) -> None:
     """Park a lookup that writes its source down when it is woken."""
     with pytest.raises(TransformLookupError) as caught:
-        feed.tree.lookup(target, source, at)
+        tree_over(live).lookup(target, source, at)
     waiter = Waiter(Question(target, source, at), 0, lambda: woken.append(source))
-    feed.waiting.park(waiter, caught.value)
+    live.waiting.park(waiter, caught.value)
 
 
-def blockers(feed: LiveTree) -> list[type[TransformLookupError]]:
-    return [type(pending.blocked_by) for pending in feed.waiting.pending()]
+def blockers(live: LiveTree) -> list[type[TransformLookupError]]:
+    return [type(pending.blocked_by) for pending in live.waiting.pending()]
 
 
 def test_a_sample_wakes_those_whose_stamp_it_reaches_and_no_others() -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 1), moving("map", "b", 1)))
+    live.insert((moving("map", "a", 1), moving("map", "b", 1)))
     for at in (5, 3, 4):
-        park(feed, "map", "a", at, woken)
-    park(feed, "map", "b", 3, woken)
-    feed.receive((moving("map", "a", 2),))
+        park(live, "map", "a", at, woken)
+    park(live, "map", "b", 3, woken)
+    live.insert((moving("map", "a", 2),))
     assert woken == []
-    feed.receive((moving("map", "a", 4),))
+    live.insert((moving("map", "a", 4),))
     assert woken == ["a", "a"]
-    assert [pending.question.at for pending in feed.waiting.pending()] == [5, 3]
+    assert [pending.question.at for pending in live.waiting.pending()] == [5, 3]
 
 
 def test_a_sample_that_expires_or_fills_the_past_wakes_nobody_who_waits_for_the_future() -> None:
-    feed = LiveTree(1e-6)
+    live = live_tree(1e-6)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 9_000), moving("map", "a", 10_000)))
-    park(feed, "map", "a", 11_000, woken)
-    feed.receive((moving("map", "a", 1), moving("map", "a", 9_500)))
+    live.insert((moving("map", "a", 9_000), moving("map", "a", 10_000)))
+    park(live, "map", "a", 11_000, woken)
+    live.insert((moving("map", "a", 1), moving("map", "a", 9_500)))
     assert woken == []
-    assert feed.statistics(4) == BufferStatistics(offered=4, inserted=3, replaced=0, expired=1, waiting=1)
+    assert live.statistics(4) == BufferStatistics(offered=4, inserted=3, replaced=0, expired=1, waiting=1)
 
 
 @pytest.mark.parametrize("sample", [moving("map", "a", 1), moving("a", "child", 1), static("map", "a")])
 def test_a_frame_becomes_known_as_child_or_as_parent(sample: object) -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("map", "b", 1),))
-    park(feed, "map", "a", 1, woken)
-    assert blockers(feed) == [UnknownFrameError]
-    feed.receive((moving("b", "c", 1),))
+    live.insert((moving("map", "b", 1),))
+    park(live, "map", "a", 1, woken)
+    assert blockers(live) == [UnknownFrameError]
+    live.insert((moving("b", "c", 1),))
     assert woken == []
-    feed.receive((sample,))  # type: ignore[arg-type]
+    live.insert((sample,))  # type: ignore[arg-type]
     assert woken == ["a"]
 
 
 @pytest.mark.parametrize("root", ["map", "world"])
 def test_two_trees_are_joined_by_a_sample_of_either_root(root: str) -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 1), moving("world", "b", 1)))
-    park(feed, "a", "b", 1, woken)
-    assert blockers(feed) == [DisconnectedError]
-    feed.receive((moving("map", "a", 2), moving("world", "b", 2)))
+    live.insert((moving("map", "a", 1), moving("world", "b", 1)))
+    park(live, "a", "b", 1, woken)
+    assert blockers(live) == [DisconnectedError]
+    live.insert((moving("map", "a", 2), moving("world", "b", 2)))
     assert woken == []
-    feed.receive((moving("elsewhere", root, 1),))
+    live.insert((moving("elsewhere", root, 1),))
     assert woken == ["b"]
 
 
@@ -96,79 +97,79 @@ def test_two_trees_are_joined_by_a_sample_of_either_root(root: str) -> None:
     ],
 )
 def test_who_asks_below_a_frame_looks_again_when_it_changes_what_its_past_samples_said(sample: object) -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 1), moving("map", "b", 1)))
-    park(feed, "map", "a", 9, woken)
-    park(feed, "map", "b", 9, woken)
-    feed.receive((sample,))  # type: ignore[arg-type]
+    live.insert((moving("map", "a", 1), moving("map", "b", 1)))
+    park(live, "map", "a", 9, woken)
+    park(live, "map", "b", 9, woken)
+    live.insert((sample,))  # type: ignore[arg-type]
     assert woken == ["a"]
 
 
 def test_a_removed_frame_wakes_who_asks_for_it_or_below_it() -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 1), moving("map", "b", 1), moving("b", "c", 1)))
+    live.insert((moving("map", "a", 1), moving("map", "b", 1), moving("b", "c", 1)))
     for source in "abc":
-        park(feed, "map", source, 9, woken)
-    feed.remove_frame("nobody")
+        park(live, "map", source, 9, woken)
+    live.remove_frame("nobody")
     assert woken == []
-    feed.remove_frame("b")
+    live.remove_frame("b")
     assert sorted(woken) == ["b", "c"]
-    assert feed.tree.frames() == ["a", "b", "c", "map"]
-    feed.remove_frame("a")
+    assert tree_over(live).frames() == ["a", "b", "c", "map"]
+    live.remove_frame("a")
     assert sorted(woken) == ["a", "b", "c"]
-    assert feed.tree.frames() == ["b", "c"]
+    assert tree_over(live).frames() == ["b", "c"]
 
 
 def test_a_root_that_goes_with_its_last_child_wakes_who_asks_for_it() -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 1), moving("world", "b", 1)))
-    park(feed, "map", "b", 9, woken)
-    feed.remove_frame("a")
+    live.insert((moving("map", "a", 1), moving("world", "b", 1)))
+    park(live, "map", "b", 9, woken)
+    live.remove_frame("a")
     assert woken == ["b"]
 
 
 def test_a_reset_drops_moving_samples_keeps_statics_and_wakes_everybody() -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("map", "a", 5), static("a", "camera")))
-    park(feed, "map", "a", 9, woken)
-    feed.reset(5, 2)
+    live.insert((moving("map", "a", 5), static("a", "camera")))
+    park(live, "map", "a", 9, woken)
+    live.reset(5, 2)
     assert woken == ["a"]
-    error = feed.last_reset
+    error = live.last_reset
     assert isinstance(error, ClockResetError)
     assert (error.before, error.after) == (5, 2)
-    assert feed.tree.can_transform("a", "camera", 5)
+    assert tree_over(live).can_transform("a", "camera", 5)
     with pytest.raises(FutureExtrapolationError):
-        feed.tree.lookup("map", "a", 5)
+        tree_over(live).lookup("map", "a", 5)
 
 
 def test_two_equal_resets_are_two_objects() -> None:
-    feed = LiveTree(None)
-    feed.reset(5, 2)
-    first = feed.last_reset
-    feed.reset(5, 2)
-    assert feed.last_reset is not first
+    live = live_tree(None)
+    live.reset(5, 2)
+    first = live.last_reset
+    live.reset(5, 2)
+    assert live.last_reset is not first
 
 
 def test_the_end_wakes_everybody_and_its_first_reason_stays() -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    park(feed, "map", "a", 9, woken)
-    feed.end("the buffer is closed")
-    feed.end("the bus is closed")
+    park(live, "map", "a", 9, woken)
+    live.end("the buffer is closed")
+    live.end("the bus is closed")
     assert woken == ["a"]
-    assert feed.ended == "the buffer is closed"
+    assert live.end_reason == "the buffer is closed"
 
 
 def test_every_sample_that_was_offered_is_counted_once() -> None:
-    feed = LiveTree(1.0)
+    live = live_tree(1.0)
     batch = (moving("map", "a", 5), moving("map", "a", 5, 1.0), static("map", "s"), static("map", "s", x=2.0))
-    feed.receive(batch)
-    feed.receive((moving("map", "a", 10**10), moving("map", "a", 6)))
-    assert feed.statistics(6) == BufferStatistics(offered=6, inserted=3, replaced=2, expired=1, waiting=0)
+    live.insert(batch)
+    live.insert((moving("map", "a", 10**10), moving("map", "a", 6)))
+    assert live.statistics(6) == BufferStatistics(offered=6, inserted=3, replaced=2, expired=1, waiting=0)
 
 
 STAMPS: tuple[int | Latest, ...] = (LATEST, 5, 15)
@@ -178,35 +179,37 @@ QUESTIONS = [
 ]
 
 
-def ask(feed: LiveTree, question: Question) -> None:
-    feed.tree.lookup(question.target, question.source, question.at, source_at=question.source_at, fixed=question.fixed)
+def ask(live: LiveTree, question: Question) -> None:
+    tree_over(live).lookup(
+        question.target, question.source, question.at, source_at=question.source_at, fixed=question.fixed
+    )
 
 
 @settings(deadline=None)
 @given(st.lists(st.lists(any_samples("abcd", 20), min_size=1, max_size=3), max_size=8), st.sampled_from([None, 8e-9]))
 def test_whoever_is_not_woken_still_has_no_answer(batches: list[list[TransformStamped]], keep: float | None) -> None:
-    feed, judge = LiveTree(keep), TransformTree(keep)
+    live, judge = live_tree(keep), TransformTree(keep)
     asleep: set[Question] = set()
     woken = list(QUESTIONS)
     for batch in batches:
         for question in woken:
             try:
-                ask(feed, question)
+                ask(live, question)
             except PastExtrapolationError:
                 continue
             except TransformLookupError as error:
-                feed.waiting.park(Waiter(question, 0, partial(woken.append, question)), error)
+                live.waiting.park(Waiter(question, 0, partial(woken.append, question)), error)
                 asleep.add(question)
         woken.clear()
         try:
             judge.insert_many(batch)
         except InvalidTransformError:
             continue
-        feed.receive(tuple(batch))
+        live.insert(tuple(batch))
         asleep.difference_update(woken)
         for question in asleep:
             with pytest.raises(TransformLookupError):
-                ask(feed, question)
+                ask(live, question)
 
 
 @pytest.mark.parametrize(
@@ -241,102 +244,102 @@ def test_whoever_is_not_woken_still_has_no_answer(batches: list[list[TransformSt
 def test_late_data_wake_whom_they_answer(
     before: list[TransformStamped], then: TransformStamped, target: str, source: str, at: int | Latest
 ) -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     for sample in before:
-        feed.receive((sample,))
+        live.insert((sample,))
     with pytest.raises(TransformLookupError) as caught:
-        feed.tree.lookup(target, source, at)
+        tree_over(live).lookup(target, source, at)
     woken: list[str] = []
-    feed.waiting.park(Waiter(Question(target, source, at), 0, partial(woken.append, source)), caught.value)
-    feed.receive((then,))
-    assert feed.tree.can_transform(target, source, at)
+    live.waiting.park(Waiter(Question(target, source, at), 0, partial(woken.append, source)), caught.value)
+    live.insert((then,))
+    assert tree_over(live).can_transform(target, source, at)
     assert woken == [source]
 
 
 def test_a_parent_that_flips_wakes_nobody_who_asks_elsewhere() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 1), moving("map", "b", 1), static("map", "mount")))
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "mount")))
     woken: list[str] = []
     for _ in range(100):
-        park(feed, "map", "a", 9, woken)
+        park(live, "map", "a", 9, woken)
     for stamp in range(2, 6):
-        feed.receive((moving("left" if stamp % 2 else "right", "b", stamp),))
-    feed.receive((moving("map", "b", 0),))
-    feed.receive((static("map", "mount", x=1.0),))
+        live.insert((moving("left" if stamp % 2 else "right", "b", stamp),))
+    live.insert((moving("map", "b", 0),))
+    live.insert((static("map", "mount", x=1.0),))
     assert woken == []
-    assert len(feed.waiting) == 100
+    assert len(live.waiting) == 100
 
 
 def test_one_waiter_that_cannot_be_woken_does_not_keep_the_others_asleep() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 1),))
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1),))
     woken: list[str] = []
 
     def gone() -> None:
         raise RuntimeError("Event loop is closed")
 
     with pytest.raises(TransformLookupError) as caught:
-        feed.tree.lookup("map", "a", 9)
-    feed.waiting.park(Waiter(Question("map", "a", 9), 0, gone), caught.value)
-    park(feed, "map", "a", 9, woken)
-    feed.receive((moving("map", "a", 9),))
+        tree_over(live).lookup("map", "a", 9)
+    live.waiting.park(Waiter(Question("map", "a", 9), 0, gone), caught.value)
+    park(live, "map", "a", 9, woken)
+    live.insert((moving("map", "a", 9),))
     assert woken == ["a"]
 
 
 def test_only_its_bus_changes_the_tree_of_a_buffer() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 1),))
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1),))
     for change in (
-        partial(feed.tree.insert, moving("map", "a", 2)),
-        partial(feed.tree.remove_frame, "a"),
-        feed.tree.clear,
+        partial(tree_over(live).insert, moving("map", "a", 2)),
+        partial(tree_over(live).remove_frame, "a"),
+        tree_over(live).clear,
     ):
         with pytest.raises(RuntimeError, match="a bus feeds this tree"):
             change()
-    own = feed.tree.copy()
+    own = tree_over(live).copy()
     own.insert(moving("map", "a", 2))
-    assert (feed.tree.latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)
+    assert (tree_over(live).latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)
 
 
 def test_whoever_asks_hears_once_of_the_end_or_at_once_of_one_that_was() -> None:
-    feed = LiveTree(10.0)
+    live = live_tree(10.0)
     heard: list[str] = []
-    feed.on_end(lambda: heard.append("early"))
-    feed.on_end(lambda: heard.append("gone")).close()
-    assert feed.anyone_waits
-    feed.end("the bus is closed")
+    live.on_end(lambda: heard.append("early"))
+    live.on_end(lambda: heard.append("gone")).close()
+    assert live.has_waiters
+    live.end("the bus is closed")
     assert heard == []
-    feed.tell_the_end()
-    feed.tell_the_end()
+    live.call_end_callbacks()
+    live.call_end_callbacks()
     assert heard == ["early"]
-    feed.on_end(lambda: heard.append("late"))
+    live.on_end(lambda: heard.append("late"))
     assert heard == ["early", "late"]
-    assert not feed.anyone_waits
+    assert not live.has_waiters
 
 
 def test_what_raises_at_the_end_is_logged_and_does_not_keep_it_from_the_others(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    feed = LiveTree(10.0)
+    live = live_tree(10.0)
     heard: list[str] = []
-    feed.on_end(lambda: 1 / 0)
-    feed.on_end(lambda: heard.append("told"))
-    feed.end("the bus is closed")
-    feed.tell_the_end()
+    live.on_end(lambda: 1 / 0)
+    live.on_end(lambda: heard.append("told"))
+    live.end("the bus is closed")
+    live.call_end_callbacks()
     assert heard == ["told"]
     assert "ZeroDivisionError" in caplog.text
 
 
 def test_an_emptied_loop_that_is_dropped_wakes_who_asked_through_it() -> None:
-    feed = LiveTree(None)
+    live = live_tree(None)
     woken: list[str] = []
-    feed.receive((moving("b", "c", 11), moving("a", "b", 10)))
-    feed.reset(11, 9)
+    live.insert((moving("b", "c", 11), moving("a", "b", 10)))
+    live.reset(11, 9)
     with pytest.raises(TransformLookupError) as caught:
-        feed.tree.lookup("c", "b")
-    feed.waiting.park(Waiter(Question("c", "b", LATEST), 0, lambda: woken.append("b")), caught.value)
+        tree_over(live).lookup("c", "b")
+    live.waiting.park(Waiter(Question("c", "b", LATEST), 0, lambda: woken.append("b")), caught.value)
     # Now c hangs on a, and b, which hung on a and carried c, is an edge of the past.
-    feed.receive((static("a", "c"),))
-    feed.receive((moving("a", "b", 10),))
-    assert feed.tree.can_transform("c", "b")
+    live.insert((static("a", "c"),))
+    live.insert((moving("a", "b", 10),))
+    assert tree_over(live).can_transform("c", "b")
     assert woken == ["b"]

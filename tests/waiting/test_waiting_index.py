@@ -62,37 +62,37 @@ def test_what_waiting_cannot_help_is_not_parked() -> None:
 def test_an_edge_takes_whoever_needs_no_more_than_its_newest_stamp_in_order_of_stamp() -> None:
     index = WaitingIndex()
     late, early, exact, first = (parked(index, short_of("tool", stamp)) for stamp in (11, 5, 10, 1))
-    assert index.take("tool", 0) == []
-    assert index.take("tool", 10) == [first, early, exact]
-    assert index.take("tool", 10) == []
-    assert index.take("tool", 11) == [late]
+    assert index.pop_unblocked("tool", 0) == []
+    assert index.pop_unblocked("tool", 10) == [first, early, exact]
+    assert index.pop_unblocked("tool", 10) == []
+    assert index.pop_unblocked("tool", 11) == [late]
 
 
 def test_who_needs_the_same_stamp_is_taken_in_order_of_arrival() -> None:
     index = WaitingIndex()
     waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
-    assert index.take("tool", 7) == waiters
+    assert index.pop_unblocked("tool", 7) == waiters
 
 
 def test_who_needs_any_sample_of_an_edge_is_taken_by_the_first_whatever_its_stamp() -> None:
     index = WaitingIndex()
     anyone = parked(index, short_of("tool", LATEST))
-    assert index.take("tool", None) == []
-    assert index.take("tool", -(2**63)) == [anyone]
+    assert index.pop_unblocked("tool", None) == []
+    assert index.pop_unblocked("tool", -(2**63)) == [anyone]
 
 
 def test_another_edge_takes_nobody() -> None:
     index = WaitingIndex()
     parked(index, short_of("tool", 1))
     parked(index, unknown("camera"))
-    assert index.take("base", 100) == []
+    assert index.pop_unblocked("base", 100) == []
     assert len(index) == 2
 
 
 def test_an_unknown_frame_takes_its_waiters_once_somebody_names_it() -> None:
     index = WaitingIndex()
     waiting = parked(index, unknown("camera"))
-    assert index.take("camera", None) == [waiting]
+    assert index.pop_unblocked("camera", None) == [waiting]
     assert len(index) == 0
 
 
@@ -100,9 +100,9 @@ def test_an_unknown_frame_takes_its_waiters_once_somebody_names_it() -> None:
 def test_either_root_takes_who_waits_for_two_trees_to_join_and_only_once(first: str, second: str) -> None:
     index = WaitingIndex()
     waiting = parked(index, apart("map", "odom"))
-    assert index.take(first, 3) == [waiting]
-    assert index.take(second, 3) == []
-    assert not index.blocked
+    assert index.pop_unblocked(first, 3) == [waiting]
+    assert index.pop_unblocked(second, 3) == []
+    assert not index.by_frame
 
 
 def test_who_waits_under_two_roots_leaves_the_other_waiters_there() -> None:
@@ -110,8 +110,8 @@ def test_who_waits_under_two_roots_leaves_the_other_waiters_there() -> None:
     joined = parked(index, apart("map", "odom"))
     other = parked(index, apart("odom", "robot"))
     stamped = parked(index, short_of("odom", 50))
-    assert index.take("map", 1) == [joined]
-    assert index.take("odom", 50) == [other, stamped]
+    assert index.pop_unblocked("map", 1) == [joined]
+    assert index.pop_unblocked("odom", 50) == [other, stamped]
 
 
 def test_a_removed_waiter_is_never_taken_and_removing_it_again_does_nothing() -> None:
@@ -122,7 +122,7 @@ def test_a_removed_waiter_is_never_taken_and_removing_it_again_does_nothing() ->
     for gone in (*waiters, *waiters):
         index.remove(gone)
     assert len(index) == 1
-    assert set(index.blocked) == {"tool"}
+    assert set(index.by_frame) == {"tool"}
     assert index.pop_all() == [stays]
 
 
@@ -130,7 +130,7 @@ def test_removing_one_of_many_with_the_same_stamp_removes_that_one() -> None:
     index = WaitingIndex()
     waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
     index.remove(waiters[2])
-    assert index.take("tool", 7) == waiters[:2] + waiters[3:]
+    assert index.pop_unblocked("tool", 7) == waiters[:2] + waiters[3:]
 
 
 def test_take_all_takes_everybody_in_order_of_arrival_and_leaves_nothing() -> None:
@@ -138,16 +138,16 @@ def test_take_all_takes_everybody_in_order_of_arrival_and_leaves_nothing() -> No
     errors = (unknown("camera"), short_of("tool", 9), apart("map", "odom"), short_of("tool", 1))
     waiters = [parked(index, error) for error in errors]
     assert index.pop_all() == waiters
-    assert (len(index), index.blocked, index.pending(), index.pop_all()) == (0, {}, (), [])
+    assert (len(index), index.by_frame, index.pending(), index.pop_all()) == (0, {}, (), [])
 
 
 def test_a_taken_waiter_can_park_again_under_another_cause() -> None:
     index = WaitingIndex()
     waiting = parked(index, unknown("camera"))
-    index.take("camera", None)
+    index.pop_unblocked("camera", None)
     index.park(waiting, short_of("camera", 20))
-    assert index.take("camera", 19) == []
-    assert index.take("camera", 20) == [waiting]
+    assert index.pop_unblocked("camera", 19) == []
+    assert index.pop_unblocked("camera", 20) == [waiting]
 
 
 def test_pending_tells_each_question_with_what_blocks_it() -> None:
@@ -165,7 +165,7 @@ def test_nobody_is_woken_by_the_index_itself() -> None:
     index = WaitingIndex()
     for name in ("first", "second"):
         index.park(waiter(partial(woken.append, name)), unknown("camera"))
-    taken = index.take("camera", None)
+    taken = index.pop_unblocked("camera", None)
     assert woken == []
     for waiting in taken:
         waiting.wake()
@@ -223,7 +223,7 @@ class IndexMachine(RuleBasedStateMachine):
             if newest is not None and needed <= newest:
                 by_stamp.append((needed, waiting))
         expected = for_any + [waiting for _, waiting in sorted(by_stamp, key=lambda place: place[0])]
-        assert self.index.take(frame, newest) == expected
+        assert self.index.pop_unblocked(frame, newest) == expected
         self.leave(expected)
 
     @rule()
@@ -242,7 +242,7 @@ class IndexMachine(RuleBasedStateMachine):
     def nothing_else_is_parked(self) -> None:
         assert len(self.index) == len(self.model)
         assert [pending.blocked_by for pending in self.index.pending()] == [error for _, error in self.model]
-        assert set(self.index.blocked) == {name for _, error in self.model for name in blocking_frames(error)}
+        assert set(self.index.by_frame) == {name for _, error in self.model for name in blocking_frames(error)}
 
 
 TestIndexAgainstAList = IndexMachine.TestCase

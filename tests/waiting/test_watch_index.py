@@ -2,6 +2,7 @@ from itertools import permutations
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.live_trees import live_tree, tree_over
 from support.samples import any_samples, moving, static
 
 from tfbus import ClockResetError, InvalidTransformError, TransformLookupError, TransformStamped, TransformTree
@@ -12,11 +13,11 @@ from tfbus.waiting.watch_index import WatchState
 class Watcher:
     """A watch that writes down how often it was woken."""
 
-    def __init__(self, feed: LiveTree, target: str, source: str) -> None:
-        self.feed = feed
+    def __init__(self, live: LiveTree, target: str, source: str) -> None:
+        self.live = live
         self.state = WatchState(target, source, self._woken)
         self.woken = 0
-        feed.watching.add(self.state)
+        live.watching.add(self.state)
 
     def _woken(self) -> None:
         self.woken += 1
@@ -24,75 +25,75 @@ class Watcher:
     def look(self) -> TransformStamped | None:
         """The answer, which is followed from now on; None while there is none."""
         try:
-            answer = self.feed.tree.lookup(self.state.target, self.state.source)
+            answer = tree_over(self.live).lookup(self.state.target, self.state.source)
         except TransformLookupError:
-            self.feed.watching.forget(self.state)
+            self.live.watching.set_no_answer(self.state)
             return None
-        self.feed.watching.follow(self.state, self.feed.tree.forest, answer.stamp)
-        self.state.flagged = False
+        self.live.watching.set_answer(self.state, self.live.forest, answer.stamp)
+        self.state.outdated = False
         return answer
 
 
-def under(feed: LiveTree) -> set[str]:
-    return set(feed.watching.under)
+def under(live: LiveTree) -> set[str]:
+    return set(live.watching.by_frame)
 
 
 def test_an_answer_is_kept_under_the_edges_that_it_is_made_of() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1), static("b", "c")))
-    watcher = Watcher(feed, "a", "c")
-    assert under(feed) == set()
+    live = live_tree(None)
+    live.insert((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1), static("b", "c")))
+    watcher = Watcher(live, "a", "c")
+    assert under(live) == set()
     watcher.look()
-    assert under(feed) == {"a", "b", "c"}
+    assert under(live) == {"a", "b", "c"}
 
 
 def test_the_first_batch_wakes_and_those_that_follow_are_only_counted() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 1), moving("a", "b", 1)))
-    watcher = Watcher(feed, "map", "b")
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1), moving("a", "b", 1)))
+    watcher = Watcher(live, "map", "b")
     watcher.look()
-    feed.receive((moving("map", "other", 2),))
-    assert (watcher.woken, watcher.state.flagged, watcher.state.updates) == (0, False, 0)
-    feed.receive((moving("map", "a", 2), moving("a", "b", 2), moving("a", "b", 3)))
-    feed.receive((moving("map", "a", 3),))
-    assert (watcher.woken, watcher.state.flagged, watcher.state.updates) == (1, True, 2)
+    live.insert((moving("map", "other", 2),))
+    assert (watcher.woken, watcher.state.outdated, watcher.state.updates) == (0, False, 0)
+    live.insert((moving("map", "a", 2), moving("a", "b", 2), moving("a", "b", 3)))
+    live.insert((moving("map", "a", 3),))
+    assert (watcher.woken, watcher.state.outdated, watcher.state.updates) == (1, True, 2)
 
 
 def test_who_has_no_answer_hears_of_no_sample() -> None:
-    feed = LiveTree(None)
-    watcher = Watcher(feed, "map", "a")
+    live = live_tree(None)
+    watcher = Watcher(live, "map", "a")
     assert watcher.look() is None
-    feed.receive((moving("map", "a", 1),))
+    live.insert((moving("map", "a", 1),))
     assert (watcher.woken, watcher.state.updates) == (0, 0)
     watcher.look()
-    feed.remove_frame("a")
+    live.remove_frame("a")
     assert watcher.woken == 1
     assert watcher.look() is None
-    assert under(feed) == set()
+    assert under(live) == set()
 
 
 def test_for_as_long_as_a_frame_has_had_two_parents_the_ways_by_both_are_followed() -> None:
-    feed = LiveTree(5e-9)
-    feed.receive((moving("map", "left", 1), moving("map", "right", 1), moving("left", "box", 1)))
-    watcher = Watcher(feed, "map", "box")
-    feed.receive((moving("right", "box", 3),))
+    live = live_tree(5e-9)
+    live.insert((moving("map", "left", 1), moving("map", "right", 1), moving("left", "box", 1)))
+    watcher = Watcher(live, "map", "box")
+    live.insert((moving("right", "box", 3),))
     # The answer is that of stamp 1, when the box was on the left; how far to go, the newest samples say.
     watcher.look()
-    assert under(feed) == {"left", "right", "box"}
-    feed.receive((moving("map", "left", 9), moving("map", "right", 9), moving("right", "box", 9)))
+    assert under(live) == {"left", "right", "box"}
+    live.insert((moving("map", "left", 9), moving("map", "right", 9), moving("right", "box", 9)))
     watcher.look()
-    assert under(feed) == {"right", "box"}
+    assert under(live) == {"right", "box"}
 
 
 def test_late_samples_that_close_a_loop_round_the_way_flag_it() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("a", "c", 0),))
-    feed.receive((moving("a", "b", 0), moving("c", "b", 1), moving("d", "a", 1)))
+    live = live_tree(None)
+    live.insert((moving("a", "c", 0),))
+    live.insert((moving("a", "b", 0), moving("c", "b", 1), moving("d", "a", 1)))
     # At stamp 0 b hung on a, and now a on b.
-    watchers = [Watcher(feed, target, source) for target, source in permutations("abc", 2)]
+    watchers = [Watcher(live, target, source) for target, source in permutations("abc", 2)]
     answers = [watcher.look() for watcher in watchers]
-    feed.receive((moving("b", "a", 0, 1.0),))
-    flagged = [watcher for watcher in watchers if watcher.state.flagged]
+    live.insert((moving("b", "a", 0, 1.0),))
+    flagged = [watcher for watcher in watchers if watcher.state.outdated]
     changed = [watcher for watcher, answer in zip(watchers, answers, strict=True) if watcher.look() != answer]
     assert changed
     assert set(changed) <= set(flagged)
@@ -100,72 +101,72 @@ def test_late_samples_that_close_a_loop_round_the_way_flag_it() -> None:
 
 
 def test_another_parent_elsewhere_flags_nobody_whose_own_frames_have_kept_theirs() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1)))
-    watcher = Watcher(feed, "map", "a")
+    live = live_tree(None)
+    live.insert((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1)))
+    watcher = Watcher(live, "map", "a")
     watcher.look()
-    feed.receive((moving("mars", "map", 2),))
-    feed.receive((moving("a", "b", 2),))
-    feed.receive((moving("map", "new", 2),))
-    assert (watcher.woken, watcher.state.flagged) == (0, False)
+    live.insert((moving("mars", "map", 2),))
+    live.insert((moving("a", "b", 2),))
+    live.insert((moving("map", "new", 2),))
+    assert (watcher.woken, watcher.state.outdated) == (0, False)
 
 
 def test_a_reset_flags_and_wakes_everybody_and_keeps_them_in() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 5),))
-    answered, waiting = Watcher(feed, "map", "a"), Watcher(feed, "map", "nobody")
+    live = live_tree(None)
+    live.insert((moving("map", "a", 5),))
+    answered, waiting = Watcher(live, "map", "a"), Watcher(live, "map", "nobody")
     answered.look()
-    feed.reset(5, 2)
+    live.reset(5, 2)
     for watcher in (answered, waiting):
-        assert (watcher.woken, watcher.state.flagged) == (1, True)
+        assert (watcher.woken, watcher.state.outdated) == (1, True)
         assert isinstance(watcher.state.reset, ClockResetError)
-    assert (len(feed.watching), under(feed)) == (2, set())
+    assert (len(live.watching), under(live)) == (2, set())
 
 
 def test_the_end_wakes_everybody_and_takes_them_out_for_good() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 5),))
-    watchers = [Watcher(feed, "map", "a"), Watcher(feed, "map", "nobody")]
+    live = live_tree(None)
+    live.insert((moving("map", "a", 5),))
+    watchers = [Watcher(live, "map", "a"), Watcher(live, "map", "nobody")]
     watchers[0].look()
-    feed.end("the bus is closed")
+    live.end("the bus is closed")
     assert [(watcher.woken, watcher.state.ended) for watcher in watchers] == [(1, True), (1, True)]
     assert watchers[0].look() is not None
-    assert (len(feed.watching), under(feed)) == (0, set())
+    assert (len(live.watching), under(live)) == (0, set())
 
 
 def test_a_watch_that_is_taken_out_leaves_the_others_under_the_same_frame() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 1),))
-    going, staying = Watcher(feed, "map", "a"), Watcher(feed, "a", "map")
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1),))
+    going, staying = Watcher(live, "map", "a"), Watcher(live, "a", "map")
     for watcher in (going, staying):
         watcher.look()
     for _ in range(2):
-        feed.watching.remove(going.state)
-    feed.receive((moving("map", "a", 2),))
-    assert (going.woken, staying.woken, len(feed.watching)) == (0, 1, 1)
+        live.watching.remove(going.state)
+    live.insert((moving("map", "a", 2),))
+    assert (going.woken, staying.woken, len(live.watching)) == (0, 1, 1)
 
 
 def test_one_watch_that_cannot_be_woken_does_not_keep_the_others_asleep() -> None:
-    feed = LiveTree(None)
-    feed.receive((moving("map", "a", 1),))
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1),))
 
     def gone() -> None:
         raise RuntimeError("Event loop is closed")
 
-    first, second = Watcher(feed, "map", "a"), Watcher(feed, "map", "a")
+    first, second = Watcher(live, "map", "a"), Watcher(live, "map", "a")
     first.state.wake = gone
     for watcher in (first, second):
         watcher.look()
-    feed.receive((moving("map", "a", 2),))
+    live.insert((moving("map", "a", 2),))
     assert second.woken == 1
 
 
 def test_whether_a_task_waits_here_is_known() -> None:
-    feed = LiveTree(None)
-    watcher = Watcher(feed, "map", "a")
-    assert not feed.anyone_waits
+    live = live_tree(None)
+    watcher = Watcher(live, "map", "a")
+    assert not live.has_waiters
     watcher.state.waiting = True
-    assert feed.anyone_waits
+    assert live.has_waiters
 
 
 @settings(deadline=None)
@@ -173,18 +174,18 @@ def test_whether_a_task_waits_here_is_known() -> None:
 def test_whoever_has_no_flag_has_the_same_answer_as_before(
     batches: list[list[TransformStamped]], keep: float | None
 ) -> None:
-    feed, judge = LiveTree(keep), TransformTree(keep)
-    watchers = [Watcher(feed, target, source) for target, source in permutations("abcd", 2)]
+    live, judge = live_tree(keep), TransformTree(keep)
+    watchers = [Watcher(live, target, source) for target, source in permutations("abcd", 2)]
     answers = [watcher.look() for watcher in watchers]
     for batch in batches:
         try:
             judge.insert_many(batch)
         except InvalidTransformError:
             continue
-        feed.receive(tuple(batch))
+        live.insert(tuple(batch))
         for place, watcher in enumerate(watchers):
-            if watcher.state.flagged:
+            if watcher.state.outdated:
                 answers[place] = watcher.look()
             else:
                 # A frame in itself is left out: with its last child it can become unknown, which changes no answer.
-                assert feed.tree.lookup(watcher.state.target, watcher.state.source) == answers[place]
+                assert tree_over(live).lookup(watcher.state.target, watcher.state.source) == answers[place]

@@ -1,5 +1,7 @@
 """Task groups that belong to an object with an ``async with`` of its own."""
 
+from typing import NoReturn
+
 import anyio.abc
 
 
@@ -14,4 +16,18 @@ async def close_task_group(tasks: anyio.abc.TaskGroup) -> None:
     except BaseExceptionGroup as group:
         if len(group.exceptions) > 1:
             raise
-        raise group.exceptions[0] from None
+        error = group.exceptions[0]
+    else:
+        return
+    raise_unchanged(error)
+
+
+def raise_unchanged(error: BaseException) -> NoReturn:
+    """Raise an error that was caught before, with the context that it had then."""
+    context = error.__context__
+    try:
+        raise error
+    finally:
+        # `raise` has replaced the context by the exception that is being handled.
+        error.__context__ = context
+        del error

@@ -68,6 +68,8 @@ class Bus:
         self._threads: list[ThreadPublisher] = []
         self._samples = 0
         self._resets = 0
+        # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
+        self._relay: object = None
         self._jumps = self.clock.on_jump(self._clock_jumped)
 
     @property

@@ -18,7 +18,7 @@ import anyio.abc
 import anyio.lowlevel
 
 from tfbus._aio.one_reader import OneReader
-from tfbus._aio.task_groups import close_task_group
+from tfbus._aio.task_groups import close_task_group, raise_unchanged
 from tfbus.buffer.buffer import Buffer
 from tfbus.errors import MAY_COME, ClockResetError, TransformError, TransformLookupError, UnknownFrameError
 from tfbus.frames import is_frame
@@ -384,10 +384,4 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     def _raise_error(self) -> None:
         error, self._error = self._error, None
         if error is not None:
-            context = error.__context__
-            try:
-                raise error
-            finally:
-                # `raise` has replaced the context of the error by the exception that is handled here.
-                error.__context__ = context
-                del error
+            raise_unchanged(error)

@@ -30,7 +30,7 @@ class Path:
         Whether it holds at every stamp, because no frame on it changes its parent inside its window.
     """
 
-    __slots__ = ("_static", "down", "frames", "permanent", "moving", "root", "up")
+    __slots__ = ("_static", "down", "frames", "moving", "permanent", "root", "up")
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
         edges = ups + downs

@@ -1,4 +1,4 @@
-"""Links over zenoh: peer to peer, or through a router."""
+"""Links over zenoh, peer to peer or through a router: `ZenohLink`, with the extra ``tfbus[zenoh]``."""
 
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 

@@ -1,4 +1,4 @@
-"""One zenoh session of a link: its keys, and what zenoh's threads bring."""
+"""One zenoh session of a link: its keys, and what zenoh's threads receive."""
 
 import re
 import threading
@@ -9,42 +9,41 @@ from typing import Any
 
 import zenoh
 
-from tfbus.links.outbox import MAX_BYTES, Message
-from tfbus.links.receive_queue import Arrival
-from tfbus.links.zenoh._settings import without_source
-from tfbus.links.zenoh._statics import StaticKeys, hear_statics
+from tfbus.links._message import MAX_BYTES, Message
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.zenoh._settings import without_source_location
+from tfbus.links.zenoh._statics import StaticKeys, subscribe_statics
 from tfbus.tf_message import MalformedMessageError
 
 _ID = re.compile("[0-9a-f]{32}")
-_SHOWN = 200
+_LONGEST_SHOWN_KEY = 200
 
 
 class ZenohSession:
-    """What blocks, for worker threads (`open`, `hear_again`, `statics`), and what does not (`put`, `close`).
+    """A session and its keys: `open`, `resubscribe_statics` and `statics` block; `put` and `close` do not.
 
     Parameters
     ----------
     config : zenoh.Config
     prefix : str
-        What all keys of the domain begin with.
+        The beginning of all keys of the domain.
     id : str
-        The link's own name, a part of all its keys.
+        The link's name, a part of all its keys.
     receive : callable
-        Called in zenoh's threads with each `Arrival`; the content of one is a payload and an attachment, a bool, or a
-        `MalformedMessageError`.
+        Called in zenoh's threads with each `Received` item; a message's content is a payload and its attachment.
 
     Attributes
     ----------
     statics : StaticKeys
-        Once it is open.
+        Exists once the session is open.
     """
 
     def __init__(
         self,
         config: zenoh.Config,
         prefix: str,
-        id: str,  # noqa: A002 - it is called so on the wire
-        receive: Callable[[Arrival], object],
+        id: str,  # noqa: A002 - the wire calls it so
+        receive: Callable[[Received], object],
     ) -> None:
         self._config = config
         self._prefix = prefix
@@ -57,7 +56,7 @@ class ZenohSession:
         self._static_subscriber: Any = None
 
     def open(self) -> None:
-        """Open the session and tell the others.
+        """Open the session and announce the link.
 
         Raises
         ------
@@ -69,13 +68,12 @@ class ZenohSession:
         def complete() -> None:
             try:
                 self._open()
-            except BaseException as error:  # noqa: BLE001 - whoever waits gets it
+            except BaseException as error:  # noqa: BLE001 - the waiting thread raises it
                 opened.set_exception(error)
             else:
                 opened.set_result(None)
 
-        # A worker of trio is a daemon. The interpreter ends without waiting for those, and what zenoh does in one at
-        # that moment aborts the process.
+        # A worker thread of trio is a daemon: the interpreter would end without it, and zenoh then aborts the process.
         threading.Thread(target=complete, daemon=False).start()
         opened.result()
 
@@ -94,17 +92,17 @@ class ZenohSession:
         self._live = session.declare_publisher(
             f"{self._prefix}/live/{self._id}", congestion_control=zenoh.CongestionControl.DROP
         )
-        self.hear_again()
+        self.resubscribe_statics()
         remote, alive = zenoh.Locality.REMOTE, session.liveliness()
-        # zenoh takes back what nobody refers to.
+        # zenoh undeclares what nobody refers to.
         self._declared = (
-            session.declare_subscriber(f"{self._prefix}/live/*", _directly(self._live_came), allowed_origin=remote),
-            alive.declare_subscriber(f"{self._prefix}/@alive/*", _directly(self._presence_changed), history=True),
+            session.declare_subscriber(f"{self._prefix}/live/*", _directly(self._receive_live), allowed_origin=remote),
+            alive.declare_subscriber(f"{self._prefix}/@alive/*", _directly(self._receive_presence), history=True),
             alive.declare_token(f"{self._prefix}/@alive/{self._id}"),
         )
 
-    def hear_again(self) -> None:
-        """Have all static frames come that there are, also those that came before; for a worker thread.
+    def resubscribe_statics(self) -> None:
+        """Have all existing static frames delivered, also those that were delivered before; for a worker thread.
 
         Raises
         ------
@@ -112,8 +110,8 @@ class ZenohSession:
             If the session is closed.
         """
         assert self._session is not None
-        before, came = self._static_subscriber, _directly(self._static_came)
-        self._static_subscriber = hear_statics(self._session, f"{self._prefix}/static/*/*", came)
+        before, receive = self._static_subscriber, _directly(self._receive_static)
+        self._static_subscriber = subscribe_statics(self._session, f"{self._prefix}/static/*/*", receive)
         if before is not None:
             before.undeclare()
 
@@ -122,12 +120,12 @@ class ZenohSession:
         self._live.put(message.payload, attachment=message.attachment)
 
     def close(self) -> threading.Thread:
-        """Begin to close the session, also one that is only about to be opened.
+        """Begin to close the session, also one that is still being opened.
 
         Returns
         -------
         threading.Thread
-            It ends when that is done: within milliseconds, or after 10 s if a peer is frozen.
+            Ends when the session is closed: within milliseconds, or after 10 s if a peer is frozen.
         """
         with self._lock:
             self._closed = True
@@ -136,13 +134,13 @@ class ZenohSession:
         closing.start()
         return closing
 
-    def _live_came(self, sample: zenoh.Sample) -> None:
-        self._came(sample, "live", moving=True)
+    def _receive_live(self, sample: zenoh.Sample) -> None:
+        self._receive_message(sample, "live", moving=True)
 
-    def _static_came(self, sample: zenoh.Sample) -> None:
-        self._came(sample, "static", moving=False)
+    def _receive_static(self, sample: zenoh.Sample) -> None:
+        self._receive_message(sample, "static", moving=False)
 
-    def _came(self, sample: zenoh.Sample, kind: str, moving: bool) -> None:
+    def _receive_message(self, sample: zenoh.Sample, kind: str, moving: bool) -> None:
         sender = self._sender(sample, kind)
         if sender is None or sample.kind != zenoh.SampleKind.PUT:
             return
@@ -150,42 +148,43 @@ class ZenohSession:
         if size > MAX_BYTES:
             self._refuse(sender, "oversized", f"{size} bytes, more than {MAX_BYTES}")
         else:
-            # A sample would keep all of the buffer that it came in.
+            # Copies, for the sample would keep the whole buffer in which it came.
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
             message = sample.payload.to_bytes(), attachment
-            self._receive(Arrival(sender, message, size, moving))
+            self._receive(Received(sender, message, size, moving))
 
-    def _presence_changed(self, sample: zenoh.Sample) -> None:
+    def _receive_presence(self, sample: zenoh.Sample) -> None:
         sender = self._sender(sample, "@alive")
         if sender is not None:
-            self._receive(Arrival(sender, sample.kind == zenoh.SampleKind.PUT))
+            present = sample.kind == zenoh.SampleKind.PUT
+            self._receive(Received(sender, Presence.JOINED if present else Presence.LEFT))
 
     def _sender(self, sample: zenoh.Sample, kind: str) -> str | None:
-        """Which peer a sample is from; None if it is from here, or if its key has none, for anybody can use any key."""
+        """The peer that a sample is from; None for this link's own, and for a key without an id, which is refused."""
         key = str(sample.key_expr)
         sender = key.removeprefix(f"{self._prefix}/{kind}/").partition("/")[0]
         if not _ID.fullmatch(sender):
-            self._refuse("", "key", f"there is no link's id in its key {key[:_SHOWN]!r}")
+            self._refuse("", "key", f"there is no link's id in its key {key[:_LONGEST_SHOWN_KEY]!r}")
             return None
         return None if sender == self._id else sender
 
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
-        self._receive(Arrival(sender, MalformedMessageError(reason, detail)))
+        self._receive(Received(sender, MalformedMessageError(reason, detail)))
 
 
 def _close(session: zenoh.Session | None) -> None:
     if session is not None:
-        # It may give up waiting for a peer, who will notice by himself.
+        # zenoh may give up waiting for a peer; that peer notices the end by itself.
         with suppress(zenoh.ZError):
             session.close()
 
 
 def _directly(callback: Callable[[zenoh.Sample], object]) -> Any:
-    # Else each has a thread of its own, and what comes by one overtakes what came by another.
+    # Otherwise each subscriber has a thread of its own, and one overtakes the other.
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
 def _as_os_error(error: zenoh.ZError) -> OSError:
-    text = f"zenoh cannot open a session: {without_source(error)}"
+    text = f"zenoh cannot open a session: {without_source_location(error)}"
     number = re.search(r"\(os error (\d+)\)", text)
     return OSError(int(number[1]), text) if number else OSError(text)

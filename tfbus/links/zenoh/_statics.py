@@ -1,4 +1,4 @@
-"""Static frames on zenoh: one key each, with the last message kept for those who join late."""
+"""Static frames on zenoh: one key each, whose last message is cached for late joiners."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,69 +7,69 @@ from urllib.parse import quote
 import zenoh
 from zenoh import ext
 
-from tfbus.links.outbox import Message
+from tfbus.links._message import Message
 
-_LINGERING = 1_000
+_MOST_TOMBSTONES = 1_000
 
 
 class StaticKeys:
     """The publishers of one link's static frames.
 
-    Declaring a publisher may take a while, so all of this is done in a worker thread, one call at a time.
+    Declaring a publisher may take a while, so a worker thread makes all calls, one at a time.
 
     Parameters
     ----------
     session : zenoh.Session
     prefix : str
-        The key of a frame is this and its quoted name.
+        The key of a frame is this prefix and the quoted name.
     """
 
     def __init__(self, session: zenoh.Session, prefix: str) -> None:
         self._session = session
         self._prefix = prefix
         self._publishers: dict[str, ext.AdvancedPublisher] = {}
-        self._lingering: dict[str, ext.AdvancedPublisher] = {}
+        self._tombstones: dict[str, ext.AdvancedPublisher] = {}
 
-    def apply(self, changes: Mapping[str, Message | None]) -> list[zenoh.ZError]:
-        """Send what has changed; a frame that has become a moving one is only forgotten.
+    def publish(self, changes: Mapping[str, Message | None]) -> list[zenoh.ZError]:
+        """Publish the new message of each frame, or with None stop to keep the frame, which moves now.
 
         Returns
         -------
         list of zenoh.ZError
-            What went wrong with some frames, while the others were sent.
+            The errors of some frames, while the others were published.
         """
         errors = []
         for frame, message in changes.items():
             try:
-                self._apply(frame, message)
+                self._publish(frame, message)
             except zenoh.ZError as error:
                 errors.append(error)
-        while len(self._lingering) > _LINGERING:
-            self._undeclare(self._lingering.pop(next(iter(self._lingering))))
+        while len(self._tombstones) > _MOST_TOMBSTONES:
+            self._undeclare(self._tombstones.pop(next(iter(self._tombstones))))
         return errors
 
     @property
-    def linger(self) -> bool:
-        """Whether there are tombstones, which `bury` takes away when they have been there for a while."""
-        return bool(self._lingering)
+    def has_tombstones(self) -> bool:
+        """Whether there are publishers of removed frames, for `drop_tombstones` to end after a while."""
+        return len(self._tombstones) > 0
 
-    def bury(self) -> None:
-        """Take away the publishers of frames that were removed."""
-        while self._lingering:
-            self._undeclare(self._lingering.popitem()[1])
+    def drop_tombstones(self) -> None:
+        """End the publishers of removed frames."""
+        while self._tombstones:
+            self._undeclare(self._tombstones.popitem()[1])
 
-    def _apply(self, frame: str, message: Message | None) -> None:
+    def _publish(self, frame: str, message: Message | None) -> None:
         if message is None:
             self._undeclare(self._publishers.pop(frame, None))
             return
-        publisher = self._lingering.pop(frame, None) or self._publishers.get(frame) or self._declare(frame)
+        publisher = self._tombstones.pop(frame, None) or self._publishers.get(frame) or self._declare(frame)
         publisher.put(message.payload, attachment=message.attachment)
         if message.samples:
             self._publishers[frame] = publisher
         else:
-            # A tombstone can be lost like anything else; while its publisher is there, it is recovered.
+            # The network can lose a tombstone; while its publisher exists, receivers recover it.
             self._publishers.pop(frame, None)
-            self._lingering[frame] = publisher
+            self._tombstones[frame] = publisher
 
     def _declare(self, frame: str) -> ext.AdvancedPublisher:
         return ext.declare_advanced_publisher(
@@ -86,8 +86,8 @@ class StaticKeys:
             publisher.undeclare()
 
 
-def hear_statics(session: zenoh.Session, keys: str, receive: Any) -> object:
-    """Hear all static frames of a domain: those that are there, those that come, and those that were lost."""
+def subscribe_statics(session: zenoh.Session, keys: str, receive: Any) -> object:
+    """Subscribe to all static frames of a domain: existing ones, future ones, and those that the network lost."""
     return ext.declare_advanced_subscriber(
         session,
         keys,

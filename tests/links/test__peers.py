@@ -1,6 +1,6 @@
 import pytest
 
-from tfbus.links.peers import MAX_PEERS, Peer, Peers
+from tfbus.links._peers import MAX_PEERS, Peer, Peers
 
 Report = tuple[str, str, str]
 
@@ -16,7 +16,7 @@ def known(peers: Peers, name: str) -> Peer:
     return peer
 
 
-def test_a_peer_is_made_once_and_keeps_what_is_known_of_it() -> None:
+def test_a_peer_is_made_once_and_keeps_its_state() -> None:
     peers, _ = peers_and_reports()
     peer = known(peers, "a")
     peer.number = 7
@@ -25,7 +25,7 @@ def test_a_peer_is_made_once_and_keeps_what_is_known_of_it() -> None:
     assert (peer.id, peer.number, peer.present, peer.authorities, peer.frames) == ("a", 7, False, set(), set())
 
 
-def test_only_those_who_have_said_so_are_present() -> None:
+def test_only_peers_that_have_announced_themselves_are_present() -> None:
     peers, _ = peers_and_reports()
     for name in "cab":
         known(peers, name)
@@ -37,7 +37,7 @@ def test_only_those_who_have_said_so_are_present() -> None:
     assert list(peers.present) == ["a"]
 
 
-def test_who_has_gone_and_comes_back_is_somebody_new() -> None:
+def test_a_peer_that_comes_back_is_a_new_and_younger_one() -> None:
     peers, _ = peers_and_reports()
     first = known(peers, "a")
     assert peers.forget("a") is first
@@ -47,7 +47,7 @@ def test_who_has_gone_and_comes_back_is_somebody_new() -> None:
     assert again.age > first.age
 
 
-def test_everybody_can_be_forgotten_at_once() -> None:
+def test_all_peers_can_be_forgotten_at_once() -> None:
     peers, _ = peers_and_reports()
     all_of_them = [known(peers, name) for name in "ab"]
     assert peers.forget_all() == all_of_them
@@ -55,7 +55,7 @@ def test_everybody_can_be_forgotten_at_once() -> None:
     assert known(peers, "a") not in all_of_them
 
 
-def test_there_is_room_for_so_many_peers_and_for_others_when_some_have_gone() -> None:
+def test_peers_are_limited_in_number_and_one_that_goes_makes_room() -> None:
     peers, reports = peers_and_reports()
     for number in range(MAX_PEERS):
         known(peers, f"{number}")
@@ -69,7 +69,7 @@ def test_there_is_room_for_so_many_peers_and_for_others_when_some_have_gone() ->
     assert peers.find("0") is None
 
 
-def test_who_says_that_he_is_there_takes_the_place_of_the_first_who_has_not() -> None:
+def test_an_announced_peer_evicts_the_first_unannounced_one() -> None:
     peers, _ = peers_and_reports()
     for number in range(MAX_PEERS):
         assert peers.make_room(f"{number}") is None
@@ -82,7 +82,7 @@ def test_who_says_that_he_is_there_takes_the_place_of_the_first_who_has_not() ->
     assert known(peers, "new").id == "new"
 
 
-def test_there_is_no_room_where_everybody_has_said_that_he_is_there() -> None:
+def test_announced_peers_are_never_evicted() -> None:
     peers, _ = peers_and_reports()
     for number in range(MAX_PEERS):
         known(peers, f"{number}").present = True
@@ -90,7 +90,7 @@ def test_there_is_no_room_where_everybody_has_said_that_he_is_there() -> None:
     assert peers.find("new") is None
 
 
-def test_what_is_refused_is_counted_each_time_and_told_once_for_each_peer_and_reason() -> None:
+def test_refusals_are_counted_each_time_and_reported_once_for_each_peer_and_reason() -> None:
     peers, reports = peers_and_reports()
     known(peers, "a")
     known(peers, "b")
@@ -109,7 +109,7 @@ def test_what_is_refused_is_counted_each_time_and_told_once_for_each_peer_and_re
     ]
 
 
-def test_who_comes_back_is_told_of_again() -> None:
+def test_refusals_of_a_peer_that_comes_back_are_reported_again() -> None:
     peers, reports = peers_and_reports()
     for _ in range(2):
         known(peers, "a")
@@ -119,7 +119,7 @@ def test_who_comes_back_is_told_of_again() -> None:
 
 
 @pytest.mark.parametrize("strangers", [1, 100_000])
-def test_strangers_without_end_are_told_of_once_for_each_reason(strangers: int) -> None:
+def test_refusals_of_unknown_peers_are_reported_once_for_each_reason(strangers: int) -> None:
     peers, reports = peers_and_reports()
     for number in range(strangers):
         peers.reject(f"{number}", "version", ValueError())

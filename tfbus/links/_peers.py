@@ -1,4 +1,4 @@
-"""The other ends of a link: who is there, how much each may send, and what was wrong with it."""
+"""The peers of a link: who is present, how much each may send, and what was refused of it."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -8,44 +8,50 @@ from tfbus._log import SeenKeys
 
 MAX_PEERS = 1_000
 MAX_AUTHORITIES = 1_000
-_REASONS = 100
+_REMEMBERED_REASONS = 100
 
-ages = count()
-"""What comes later, a peer or a loss, takes a higher one."""
+_ages = count()
+
+
+def next_age() -> int:
+    """A number higher than all before it: it tells which of two meetings and losses of peers was later."""
+    return next(_ages)
 
 
 class Peer:
-    """Another end of a link, as far as this one knows it.
+    """The other end of a link, as far as this end knows it.
 
     Attributes
     ----------
     id : str
     age : int
-        Higher for one that was met later, also for one that has come back.
+        From `next_age`, when it was met; a peer that was lost and comes back is met anew.
     present : bool
-        Whether it has said that it is there.
+        Whether it has announced that it is there.
     number : int
-        That of its newest live message.
+        The number of its newest live message.
     authorities : set of str
-        Whom it has spoken for.
+        The authorities whose samples it has sent.
     frames : set of (bytes, str)
-        Origin and child of all that it has brought: what its limit counts.
+        Origin and child of all frames that it was the first to bring; their number is limited.
+    reported : SeenKeys
+        The reasons of refusals that were reported.
     """
 
-    __slots__ = ("age", "authorities", "frames", "id", "number", "present", "told")
+    __slots__ = ("age", "authorities", "frames", "id", "number", "present", "reported")
 
-    def __init__(self, id: str) -> None:  # noqa: A002 - it is called so on the wire
+    def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
         self.id = id
-        self.age = next(ages)
+        self.age = next_age()
         self.present = False
         self.number = 0
         self.authorities: set[str] = set()
         self.frames: set[tuple[bytes, str]] = set()
-        self.told = SeenKeys(_REASONS)
+        self.reported = SeenKeys(_REMEMBERED_REASONS)
 
 
 class Peers:
-    """All of one link.
+    """All peers of one link.
 
     Parameters
     ----------
@@ -55,22 +61,22 @@ class Peers:
     Attributes
     ----------
     rejected : Counter
-        What was refused, by reason.
+        How many messages and samples were refused, by reason.
     """
 
     def __init__(self, report: Callable[[str, str, Exception], object]) -> None:
         self._report = report
         self._peers: dict[str, Peer] = {}
-        self._strangers = SeenKeys(_REASONS)
+        self._reported_of_unknown = SeenKeys(_REMEMBERED_REASONS)
         self.rejected: Counter[str] = Counter()
 
     @property
     def present(self) -> tuple[str, ...]:
-        """The ids of those who have said that they are there, sorted."""
+        """The ids of the peers that have announced themselves, sorted."""
         return tuple(sorted(peer.id for peer in self._peers.values() if peer.present))
 
     def find(self, id: str) -> Peer | None:  # noqa: A002
-        """The peer of an id, new or known; None if there are too many."""
+        """The peer of an id, known or new; None if it is new and there are too many."""
         peer = self._peers.get(id)
         if peer is None:
             if len(self._peers) >= MAX_PEERS:
@@ -80,25 +86,32 @@ class Peers:
         return peer
 
     def make_room(self, id: str) -> Peer | None:  # noqa: A002
-        """Take out the first one that has not said that it is there, if there is no room for somebody new who has."""
+        """Evict a peer that has not announced itself, if all places are taken, for a new one that has.
+
+        Returns
+        -------
+        Peer or None
+            The evicted one.
+        """
         if id in self._peers or len(self._peers) < MAX_PEERS:
             return None
-        stranger = next((peer for peer in self._peers.values() if not peer.present), None)
-        return None if stranger is None else self._peers.pop(stranger.id)
+        unannounced = next((peer for peer in self._peers.values() if not peer.present), None)
+        return None if unannounced is None else self._peers.pop(unannounced.id)
 
     def forget(self, id: str) -> Peer | None:  # noqa: A002
-        """Take out a peer that has gone, if it was known."""
+        """Remove a peer that has gone; returns it if it was known."""
         return self._peers.pop(id, None)
 
     def forget_all(self) -> list[Peer]:
-        """Take out everybody."""
+        """Remove all peers, and return them."""
         peers = list(self._peers.values())
         self._peers.clear()
         return peers
 
     def reject(self, id: str, reason: str, error: Exception, count: int = 1) -> None:  # noqa: A002
-        """Count what a peer sent and must not have, and report it if that is new."""
+        """Count what was refused of a peer, and report the first refusal for each reason."""
         self.rejected[reason] += count
         peer = self._peers.get(id)
-        if peer.told.first(reason) if peer is not None else self._strangers.first(reason):
+        reported = self._reported_of_unknown if peer is None else peer.reported
+        if reported.first(reason):
             self._report(id, reason, error)

@@ -7,17 +7,17 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from support.allocations import peak_of
 
-from tfbus.links.attachment import (
+from tfbus.links._attachment import (
     MAX_BYTES,
     MAX_ENTRIES,
     VERSION,
     Attachment,
     Entry,
     PublishedBatch,
-    RemovedFrame,
     pack,
     unpack,
 )
+from tfbus.links._outbox import RemovedFrame
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 ONE, OTHER = b"0123456789abcdef", b"another origin !"

@@ -12,16 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
 from support.samples import moving, static
-from support.wires import size_of
+from support.wires import End, size_of
 
-from tfbus import Buffer, Bus, BusClosedError, FrameAdded, SimulatedClock, TransformStamped
+from tfbus import Buffer, Bus, BusClosedError, FrameAdded, PeerLost, PeerRejected, SimulatedClock, TransformStamped
 from tfbus.bus._ownership import OnConflict
-from tfbus.links.attachment import MAX_ENTRIES, Entry, PublishedBatch, RemovedFrame, pack
-from tfbus.links.inbox import Inbox
-from tfbus.links.outbox import Outbox
-from tfbus.links.peers import MAX_AUTHORITIES, MAX_PEERS, Peers
-from tfbus.links.provenance import ReceivedTransform
-from tfbus.links.relay import join, leave
+from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
+from tfbus.links._message import Message
+from tfbus.links._outbox import RemovedFrame
+from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
+from tfbus.links._provenance import ReceivedTransform
+from tfbus.links._receive_queue import Presence
 from tfbus.tf_message import encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
@@ -29,19 +29,45 @@ Batch = tuple[TransformStamped, ...]
 
 
 class Receiver:
-    """A bus with one link, what it has heard, and peers that write their messages by hand."""
+    """A bus with one link, the batches that it has heard, and peers whose messages a test writes by hand."""
 
     def __init__(
-        self, frames: Collection[str] | None = None, max_frames: int = 10_000, on_conflict: OnConflict = "last"
+        self,
+        frames: Collection[str] | None = None,
+        max_frames: int = 10_000,
+        on_conflict: OnConflict = "last",
+        drop_lost: bool = False,
     ) -> None:
         self.bus = Bus(SimulatedClock(), on_conflict)
         self.heard: list[Batch] = []
         self.bus.subscribe(self.heard.append)
-        self.reports: list[tuple[str, str]] = []
-        self.outbox = Outbox(None, lambda: None, lambda _: None)
-        self.peers = Peers(lambda peer, reason, _: self.reports.append((peer, reason)))
-        self.relay = join(self.bus, self.outbox)
-        self.inbox = Inbox(self.bus, self.relay, self.outbox, frames, max_frames, self.peers)
+        self.end = End("here", self.bus, lambda _, message: self.sent.append(message), frames, max_frames, drop_lost)
+        self.sent: list[Message] = []
+        self.inbox = self.end.endpoint.inbox
+        self.peers = self.end.endpoint.peers
+        self._events = self.bus.events()
+
+    @property
+    def reports(self) -> list[tuple[str, str]]:
+        """Peer and reason of each refusal that was announced since the last call."""
+        events = iter(self._events.queue.get, None)
+        return [(event.peer, event.reason) for event in events if isinstance(event, PeerRejected)]
+
+    def receive_bytes(self, payload: bytes, attachment: bytes, sender: str = "peer") -> None:
+        self.end.receive(sender, Message(payload, attachment, 0))
+
+    def lose(self, sender: str = "peer") -> tuple[str, ...]:
+        """A peer goes; returns the frames that the bus announces as lost with it."""
+        with self.bus.events() as events:
+            self.end.receive(sender, Presence.LEFT)
+            (frames,) = (event.frames for event in iter(events.queue.get, None) if isinstance(event, PeerLost))
+            return frames
+
+    def turn(self) -> list[Message]:
+        """End a turn of the event loop; returns the messages that go out."""
+        self.sent.clear()
+        self.end.endpoint.send()
+        return self.sent
 
     def receive(
         self,
@@ -52,12 +78,12 @@ class Receiver:
         sender: str = "peer",
     ) -> None:
         """One batch in a message of its own."""
-        self.inbox.receive(sender, encode(samples), pack(number, [batch(samples, origin, sequence)]))
+        self.receive_bytes(encode(samples), pack(number, [batch(samples, origin, sequence)]), sender)
 
     def remove(
         self, frame: str, origin: bytes = ORIGIN, sequence: int = 1, sender: str = "peer", lost: bool = False
     ) -> None:
-        self.inbox.receive(sender, encode(()), pack(1, [RemovedFrame(origin, sequence, frame, lost)]))
+        self.receive_bytes(encode(()), pack(1, [RemovedFrame(origin, sequence, frame, lost)]), sender)
 
     @property
     def frames(self) -> list[str]:
@@ -73,11 +99,14 @@ class Receiver:
 
 @contextmanager
 def receiver(
-    frames: Collection[str] | None = None, max_frames: int = 10_000, on_conflict: OnConflict = "last"
+    frames: Collection[str] | None = None,
+    max_frames: int = 10_000,
+    on_conflict: OnConflict = "last",
+    drop_lost: bool = False,
 ) -> Iterator[Receiver]:
-    made = Receiver(frames, max_frames, on_conflict)
+    made = Receiver(frames, max_frames, on_conflict, drop_lost)
     yield made
-    leave(made.bus, made.outbox)
+    made.end.leave()
 
 
 def batch(samples: Sequence[TransformStamped], origin: bytes = ORIGIN, sequence: int = 1) -> PublishedBatch:
@@ -98,12 +127,12 @@ def test_a_message_is_published_batch_by_batch_with_everything_that_was_said() -
     second = [moving("map", "a", 3, authority="slam")]
     entries: list[Entry] = [batch(first, ORIGIN, 8), RemovedFrame(OTHER, 3, "c"), batch(second, ORIGIN, 9)]
     with receiver() as here, Buffer(here.bus) as buffer:
-        here.inbox.receive("peer", encode([*first, *second]), pack(1, entries))
+        here.receive_bytes(encode([*first, *second]), pack(1, entries))
         assert here.heard == [tuple(first), tuple(second)]
         assert "c" not in buffer.tree
         assert buffer.lookup_nowait("map", "b", 1).transform.translation == (3.0, 0.0, 0.0)
         assert here.counts == (1, 4, 0, 0)
-        assert here.outbox.flush() == [], "nothing goes back where it came from"
+        assert here.turn() == [], "nothing goes back where it came from"
 
 
 @given(samples=st.lists(some.samples(names=st.sampled_from("abc"), at=some.stamps(0, 2**60)), min_size=1, max_size=6))
@@ -115,13 +144,13 @@ def test_what_was_published_there_is_published_here_to_the_bit(samples: list[Tra
         here.receive(*samples)
         assert here.heard == heard
         for got in here.heard:
-            assert all(type(sample) is ReceivedTransform and sample._source.origin == ORIGIN for sample in got)
+            assert all(type(sample) is ReceivedTransform and sample._provenance.origin == ORIGIN for sample in got)
 
 
 def test_an_empty_message_and_an_empty_batch_call_nobody() -> None:
     with receiver() as here:
-        here.inbox.receive("peer", encode(()), pack(1, []))
-        here.inbox.receive("peer", encode(()), pack(2, [PublishedBatch(ORIGIN, 1, ())]))
+        here.receive_bytes(encode(()), pack(1, []))
+        here.receive_bytes(encode(()), pack(2, [PublishedBatch(ORIGIN, 1, ())]))
         assert (here.heard, here.counts) == ([], (2, 0, 0, 0))
 
 
@@ -138,14 +167,6 @@ def test_only_wanted_frames_come_in_or_go() -> None:
 
 
 # Numbers.
-
-
-def numbers(*given: int, sender: str = "peer") -> tuple[Receiver, int]:
-    with receiver() as here:
-        for stamp, number in enumerate(given):
-            here.receive(moving("map", "a", stamp), sequence=stamp, number=number, sender=sender)
-        assert here.inbox.samples == len(given)
-        return here, here.inbox.lost
 
 
 @pytest.mark.parametrize(
@@ -167,18 +188,23 @@ def numbers(*given: int, sender: str = "peer") -> tuple[Receiver, int]:
     ids=str,
 )
 def test_gaps_in_the_numbers_of_a_peer_are_messages_that_were_lost(given: tuple[int, ...], lost: int) -> None:
-    assert numbers(*given)[1] == lost
+    with receiver() as here:
+        for stamp, number in enumerate(given):
+            here.receive(moving("map", "a", stamp), sequence=stamp, number=number)
+        assert here.counts == (len(given), len(given), 0, lost)
 
 
 def test_each_peer_has_numbers_of_its_own_and_begins_anew_when_it_comes_back() -> None:
-    here, lost = numbers(1, 2, 5)
-    assert lost == 2
-    here.receive(moving("map", "b", 1), sequence=1, number=9, sender="other")
-    assert here.inbox.lost == 2
-    here.peers.forget("peer")
-    here.receive(moving("map", "b", 1), sequence=2, number=1)
-    here.receive(moving("map", "b", 1), sequence=3, number=3)
-    assert here.inbox.lost == 3
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1, number=2)
+        here.receive(moving("map", "a", 2), sequence=2, number=5)
+        assert here.inbox.lost == 2
+        here.receive(moving("map", "b", 1), sequence=1, number=9, sender="other")
+        assert here.inbox.lost == 2
+        here.lose()
+        here.receive(moving("map", "b", 1), sequence=2, number=1)
+        here.receive(moving("map", "b", 1), sequence=3, number=3)
+        assert here.inbox.lost == 3
 
 
 # What has come already.
@@ -265,7 +291,7 @@ def test_of_very_many_removals_the_highest_number_is_remembered_for_live_message
     with receiver() as here:
         for start in (10, 6_010):
             entries: list[Entry] = [RemovedFrame(ORIGIN, start + n, f"{start + n}") for n in range(6_000)]
-            here.inbox.receive("peer", encode(()), pack(start, entries))
+            here.receive_bytes(encode(()), pack(start, entries))
         here.receive(moving("map", "10", 1), sequence=9, number=20_000)
         here.receive(moving("map", "new", 1), sequence=8, number=20_001)
         assert here.heard == []
@@ -279,7 +305,7 @@ def test_removals_of_very_many_origins_are_not_remembered_without_end() -> None:
     with receiver() as here:
         for number in range(15_000):
             here.remove("a", origin=number.to_bytes(16))
-        assert 10_000 <= size_of(here.relay) < 11_100
+        assert 10_000 <= size_of(here.end.relay) < 11_100
 
 
 def test_the_loss_of_a_frame_is_about_what_that_peer_has_brought() -> None:
@@ -319,12 +345,11 @@ def test_after_a_loss_a_removal_counts_as_ever() -> None:
 
 @pytest.mark.parametrize("drop", [True, False])
 def test_when_a_peer_is_lost_only_who_comes_later_may_say_the_same_again(drop: bool) -> None:
-    with receiver() as here:
+    with receiver(drop_lost=drop) as here:
         here.receive(moving("map", "b", 1), sequence=1, sender="old")
         here.receive(moving("map", "a", 5), sequence=5)
-        lost = here.peers.forget("peer")
-        assert lost is not None
-        assert here.relay.lose(lost, here.outbox, drop) == ("a",)
+        assert here.lose() == ("a",)
+        assert set(here.frames) == ({"b"} if drop else {"a", "b"})
         here.receive(moving("map", "a", 5), sequence=5, sender="old")
         here.receive(moving("map", "a", 4), sequence=4, sender="new")
         assert here.counts[1:3] == (2, 2)
@@ -345,9 +370,9 @@ def test_the_highest_of_all_sequences_does_no_harm() -> None:
 
 def test_what_this_bus_has_published_itself_is_no_news() -> None:
     with receiver() as here:
-        here.receive(moving("map", "a", 1), origin=here.relay.origin, sequence=100)
+        here.receive(moving("map", "a", 1), origin=here.end.relay.origin, sequence=100)
         here.bus.publish(static("map", "s"))
-        here.remove("s", origin=here.relay.origin, sequence=2**64 - 1)
+        here.remove("s", origin=here.end.relay.origin, sequence=2**64 - 1)
         assert here.heard == [(static("map", "s"),)]
         assert here.counts == (2, 0, 1, 0)
 
@@ -360,7 +385,7 @@ def test_what_is_wrong_with_a_sample_is_counted_by_reason_while_the_rest_of_its_
     with receiver() as here:
         entries = [batch(samples[:3]), batch(samples[3:], sequence=2)]
         for number in (1, 2):
-            here.inbox.receive("peer", spoilt(samples), pack(number, entries))
+            here.receive_bytes(spoilt(samples), pack(number, entries))
         assert here.heard == [(samples[0], samples[2])]
         assert here.peers.rejected == {"not finite": 4}
         assert here.reports == [("peer", "not finite")]
@@ -394,10 +419,6 @@ def test_samples_that_close_a_loop_one_after_the_other_are_refused_and_the_bus_g
         assert here.bus.statistics().rejected == {"cycle": 1}
 
 
-def wrong(number: int, *entries: Entry, samples: Sequence[TransformStamped] = ()) -> tuple[bytes, bytes]:
-    return encode(samples), pack(number, entries)
-
-
 TWO = [moving("map", "a", 1), moving("map", "b", 1)]
 MALFORMED = [
     pytest.param(encode(TWO), b"", "version", id="no attachment"),
@@ -420,7 +441,7 @@ MALFORMED = [
 def test_nothing_is_taken_of_what_is_no_message(payload: bytes, attachment: bytes, reason: str) -> None:
     with receiver() as here:
         for _ in range(3):
-            here.inbox.receive("peer", payload, attachment)
+            here.receive_bytes(payload, attachment)
         assert (here.heard, here.counts) == ([], (0, 0, 0, 0))
         assert here.peers.rejected == {reason: 3}
         assert here.reports == [("peer", reason)]
@@ -457,7 +478,7 @@ def test_many_origins_do_not_get_around_the_limit() -> None:
             here.receive(moving("map", f"{number}", 1), origin=number.to_bytes(16), sequence=number)
         assert here.bus.statistics().frames <= 10
         assert here.inbox.samples == 10
-        assert size_of(here.relay) < 100
+        assert size_of(here.end.relay) < 100
         assert here.peers.rejected == {"too many frames": 1_990}
 
 
@@ -483,13 +504,14 @@ def test_frames_that_the_bus_refused_are_given_back_with_their_removal_too() -> 
         assert here.peers.rejected == {}
 
 
-def test_frames_are_given_back_when_the_peer_is_lost() -> None:
-    with receiver(max_frames=2) as here:
+@pytest.mark.parametrize("drop", [True, False])
+def test_frames_are_given_back_when_the_peer_is_lost(drop: bool) -> None:
+    with receiver(max_frames=2, drop_lost=drop) as here:
         for number in range(20):
             here.receive(moving("map", f"{number}", 1), moving("map", f"{number} too", 1), sequence=number)
-            peer = here.peers.forget("peer")
+            peer = here.peers.find("peer")
             assert peer is not None
-            here.relay.lose(peer, here.outbox, drop=number % 2 == 0)
+            here.lose()
             assert peer.frames == set()
         assert here.inbox.samples == 40
 
@@ -523,16 +545,16 @@ def test_removals_of_what_nobody_knows_do_not_trouble_the_bus() -> None:
     calls: Counter[str] = Counter()
     with receiver() as here:
         here.bus.publish(moving("map", "a", 1))
-        here.outbox.flush()
+        here.turn()
         sys.setprofile(lambda frame, event, _: calls.update([frame.f_code.co_name] if event == "call" else []))
         try:
-            here.inbox.receive("peer", encode(()), pack(1, entries))
+            here.receive_bytes(encode(()), pack(1, entries))
             here.remove("a", sequence=MAX_ENTRIES)
         finally:
             sys.setprofile(None)
         assert calls["remove_frame"] == 1, "it would look at all names for each"
         assert here.bus.statistics().frames == 0
-        assert here.outbox.flush() == []
+        assert len(here.turn()) == 0
 
 
 # The end.
@@ -553,19 +575,19 @@ def test_a_subscriber_that_closes_the_bus_in_the_middle_of_a_message_ends_it() -
         here.bus.subscribe(lambda _: here.bus.close())
         samples = [moving("map", "a", stamp) for stamp in range(3)]
         entries: list[Entry] = [batch(samples[:1]), RemovedFrame(ORIGIN, 2, "a"), batch(samples[1:], sequence=3)]
-        here.inbox.receive("peer", encode(samples), pack(1, entries))
+        here.receive_bytes(encode(samples), pack(1, entries))
         assert here.heard == [tuple(samples[:1])]
         with pytest.raises(BusClosedError):
             here.bus.publish(samples)
 
 
 def test_a_peer_that_is_lost_when_the_bus_is_closed_does_no_harm() -> None:
-    with receiver() as here:
+    with receiver(drop_lost=True) as here:
         here.receive(moving("map", "a", 1))
-        peer = here.peers.forget("peer")
         here.bus.close()
-        assert peer is not None
-        assert here.relay.lose(peer, here.outbox, drop=True) == ("a",)
+        here.end.receive("peer", Presence.LEFT)
+        assert here.peers.forget("peer") is None
+        assert here.peers.rejected == {}
 
 
 # Anything at all.
@@ -583,7 +605,7 @@ def test_many_damaged_messages_do_no_harm() -> None:
             for _ in range(chance.randrange(1, 4)):
                 part = parts[chance.randrange(2)]
                 part[chance.randrange(len(part))] = chance.randrange(256)
-            here.inbox.receive(f"peer {chance.randrange(3)}", bytes(parts[0]), bytes(parts[1]))
+            here.receive_bytes(bytes(parts[0]), bytes(parts[1]), f"peer {chance.randrange(3)}")
         assert here.bus.statistics().callbacks_failed == 0
         assert here.inbox.messages > 1_000
         assert sum(here.peers.rejected.values()) > 1_000
@@ -619,5 +641,5 @@ def test_messages_of_any_content_do_no_harm(messages: list[tuple[list[Entry], in
                 attachment = pack(number, entries)
             except ValueError:
                 continue
-            here.inbox.receive(sender, encode(wanted), attachment)
+            here.receive_bytes(encode(wanted), attachment, sender)
         assert here.inbox.samples == sum(map(len, here.heard)) + sum(here.bus.statistics().rejected.values())

@@ -23,9 +23,10 @@ from support.wires import (
     size_of,
 )
 
-from tfbus import Buffer, Bus, BusClosedError, SimulatedClock, TransformStamped
-from tfbus.links import relay as relay_module
-from tfbus.links.relay import join
+from tfbus import Buffer, Bus, BusClosedError, PeerLost, SimulatedClock, TransformStamped
+from tfbus.bus.event_stream import EventStream
+from tfbus.links._outbox import Turn
+from tfbus.links._relay import relay_of
 
 Step = tuple[str, int, int, list[int]]
 """What happens, to whom, where, and a few numbers to do it with."""
@@ -39,6 +40,11 @@ def frames_of(bus: Bus) -> set[str]:
     """The children that a bus knows now, through what it would tell a new reader of events."""
     with bus.events() as events:
         return {event.frame for event in iter(events.queue.get, None) if hasattr(event, "frame")}
+
+
+def losses(events: EventStream) -> list[tuple[str, tuple[str, ...]]]:
+    """Each lost peer that a stream of events tells of, with its frames."""
+    return [(event.peer, event.frames) for event in iter(events.queue.get, None) if isinstance(event, PeerLost)]
 
 
 # What is published.
@@ -178,8 +184,8 @@ def test_nobody_keeps_a_removed_static_frame_for_late_joiners(graph: Graph, remo
         net.buses[removes].remove_frame("s")
         net.settle()
         for end in net.ends:
-            end.bury()
-            assert set(end.cache) <= {"t"}
+            end.carrier.drop_tombstones()
+            assert set(end.carrier.kept) <= {"t"}
         for domain in net.domains:
             late = net.add_bus()
             domain.join(late)
@@ -199,7 +205,7 @@ def test_what_is_kept_for_late_joiners_is_what_was_published_last_by_whomever() 
             assert latched(late) == {"s": newest}
         net.buses[1].publish(moving("map", "s", 1))
         net.settle()
-        assert [end.cache for end in net.ends] == [{}] * len(net.ends)
+        assert [end.carrier.kept for end in net.ends] == [{}] * len(net.ends)
 
 
 def test_the_second_bridge_does_not_keep_what_the_first_one_told_it_was_removed() -> None:
@@ -218,8 +224,8 @@ def test_the_second_bridge_does_not_keep_what_the_first_one_told_it_was_removed(
             net.send(receiver)
         net.settle()
         for end in net.ends:
-            end.bury()
-            assert end.cache == {}
+            end.carrier.drop_tombstones()
+            assert end.carrier.kept == {}
 
 
 def test_a_copy_on_a_slower_way_does_not_bring_a_removed_frame_back() -> None:
@@ -269,14 +275,14 @@ def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> No
                 net.buses[number % 3].remove_frame(name)
             net.settle()
             for end in net.ends:
-                end.bury()
+                end.carrier.drop_tombstones()
         assert [bus.statistics().frames for bus in net.buses] == [0, 0, 0]
         for relay in relays:
             assert 1_000 < size_of(relay) <= 10_020, "what was removed last is remembered, and it is not without end"
         for end in net.ends:
-            assert size_of(end.outbox) == 0
-            assert end.cache == {}
-            assert all(peer.frames == set() for peer in end.peers.forget_all())
+            assert size_of(end.endpoint.outbox) == 0
+            assert end.carrier.kept == {}
+            assert all(peer.frames == set() for peer in end.endpoint.peers.forget_all())
 
 
 def test_what_a_subscriber_removes_on_hearing_of_a_removal_is_removed_everywhere() -> None:
@@ -346,9 +352,10 @@ def test_a_peer_that_is_lost_has_the_frames_that_it_was_the_last_to_publish() ->
         a.publish(moving("map", "u", 2))
         net.settle()
         lost = net.domains[0].ends[0]
+        streams = [bus.events() for bus in (b, c, d)]
         net.domains[0].kill(lost)
         net.settle()
-        assert [end.losses for end in net.ends] == [[(lost.id, ("new", "u", "v", "z"))]] * 3
+        assert [losses(events) for events in streams] == [[(lost.id, ("new", "u", "v", "z"))]] * 3
         assert {"u", "v", "x", "y", "z", "new"} == frames_of(b) == frames_of(c) == frames_of(d)
 
 
@@ -478,27 +485,26 @@ def test_who_removes_or_publishes_what_is_lost_on_hearing_of_it_disturbs_nobody(
         b.subscribe(lambda _: None, removed)
         a.publish([static("map", name) for name in ("arm", "tool", "wheel", "zoo")])
         net.settle()
-        net.domains[0].kill(net.domains[0].ends[0])
-        net.settle()
+        with b.events() as events:
+            net.domains[0].kill(net.domains[0].ends[0])
+            net.settle()
+            assert [frames for _, frames in losses(events)] == [("arm", "tool", "wheel", "zoo")]
         assert heard == ["arm", "tool", "zoo"]
         assert latched(b) == {"wheel": static("map", "wheel", 2.0)}
         assert b.statistics().callbacks_failed == 0
-        assert net.domains[0].ends[0].losses[0][1] == ("arm", "tool", "wheel", "zoo")
 
 
 # The life of a relay.
 
 
-def test_a_bus_without_links_has_no_relay_and_can_go() -> None:
+def test_a_link_that_has_ended_sends_nothing_and_its_bus_can_go() -> None:
     with Network(PAIR) as net:
-        a, b = net.buses
+        _, b = net.buses
         net.domains[0].ends[1].leave()
         heard = len(net.heard[1])
-        assert b not in relay_module._relays
-        assert a in relay_module._relays
         b.publish(static("map", "b"))
         assert len(net.heard[1]) == heard + 1
-        assert net.domains[0].ends[1].outbox.flush() == []
+        assert net.domains[0].ends[1].endpoint.outbox.flush() == Turn([], {})
         net.domains[0].ends.pop()
     gone = weakref.ref(b)
     del b
@@ -509,18 +515,22 @@ def test_a_bus_without_links_has_no_relay_and_can_go() -> None:
     assert gone() is None
 
 
-def test_a_relay_hears_nothing_any_more_when_the_last_link_has_left() -> None:
-    bus = Bus(SimulatedClock())
-    domain = Domain()
-    ends = [domain.join(bus), Domain().join(bus)]
-    relay = weakref.ref(ends[0].relay)
-    for end in ends:
-        end.leave()
-    del end
-    ends.clear()
-    domain.ends.clear()
-    gc.collect()
-    assert relay() is None
+def test_the_links_of_a_bus_share_a_relay_that_forgets_everything_when_the_last_one_ends() -> None:
+    with Network(RING) as net:
+        a, b, _ = net.buses
+        a.publish([static("map", "s"), moving("map", "a", 1)])
+        b.publish([static("map", "t"), moving("map", "b", 1)])
+        net.settle()
+        a.remove_frame("b")
+        net.settle()
+        first, second = [end for end in net.ends if end.bus is a]
+        assert first.relay is second.relay
+        first.leave()
+        assert size_of(first.relay) > len(first.relay.origin), "the other link still needs it"
+        second.leave()
+        assert size_of(first.relay) == len(first.relay.origin)
+        for domain in net.domains:
+            domain.ends = [end for end in domain.ends if end.bus is not a]
 
 
 def test_a_bus_whose_links_end_and_begin_again_is_told_nothing_of_its_own() -> None:
@@ -564,10 +574,9 @@ def test_a_bus_whose_links_end_and_begin_again_knows_its_own_samples() -> None:
 def test_a_closed_bus_is_not_joined() -> None:
     bus = Bus(SimulatedClock())
     bus.close()
-    with Network(PAIR) as net:
-        with pytest.raises(BusClosedError):
-            join(bus, net.domains[0].ends[0].outbox)
-        assert bus not in relay_module._relays
+    with Network(PAIR) as net, pytest.raises(BusClosedError):
+        net.domains[0].join(bus)
+    assert size_of(relay_of(bus)) == len(relay_of(bus).origin)
 
 
 # Models.
@@ -648,7 +657,7 @@ class Model:
             assert bus.statistics().callbacks_failed == 0
             assert bus.statistics().rejected == {}
         for end in self.net.ends:
-            assert (end.refused, end.reports, end.peers.rejected) == ([], [], {})
+            assert (end.carrier.refused, end.endpoint.peers.rejected) == ([], {})
 
     def check_nothing_older_came(self, say_again: bool = False) -> None:
         """Of each origin and frame, what is heard is ever newer."""
@@ -698,9 +707,9 @@ def test_without_loss_everybody_hears_every_batch_once_whole_and_in_order(graph:
         assert len({frozenset(frames_of(bus)) for bus in net.buses}) == 1
         for child in frames_of(net.buses[0]):
             assert len({buffer.tree.parent(child) for buffer in buffers}) == 1
-        assert sum(end.inbox.lost for end in net.ends) == 0
+        assert sum(end.endpoint.inbox.lost for end in net.ends) == 0
         for end in net.ends:
-            end.bury()
+            end.carrier.drop_tombstones()
         late = net.add_bus()
         net.domains[-1].join(late)
         net.settle()

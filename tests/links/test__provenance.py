@@ -9,11 +9,11 @@ from support import strategies as some
 from support.samples import moving
 
 from tfbus import SECOND, Buffer, Bus, SimulatedClock, TransformStamped
-from tfbus.links.peers import Peer
-from tfbus.links.provenance import ReceivedTransform, Source
+from tfbus.links._peers import Peer
+from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.tf_message import decode, encode
 
-SOURCE = Source(b"0123456789abcdef", 7, object(), Peer("other"))
+PROVENANCE = Provenance(b"0123456789abcdef", 7, object(), Peer("other"))
 SHARED: list[Callable[[TransformStamped], TransformStamped]] = [
     copy.copy,
     copy.deepcopy,
@@ -25,7 +25,7 @@ def received(sample: TransformStamped) -> ReceivedTransform:
     """The same sample as if it had come over a link."""
     (twin,) = decode(encode([sample]), [(sample.authority, sample.static)], ReceivedTransform).samples
     assert twin is not None
-    twin._source = SOURCE
+    twin._provenance = PROVENANCE
     return twin
 
 
@@ -36,7 +36,7 @@ def bits(sample: TransformStamped) -> tuple[object, ...]:
 
 
 @given(sample=some.samples(at=some.stamps(0, 2**31 * SECOND - 1)))
-def test_it_is_equal_to_a_sample_that_was_never_on_a_link(sample: TransformStamped) -> None:
+def test_a_received_sample_equals_one_that_never_was_on_a_link(sample: TransformStamped) -> None:
     twin = received(sample)
     assert twin == sample
     assert sample == twin
@@ -46,7 +46,7 @@ def test_it_is_equal_to_a_sample_that_was_never_on_a_link(sample: TransformStamp
     assert isinstance(twin, TransformStamped)
 
 
-def test_another_sample_is_another_one_wherever_it_came_from() -> None:
+def test_samples_that_differ_are_unequal_wherever_they_came_from() -> None:
     assert received(moving("map", "a", 1)) != moving("map", "a", 2)
     assert received(moving("map", "a", 1)) != "a"
 
@@ -70,13 +70,13 @@ def test_a_quaternion_that_is_a_little_off_is_normalised_once_and_then_copied_as
         assert bits(share(twin)) == bits(twin)
 
 
-def test_a_sample_with_a_change_is_a_plain_one() -> None:
+def test_a_changed_sample_is_a_plain_one() -> None:
     changed = received(moving("map", "a", 1, 2.0, "odometry")).replace(stamp=5)
     assert type(changed) is TransformStamped
     assert changed == moving("map", "a", 5, 2.0, "odometry")
 
 
-def test_what_a_buffer_answers_has_no_way_here() -> None:
+def test_the_answer_of_a_buffer_is_a_plain_sample() -> None:
     with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
         bus.publish([received(moving("map", "a", 1))])
         assert type(buffer.lookup_nowait("map", "a", 1)) is TransformStamped

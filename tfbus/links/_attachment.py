@@ -1,7 +1,8 @@
-"""What goes beside a TFMessage: whose samples they are, in which batches, and what was removed between them.
+"""The attachment of a message between links: the origin, number and authority of its samples, and removals.
 
-ROS has no words for origin, authority, sequence and tombstone. A message holds the samples of several batches behind
-each other; its attachment says how many belong to which, in the order in which all of it happened. Little endian::
+ROS's TFMessage has no fields for these. A message holds the samples of several batches one after the other; its
+attachment says how many samples belong to which batch, in the order in which batches and removals happened. Little
+endian::
 
     version u8, origins u8, authorities u16, entries u32, number u64
     origins      16 bytes each
@@ -11,7 +12,7 @@ each other; its attachment says how many belong to which, in the order in which 
         removal  the length of the name in place of runs, UTF-8
         loss     as a removal
 
-What it costs to read one is in proportion to its bytes, and to take in an entry may cost more; both have a limit.
+Reading one costs time in proportion to its bytes; handling an entry may cost more, so both have a limit.
 """
 
 import struct
@@ -19,6 +20,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 
+from tfbus.links._outbox import RemovedFrame
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 VERSION = 1
@@ -35,7 +37,17 @@ _BATCH, _REMOVAL, _LOSS = 0, 1, 2
 
 @dataclass(frozen=True, slots=True)
 class PublishedBatch:
-    """A batch: `runs` says of how many samples each, in the message's order, is which authority and whether static."""
+    """The attachment's entry for a batch.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which the batch was published first, 16 bytes.
+    sequence : int
+        The batch's number on that bus.
+    runs : tuple of (str, bool, int)
+        Authority, static flag and number of consecutive samples that share both, in the order of the message.
+    """
 
     origin: bytes
     sequence: int
@@ -43,18 +55,8 @@ class PublishedBatch:
 
     @property
     def count(self) -> int:
-        """How many samples it has."""
+        """The number of its samples."""
         return sum(count for _, _, count in self.runs)
-
-
-@dataclass(frozen=True, slots=True)
-class RemovedFrame:
-    """A tombstone; with `lost`, it is only about what the sender has brought itself, and lost where that came from."""
-
-    origin: bytes
-    sequence: int
-    frame: str
-    lost: bool = False
 
 
 Entry = PublishedBatch | RemovedFrame
@@ -62,13 +64,13 @@ Entry = PublishedBatch | RemovedFrame
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """What goes beside a message; the sender numbers its live messages 1, 2, 3, and all others 0."""
+    """An attachment, unpacked; the sender numbers its live messages 1, 2, 3, and all others 0."""
 
     number: int
     entries: tuple[Entry, ...]
 
     def tags(self) -> Iterator[tuple[str, bool]]:
-        """Authority and kind of each sample of the message."""
+        """Authority and static flag of each sample of the message."""
         batches = (entry for entry in self.entries if isinstance(entry, PublishedBatch))
         runs = chain.from_iterable(batch.runs for batch in batches)
         return chain.from_iterable(repeat((authority, static), count) for authority, static, count in runs)
@@ -80,8 +82,9 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
     Raises
     ------
     ValueError
-        If it has more than 255 origins, `MAX_ENTRIES`, `MAX_BYTES`, 65,535 authorities, bytes of one or runs of one
-        batch; or if the name of a removed frame has more than `MAX_NAME` bytes. Also for a name that has no UTF-8.
+        If there are more than 255 origins, `MAX_ENTRIES` entries, 65,535 authorities or runs of one batch; if an
+        authority has more than 65,535 bytes, a removed frame's name more than `MAX_NAME`, or all together more than
+        `MAX_BYTES`; or if a name cannot be written in UTF-8.
     """
     if len(entries) > MAX_ENTRIES:
         raise ValueError(f"too much for one attachment: {len(entries)} entries, more than {MAX_ENTRIES}")
@@ -101,8 +104,8 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
             for authority, static, count in entry.runs:
                 body += _pack(_RUN, authorities.setdefault(authority, len(authorities)), static, count)
     head = bytearray(_pack(_HEADER, VERSION, len(origins), len(authorities), len(entries), number))
-    for known in origins:
-        head += known
+    for origin_bytes in origins:
+        head += origin_bytes
     for authority in authorities:
         text = authority.encode()
         head += _pack(_LENGTH, len(text)) + text
@@ -112,12 +115,12 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
 
 
 def unpack(data: bytes) -> Attachment:
-    """The attachment that bytes hold.
+    """The attachment in some bytes.
 
     Raises
     ------
     MalformedMessageError
-        If they hold none of this version.
+        If the bytes are not an attachment of this version.
     """
     if not data or data[0] != VERSION:
         found = f"version {data[0]}" if data else "nothing"
@@ -146,7 +149,7 @@ def _unpack(data: bytes) -> Attachment:
         authorities.append(data[at : at + length].decode())
         at += length
     entries: list[Entry] = []
-    # Each takes some bytes, so a count that is a lie ends the loop with an error before the list is long.
+    # Each entry takes some bytes, so a false count ends the loop with an error before the list grows long.
     for _ in range(entry_count):
         kind, origin, size, sequence = _ENTRY.unpack_from(data, at)
         at += _ENTRY.size
@@ -161,7 +164,7 @@ def _unpack(data: bytes) -> Attachment:
             entries.append(PublishedBatch(origins[origin], sequence, named))
         else:
             raise IndexError
-    # Slices end with the data, counts may not.
+    # Slicing past the end raises nothing, so the end is checked.
     if at != len(data):
         raise IndexError
     return Attachment(number, tuple(entries))

@@ -14,7 +14,7 @@ import pytest
 
 from tfbus.cli import app
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 GUIDE = ROOT / "demos" / "guide"
 PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md"))]
 REFERENCE = sorted((GUIDE / "reference").glob("*.rst"))

@@ -1,0 +1,144 @@
+"""An endpoint's own behaviour; the other tests of this room drive whole networks of endpoints."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
+from support.samples import moving
+
+from tfbus import Bus, Event, SimulatedClock
+from tfbus.events import PeerJoined, PeerLost, PeerRejected
+from tfbus.links._endpoint import Endpoint
+from tfbus.links._outbox import Turn
+from tfbus.links._peers import MAX_PEERS
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.tf_message import MalformedMessageError
+
+
+class NotingCarrier(ForeignCarrier):
+    """Notes what its link tells it."""
+
+    def __init__(self) -> None:
+        super().__init__(ForeignWorld())
+        self.turns: list[Turn] = []
+        self.joined: list[tuple[str, bool]] = []
+
+    def send(self, turn: Turn) -> None:
+        self.turns.append(turn)
+
+    def peer_joined(self, peer: str, again: bool) -> None:
+        self.joined.append((peer, again))
+
+
+class Scene:
+    """An endpoint of a bus whose clock stands at 7 ns."""
+
+    def __init__(self, **options: Any) -> None:
+        self.bus = Bus(SimulatedClock(start=7))
+        self.carrier = NotingCarrier()
+        self.notified = 0
+        self.endpoint = Endpoint(self.bus, "world", self.carrier, self._note, **options)
+        self.endpoint.attach()
+        self._events = self.bus.events(stale_after=None)
+
+    def _note(self) -> None:
+        self.notified += 1
+
+    def handle(self, *contents: object, sender: str = "driver") -> None:
+        for content in contents:
+            self.endpoint.handle(Received(sender, content))
+
+    def told(self) -> list[Event]:
+        """The events of links since the last call."""
+        wanted = (PeerJoined, PeerLost, PeerRejected)
+        return [event for event in iter(self._events.queue.get, None) if isinstance(event, wanted)]
+
+
+@contextmanager
+def scene(**options: Any) -> Iterator[Scene]:
+    made = Scene(**options)
+    yield made
+    made.endpoint.detach()
+
+
+def message(*children: str) -> ForeignMessage:
+    return ForeignMessage(False, [ForeignTransform("map", child, 1, 0.0) for child in children])
+
+
+def test_a_turn_goes_to_the_carrier_once_and_an_empty_one_never() -> None:
+    with scene() as here:
+        here.endpoint.send()
+        here.bus.publish(moving("map", "a", 1))
+        assert (here.notified, here.carrier.turns) == (1, [])
+        here.endpoint.send()
+        here.endpoint.send()
+        (turn,) = here.carrier.turns
+        assert [tuple(entry.samples) for entry in turn.entries if hasattr(entry, "samples")] == [
+            (moving("map", "a", 1),)
+        ]
+        assert turn.statics == {}
+
+
+def test_a_peer_is_announced_when_it_joins_and_leaves_and_the_carrier_knows_who_comes_again() -> None:
+    with scene() as here:
+        here.handle(Presence.JOINED, Presence.JOINED, message("b", "a"), Presence.LEFT, Presence.LEFT, Presence.JOINED)
+        assert here.told() == [
+            PeerJoined(7, "world", "driver"),
+            PeerLost(7, "world", "driver", ("foreign",), ("a", "b")),
+            PeerJoined(7, "world", "driver"),
+        ]
+        assert here.carrier.joined == [("driver", False), ("driver", True)]
+        assert here.endpoint.peers.present == ("driver",)
+        assert here.bus.statistics().frames == 2
+
+
+def test_the_frames_of_a_lost_peer_leave_the_bus_if_they_are_to_be_dropped() -> None:
+    with scene(drop_lost=True) as here:
+        here.handle(message("a"), sender="stays")
+        here.handle(message("b"), Presence.LEFT)
+        assert here.bus.statistics().frames == 1
+
+
+def test_an_announced_peer_evicts_an_unannounced_one_whose_frames_stay() -> None:
+    with scene(drop_lost=True) as here:
+        for number in range(MAX_PEERS):
+            here.handle(message("a"), sender=f"{number}")
+        here.handle(Presence.JOINED)
+        assert here.endpoint.peers.present == ("driver",)
+        assert here.endpoint.peers.rejected == {}
+        assert here.bus.statistics().frames == 1
+        here.handle(message("b"), sender="0")
+        assert here.endpoint.peers.rejected == {"too many peers": 1}
+
+
+def test_a_refused_message_is_counted_each_time_and_announced_and_logged_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with scene() as here, caplog.at_level(logging.WARNING, "tfbus"):
+        error = MalformedMessageError("oversized", "9 bytes")
+        here.handle(error, error, ForeignMessage(False, []), object(), message("a"))
+        assert here.endpoint.peers.rejected == {"oversized": 2, "empty": 1, "not published": 1}
+        told = here.told()
+    assert [
+        (event.stamp, event.link, event.peer, event.reason) for event in told if isinstance(event, PeerRejected)
+    ] == [(7, "world", "driver", reason) for reason in ("oversized", "empty", "not published")]
+    assert isinstance(told[0], PeerRejected)
+    assert (told[0].error.args, told[0].error is error) == (error.args, False)
+    assert caplog.messages[0] == (
+        "refused what peer driver sent over the link world: no message of transforms (oversized): 9 bytes"
+    )
+    assert len(caplog.messages) == 3
+
+
+def test_a_detached_endpoint_forgets_its_peers_and_keeps_their_frames() -> None:
+    made = Scene(drop_lost=True)
+    made.handle(Presence.JOINED, message("a"))
+    made.endpoint.detach()
+    assert made.endpoint.peers.present == ()
+    assert made.bus.statistics().frames == 1
+    made.bus.publish(moving("map", "b", 1))
+    made.endpoint.send()
+    assert made.carrier.turns == []

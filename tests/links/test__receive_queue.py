@@ -1,0 +1,169 @@
+import threading
+from collections import Counter
+from functools import partial
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfbus.links._receive_queue import MAX_BYTES, Received, ReceiveQueue
+from tfbus.statistics import QueueStatistics
+
+MIB = 2**20
+
+
+def moving(content: object, size: int = 0) -> Received:
+    return Received("peer", content, size, moving=True)
+
+
+def kept(content: object, size: int = 0) -> Received:
+    return Received("peer", content, size)
+
+
+def drained(queue: ReceiveQueue) -> list[object]:
+    contents = []
+    while (item := queue.get()) is not None:
+        contents.append(item.content)
+    return contents
+
+
+def test_items_are_read_in_the_order_in_which_they_came() -> None:
+    queue = ReceiveQueue(10)
+    assert queue.get() is None
+    for item in (moving(1), kept(2), moving(3), kept(True)):
+        queue.put(item)
+    assert len(queue) == 4
+    assert drained(queue) == [1, 2, 3, True]
+    assert (len(queue), queue.get()) == (0, None)
+
+
+def test_beyond_the_capacity_the_oldest_moving_items_are_dropped_and_the_others_stay_in_order() -> None:
+    queue = ReceiveQueue(2)
+    for item in (kept("a"), moving(1), kept("b"), moving(2), moving(3), kept("c"), moving(4)):
+        queue.put(item)
+    assert queue.statistics() == QueueStatistics("link", "drop_oldest", 2, pending=5, dropped=2)
+    assert drained(queue) == ["a", "b", 3, "c", 4]
+
+
+def test_items_that_do_not_move_take_no_room_from_moving_ones() -> None:
+    queue = ReceiveQueue(1)
+    for number in range(10_000):
+        queue.put(kept(number))
+    queue.put(moving("last"))
+    assert queue.statistics().dropped == 0
+    assert drained(queue) == [*range(10_000), "last"]
+
+
+def test_beyond_the_bytes_moving_items_are_dropped_first_and_then_the_oldest_of_the_others() -> None:
+    queue = ReceiveQueue(1_000)
+    for number in range(3):
+        queue.put(kept(f"kept {number}", 15 * MIB))
+        queue.put(moving(number, 5 * MIB))
+    queue.put(moving("large", 15 * MIB))
+    assert queue.statistics().dropped == 3
+    queue.put(kept("kept 3", 15 * MIB))
+    assert queue.statistics().dropped == 4
+    queue.put(kept("kept 4", 15 * MIB))
+    assert queue.statistics().dropped == 5
+    assert drained(queue) == ["kept 1", "kept 2", "kept 3", "kept 4"]
+
+
+def test_reading_frees_room() -> None:
+    queue = ReceiveQueue(2)
+    for number in range(1_000):
+        queue.put(moving(number, 16 * MIB))
+        queue.put(kept(number, 16 * MIB))
+        assert drained(queue) == [number, number]
+    assert queue.statistics().dropped == 0
+
+
+def test_an_item_larger_than_all_the_room_is_dropped() -> None:
+    queue = ReceiveQueue(2)
+    queue.put(kept("small"))
+    queue.put(moving("huge", MAX_BYTES + 1))
+    assert drained(queue) == ["small"]
+    queue.put(kept("huge", MAX_BYTES + 1))
+    queue.put(kept("small"))
+    assert drained(queue) == ["small"]
+    assert queue.statistics().dropped == 2
+
+
+def test_the_number_of_items_without_content_is_bounded_too() -> None:
+    queue = ReceiveQueue(1)
+    for number in range(400_000):
+        queue.put(kept(number % 2 == 0))
+    statistics = queue.statistics()
+    assert statistics.pending <= 300_000
+    assert statistics.pending + statistics.dropped == 400_000
+
+
+def test_discarding_moving_items_counts_them_as_dropped() -> None:
+    queue = ReceiveQueue(3)
+    for item in (kept("a", MIB), moving(1, MIB), moving(2), moving(3), kept("b"), moving(4)):
+        queue.put(item)
+    queue.discard_moving()
+    assert queue.statistics() == QueueStatistics("link", "drop_oldest", 3, pending=2, dropped=4)
+    for number in range(3):
+        queue.put(moving(number))
+    assert queue.statistics().dropped == 4
+    assert drained(queue) == ["a", "b", 0, 1, 2]
+
+
+STEPS = st.lists(st.sampled_from(("moving", "kept", "get", "get", "discard")), max_size=60)
+
+
+@given(capacity=st.integers(1, 4), steps=STEPS)
+def test_the_queue_behaves_like_a_list(capacity: int, steps: list[str]) -> None:
+    queue = ReceiveQueue(capacity)
+    model: list[Received] = []
+    dropped = 0
+    for number, step in enumerate(steps):
+        if step == "get":
+            assert queue.get() == (model.pop(0) if model else None)
+            continue
+        if step == "discard":
+            queue.discard_moving()
+            gone = [item for item in model if item.moving]
+        else:
+            model.append(moving(number) if step == "moving" else kept(number))
+            queue.put(model[-1])
+            gone = [item for item in model if item.moving][:-capacity]
+        model = [item for item in model if item not in gone]
+        dropped += len(gone)
+        assert (len(queue), queue.statistics().dropped) == (len(model), dropped)
+    assert drained(queue) == [item.content for item in model]
+
+
+def test_threads_that_put_and_get_at_once_lose_nothing_uncounted_and_keep_the_order() -> None:
+    queue = ReceiveQueue(50)
+    done = threading.Event()
+    taken: list[list[Received]] = [[], []]
+
+    def put(name: str) -> None:
+        for number in range(5_000):
+            queue.put(Received(name, number, 10, moving=number % 3 > 0))
+
+    def take(into: list[Received]) -> None:
+        while not done.is_set() or len(queue):
+            item = queue.get()
+            if item is not None:
+                into.append(item)
+
+    takers = [threading.Thread(target=partial(take, into)) for into in taken]
+    putters = [threading.Thread(target=partial(put, name)) for name in "abcd"]
+    for thread in (*takers, *putters):
+        thread.start()
+    for thread in putters:
+        thread.join(60)
+    done.set()
+    for thread in takers:
+        thread.join(60)
+        assert not thread.is_alive()
+    everything = [item for into in taken for item in into]
+    assert len(everything) + queue.statistics().dropped == 20_000
+    assert Counter(item.sender for item in everything if not item.moving) == dict.fromkeys("abcd", 1_667)
+    assert len({(item.sender, item.content) for item in everything}) == len(everything)
+    for into in taken:
+        last: dict[str, int] = {}
+        for item in into:
+            assert item.content > last.get(item.sender, -1)
+            last[item.sender] = item.content

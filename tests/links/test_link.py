@@ -1,0 +1,337 @@
+import asyncio
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import anyio.to_thread
+import pytest
+from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
+from support.processes import until
+from support.samples import moving, static
+
+from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
+from tfbus.links import Link
+from tfbus.links._carrier import SendReport
+from tfbus.links._inbox import ReceivedMessage
+from tfbus.links._outbox import Turn
+from tfbus.links._receive_queue import Presence, Received
+
+pytestmark = pytest.mark.anyio
+
+ARM = ForeignTransform("map", "arm", 5, 1.0)
+
+
+class MineError(Exception):
+    pass
+
+
+class LoggedCarrier(ForeignCarrier):
+    """Notes the calls of its link, and fails where a test wants it to."""
+
+    def __init__(self, world: ForeignWorld | None = None, fails: str = "") -> None:
+        super().__init__(world or ForeignWorld())
+        self.calls: list[str] = []
+        self.joined: list[tuple[str, bool]] = []
+        self.receive: Callable[[Received], object] = print
+        self.fails = fails
+        self.while_opening: Callable[[], object] = lambda: None
+
+    def _note(self, call: str) -> None:
+        self.calls.append(call)
+        if call == self.fails:
+            raise MineError(call)
+
+    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
+        self.receive = receive
+        self._note("open")
+        await super().open(receive, report)
+        self.while_opening()
+        await anyio.lowlevel.checkpoint()
+
+    def send(self, turn: Turn) -> None:
+        self._note(f"send {sum(len(entry.samples) for entry in turn.entries if hasattr(entry, 'samples'))}")
+        super().send(turn)
+
+    def read(self, content: ForeignMessage) -> ReceivedMessage:
+        if content.transforms and content.transforms[0].child == self.fails:
+            raise MineError(self.fails)
+        return super().read(content)
+
+    def peer_joined(self, peer: str, again: bool) -> None:
+        self.joined.append((peer, again))
+
+    async def run(self) -> None:
+        self._note("run")
+        await anyio.sleep_forever()
+
+    async def close(self) -> None:
+        self.calls.append("close")
+        await super().close()
+
+
+async def receive_samples(link: Link, samples: int) -> None:
+    """Wait until a link has published so many samples on its bus."""
+    await until(lambda: link.statistics().received_samples >= samples)
+
+
+async def test_a_link_between_a_bus_and_a_foreign_world_works_both_ways() -> None:
+    world = ForeignWorld()
+    world.say(ForeignTransform("map", "lidar", 0, 2.0), static=True)
+    with Bus() as bus:
+        bus.publish(static("map", "camera"))
+        heard: list[Any] = []
+        bus.subscribe(heard.append)
+        async with Link(bus, "world", ForeignCarrier(world)) as link:
+            world.say(ARM)
+            await receive_samples(link, 2)
+            bus.publish(moving("map", "base", 7, 3.0))
+            await until(lambda: link.statistics().sent_messages == 2)
+        assert heard[1:] == [
+            (static("map", "lidar", 2.0, authority="foreign"),),
+            (moving("map", "arm", 5, 1.0, "foreign"),),
+            (moving("map", "base", 7, 3.0),),
+        ]
+        world.say(ARM._replace(stamp=9))
+        bus.publish(moving("map", "base", 8))
+        await anyio.lowlevel.checkpoint()
+    assert [message for node, message in world.published if node == "tfbus"] == [
+        ForeignMessage(True, [ForeignTransform("map", "camera", 0, 0.0)]),
+        ForeignMessage(False, [ForeignTransform("map", "base", 7, 3.0)]),
+    ]
+    assert len(heard) == 5, "what comes behind the end stays outside"
+    assert link.id == "tfbus"
+
+
+async def test_what_is_published_in_one_turn_goes_out_together_and_a_full_turn_at_once() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier):
+            for stamp in range(10):
+                bus.publish([moving("map", "a", stamp), moving("map", "b", stamp)])
+            assert carrier.calls == ["open"]
+            await until(lambda: "send 20" in carrier.calls)
+            carrier.calls.clear()
+            bus.publish([moving("map", "a", stamp) for stamp in range(4_999)])
+            assert carrier.calls == []
+            bus.publish(moving("map", "a", 4_999))
+            assert carrier.calls == ["send 5000"]
+            bus.publish(moving("map", "a", 5_000))
+        assert carrier.calls == ["send 5000", "send 1", "close"]
+
+
+async def test_a_link_is_entered_once() -> None:
+    with Bus() as bus:
+        link = Link(bus, "world", LoggedCarrier())
+        async with link:
+            with pytest.raises(RuntimeError, match="entered once"):
+                await link.__aenter__()
+        with pytest.raises(RuntimeError, match="entered once"):
+            await link.__aenter__()
+
+
+async def test_a_closed_bus_and_the_bus_of_another_thread_cannot_be_linked() -> None:
+    closed, carrier = Bus(), LoggedCarrier()
+    closed.close()
+    with pytest.raises(BusClosedError):
+        await Link(closed, "world", carrier).__aenter__()
+
+    async def enter(bus: Bus) -> None:
+        with pytest.raises(RuntimeError, match="thread"):
+            await Link(bus, "world", carrier).__aenter__()
+
+    with Bus() as bus, bus.threadsafe():
+        # This event loop has a claim on the bus now.
+        await anyio.to_thread.run_sync(asyncio.run, enter(bus))
+    assert carrier.calls == []
+
+
+async def test_arguments_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(TypeError, match="'base'"):
+        Link(Bus(), "world", LoggedCarrier(), frames="base")
+    with pytest.raises(ValueError, match="capacity"):
+        Link(Bus(), "world", LoggedCarrier(), capacity=0)
+    with pytest.raises(ValueError, match="max_frames"):
+        Link(Bus(), "world", LoggedCarrier(), max_frames=0)
+
+
+async def test_a_carrier_that_cannot_open_is_closed_and_the_bus_is_as_before() -> None:
+    carrier = LoggedCarrier(fails="open")
+    with Bus() as bus:
+        with pytest.raises(MineError):
+            await Link(bus, "world", carrier).__aenter__()
+        assert carrier.calls == ["open", "close"]
+        bus.publish(moving("map", "a", 1))
+        async with Link(bus, "world", LoggedCarrier()):
+            pass
+
+
+async def test_a_link_that_is_cancelled_while_it_opens_closes_its_carrier() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus, anyio.CancelScope() as scope:
+        scope.cancel()
+        async with Link(bus, "world", carrier):
+            pass
+    assert scope.cancelled_caught
+    assert carrier.calls == ["open", "close"]
+
+
+async def test_a_bus_that_closes_while_the_carrier_opens_is_not_linked() -> None:
+    carrier = LoggedCarrier()
+    bus = Bus()
+    carrier.while_opening = bus.close
+    with pytest.raises(BusClosedError):
+        await Link(bus, "world", carrier).__aenter__()
+    assert carrier.calls == ["open", "close"]
+
+
+async def test_the_error_of_the_body_comes_out_as_it_is_and_the_last_turn_goes_out() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus, pytest.raises(MineError) as caught:
+        async with Link(bus, "world", carrier):
+            await until(lambda: "run" in carrier.calls)
+            bus.publish(moving("map", "a", 1))
+            raise MineError
+    assert caught.value.__cause__ is None
+    assert caught.value.__context__ is None
+    assert carrier.calls == ["open", "run", "send 1", "close"]
+
+
+async def test_an_error_of_the_running_carrier_ends_the_body_and_comes_out_as_it_is() -> None:
+    carrier = LoggedCarrier(fails="run")
+    with Bus() as bus, pytest.raises(MineError):
+        async with Link(bus, "world", carrier):
+            await anyio.sleep_forever()
+    assert carrier.calls[-1] == "close"
+
+
+async def test_a_cancelled_body_closes_the_carrier() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus, anyio.CancelScope() as scope:
+        async with Link(bus, "world", carrier):
+            scope.cancel()
+            await anyio.sleep_forever()
+    assert scope.cancelled_caught
+    assert carrier.calls[-1] == "close"
+
+
+async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_for_others() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier) as link:
+
+            def bring() -> None:
+                for stamp in range(2_000):
+                    message = ForeignMessage(False, [ARM._replace(stamp=stamp)])
+                    carrier.receive(Received("driver", message, moving=True))
+
+            thread = threading.Thread(target=bring)
+            thread.start()
+            thread.join()
+            seen = set()
+            while link.statistics().received_samples < 2_000:
+                seen.add(link.statistics().received_samples)
+                await anyio.lowlevel.checkpoint()
+            # At most 100 items in a turn, and this task has been run in between.
+            assert len(seen) >= 3
+            assert link.statistics().received_messages == 2_000
+
+
+async def test_a_large_message_ends_a_turn_by_its_bytes() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier) as link:
+            for stamp in range(50):
+                message = ForeignMessage(False, [ARM._replace(stamp=stamp)])
+                carrier.receive(Received("driver", message, size=2**16, moving=True))
+            seen = set()
+            while link.statistics().received_samples < 50:
+                seen.add(link.statistics().received_samples)
+                await anyio.lowlevel.checkpoint()
+            assert len(seen) >= 3
+
+
+async def test_messages_beyond_the_capacity_are_dropped_and_counted() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier, capacity=10) as link:
+            for stamp in range(25):
+                carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(stamp=stamp)]), moving=True))
+            assert (link.statistics().queue.pending, link.statistics().queue.dropped) == (10, 15)
+            await receive_samples(link, 10)
+
+
+async def test_what_waits_when_the_clock_jumps_back_is_dropped_unless_it_is_static() -> None:
+    clock, carrier = SimulatedClock(start=10), LoggedCarrier()
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier) as link:
+            for is_static in (False, True):
+                message = ForeignMessage(is_static, [ARM._replace(child=f"{is_static}")])
+                carrier.receive(Received("driver", message, moving=not is_static))
+            clock.set(20)
+            assert link.statistics().queue.dropped == 0
+            clock.set(5)
+            await receive_samples(link, 1)
+            assert link.statistics().queue.dropped == 1
+            assert bus.statistics().frames == 1
+
+
+async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() -> None:
+    carrier = LoggedCarrier(fails="broken")
+    with Bus() as bus, bus.events(stale_after=None) as events:
+        async with Link(bus, "world", carrier, drop_lost=True) as link:
+            message = ForeignMessage(False, [ARM])
+            broken = ForeignMessage(False, [ARM._replace(child="broken")])
+            for content in (Presence.JOINED, message, broken, Presence.JOINED):
+                carrier.receive(Received("driver", content))
+            await until(lambda: link.statistics().rejected == {"not published": 1})
+            await until(lambda: link.statistics().queue.pending == 0)
+            assert link.peers == ("driver",)
+            for content in (Presence.LEFT, Presence.LEFT, Presence.JOINED):
+                carrier.receive(Received("driver", content))
+            await until(lambda: len(carrier.joined) == 2)
+            assert bus.statistics().frames == 0
+        bus.close()
+        told = [event async for event in events if isinstance(event, PeerJoined | PeerLost | PeerRejected)]
+    assert carrier.joined == [("driver", False), ("driver", True)]
+    assert [type(event) for event in told] == [PeerJoined, PeerRejected, PeerLost, PeerJoined]
+    assert {(event.link, event.peer) for event in told} == {("world", "driver")}
+    rejected, lost = told[1], told[2]
+    assert isinstance(rejected, PeerRejected)
+    assert (rejected.reason, str(rejected.error)) == ("not published", "broken")
+    assert isinstance(lost, PeerLost)
+    assert (lost.authorities, lost.frames) == (("foreign",), ("arm",))
+
+
+async def test_only_wanted_frames_go_out_and_come_in() -> None:
+    world = ForeignWorld()
+    with Bus() as bus:
+        async with Link(bus, "world", ForeignCarrier(world), frames=iter(["arm", "base"])) as link:
+            world.say(ARM, ForeignTransform("map", "tool", 1, 0.0))
+            await receive_samples(link, 1)
+            bus.publish([moving("map", "base", 1), moving("map", "lidar", 1)])
+            await until(lambda: link.statistics().sent_samples == 1)
+        assert bus.statistics().samples == 3
+    assert world.published[-1] == ("tfbus", ForeignMessage(False, [ForeignTransform("map", "base", 1, 0.0)]))
+
+
+def test_what_comes_when_the_event_loop_has_ended_without_the_link_does_no_harm() -> None:
+    carrier = LoggedCarrier()
+    message = Received("driver", ForeignMessage(False, [ARM]), moving=True)
+
+    async def crash(bus: Bus) -> Link:
+        link = Link(bus, "world", carrier)
+        await link.__aenter__()
+        return link
+
+    with Bus() as bus:
+        loop = asyncio.new_event_loop()
+        link = loop.run_until_complete(crash(bus))
+        for task in asyncio.all_tasks(loop):
+            task.cancel()
+        loop.run_until_complete(asyncio.sleep(0))
+        loop.close()
+        for _ in range(3):
+            carrier.receive(message)
+        assert link.statistics().queue.pending == 3

@@ -1,0 +1,119 @@
+"""The protocol between a link and the carrier below it."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from tfbus.links._inbox import ReceivedMessage
+from tfbus.links._outbox import Turn
+from tfbus.links._receive_queue import Received
+
+
+class SendReport:
+    """Counts what a carrier has sent, and what it could not send; for the event loop only.
+
+    Parameters
+    ----------
+    warn : callable
+        Called with the error of everything that could not be sent.
+
+    Attributes
+    ----------
+    messages, samples : int
+        What was handed to the network.
+    not_sent : Counter
+        Samples and removals that no message can hold, by reason.
+    """
+
+    def __init__(self, warn: Callable[[Exception], object]) -> None:
+        self._warn = warn
+        self.messages = 0
+        self.samples = 0
+        self.not_sent: Counter[str] = Counter()
+
+    def sent(self, samples: int) -> None:
+        """Count one message with so many samples."""
+        self.messages += 1
+        self.samples += samples
+
+    def refused(self, reason: str, error: Exception, count: int = 1) -> None:
+        """Count samples and removals that the carrier's messages cannot hold."""
+        self.not_sent[reason] += count
+        self._warn(error)
+
+    def failed(self, error: Exception) -> None:
+        """Tell of a message that the network did not accept."""
+        self._warn(error)
+
+
+class Carrier(Protocol):
+    """Carries what a link sends over one network, and brings what comes from there.
+
+    The link decides what goes out, what is news and what is refused; a carrier decides how it is written, and keeps
+    static frames for late joiners as its network allows. A carrier is used by one link, and opened once.
+
+    The event loop calls everything here, in this order: `open`; then, while `run` runs as a task, `send`, `read` and
+    `peer_joined`; when `run` has been cancelled, a last `send` may have come, and `close` is called.
+
+    Attributes
+    ----------
+    id : str
+        The name of this end for its peers.
+    """
+
+    id: str
+
+    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
+        """Connect to the network.
+
+        Parameters
+        ----------
+        receive : callable
+            Takes an item that has come: a peer's message, that a peer has come or gone, or that a message was refused.
+            Any thread may call it, from now until `close` has returned and later; it never blocks and never raises.
+            Items are handled in the order of the calls, so a peer's `Presence.LEFT` has to be the last of its items. A
+            carrier whose network tells nothing of presence leaves presence out.
+        report : SendReport
+            Counts what was sent and what could not be; for the event loop only.
+
+        Raises
+        ------
+        OSError
+            If there is no connection. Whatever it raises, also when it is cancelled, the link calls `close` next.
+        """
+
+    def send(self, turn: Turn) -> None:
+        """Send what one turn of the event loop has published and removed; a turn is never empty.
+
+        It must not block and must not raise: entries that the carrier's messages cannot hold, and messages that the
+        network does not accept, go to the report. Entries leave in order; the changes of static frames go out behind
+        the entries of the same turn and may be conflated with later ones.
+        """
+
+    def read(self, content: Any) -> ReceivedMessage:
+        """Decode a message: the content of an item that the carrier has passed to `receive`.
+
+        A batch without an origin is for a sender that knows no buses: it becomes this bus's own, and goes out by the
+        other links of the bus and never by this one. Samples that cannot be decoded are in the message's errors.
+
+        Raises
+        ------
+        MalformedMessageError
+            If nothing of it can be used; it is counted by its reason.
+        """
+
+    def peer_joined(self, peer: str, again: bool) -> None:
+        """A peer has announced itself; `again` if it was lost before, so that its frames were forgotten here."""
+
+    async def run(self) -> None:
+        """Do what takes time, such as declaring what is kept for late joiners, until cancelled; may return early.
+
+        An error that it raises ends the link's body, as that of any task does.
+        """
+
+    async def close(self) -> None:
+        """Disconnect, also if `open` has failed or was cancelled; all that was sent before still goes out.
+
+        The closing has to begin before the first checkpoint, because asyncio's own cancellation knows no shield, and
+        has to return within about a second, whatever the network does.
+        """

@@ -1,0 +1,158 @@
+"""The inbox of a link: it publishes on the bus what peers have sent, within the limits of each peer."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from tfbus.bus.bus import Bus
+from tfbus.errors import InvalidTransformError
+from tfbus.links._outbox import Outbox, RemovedFrame
+from tfbus.links._peers import MAX_AUTHORITIES, Peer, Peers
+from tfbus.links._provenance import Provenance, ReceivedTransform
+from tfbus.links._relay import Relay
+
+_LARGEST_GAP = 2**32
+
+
+class ReceivedBatch:
+    """Samples of one batch, as they came in.
+
+    Attributes
+    ----------
+    samples : list of ReceivedTransform
+        Their provenance is not set yet.
+    authorities : collection of str
+        The authorities that the batch names; a peer may name only so many.
+    origin : bytes or None
+        The bus on which the batch was published first, 16 bytes; None if the sender knows no buses, as ROS.
+    sequence : int
+        The batch's number on that bus; without an origin it is not used.
+    """
+
+    __slots__ = ("authorities", "origin", "samples", "sequence")
+
+    def __init__(
+        self,
+        samples: list[ReceivedTransform],
+        authorities: Collection[str],
+        origin: bytes | None = None,
+        sequence: int = 0,
+    ) -> None:
+        self.samples = samples
+        self.authorities = authorities
+        self.origin = origin
+        self.sequence = sequence
+
+
+@dataclass(slots=True)
+class ReceivedMessage:
+    """One message of a peer, decoded.
+
+    Attributes
+    ----------
+    entries : list of ReceivedBatch or RemovedFrame
+        In the order in which it happened.
+    number : int
+        The sender numbers its live messages 1, 2, 3, so that gaps are noticed; 0 for a message without a number: one
+        that was kept for late joiners, or one of a sender that does not number.
+    errors : list of InvalidTransformError
+        One for each sample that was refused; `entries` has the others.
+    """
+
+    entries: list[ReceivedBatch | RemovedFrame]
+    number: int = 0
+    errors: list[InvalidTransformError] = field(default_factory=list)
+
+
+class Inbox:
+    """The receiving half of a link; nothing that a peer sends makes it raise.
+
+    Parameters
+    ----------
+    bus : Bus
+    relay : Relay
+    outbox : Outbox
+        The sending half of the same link, which does not send back what comes in here.
+    frames : collection of str or None
+        The children that may come in; None for all.
+    max_frames : int
+        How many frames one peer may have.
+    peers : Peers
+
+    Attributes
+    ----------
+    messages, samples : int
+        How many messages were accepted, and how many samples were published.
+    lost : int
+        How many live messages never came, by their numbers.
+    duplicates : int
+        How many samples were no news.
+    """
+
+    def __init__(
+        self, bus: Bus, relay: Relay, outbox: Outbox, frames: Collection[str] | None, max_frames: int, peers: Peers
+    ) -> None:
+        self._bus = bus
+        self._relay = relay
+        self._outbox = outbox
+        self._frames = frames
+        self._max_frames = max_frames
+        self._peers = peers
+        self.messages = 0
+        self.samples = 0
+        self.lost = 0
+        self.duplicates = 0
+
+    def receive(self, sender: str, message: ReceivedMessage) -> None:
+        """Publish and remove what a message of a peer says."""
+        peer = self._peers.find(sender)
+        if peer is None or self._bus.closed:
+            return
+        self.messages += 1
+        self._count_gap(peer, message.number)
+        for error in message.errors:
+            self._peers.reject(sender, error.reason, error)
+        live = message.number > 0
+        for entry in message.entries:
+            if self._bus.closed:
+                # A subscriber may have closed it since the last entry.
+                return
+            if isinstance(entry, ReceivedBatch):
+                if self._admit_authorities(peer, entry):
+                    self._publish(peer, entry, live)
+            elif self._frames is None or entry.frame in self._frames:
+                provenance = Provenance(entry.origin, entry.sequence, self._outbox, peer, live, entry.lost)
+                self._relay.remove(provenance, entry.frame)
+
+    def _publish(self, peer: Peer, batch: ReceivedBatch, live: bool) -> None:
+        samples: list[ReceivedTransform] = batch.samples
+        if self._frames is not None:
+            samples = [sample for sample in samples if sample.child in self._frames]
+        if batch.origin is None:
+            published, refused = self._relay.publish_foreign(self._outbox, peer, samples, self._max_frames)
+        else:
+            provenance = Provenance(batch.origin, batch.sequence, self._outbox, peer, live)
+            published, refused = self._relay.publish(provenance, samples, self._max_frames)
+        self.samples += published
+        self.duplicates += len(samples) - published - refused
+        if refused:
+            error = ValueError(f"the peer has announced more than {self._max_frames} frames")
+            self._peers.reject(peer.id, "too many frames", error, refused)
+
+    def _admit_authorities(self, peer: Peer, batch: ReceivedBatch) -> bool:
+        """Note the authorities that a batch names; returns False, and refuses the batch, if they are too many."""
+        for authority in batch.authorities:
+            if authority not in peer.authorities:
+                if len(peer.authorities) >= MAX_AUTHORITIES:
+                    error = ValueError(f"the peer has spoken for more than {MAX_AUTHORITIES} authorities")
+                    self._peers.reject(peer.id, "too many authorities", error, len(batch.samples))
+                    return False
+                peer.authorities.add(authority)
+        return True
+
+    def _count_gap(self, peer: Peer, number: int) -> None:
+        if number > peer.number:
+            missing = number - peer.number - 1
+            # Nobody has sent so many messages: a larger gap means that the number is made up.
+            if peer.number and missing <= _LARGEST_GAP:
+                self.lost += missing
+            peer.number = number

@@ -1,0 +1,49 @@
+"""The provenance of samples that came over a link, so that no link sends them back."""
+
+from typing import Any
+
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._peers import Peer
+
+
+class Provenance:
+    """Where a received batch or removal came from.
+
+    Attributes
+    ----------
+    origin : bytes
+        The bus on which it was published first, 16 bytes.
+    sequence : int
+        Its number on that bus; later ones have higher numbers.
+    outbox : object
+        The outbox of the link that brought it: what came in there does not go out there.
+    peer : Peer
+        The other end of that link.
+    live : bool
+        Whether it came in order with everything else of that peer, rather than out of what is kept for late joiners.
+    lost : bool
+        Of a removal: whether the frame was not removed but the peer that brought it was lost.
+    """
+
+    __slots__ = ("live", "lost", "origin", "outbox", "peer", "sequence")
+
+    def __init__(
+        self, origin: bytes, sequence: int, outbox: object, peer: Peer, live: bool = True, lost: bool = False
+    ) -> None:
+        self.origin = origin
+        self.sequence = sequence
+        self.outbox = outbox
+        self.peer = peer
+        self.live = live
+        self.lost = lost
+
+
+class ReceivedTransform(TransformStamped):
+    """A sample that came over a link; equal to one that did not."""
+
+    __slots__ = ("_provenance",)
+    _provenance: Provenance
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # A copy in another process has not come over this link.
+        return TransformStamped, (self.parent, self.child, self.stamp, self.transform, self.authority, self.static)

@@ -1,0 +1,114 @@
+"""The queue between the threads of a network and the event loop."""
+
+import enum
+import threading
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from tfbus.statistics import QueueStatistics
+
+MAX_BYTES = 64 * 2**20
+_OVERHEAD = 256
+"""Bytes that an item takes besides its content."""
+
+
+class Presence(enum.Enum):
+    """The content of an item that tells that a peer has come or gone."""
+
+    JOINED = enum.auto()
+    LEFT = enum.auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """One item that a carrier has received.
+
+    Attributes
+    ----------
+    sender : str
+        The id of the peer; empty if it is unknown.
+    content : Any
+        A `Presence`; a `MalformedMessageError`, for which the carrier has refused a message; or a message, which the
+        carrier's `read` decodes on the event loop.
+    size : int
+        Bytes that the content keeps in memory.
+    moving : bool
+        Whether the item may be dropped under load, because newer data will follow.
+    """
+
+    sender: str
+    content: Any
+    size: int = 0
+    moving: bool = False
+
+
+class ReceiveQueue:
+    """Holds what threads have received until the event loop reads it, in order.
+
+    Parameters
+    ----------
+    capacity : int
+        How many moving items may be pending, within 64 MiB for all items together; beyond that the oldest moving items
+        are dropped, and when there are none, the oldest of the others.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._lock = threading.Lock()
+        # Items that do not move and were passed over in a search for the oldest moving one.
+        self._kept: deque[Received] = deque()
+        self._pending: deque[Received] = deque()
+        self._bytes = 0
+        self._moving = 0
+        self._dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._kept) + len(self._pending)
+
+    def put(self, item: Received) -> None:
+        """Append an item, from any thread."""
+        with self._lock:
+            self._pending.append(item)
+            self._bytes += _footprint(item)
+            self._moving += item.moving
+            while self._moving > self._capacity or self._bytes > MAX_BYTES:
+                self._drop_oldest()
+
+    def get(self) -> Received | None:
+        """Remove and return the oldest item; None if the queue is empty."""
+        with self._lock:
+            for queue in (self._kept, self._pending):
+                if queue:
+                    return self._pop(queue)
+        return None
+
+    def discard_moving(self) -> None:
+        """Drop all moving items, because the clock has jumped back."""
+        with self._lock:
+            kept = [item for item in (*self._kept, *self._pending) if not item.moving]
+            self._dropped += self._moving
+            self._kept, self._pending = deque(kept), deque()
+            self._bytes = sum(map(_footprint, kept))
+            self._moving = 0
+
+    def statistics(self) -> QueueStatistics:
+        """The queue's counters, in items."""
+        with self._lock:
+            return QueueStatistics("link", "drop_oldest", self._capacity, len(self), self._dropped)
+
+    def _drop_oldest(self) -> None:
+        while self._pending and not self._pending[0].moving:
+            self._kept.append(self._pending.popleft())
+        self._pop(self._pending or self._kept)
+        self._dropped += 1
+
+    def _pop(self, queue: deque[Received]) -> Received:
+        item = queue.popleft()
+        self._bytes -= _footprint(item)
+        self._moving -= item.moving
+        return item
+
+
+def _footprint(item: Received) -> int:
+    return item.size + _OVERHEAD

@@ -1,0 +1,296 @@
+"""The relay of a bus: all its links share it, so that what comes by one goes out by the others, and nothing goes round.
+
+Every batch is numbered by the bus on which it was published first, its *origin*. The same batch may arrive on several
+ways, for a bus with two links passes on by each what came by the other. So a sample is news only if its number is
+higher than that of the newest sample of the same origin and child; then no ring of buses has an echo. Batches of a
+world that has no origins, such as ROS, get this bus as their origin.
+
+Removals are remembered with their numbers, so that a copy on a slower way does not bring the frame back. Their memory
+is bounded: of the removals that leave it, only the highest number of each origin is remembered, and live samples of
+unknown frames below that number count as outdated.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import count, groupby
+from typing import NamedTuple
+from uuid import uuid4
+
+from tfbus.bus.bus import Bus
+from tfbus.errors import UnknownFrameError
+from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.links._outbox import Outbox, OutgoingBatch, RemovedFrame
+from tfbus.links._peers import Peer, next_age
+from tfbus.links._provenance import Provenance, ReceivedTransform
+from tfbus.registration import Registration
+
+_REMEMBERED_REMOVALS = 10_000
+_REMEMBERED_ORIGINS = 1_000
+
+
+class _Removal(NamedTuple):
+    """The memory of a frame of one origin that has gone.
+
+    Samples with a number up to `sequence` are outdated. If the frame was not removed but lost with a peer, `lost_at` is
+    the age from `next_age` at that moment: the sample with just that number is news again from peers met later, and
+    from the peer that told of the loss, `told_by`; from all others it may only be late.
+    """
+
+    sequence: int
+    lost_at: int | None = None
+    told_by: str = ""
+
+
+class Relay:
+    """Passes samples and removals between one bus and its links.
+
+    There is one relay a bus, from `relay_of`. While no link is attached, it does nothing and remembers nothing but its
+    origin and its numbers: by those the bus knows its own samples when its links have ended and others begin.
+
+    Attributes
+    ----------
+    origin : bytes
+        The name of this bus for others: 16 random bytes.
+    """
+
+    _registration: Registration
+
+    def __init__(self, bus: Bus) -> None:
+        self.origin = uuid4().bytes
+        self._numbers = count(1)
+        self._bus = bus
+        self._outboxes: list[Outbox] = []
+        self._newest: dict[bytes, dict[str, int]] = {}
+        self._brought_by: dict[tuple[bytes, str], Peer] = {}
+        self._removals: dict[tuple[bytes, str], _Removal] = {}
+        self._outdated_up_to: dict[bytes, int] = {}
+        self._last_sender: dict[str, Peer | None] = {}
+        self._removing: tuple[str, Provenance] | None = None
+
+    def attach(self, outbox: Outbox) -> None:
+        """Give a link all that is latched, and all that is published from now on.
+
+        Raises
+        ------
+        BusClosedError
+        """
+        if not self._outboxes:
+            self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
+        self._bus.subscribe(lambda batch: self._send(batch, [outbox])).close()
+        self._outboxes.append(outbox)
+
+    def detach(self, outbox: Outbox) -> None:
+        """Give a link nothing any more; its peers must be lost before, with `lose`."""
+        self._outboxes.remove(outbox)
+        if not self._outboxes:
+            self._registration.close()
+            for memory in (self._newest, self._brought_by, self._removals, self._outdated_up_to, self._last_sender):
+                memory.clear()
+
+    def publish(self, provenance: Provenance, samples: Iterable[ReceivedTransform], max_frames: int) -> tuple[int, int]:
+        """Publish those samples of a received batch that are news.
+
+        Parameters
+        ----------
+        provenance : Provenance
+        samples : iterable of ReceivedTransform
+        max_frames : int
+            How many frames the peer may have.
+
+        Returns
+        -------
+        published, refused : int
+            Samples that were published, and samples whose frames are too many; all others are no news.
+        """
+        if provenance.origin == self.origin:
+            return 0, 0
+        return self._publish_news(provenance, samples, max_frames)
+
+    def publish_foreign(
+        self, outbox: Outbox, peer: Peer, samples: Iterable[ReceivedTransform], max_frames: int
+    ) -> tuple[int, int]:
+        """Publish a batch of a world that has neither origins nor numbers; all its samples are news.
+
+        The batch gets this bus as its origin and the next number of this bus. It goes out by all links but the one that
+        brought it, whose outbox is `outbox`. Parameters and results are those of `publish`.
+        """
+        provenance = Provenance(self.origin, next(self._numbers), outbox, peer)
+        return self._publish_news(provenance, samples, max_frames)
+
+    def remove(self, provenance: Provenance, frame: str) -> None:
+        """Remove a frame from the bus, unless newer samples of it have come from the same origin.
+
+        If the frame was lost rather than removed, it goes only if that peer was the last to bring it.
+        """
+        if provenance.origin == self.origin:
+            return
+        if provenance.lost:
+            # Others may still bring it, on another way.
+            news = self._last_sender.get(frame) is provenance.peer
+        else:
+            newest = self._newest.get(provenance.origin, {}).get(frame, -1)
+            news = newest < provenance.sequence and not self._is_outdated(provenance, frame)
+        if news:
+            self._remove_from_bus(frame, provenance)
+
+    def lose(self, peer: Peer, outbox: Outbox, drop: bool) -> tuple[str, ...]:
+        """Forget a peer.
+
+        Parameters
+        ----------
+        peer : Peer
+        outbox : Outbox
+            That of the link which has lost it; the peers behind that link notice the loss themselves.
+        drop : bool
+            Whether the frames that it was the last to bring leave the bus.
+
+        Returns
+        -------
+        tuple of str
+            Those frames, sorted.
+        """
+        frames = tuple(sorted(frame for frame, last in self._last_sender.items() if last is peer))
+        lost_at = next_age()
+        for origin, child in tuple(peer.frames):
+            self._remember_removal(origin, child, _Removal(self._newest[origin][child], lost_at))
+            self._release(origin, child)
+        for frame in frames:
+            # A subscriber that hears of one removal may have removed or published other frames.
+            if self._last_sender.get(frame) is peer:
+                if drop and not self._bus.closed:
+                    provenance = Provenance(self.origin, next(self._numbers), outbox, peer, lost=True)
+                    self._remove_from_bus(frame, provenance)
+                else:
+                    self._last_sender[frame] = None
+        return frames
+
+    def _publish_news(
+        self, provenance: Provenance, samples: Iterable[ReceivedTransform], max_frames: int
+    ) -> tuple[int, int]:
+        refused = 0
+        newest = self._newest.setdefault(provenance.origin, {})
+        news = []
+        for sample in samples:
+            child = sample._fields[1]
+            known = newest.get(child)
+            if known is not None:
+                if known >= provenance.sequence:
+                    continue
+            # Otherwise the child is new in this batch, and this is not its first sample there.
+            elif (provenance.origin, child) not in provenance.peer.frames:
+                if self._is_outdated(provenance, child):
+                    continue
+                if len(provenance.peer.frames) >= max_frames:
+                    refused += 1
+                    continue
+                self._assign(provenance, child)
+            sample._provenance = provenance
+            news.append(sample)
+        # Only now, for a batch may have several samples of one child.
+        for sample in news:
+            newest[sample._fields[1]] = provenance.sequence
+        if not newest:
+            del self._newest[provenance.origin]
+        if news:
+            self._bus.publish(news, invalid="drop")
+        return len(news), refused
+
+    def _remove_from_bus(self, frame: str, provenance: Provenance) -> None:
+        if frame not in self._last_sender:
+            # None of its samples was passed on, so no link has to be told.
+            self._forget_frame(frame, provenance)
+            return
+        self._removing = frame, provenance
+        try:
+            self._bus.remove_frame(frame)
+        except UnknownFrameError:
+            # The bus forgot it when its clock jumped back, but other buses did not.
+            self._on_removal(frame)
+        finally:
+            self._removing = None
+
+    def _on_batch(self, batch: Batch) -> None:
+        for sample in batch:
+            provenance = _provenance_of(sample)
+            self._last_sender[sample._fields[1]] = None if provenance is None else provenance.peer
+        self._send(batch, self._outboxes)
+
+    def _send(self, batch: Batch, outboxes: Sequence[Outbox]) -> None:
+        for provenance, samples in groupby(batch, _provenance_of):
+            if provenance is None:
+                outgoing, brought_by = OutgoingBatch(self.origin, next(self._numbers), tuple(samples)), None
+            else:
+                outgoing = OutgoingBatch(provenance.origin, provenance.sequence, tuple(samples))
+                brought_by = provenance.outbox
+            for outbox in outboxes:
+                outbox.add_batch(outgoing, echo=outbox is brought_by)
+
+    def _on_removal(self, frame: str) -> None:
+        if self._removing is not None and self._removing[0] == frame:
+            provenance = self._removing[1]
+        else:
+            provenance = Provenance(self.origin, next(self._numbers), None, _NOBODY)
+        self._last_sender.pop(frame, None)
+        self._forget_frame(frame, provenance)
+        removal = RemovedFrame(provenance.origin, provenance.sequence, frame, provenance.lost)
+        for outbox in self._outboxes:
+            outbox.add_removal(removal, echo=outbox is provenance.outbox)
+
+    def _forget_frame(self, frame: str, provenance: Provenance) -> None:
+        lost_at, told_by = (next_age(), provenance.peer.id) if provenance.lost else (None, "")
+        for origin in [origin for origin, newest in self._newest.items() if frame in newest]:
+            self._remember_removal(origin, frame, _Removal(self._newest[origin][frame], lost_at, told_by))
+            self._release(origin, frame)
+        self._remember_removal(provenance.origin, frame, _Removal(provenance.sequence, lost_at, told_by))
+
+    def _assign(self, provenance: Provenance, child: str) -> None:
+        """Count a frame of an origin for the peer that was the first to bring it."""
+        provenance.peer.frames.add((provenance.origin, child))
+        self._brought_by[provenance.origin, child] = provenance.peer
+
+    def _release(self, origin: bytes, child: str) -> None:
+        """Count a frame of an origin for nobody any more."""
+        self._brought_by.pop((origin, child)).frames.discard((origin, child))
+        newest = self._newest[origin]
+        del newest[child]
+        if not newest:
+            del self._newest[origin]
+
+    def _is_outdated(self, provenance: Provenance, child: str) -> bool:
+        """Whether samples of a child that is not there are older than its removal."""
+        removal = self._removals.get((provenance.origin, child))
+        if removal is None:
+            # What is kept for late joiners holds now, however old it is.
+            return provenance.live and provenance.sequence <= self._outdated_up_to.get(provenance.origin, -1)
+        if removal.sequence == provenance.sequence and removal.lost_at is not None:
+            return provenance.peer.age < removal.lost_at and provenance.peer.id != removal.told_by
+        return removal.sequence >= provenance.sequence
+
+    def _remember_removal(self, origin: bytes, frame: str, removal: _Removal) -> None:
+        if origin == self.origin:
+            return
+        known = self._removals.pop((origin, frame), None)
+        if known is not None and known.sequence > removal.sequence:
+            removal = known
+        self._removals[origin, frame] = removal
+        if len(self._removals) > _REMEMBERED_REMOVALS:
+            oldest = next(iter(self._removals))
+            self._forget_removal(oldest[0], self._removals.pop(oldest).sequence)
+
+    def _forget_removal(self, origin: bytes, sequence: int) -> None:
+        self._outdated_up_to[origin] = max(sequence, self._outdated_up_to.pop(origin, -1))
+        if len(self._outdated_up_to) > _REMEMBERED_ORIGINS:
+            del self._outdated_up_to[next(iter(self._outdated_up_to))]
+
+
+_NOBODY = Peer("")
+
+
+def relay_of(bus: Bus) -> Relay:
+    """The relay of a bus, which its links share; the bus itself holds it."""
+    if not isinstance(bus._relay, Relay):
+        bus._relay = Relay(bus)
+    return bus._relay
+
+
+def _provenance_of(sample: TransformStamped) -> Provenance | None:
+    return sample._provenance if type(sample) is ReceivedTransform else None

@@ -1,0 +1,197 @@
+"""The half that all links share: it joins a bus to a carrier for as long as its ``async with`` lasts."""
+
+import logging
+from collections.abc import Iterable
+from types import TracebackType
+from typing import Self
+
+import anyio
+import anyio.abc
+
+from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.task_groups import close_task_group
+from tfbus._log import OnceLogger
+from tfbus.bus.bus import Bus
+from tfbus.bus.sample_queue import check_capacity
+from tfbus.errors import BusClosedError
+from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._endpoint import Endpoint
+from tfbus.links._receive_queue import Received, ReceiveQueue
+from tfbus.registration import Registration
+from tfbus.statistics import LinkStatistics
+
+_FULL_TURN = 5_000
+"""So many samples and removals are sent at once, before the turn of the event loop ends."""
+_ITEMS_PER_TURN = 100
+_BYTES_PER_TURN = 2**16
+
+
+class Link:
+    """Joins a bus to other buses, or to another world: ``async with link``.
+
+    What is published in one turn of the event loop goes out together at its end. What comes in waits in a bounded queue
+    and is published on the event loop, a limited amount a turn.
+
+    Parameters
+    ----------
+    bus : Bus
+    name : str
+        How events and log lines call the link.
+    carrier : Carrier
+        Connects to the network, and writes and reads its messages.
+    frames : iterable of str, optional
+        Send and take only these children; by default all.
+    drop_lost : bool
+        Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
+    max_frames : int
+        How many frames one peer may have; samples of others are refused and counted.
+    capacity : int
+        How many live messages may wait for the event loop; beyond that the oldest are dropped and counted.
+
+    Attributes
+    ----------
+    bus : Bus
+    id : str
+        The name of this end for its peers.
+
+    Raises
+    ------
+    ValueError
+        If a number is out of range.
+    TypeError
+        If `frames` is one name, or a number is of another type.
+    OSError
+        On entering, if the carrier cannot connect.
+    BusClosedError, RuntimeError
+        On entering, if the bus is closed; if it belongs to another thread, or the link was entered before.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        name: str,
+        carrier: Carrier,
+        *,
+        frames: Iterable[str] | None = None,
+        drop_lost: bool = False,
+        max_frames: int = 10_000,
+        capacity: int = 10_000,
+    ) -> None:
+        if isinstance(frames, str):
+            raise TypeError(f"frames must be several names, not {frames!r}")
+        check_capacity(capacity)
+        check_capacity(max_frames, "max_frames")
+        self.bus = bus
+        self.id = carrier.id
+        self._name = name
+        self._carrier = carrier
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._endpoint = Endpoint(
+            bus,
+            name,
+            carrier,
+            self._schedule_send,
+            frames=None if frames is None else frozenset(frames),
+            drop_lost=drop_lost,
+            max_frames=max_frames,
+        )
+        self._send_report = SendReport(self._warn_not_sent)
+        self._receive_queue = ReceiveQueue(capacity)
+        self._received = LoopWaker(self._handle_received)
+        self._turn_ends = LoopWaker(self._endpoint.send)
+        self._entered = False
+        self._attached = False
+        self._tasks: anyio.abc.TaskGroup | None = None
+        self._jumps: Registration | None = None
+
+    @property
+    def peers(self) -> tuple[str, ...]:
+        """The ids of the other ends that are there, sorted."""
+        return self._endpoint.peers.present
+
+    def statistics(self) -> LinkStatistics:
+        """All counters, as they are now."""
+        endpoint, report = self._endpoint, self._send_report
+        return LinkStatistics(
+            peers=len(endpoint.peers.present),
+            sent_messages=report.messages,
+            sent_samples=report.samples,
+            received_messages=endpoint.inbox.messages,
+            received_samples=endpoint.inbox.samples,
+            lost=endpoint.inbox.lost,
+            duplicates=endpoint.inbox.duplicates,
+            not_sent=dict(report.not_sent),
+            rejected=dict(endpoint.peers.rejected),
+            queue=self._receive_queue.statistics(),
+        )
+
+    async def __aenter__(self) -> Self:
+        if self._entered:
+            raise RuntimeError("a link is entered once: make another one")
+        self.bus._check_thread()
+        if self.bus.closed:
+            raise BusClosedError
+        self._entered = True
+        for waker in (self._received, self._turn_ends):
+            waker.connect()
+        try:
+            await self._carrier.open(self._receive, self._send_report)
+            self._endpoint.attach()
+        except BaseException:
+            await self._carrier.close()
+            raise
+        self._attached = True
+        self._jumps = self.bus.clock.on_jump(self._clock_jumped)
+        self._tasks = await anyio.create_task_group().__aenter__()
+        self._tasks.start_soon(self._carrier.run)
+        # Items that came before the link was attached are still in the queue.
+        self._received.ring()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        assert self._tasks is not None
+        assert self._jumps is not None
+        self._jumps.close()
+        self._attached = False
+        self._endpoint.detach()
+        self._endpoint.send()
+        self._tasks.cancel_scope.cancel()
+        try:
+            await close_task_group(self._tasks)
+        finally:
+            await self._carrier.close()
+
+    def _schedule_send(self) -> None:
+        if self._endpoint.outbox.pending >= _FULL_TURN:
+            self._endpoint.send()
+        else:
+            self._turn_ends.ring()
+
+    def _warn_not_sent(self, error: Exception) -> None:
+        self._log.warning(str(error), "not sent over the link %s: %s", self._name, error)
+
+    def _receive(self, item: Received) -> None:
+        self._receive_queue.put(item)
+        try:
+            self._received.ring()
+        except RuntimeError:
+            # The event loop has ended without the end of the link, as in a crash.
+            return
+
+    def _handle_received(self) -> None:
+        cost = 0
+        while self._attached and cost < _BYTES_PER_TURN:
+            item = self._receive_queue.get()
+            if item is None:
+                return
+            cost += item.size + _BYTES_PER_TURN // _ITEMS_PER_TURN
+            self._endpoint.handle(item)
+        if self._attached:
+            # Other tasks get their turn first.
+            self._received.ring()
+
+    def _clock_jumped(self, before: int, after: int) -> None:
+        if after < before:
+            self._receive_queue.discard_moving()
