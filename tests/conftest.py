@@ -10,8 +10,8 @@ A test of hypothesis is in both suites: with a few examples, always the same, in
 the thorough one, new ones at each run unless the variable `CI` is set. ``--hypothesis-profile`` chooses otherwise:
 ``default`` or ``thorough``.
 
-Folders are tested by as many processes as there are cores, at most four, and single files by one. ``-n`` chooses
-otherwise. Ctrl-C and ``--pdb`` work as ever.
+Folders are tested by as many processes as there are cores, at most four; single files and benchmarks by one. ``-n``
+chooses otherwise.
 """
 
 import os
@@ -76,9 +76,10 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    if all(Path(argument.partition("::")[0]).is_file() for argument in config.args):
-        return 0
-    return min(os.cpu_count() or 1, 4)
+    """None but this one for single files, and for benchmarks, which would disturb each other."""
+    paths = [Path(argument.partition("::")[0]) for argument in config.args]
+    alone = all(path.is_file() or path.name == "benchmarks" for path in paths)
+    return 0 if alone else min(os.cpu_count() or 1, 4)
 
 
 @pytest.hookimpl(tryfirst=True)

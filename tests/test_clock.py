@@ -25,7 +25,7 @@ from tfbus import (
     to_seconds,
 )
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
 Run = Callable[[Callable[[], Awaitable[list[str]]]], list[str]]
 

@@ -7,6 +7,7 @@ from tfbus.testing import assert_close, simulate
 pytestmark = pytest.mark.anyio
 
 
+@pytest.mark.every_loop
 async def test_simulate_lets_time_pass_until_the_function_has_ended() -> None:
     clock = SimulatedClock()
 

@@ -10,7 +10,7 @@ from support.asking import settle
 
 from tfbus._aio.loop_waker import LoopWaker
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 

@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 import anyio
+import pytest
 from beside import Table
 from lag import probe
 
@@ -52,6 +53,7 @@ async def watch(buffer: Buffer, number: int, count: list[int]) -> None:
             count[0] += 1
 
 
+@pytest.mark.every_loop
 def test_lag_under_load(table: Table, run: Run, anyio_backend: tuple[str, dict[str, Any]]) -> None:
     sent, answered, seen = [0], [0], [0]
     lags: list[float] = []

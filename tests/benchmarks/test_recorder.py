@@ -6,6 +6,7 @@ from statistics import median
 from typing import Any
 
 import anyio
+import pytest
 from beside import Table
 from lag import probe
 
@@ -37,6 +38,7 @@ def percentile(lags: list[float], part: float) -> float:
     return sorted(lags)[int(part * len(lags))] * 1e3
 
 
+@pytest.mark.every_loop
 def test_lag_while_recording(table: Table, run: Run, tmp_path: Path, anyio_backend: tuple[str, dict[str, Any]]) -> None:
     sent = [0]
     lags: dict[bool, list[list[float]]] = {False: [], True: []}

@@ -157,6 +157,7 @@ async def wake_up(
     return woken - start
 
 
+@pytest.mark.every_loop
 def test_wake_up(table: Table, run: Run, anyio_backend: Backend) -> None:
     bus = Bus()
     buffer = Buffer(bus)
@@ -222,6 +223,7 @@ def test_publishing_past_waiters(table: Table) -> None:
     table.compare("publish on B while 10,000 wait on A", crowded, "none", empty, "<= 1.1")
 
 
+@pytest.mark.every_loop
 def test_cancelling(table: Table, run: Run, anyio_backend: Backend) -> None:
     bus = Bus()
     buffer = Buffer(bus)

@@ -24,7 +24,7 @@ from tfbus import (
     to_seconds,
 )
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ def make(start: int = 0, keep: float | None = 10.0) -> tuple[SimulatedClock, Bus
 # Answers at once
 
 
+@pytest.mark.every_loop
 async def test_what_can_be_answered_is_answered_after_one_checkpoint() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])
@@ -424,6 +425,7 @@ def waiting(bus: Bus) -> int:
     return bus.statistics().buffers[0].waiting
 
 
+@pytest.mark.thorough
 async def test_ten_thousand_waiters_on_one_edge_sleep_through_samples_of_another_and_can_be_cancelled() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "quiet", 0), driving("map", "busy", 0), driving("map", "x", 0), static("map", "s")])

@@ -93,6 +93,7 @@ async def read_along(
 # What comes
 
 
+@pytest.mark.every_loop
 async def test_it_starts_with_what_holds_now_and_then_gives_each_new_answer() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])

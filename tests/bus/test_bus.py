@@ -599,6 +599,7 @@ def test_statistics_are_plain_data() -> None:
     assert bus.statistics().buffers == ()
 
 
+@pytest.mark.thorough
 def test_a_long_run_keeps_memory_flat() -> None:
     clock = SimulatedClock()
     bus = Bus(clock)
@@ -629,6 +630,7 @@ def test_a_long_run_keeps_memory_flat() -> None:
     assert sum(asdict(statistics.buffers[0])[outcome] for outcome in ("inserted", "replaced")) == 12_000
 
 
+@pytest.mark.thorough
 def test_frames_that_come_and_go_keep_memory_flat(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("CRITICAL", logger="tfbus")
     bus = Bus(SimulatedClock())

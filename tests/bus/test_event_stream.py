@@ -38,6 +38,7 @@ async def read(events: EventStream, got: Events) -> None:
         got.append(event)
 
 
+@pytest.mark.every_loop
 async def test_a_reader_that_waits_is_woken_by_what_happens() -> None:
     bus = Bus(SimulatedClock(start=5))
     got: Events = []

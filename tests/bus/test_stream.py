@@ -21,6 +21,7 @@ async def read(stream: Stream, batches: Batches) -> None:
         batches.append(batch)
 
 
+@pytest.mark.every_loop
 async def test_batches_arrive_whole_and_in_order() -> None:
     bus = Bus(SimulatedClock())
     sent = [(moving("map", "a", k), moving("a", "b", k)) for k in range(20)]

@@ -13,7 +13,7 @@ from support.threads import threads_that
 
 from tfbus import LATEST, Buffer, Bus, BusClosedError, PointStamped, SimulatedClock, ThreadPublisher, TransformStamped
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 
@@ -326,6 +326,7 @@ async def test_worker_threads_may_read_while_the_loop_publishes() -> None:
 
 
 @pytest.mark.parametrize("names", [{}, {"prefix": "robot/", "shared": {"map"}}], ids=["whole names", "prefix"])
+@pytest.mark.thorough
 async def test_all_that_only_reads_may_be_asked_by_threads_while_lookups_wait_and_are_woken(names: Any) -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus, keep=1e-6, **names)

@@ -136,6 +136,7 @@ async def test_a_message_in_the_target_frame_needs_no_transforms(buffer: Buffer,
     assert (found.parent, found.child, found.stamp, found.transform) == ("map", "map", 5, Transform.identity())
 
 
+@pytest.mark.every_loop
 async def test_a_message_whose_transform_is_there_comes_out(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     bus.publish([moving("map", "laser", 4, x=4.0), moving("map", "laser", 6, x=6.0)])

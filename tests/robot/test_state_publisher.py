@@ -94,6 +94,7 @@ def test_the_hook_is_where_the_closed_form_says() -> None:
         assert buffer.lookup_nowait("boom", "shadow").transform.translation == (0.75, 0.0, 0.0)
 
 
+@pytest.mark.every_loop
 async def test_a_lookup_that_waits_for_a_stamp_is_woken_by_the_message_of_that_stamp() -> None:
     with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
         robot = RobotStatePublisher(bus, CRANE)

@@ -483,7 +483,7 @@ BURSTS = st.builds(
 )
 
 
-@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(on_conflict=st.sampled_from(["last", "reject"]), bursts=st.lists(BURSTS, min_size=2, max_size=10))
 def test_every_reader_reads_exactly_what_the_model_says(run: Run, on_conflict: OnConflict, bursts: list[Burst]) -> None:
     async def play() -> None:

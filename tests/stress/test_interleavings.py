@@ -401,7 +401,7 @@ BURSTS = st.builds(
 )
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(known=EVERYTHING | st.none(), bursts=st.lists(BURSTS, min_size=1, max_size=12))
 def test_every_lookup_ends_as_the_model_says_and_leaves_nothing_behind(
     run: Run, known: Insert | None, bursts: list[Burst]

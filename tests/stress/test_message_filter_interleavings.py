@@ -473,13 +473,13 @@ OPTIONS = st.builds(
 DEFINITE = OPTIONS.filter(lambda options: (options.overflow, options.order) != ("block", "stamp"))
 
 
-@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(options=DEFINITE, steps=st.lists(STEPS, min_size=1, max_size=25))
 def test_every_message_ends_as_the_model_says(run: Run, options: Options, steps: list[Step]) -> None:
     run(lambda: Game(options).play(steps))
 
 
-@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(options=OPTIONS, bursts=st.lists(st.lists(STEPS, min_size=1, max_size=6), min_size=1, max_size=8))
 def test_whatever_happens_in_one_turn_no_message_is_lost(run: Run, options: Options, bursts: list[list[Step]]) -> None:
     run(lambda: Game(options).play_wildly(bursts))

@@ -112,7 +112,7 @@ BURSTS = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     bursts=BURSTS,
     ends=st.permutations("abc").map(lambda frames: frames[:2]),

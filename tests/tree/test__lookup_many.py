@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, over, static, tree_of
 from support.strategies import TODAY, transforms
@@ -137,7 +137,6 @@ def scenes(draw: st.DrawFn) -> tuple[TransformTree, st.SearchStrategy[int]]:
     return tree, st.integers(low, high) | worth | beside
 
 
-@settings(max_examples=200)
 @given(scenes(), st.data())
 def test_many_lookups_are_the_same_as_one_after_the_other(
     scene: tuple[TransformTree, st.SearchStrategy[int]], data: st.DataObject
@@ -151,7 +150,6 @@ def test_many_lookups_are_the_same_as_one_after_the_other(
             compare(partial(tree.lookup_many, *ends, asked), expected, is_severed(expected))
 
 
-@settings(max_examples=150)
 @given(scenes(), st.data())
 def test_many_lookups_over_a_fixed_frame_are_the_same_as_one_after_the_other(
     scene: tuple[TransformTree, st.SearchStrategy[int]], data: st.DataObject

@@ -342,6 +342,7 @@ def test_a_static_sample_and_an_empty_history_fit_any_window() -> None:
     assert twin.insert("parent", 1, row(1.0), "") is INSERTED
 
 
+@pytest.mark.thorough
 def test_a_million_samples_take_no_more_than_the_window_and_its_slack() -> None:
     samples = history(keep=1_000, stamps=[0])
     pose = row(1.0)

@@ -205,7 +205,7 @@ NAMES = "abcdef"
 ANY_PARENTS = st.tuples(*(st.sampled_from((NAMES + "g").replace(name, "")) for name in NAMES))
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None)
 @given(ANY_PARENTS, st.sampled_from(NAMES), st.sampled_from(NAMES))
 def test_a_search_ends_even_where_frames_hang_on_each_other_in_a_circle(
     parents: tuple[str, ...], target: str, source: str

@@ -507,6 +507,7 @@ def test_a_sample_takes_at_most_100_bytes(insert: Callable[[TransformTree, Any],
     assert {edge.samples for edge in tree.edges()} == {1_000}
 
 
+@pytest.mark.thorough
 def test_memory_is_flat_while_samples_come_and_go() -> None:
     tree = TransformTree(keep=1e-6)
 
@@ -522,6 +523,7 @@ def test_memory_is_flat_while_samples_come_and_go() -> None:
     assert [edge.samples for edge in tree.edges()] == [1_001, 1_001]
 
 
+@pytest.mark.thorough
 def test_memory_is_flat_while_frames_of_ever_new_names_come_and_go() -> None:
     tree = tree_of(static("map", "base"))
 

@@ -246,4 +246,4 @@ class IndexMachine(RuleBasedStateMachine):
 
 
 TestIndexAgainstAList = IndexMachine.TestCase
-TestIndexAgainstAList.settings = settings(deadline=None, max_examples=100, stateful_step_count=40)
+TestIndexAgainstAList.settings = settings(deadline=None, stateful_step_count=40)

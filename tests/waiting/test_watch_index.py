@@ -169,7 +169,7 @@ def test_whether_a_task_waits_here_is_known() -> None:
     assert live.has_waiters
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None)
 @given(st.lists(st.lists(any_samples("abcd", 20), min_size=1, max_size=3), max_size=8), st.sampled_from([None, 8e-9]))
 def test_whoever_has_no_flag_has_the_same_answer_as_before(
     batches: list[list[TransformStamped]], keep: float | None
