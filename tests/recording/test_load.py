@@ -25,6 +25,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.recording import load
+from tfbus.tree.tree import forest_of
 
 SECOND = 1_000_000_000
 TOLERANCE = 1e-9
@@ -196,4 +197,5 @@ def test_a_lookup_in_a_loaded_tree_is_not_stale_after_the_shape_has_changed(tmp_
     )
     assert tree.parent("b", 3) == "a"
     assert tree.parent("b", 7) == "z"
-    assert (tree.forest.changed, tree.forest.joined) == (set(), set())
+    forest = forest_of(tree)
+    assert (forest.changed, forest.new_parents) == (set(), set())

@@ -108,7 +108,7 @@ class Endpoint:
         peer = self.peers.find(sender)
         if peer is not None and not peer.present:
             peer.present = True
-            self._carrier.peer_joined(sender, again=not self._joined_before.first(sender))
+            self._carrier.peer_joined(sender, again=not self._joined_before.add(sender))
             self._bus._announce(PeerJoined(self._bus.clock.now(), self._name, sender))
 
     def _peer_left(self, sender: str) -> None:

@@ -113,5 +113,5 @@ class Peers:
         self.rejected[reason] += count
         peer = self._peers.get(id)
         reported = self._reported_of_unknown if peer is None else peer.reported
-        if reported.first(reason):
+        if reported.add(reason):
             self._report(id, reason, error)

@@ -133,7 +133,7 @@ class Link:
             raise BusClosedError
         self._entered = True
         for waker in (self._received, self._turn_ends):
-            waker.connect()
+            waker.bind()
         try:
             await self._carrier.open(self._receive, self._send_report)
             self._endpoint.attach()
@@ -145,7 +145,7 @@ class Link:
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._carrier.run)
         # Items that came before the link was attached are still in the queue.
-        self._received.ring()
+        self._received.wake()
         return self
 
     async def __aexit__(
@@ -167,7 +167,7 @@ class Link:
         if self._endpoint.outbox.pending >= _FULL_TURN:
             self._endpoint.send()
         else:
-            self._turn_ends.ring()
+            self._turn_ends.wake()
 
     def _warn_not_sent(self, error: Exception) -> None:
         self._log.warning(str(error), "not sent over the link %s: %s", self._name, error)
@@ -175,7 +175,7 @@ class Link:
     def _receive(self, item: Received) -> None:
         self._receive_queue.put(item)
         try:
-            self._received.ring()
+            self._received.wake()
         except RuntimeError:
             # The event loop has ended without the end of the link, as in a crash.
             return
@@ -190,7 +190,7 @@ class Link:
             self._endpoint.handle(item)
         if self._attached:
             # Other tasks get their turn first.
-            self._received.ring()
+            self._received.wake()
 
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.recording import RecordedMessage, open_recording
 from tfbus.tree.cycles import NewestEdge, admit
-from tfbus.tree.tree import TransformTree
+from tfbus.tree.tree import TransformTree, forest_of
 
 
 def load(
@@ -55,11 +55,12 @@ def load(
 
 def fill(tree: TransformTree, messages: Iterable[RecordedMessage], problems: Counter[str]) -> None:
     """Insert the samples of some messages into a tree, and count by reason those that are left out."""
+    forest = forest_of(tree)
     for _, batch, errors in messages:
         if errors:
             problems.update(error.reason for error in errors)
-        tree.commit(without_loops(tree.forest.frames, batch, problems))
-    tree.forest.forget_changes()
+        forest.commit(without_loops(forest.frames, batch, problems))
+    forest.forget_changes()
 
 
 def without_loops(edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str]) -> Batch:
