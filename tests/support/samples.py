@@ -42,3 +42,13 @@ def tree_of(*batch: TransformStamped, keep: float | None = 10.0) -> TransformTre
 def x_of(tree: TransformTree, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> float:
     """What a lookup tells of x, in m."""
     return tree.lookup(target, source, at, **question).transform.translation[0]
+
+
+def newest_samples(stored: Iterable[TransformStamped]) -> dict[str, TransformStamped]:
+    """The newest sample of each child, of samples in the order of their arrival; the last kind wins."""
+    newest: dict[str, TransformStamped] = {}
+    for sample in stored:
+        before = newest.get(sample.child)
+        if before is None or before.static or sample.static or sample.stamp >= before.stamp:
+            newest[sample.child] = sample
+    return newest

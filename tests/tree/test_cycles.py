@@ -1,0 +1,181 @@
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.samples import any_samples, moving, newest_samples, static
+
+from tfbus import TransformStamped
+from tfbus.tree.cycles import admit
+
+
+@dataclass(frozen=True)
+class KnownEdge:
+    """The newest edge of a child, as plain data."""
+
+    parent: str
+    static: bool = False
+    newest: int | None = None
+    authority: str = ""
+
+
+def edges_of(*stored: TransformStamped) -> dict[str, KnownEdge]:
+    """The newest edge of each child of some samples."""
+    return {
+        child: KnownEdge(sample.parent, sample.static, None if sample.static else sample.stamp, sample.authority)
+        for child, sample in newest_samples(stored).items()
+    }
+
+
+def parents_after(stored: Iterable[TransformStamped]) -> dict[str, str]:
+    return {child: sample.parent for child, sample in newest_samples(stored).items()}
+
+
+def has_loop(parent_of: Mapping[str, str]) -> bool:
+    """Whether a walk from some child takes more steps than there are children."""
+    for child in parent_of:
+        here: str | None = child
+        for _ in range(len(parent_of) + 1):
+            here = None if here is None else parent_of.get(here)
+        if here is not None:
+            return True
+    return False
+
+
+BEFORE = edges_of(moving("map", "base", 10), moving("base", "tool", 10))
+
+
+@pytest.mark.parametrize(
+    ("edges", "batch", "refused"),
+    [
+        pytest.param({}, [], [], id="an empty batch"),
+        pytest.param(BEFORE, [moving("tool", "base", 5)], [], id="a sample that is older than the newest"),
+        pytest.param(BEFORE, [moving("tool", "base", 10)], [0], id="a sample at the newest stamp"),
+        pytest.param(BEFORE, [static("tool", "base", stamp=0)], [0], id="a static sample of any stamp"),
+        pytest.param(BEFORE, [moving("tool", "map", -5)], [0], id="the first sample of a child"),
+        pytest.param(
+            edges_of(static("map", "base", stamp=10), moving("base", "tool", 10)),
+            [moving("tool", "base", 1)],
+            [0],
+            id="a moving sample of any stamp after a static one",
+        ),
+        pytest.param(edges_of(static("a", "b"), static("b", "c")), [static("c", "a")], [0], id="static edges"),
+        pytest.param(BEFORE, [moving("base", "map", 11)], [0], id="an edge turned round"),
+        pytest.param(
+            BEFORE, [moving("base", "map", 11), moving("world", "base", 11)], [], id="an edge turned round under a root"
+        ),
+        pytest.param(
+            BEFORE, [moving("world", "base", 11), moving("base", "map", 11)], [], id="the same in the other order"
+        ),
+        pytest.param(
+            {}, [moving("a", "b", 0), moving("b", "c", 0), moving("c", "a", 0)], [2], id="a loop inside the batch"
+        ),
+        pytest.param(
+            BEFORE,
+            [moving("tool", "map", 11), moving("tool", "map", 12), moving("x", "y", 0)],
+            [1, 0],
+            id="a loop that is closed twice",
+        ),
+        pytest.param(
+            BEFORE, [moving("world", "map", 11), moving("tool", "map", 12)], [1], id="only the newer of two parents"
+        ),
+        pytest.param(
+            BEFORE, [moving("world", "map", 12), moving("tool", "map", 11)], [], id="only the older of two parents"
+        ),
+        pytest.param(
+            BEFORE, [static("tool", "map"), moving("world", "map", 0)], [], id="a moving sample after a static one"
+        ),
+        pytest.param(
+            BEFORE, [moving("world", "map", 0), static("tool", "map")], [1], id="a static sample after a moving one"
+        ),
+        pytest.param(
+            {},
+            [moving("a", "b", 0), moving("x", "y", 0), moving("b", "a", 0), moving("y", "x", 0)],
+            [3, 2],
+            id="two loops",
+        ),
+        pytest.param(
+            {"a": KnownEdge("b"), **edges_of(moving("b", "c", 5))},
+            [moving("a", "b", 0)],
+            [],
+            id="a parent that is remembered without a sample",
+        ),
+        pytest.param(
+            edges_of(moving("a", "b", 0), moving("b", "a", 0)),
+            [moving("a", "c", 5)],
+            [],
+            id="a loop that the batch does not change",
+        ),
+    ],
+)
+def test_admit_refuses_the_last_samples_that_close_loops_of_newest_parents(
+    edges: dict[str, KnownEdge], batch: list[TransformStamped], refused: list[int]
+) -> None:
+    accepted, errors = admit(edges, batch)
+    assert accepted == tuple(sample for place, sample in enumerate(batch) if place not in refused)
+    assert [(error.reason, error.parent, error.child) for error in errors] == [
+        ("cycle", batch[place].parent, batch[place].child) for place in refused
+    ]
+
+
+@pytest.mark.parametrize("length", [2, 3, 9, 10, 1_000])
+def test_the_error_names_the_whole_loop_and_its_message_at_most_ten_frames(length: int) -> None:
+    names = [f"frame {number}" for number in range(length)]
+    edges = edges_of(*(moving(parent, child, 0) for parent, child in pairwise(names)))
+    _, (error,) = admit(edges, [moving(names[-1], names[0], 1, authority="somebody")])
+    assert (error.reason, error.parent, error.child, error.authority) == ("cycle", names[-1], names[0], "somebody")
+    assert error.loop == (names[0], *reversed(names))
+    shown = error.loop if length < 10 else (*error.loop[:8], f"({length - 8} more)", names[0])
+    assert str(error) == (f"the edge {names[-1]!r} -> {names[0]!r} would close a loop of parents: {' -> '.join(shown)}")
+
+
+def test_the_error_names_the_authorities_of_the_other_edges_of_the_loop_sorted() -> None:
+    edges = edges_of(
+        moving("a", "b", 0, authority="slam"),
+        moving("b", "c", 0, authority="arm"),
+        moving("c", "d", 0),
+        moving("x", "a", 0, authority="old"),
+        moving("c", "y", 0, authority="elsewhere"),
+    )
+    _, (error,) = admit(edges, [moving("d", "a", 1, authority="culprit")])
+    assert str(error).endswith("a -> d -> c -> b -> a, with edges from 'arm' and 'slam'")
+
+
+BATCHES = st.lists(st.lists(any_samples("abcde", last=3), min_size=1, max_size=6), max_size=6)
+
+
+@given(BATCHES)
+def test_a_batch_is_admitted_whole_exactly_if_the_newest_parents_after_it_form_a_forest(
+    batches: list[list[TransformStamped]],
+) -> None:
+    stored: list[TransformStamped] = []
+    for batch in batches:
+        accepted, errors = admit(edges_of(*stored), batch)
+        after = parents_after([*stored, *batch])
+        assert (accepted == tuple(batch)) == (not has_loop(after))
+        assert len(accepted) + len(errors) == len(batch)
+        if errors:
+            # The first refusals are judged by the whole batch; later ones by what is left of it.
+            loop = errors[0].loop
+            assert loop[0] == loop[-1]
+            assert all(after[child] == parent for child, parent in pairwise(loop))
+        stored += accepted
+        assert not has_loop(parents_after(stored))
+
+
+def test_a_long_chain_in_one_batch_is_judged_in_linear_time() -> None:
+    class CountedEdges(dict[str, Any]):
+        reads = 0
+
+        def get(self, key: str, default: Any = None) -> Any:
+            self.reads += 1
+            return super().get(key, default)
+
+    edges = CountedEdges()
+    links = 2_000
+    _, refused = admit(edges, [moving(f"f{i}", f"f{i + 1}", 0) for i in reversed(range(links))])
+    assert not refused
+    assert edges.reads < 10 * links
