@@ -354,20 +354,6 @@ def test_each_instant_may_be_out_of_range_by_itself(asked: Asked) -> None:
     assert (caught.value.index, caught.value.child) == (1, "b")
 
 
-# What happens to the tree afterwards
-
-
-@each_number
-def test_answers_do_not_change_with_the_tree(asked: Asked) -> None:
-    tree = tree_of(*over("a", "b", [0, 10, 20]))
-    stamps = asked([1, 5, 15, 20])
-    found = tree.lookup_many("a", "b", stamps)
-    tree.insert_many([moving("a", "b", 10, -50.0), moving("z", "b", 20, -50.0)])
-    tree.clear()
-    tree.insert(static("a", "b", 7.0))
-    assert xs(found) == pytest.approx([float(stamp) for stamp in stamps])
-
-
 # Many stamps
 
 
