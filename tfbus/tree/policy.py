@@ -29,7 +29,7 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """The limits of how far an answer may depart from its stamp; all in ns. `policy_of` makes one from what users write.
+    """The limits of how far an answer may depart from its stamp; all in ns. Made by `policy_of`.
 
     Parameters
     ----------
