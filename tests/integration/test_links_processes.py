@@ -13,6 +13,8 @@ from uuid import uuid4
 import pytest
 from support.processes import PATIENCE, Crowd, PeerProcess, crowd, free_ports, new_domain
 
+pytestmark = pytest.mark.thorough
+
 BACKENDS = ("asyncio", "trio", "asyncio+uvloop")
 SECONDS = 10
 RATE = 500 / 3

@@ -15,6 +15,8 @@ from tfbus.links._message import MAX_BYTES
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import encode
 
+pytestmark = pytest.mark.thorough
+
 NAMED = encode([moving("map", f"aaaaaaaa{number}", 0) for number in range(5_000)])
 STATICS = [f"fixed {number}" for number in range(50)]
 

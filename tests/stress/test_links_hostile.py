@@ -20,6 +20,8 @@ from tfbus.links._peers import MAX_PEERS
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import encode
 
+pytestmark = pytest.mark.thorough
+
 NAN = struct.pack("<d", float("nan"))
 Message = tuple[bytes, bytes]
 
