@@ -81,8 +81,8 @@ async def test_static_frames_are_kept_as_messages_without_a_number_and_what_no_m
     async with ends() as (here, there):
         names = [f"{number}" for number in range(150)]
         bad = OutgoingBatch(ORIGIN, 1, (static("map", "bad", authority="\ud800"),))
-        here.carrier.send(Turn([], {"bad": bad} | {name: kept(name) for name in names}))
-        found = set()
+        here.carrier.send(Turn([], {"bad": bad, **{name: kept(name) for name in names}}))
+        found: set[str] = set()
         while len(found) < 150:
             message = await there.next()
             assert isinstance(message, ReceivedMessage)
