@@ -120,4 +120,4 @@ def test_without_prefix_and_shared_names_there_is_no_prefix(shared: Any) -> None
 def test_a_prefix_with_shared_names_is_a_prefix() -> None:
     prefix = as_prefix("robot1/", ["map"])
     assert prefix is not None
-    assert (prefix.prefix, prefix.shared) == ("robot1/", {"map"})
+    assert (prefix.prefix, prefix.shared) == ("robot1/", frozenset({"map"}))
