@@ -31,7 +31,7 @@ async def test_simulate_raises_what_the_function_raises_without_a_group() -> Non
         await simulate(clock, fail)
 
 
-async def test_simulate_gives_up_on_what_nobody_sends() -> None:
+async def test_simulate_raises_timeout_error_at_the_limit() -> None:
     with pytest.raises(TimeoutError, match="not finished after 60 simulated s"):
         await simulate(SimulatedClock(), lambda: anyio.Event().wait(), limit=60.0)
 

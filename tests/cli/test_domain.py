@@ -4,7 +4,8 @@ import re
 import signal
 import socket
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 import anyio
 import anyio.lowlevel
@@ -133,7 +134,7 @@ async def publish_late(bus: Bus) -> None:
     ],
 )
 def test_waiting_for_the_first_transform_is_announced_once_if_it_takes_more_than_a_second(
-    publish: Callable[[Bus], Awaitable[None]], seconds: float, notice: str, capsys: pytest.CaptureFixture[str]
+    publish: Callable[[Bus], Coroutine[Any, Any, None]], seconds: float, notice: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async def wait() -> int:
         clock = SimulatedClock(START)

@@ -29,7 +29,7 @@ def test_results_go_to_standard_output_and_everything_else_to_standard_error(
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_lines_leave_a_buffered_stream_at_once(stream: str, monkeypatch: pytest.MonkeyPatch) -> None:
     received = io.BytesIO()
-    monkeypatch.setattr(sys, stream, io.TextIOWrapper(io.BufferedWriter(received), encoding="utf-8"))  # type: ignore[type-var]
+    monkeypatch.setattr(sys, stream, io.TextIOWrapper(io.BufferedWriter(received), encoding="utf-8"))
     (print_now if stream == "stdout" else say)("line")
     assert received.getvalue() == b"line\n"
 

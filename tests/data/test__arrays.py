@@ -45,7 +45,7 @@ def test_copies_have_the_same_contents_and_are_read_only_too(data: Any, twin_of:
 
 @pytest.mark.parametrize("made", [*COPIES, pytest.param(lambda data: do_transform(data, ANSWER), id="moved")])
 @pytest.mark.parametrize("data", OWNERS, ids=name_of)
-def test_nobody_can_make_a_copied_array_writable_again(data: Any, made: Callable[[Any], Any]) -> None:
+def test_a_copied_array_cannot_be_made_writable_again(data: Any, made: Callable[[Any], Any]) -> None:
     for array in arrays_of(data) + arrays_of(made(data)):
         with pytest.raises(ValueError, match="WRITEABLE"):
             array.flags.writeable = True
@@ -58,14 +58,14 @@ def test_a_deep_copy_shares_no_array(data: Any) -> None:
 
 
 @pytest.mark.parametrize("data", HOLDERS, ids=name_of)
-def test_what_holds_arrays_is_equal_only_to_itself(data: Any) -> None:
+def test_data_with_arrays_are_equal_only_to_themselves(data: Any) -> None:
     assert data == data
     assert data != copy.copy(data)
     assert len({data, copy.copy(data)}) == 2
 
 
 @pytest.mark.parametrize("data", VALUES, ids=name_of)
-def test_what_holds_no_array_is_a_value(data: Any) -> None:
+def test_data_without_arrays_compare_by_value(data: Any) -> None:
     twin = copy.deepcopy(data)
     assert twin == data
     assert hash(twin) == hash(data)
@@ -79,7 +79,7 @@ def test_data_are_immutable(data: Any) -> None:
     assert not hasattr(data, "__dict__")
 
 
-def test_clouds_and_scans_look_at_the_arrays_of_their_owner_and_leave_them_writable() -> None:
+def test_clouds_and_scans_view_the_given_arrays_which_stay_writable() -> None:
     points, stamps, column = np.zeros((2, 3), np.float32), np.array([1, 2]), np.array([5.0, 6.0])
     cloud = PointCloud("map", 0, points, stamps, {"ring": column})
     scan = LaserScan("map", 0, column, angle_min=0.0, angle_increment=1.0, intensities=stamps)
@@ -95,7 +95,7 @@ def test_clouds_and_scans_look_at_the_arrays_of_their_owner_and_leave_them_writa
         assert owned.flags.writeable
 
 
-def test_what_is_small_is_copied() -> None:
+def test_small_arrays_are_copied() -> None:
     points, covariance = np.zeros((3, 3)), np.eye(6)
     polygon = Polygon("map", 0, points)
     pose = PoseWithCovarianceStamped("map", 0, Transform(), covariance)
@@ -135,11 +135,11 @@ def test_points_of_another_shape_are_refused_with_the_shape(build: Any, shape: t
 
 @pytest.mark.parametrize("build", POINTS_OF)
 @pytest.mark.parametrize("wrong", [[("1", "2", "3")], [(True, False, True)], [(1j, 0, 0)], [(None, None, None)]])
-def test_points_that_are_no_numbers_are_refused_with_the_dtype(build: Any, wrong: Any) -> None:
+def test_points_of_another_dtype_are_refused_with_the_dtype(build: Any, wrong: Any) -> None:
     with pytest.raises(TypeError, match="points must be numbers, not of dtype"):
         build(wrong)
 
 
-def test_a_scan_survives_its_keyword_only_fields() -> None:
+def test_a_scan_is_copied_and_pickled_with_its_keyword_only_fields() -> None:
     scan = replace(SCAN, angle_min=-0.5, time_increment=0.001, range_max=30.0)
     assert contents(pickle.loads(pickle.dumps(scan))) == contents(scan)

@@ -56,7 +56,7 @@ def test_three_numbers_of_any_kind_become_a_tuple_of_floats(build: Any, numbers:
 
 
 @pytest.mark.parametrize("build", TRIPLES)
-def test_three_numbers_may_be_missing(build: Any) -> None:
+def test_three_numbers_may_be_nan_or_infinite(build: Any) -> None:
     missing, beyond, there = build((math.nan, -math.inf, -0.0))
     assert math.isnan(missing)
     assert beyond == -math.inf
@@ -98,7 +98,7 @@ def test_another_number_of_numbers_is_refused_with_the_shape(build: Any, numbers
     ],
 )
 @pytest.mark.parametrize("build", TRIPLES)
-def test_what_is_no_number_is_refused_with_what_was_given(build: Any, wrong: Any) -> None:
+def test_values_that_are_not_numbers_are_refused_and_shown(build: Any, wrong: Any) -> None:
     with pytest.raises(TypeError, match="must be three numbers, not") as caught:
         build(wrong)
     assert repr(wrong) in str(caught.value)

@@ -14,14 +14,14 @@ from tfbus.geometry.rows import Vector
 POINTS = np.zeros((2, 3))
 
 
-def test_every_point_is_moved() -> None:
+def test_every_point_is_transformed() -> None:
     # The numbers of tf2_sensor_msgs' test_tf2_sensor_msgs.cpp.
     moved = do_transform(PointCloud("B", 0, np.array([(1.0, 2.0, 3.0), (0.0, 0.0, 0.0)])), ANSWER)
     np.testing.assert_allclose(moved.points, [(-9.0, 18.0, 27.0), (-10.0, 20.0, 30.0)], rtol=0.0, atol=1e-13)
 
 
 @given(transforms(), st.lists(vectors(), min_size=1, max_size=5))
-def test_a_cloud_moves_as_its_points_do(t: Transform, points: list[Vector]) -> None:
+def test_a_cloud_is_transformed_point_by_point(t: Transform, points: list[Vector]) -> None:
     sample = TransformStamped("A", "B", 0, t)
     moved = do_transform(PointCloud("B", 0, np.array(points)), sample)
     one_by_one = [do_transform(PointStamped("B", 0, point), sample).point for point in points]
@@ -29,7 +29,7 @@ def test_a_cloud_moves_as_its_points_do(t: Transform, points: list[Vector]) -> N
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_moved_points_keep_their_dtype(dtype: Any) -> None:
+def test_transformed_points_keep_their_dtype(dtype: Any) -> None:
     assert do_transform(PointCloud("B", 0, np.ones((2, 3), dtype)), ANSWER).points.dtype == dtype
 
 
@@ -47,7 +47,7 @@ def test_an_infinite_point_stays_not_finite_without_a_warning(dtype: Any) -> Non
         assert np.isfinite(moved.points).all(axis=1).tolist() == [False, False, False, True]
 
 
-def test_stamps_and_fields_are_carried_along_uncopied() -> None:
+def test_stamps_and_fields_are_passed_on_without_a_copy() -> None:
     moved = do_transform(CLOUD, ANSWER)
     assert moved.stamps is CLOUD.stamps
     assert moved.fields["intensity"] is CLOUD.fields["intensity"]
@@ -80,7 +80,7 @@ def test_stamps_become_int64_without_losing_a_nanosecond(stamps: Any) -> None:
 
 
 @pytest.mark.parametrize("stamps", [[0.5, 1.5], np.array([1.0, 2.0])])
-def test_stamps_in_seconds_are_refused_with_the_way_out(stamps: Any) -> None:
+def test_stamps_in_seconds_are_refused_with_a_hint_at_from_seconds(stamps: Any) -> None:
     with pytest.raises(TypeError, match="from_seconds"):
         PointCloud("map", 0, POINTS, stamps)
 
@@ -109,7 +109,7 @@ def test_there_is_one_stamp_for_each_point(stamps: Any, message: str) -> None:
     ],
     ids=["numbers", "words", "patches", "records"],
 )
-def test_a_field_may_be_anything_with_one_row_for_each_point(values: Any) -> None:
+def test_a_field_is_any_array_with_one_row_for_each_point(values: Any) -> None:
     kept = do_transform(PointCloud("B", 0, POINTS, fields={"extra": values}), ANSWER).fields["extra"]
     assert kept.dtype == np.asarray(values).dtype
     np.testing.assert_array_equal(kept, values)
@@ -126,7 +126,7 @@ def test_the_name_of_a_field_is_a_str() -> None:
         PointCloud("map", 0, POINTS, fields={5: np.zeros(2)})  # type: ignore[dict-item]
 
 
-def test_fields_cannot_be_changed_by_either_side() -> None:
+def test_fields_can_neither_be_changed_by_the_caller_nor_through_the_cloud() -> None:
     mine = {"ring": np.array([1, 2])}
     cloud = PointCloud("map", 0, POINTS, fields=mine)
     mine["late"] = np.array([3, 4])

@@ -21,29 +21,29 @@ from tfbus import (
 from tfbus.geometry.rows import Quaternion, Vector
 
 
-def test_a_point_is_moved() -> None:
+def test_a_point_is_rotated_and_translated() -> None:
     moved = do_transform(PointStamped("B", 7, (1.0, 2.0, 3.0)), ANSWER)
     assert moved.point == pytest.approx((-9.0, 18.0, 27.0), abs=1e-13)
 
 
-def test_a_vector_is_turned_but_not_shifted() -> None:
+def test_a_vector_is_rotated_but_not_translated() -> None:
     moved = do_transform(Vector3Stamped("B", 7, (1.0, 2.0, 3.0)), ANSWER)
     assert moved.vector == pytest.approx((1.0, -2.0, -3.0), abs=1e-13)
 
 
-def test_a_pose_is_moved_and_turned() -> None:
+def test_a_pose_is_composed_with_the_transform() -> None:
     moved = do_transform(PoseStamped("B", 7, Transform((1.0, 2.0, 3.0))), ANSWER)
     assert moved.pose.is_close(Transform((-9.0, 18.0, 27.0), (1.0, 0.0, 0.0, 0.0)), translation_tolerance=1e-12)
 
 
-def test_an_orientation_is_turned_but_not_shifted() -> None:
+def test_an_orientation_is_rotated_but_not_translated() -> None:
     half = math.sqrt(0.5)
     answer = TransformStamped("A", "B", 0, Transform((10.0, 20.0, 30.0), (1.0, 0.0, 0.0, 0.0)))
     moved = do_transform(QuaternionStamped("B", 7, (0.0, -half, 0.0, half)), answer)
     assert moved.quaternion == pytest.approx((half, 0.0, -half, 0.0), abs=1e-15)
 
 
-def test_a_polygon_is_moved_corner_by_corner() -> None:
+def test_a_polygon_is_transformed_corner_by_corner() -> None:
     moved = do_transform(Polygon("B", 7, np.array([(1, 2, 3), (0, 0, 0)], np.float32)), ANSWER)
     assert moved.points.dtype == np.float32
     np.testing.assert_allclose(moved.points, [(-9.0, 18.0, 27.0), (-10.0, 20.0, 30.0)], rtol=1e-6)
@@ -91,13 +91,13 @@ def test_a_pose_is_a_transform(pose: Any) -> None:
         PoseStamped("map", 0, pose)
 
 
-def test_a_quaternion_that_is_nearly_a_unit_is_normalised_with_its_sign() -> None:
+def test_a_quaternion_near_unit_norm_is_normalised_and_keeps_its_sign() -> None:
     nearly: Any = np.array([0.0, 0.0, 0.0, -1.005])
     stored = QuaternionStamped("map", 0, nearly).quaternion
     assert stored == (0.0, 0.0, 0.0, -1.0)
 
 
 @pytest.mark.parametrize("bad", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.1), (0.0, 0.0, 0.0, math.nan), (0.0, 1.0)])
-def test_a_quaternion_that_is_no_rotation_is_refused_by_its_name(bad: Any) -> None:
+def test_an_invalid_quaternion_is_refused_with_the_name_of_the_field(bad: Any) -> None:
     with pytest.raises(InvalidTransformError, match=r"^quaternion "):
         QuaternionStamped("map", 0, bad)

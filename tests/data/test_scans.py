@@ -18,7 +18,7 @@ def scan_of(ranges: Any, **changes: Any) -> LaserScan:
     return LaserScan("laser", 0, ranges, **{"angle_min": -math.pi / 4, "angle_increment": math.pi / 4, **changes})
 
 
-def test_a_ray_goes_at_its_angle_and_as_far_as_its_range() -> None:
+def test_a_point_is_at_the_angle_and_the_range_of_its_ray() -> None:
     cloud = scan_of([math.sqrt(2.0), 3.0, math.sqrt(2.0), 2.0]).to_points()
     expected = [(1.0, -1.0, 0.0), (3.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 2.0, 0.0)]
     np.testing.assert_allclose(cloud.points, expected, atol=1e-15)
@@ -50,24 +50,24 @@ def test_points_have_the_dtype_of_the_ranges_and_are_exact_to_its_last_digits(dt
 # Which rays count
 
 
-def test_rays_that_saw_nothing_or_are_beyond_the_limits_are_no_points() -> None:
+def test_ranges_that_are_not_finite_or_outside_the_limits_give_no_points() -> None:
     ranges = [math.nan, math.inf, -math.inf, 0.05, 0.1, 5.0, 30.0, 30.5, 0.0, -1.0]
     cloud = scan_of(ranges, range_min=0.1, range_max=30.0).to_points()
     assert cloud.fields["index"].tolist() == [4, 5, 6]
     np.testing.assert_allclose(np.linalg.norm(cloud.points, axis=1), [0.1, 5.0, 30.0])
 
 
-def test_without_limits_every_finite_range_that_is_not_negative_counts() -> None:
+def test_without_limits_every_finite_range_from_zero_is_valid() -> None:
     assert scan_of([-1.0, 0.0, 1e9, math.inf, math.nan]).to_points().fields["index"].tolist() == [1, 2]
 
 
-def test_a_range_at_a_limit_that_was_rounded_to_float32_counts() -> None:
+def test_a_range_at_a_limit_rounded_to_float32_is_valid() -> None:
     ranges = np.array([0.1, 30.1], np.float32)
     assert len(scan_of(ranges, range_min=0.1, range_max=30.1).to_points()) == 2
 
 
 @pytest.mark.parametrize(("dtype", "beyond"), [(np.float32, 1e300), (np.float16, 1e5), (np.float16, 1e300)])
-def test_a_limit_beyond_all_numbers_of_the_size_of_the_ranges_is_one_all_the_same(dtype: Any, beyond: float) -> None:
+def test_a_limit_beyond_the_dtype_of_the_ranges_is_infinite(dtype: Any, beyond: float) -> None:
     ranges = np.array([1.0, math.inf, np.finfo(dtype).max, math.nan, -1.0], dtype)
     index = scan_of(ranges, range_max=beyond).to_points().fields["index"]
     assert index.tolist() == [0, 2]
@@ -76,7 +76,7 @@ def test_a_limit_beyond_all_numbers_of_the_size_of_the_ranges_is_one_all_the_sam
 
 
 @pytest.mark.parametrize("ranges", [[], [math.nan, math.inf]])
-def test_a_scan_that_saw_nothing_is_an_empty_cloud(ranges: list[float]) -> None:
+def test_a_scan_without_valid_ranges_is_an_empty_cloud(ranges: list[float]) -> None:
     cloud = scan_of(ranges, intensities=np.zeros(len(ranges))).to_points()
     assert cloud.points.shape == (0, 3)
     assert cloud.stamps is not None
@@ -90,7 +90,7 @@ def test_intensities_stay_with_their_rays() -> None:
 
 
 @pytest.mark.parametrize("none", [None, [], np.array([], np.float32)])
-def test_an_empty_array_of_intensities_is_none_at_all(none: Any) -> None:
+def test_an_empty_array_of_intensities_becomes_none(none: Any) -> None:
     scan = scan_of([1.0, 2.0], intensities=none)
     assert scan.intensities is None
     assert list(scan.to_points().fields) == ["index"]
@@ -123,7 +123,7 @@ def test_rays_of_one_instant_have_one_stamp() -> None:
     assert cloud.stamps.tolist() == [TODAY, TODAY]
 
 
-def test_a_scan_of_the_latest_has_no_stamps_to_give() -> None:
+def test_a_scan_stamped_latest_gives_no_stamps() -> None:
     cloud = replace(scan_of([1.0, 1.0], time_increment=0.5), stamp=LATEST).to_points()
     assert cloud.stamp is LATEST
     assert cloud.stamps is None
@@ -186,7 +186,7 @@ def test_the_rounding_of_drivers_is_no_error() -> None:
         ({"range_max": math.nan}, "range_min must not be above range_max"),
     ],
 )
-def test_a_scan_that_makes_no_sense_is_refused_with_what_was_given(changes: dict[str, Any], message: str) -> None:
+def test_an_inconsistent_scan_is_refused_with_the_value(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         replace(SCAN, **changes)
 
@@ -195,7 +195,7 @@ def test_a_scan_that_makes_no_sense_is_refused_with_what_was_given(changes: dict
     "name", ["angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max"]
 )
 @pytest.mark.parametrize("wrong", ["1", True, (1.0,)])
-def test_what_is_no_number_is_refused_by_its_name(name: str, wrong: Any) -> None:
+def test_a_value_that_is_not_a_number_is_refused_with_the_name_of_the_field(name: str, wrong: Any) -> None:
     with pytest.raises(TypeError, match=f"{name} must be a number, not"):
         replace(SCAN, **{name: wrong})
 

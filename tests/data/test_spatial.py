@@ -36,7 +36,7 @@ def turned(covariance: npt.ArrayLike, target_from_source: Transform) -> npt.NDAr
     return moved
 
 
-def test_the_covariance_that_tf2_turns_upside_down() -> None:
+def test_the_covariance_of_tf2s_own_test_is_rotated_as_in_tf2() -> None:
     # The numbers of tf2_geometry_msgs' test_tf2_geometry_msgs.py.
     data = PoseWithCovarianceStamped("source", 0, Transform((1.0, 2.0, 3.0), HALF_TURN), np.tile(np.arange(1.0, 7), 6))
     moved = do_transform(data, answer(Transform((1.0, 2.0, 3.0), HALF_TURN)))
@@ -54,19 +54,19 @@ def test_a_quarter_turn_swaps_x_and_y_of_both_halves() -> None:
 
 
 @given(transforms(), SIX)
-def test_an_error_along_one_line_turns_as_its_two_vectors_do(t: Transform, error: tuple[Vector, Vector]) -> None:
+def test_a_covariance_of_rank_one_is_rotated_like_its_vector(t: Transform, error: tuple[Vector, Vector]) -> None:
     there = [do_transform(Vector3Stamped("source", 0, part), answer(t)).vector for part in error]
     expected = np.outer(np.ravel(there), np.ravel(there))
     np.testing.assert_allclose(turned(np.outer(np.ravel(error), np.ravel(error)), t), expected, atol=1e-11)
 
 
 @given(transforms())
-def test_what_is_as_uncertain_in_every_direction_stays_so(t: Transform) -> None:
+def test_an_isotropic_covariance_does_not_change(t: Transform) -> None:
     round_error = np.diag([0.5, 0.5, 0.5, 0.1, 0.1, 0.1])
     np.testing.assert_allclose(turned(round_error, t), round_error, atol=1e-14)
 
 
-def test_an_unknown_block_leaves_the_others_known() -> None:
+def test_a_nan_block_does_not_spread_to_the_others() -> None:
     covariance = np.eye(6)
     covariance[3:, 3:] = math.nan
     moved = turned(covariance, Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.1, 0.2, 0.3)))
@@ -76,7 +76,7 @@ def test_an_unknown_block_leaves_the_others_known() -> None:
 
 
 @pytest.mark.parametrize("numbers", [range(36), list(range(36)), np.arange(36.0), np.arange(36).reshape(6, 6)])
-def test_a_covariance_comes_as_a_matrix_or_row_by_row(numbers: Any) -> None:
+def test_a_covariance_is_given_as_a_matrix_or_row_by_row(numbers: Any) -> None:
     covariance = PoseWithCovarianceStamped("map", 0, Transform(), numbers).covariance
     assert covariance.dtype == np.float64
     assert covariance.tolist() == [[float(6 * row + column) for column in range(6)] for row in range(6)]
@@ -135,7 +135,7 @@ def adjoint(t: Transform) -> npt.NDArray[np.float64]:
 
 
 @given(transforms(), SIX)
-def test_a_twist_goes_by_the_adjoint_matrix(t: Transform, six: tuple[Vector, Vector]) -> None:
+def test_a_twist_is_transformed_by_the_adjoint_matrix(t: Transform, six: tuple[Vector, Vector]) -> None:
     moved = do_transform(TwistStamped("source", 0, *six), answer(t))
     expected = adjoint(t) @ np.ravel(six)
     np.testing.assert_allclose((*moved.linear, *moved.angular), expected, atol=1e-9)
@@ -155,7 +155,7 @@ def test_the_adjoint_of_a_product_is_the_product_of_the_adjoints(a: Transform, b
 # Wrenches
 
 
-def test_the_wrench_that_tf2_moves() -> None:
+def test_the_wrench_of_tf2s_own_test_is_transformed_as_in_tf2() -> None:
     # The numbers of tf2_geometry_msgs' test_tf2_geometry_msgs.cpp.
     t = Transform.from_axis_angle((0.0, 0.0, 1.0), -math.pi / 2, (0.0, -2.0, 0.0))
     moved = do_transform(WrenchStamped("source", 0, (2.0, 1.0, 3.0), (2.0, 1.0, 3.0)), answer(t))

@@ -29,7 +29,7 @@ def test_a_view_is_read_only_and_its_owner_may_still_write() -> None:
 
 @pytest.mark.parametrize("laid_out", LAYOUTS)
 @pytest.mark.parametrize("dtype", ["f2", "f4", "f8", ">f4", "g", "i8"])
-def test_what_is_locked_has_its_numbers_and_nothing_cut_out_of_it_becomes_writable(
+def test_a_locked_array_has_the_same_numbers_and_no_view_of_it_becomes_writable(
     laid_out: Callable[[Array], Array], dtype: str
 ) -> None:
     array = laid_out(np.arange(12).reshape(4, 3).astype(dtype))

@@ -109,7 +109,7 @@ def test_a_changed_copy_differs_in_that_field_only(name: str, value: Any) -> Non
     assert changed.replace(**{name: getattr(sample, name)}) == sample
 
 
-def test_a_changed_copy_is_checked_again() -> None:
+def test_replaced_fields_are_checked_again() -> None:
     sample = TransformStamped("map", "base_link", 7, MOVE, "odometry")
     with pytest.raises(InvalidTransformError, match="own parent"):
         sample.replace(parent="base_link")
@@ -120,7 +120,9 @@ def test_a_changed_copy_is_checked_again() -> None:
 
 
 @given(samples())
-def test_equal_samples_have_equal_hashes_and_survive_pickling_and_copying(sample: TransformStamped) -> None:
+def test_copies_pickles_and_the_repr_of_a_sample_are_equal_to_it(sample: TransformStamped) -> None:
+    names = {"Transform": Transform, "TransformStamped": TransformStamped}
+    assert eval(repr(sample), names) == sample
     for twin in (sample.replace(), pickle.loads(pickle.dumps(sample)), copy.copy(sample), copy.deepcopy(sample)):
         assert twin == sample
         assert hash(twin) == hash(sample)
@@ -130,13 +132,7 @@ def test_a_sample_equals_nothing_else() -> None:
     assert TransformStamped("map", "base_link", 7, MOVE) != ("map", "base_link", 7, MOVE)
 
 
-@given(samples())
-def test_the_repr_makes_the_same_sample(sample: TransformStamped) -> None:
-    names = {"Transform": Transform, "TransformStamped": TransformStamped}
-    assert eval(repr(sample), names) == sample
-
-
-def test_the_text_for_people_has_frames_and_seconds() -> None:
+def test_the_text_of_a_sample_has_frames_and_seconds() -> None:
     sample = TransformStamped("map", "base_link", 12_500_000_000, MOVE)
     assert str(sample).startswith("map <- base_link at 12.500 s: ")
     assert str(sample.replace(static=True)).startswith("map <- base_link static: ")
@@ -165,12 +161,12 @@ def test_any_iterable_of_samples_is_a_batch_in_its_order() -> None:
 @pytest.mark.parametrize(
     ("samples", "shown"), [(None, "None"), ("map", "'map'"), (b"map", "b'map'"), (7, "7"), (MOVE, "Transform")]
 )
-def test_what_is_no_batch_is_a_type_error_that_shows_it(samples: Any, shown: str) -> None:
+def test_other_values_than_a_batch_are_a_type_error_that_shows_them(samples: Any, shown: str) -> None:
     with pytest.raises(TypeError, match=shown):
         as_batch(samples)
 
 
 @pytest.mark.parametrize("bad", [None, MOVE, ("map", "odom", 1, MOVE)])
-def test_what_is_no_sample_in_a_batch_is_a_type_error(bad: Any) -> None:
+def test_an_element_of_a_batch_that_is_no_sample_is_a_type_error(bad: Any) -> None:
     with pytest.raises(TypeError, match="expected a TransformStamped"):
         as_batch([FIRST, bad])

@@ -1,4 +1,4 @@
-"""Buses in processes of their own, joined over the loopback or between namespaces; all are ended by their own id."""
+"""Buses in processes of their own, linked over the loopback or between network namespaces."""
 
 import os
 import shutil
@@ -13,6 +13,8 @@ from uuid import uuid4
 import pytest
 from support.processes import PATIENCE, Crowd, PeerProcess, crowd, free_ports, new_domain
 
+pytestmark = pytest.mark.thorough
+
 BACKENDS = ("asyncio", "trio", "asyncio+uvloop")
 SECONDS = 10
 RATE = 500 / 3
@@ -26,7 +28,7 @@ def processes() -> Iterator[Crowd]:
 
 
 class Place:
-    """A domain of one test, and the addresses of some who listen."""
+    """A domain of one test, and addresses to listen at."""
 
     def __init__(self, listeners: int = 1) -> None:
         self.domain = new_domain()
@@ -50,7 +52,7 @@ def meet(*processes: PeerProcess) -> None:
 
 
 def send_in_turn(processes: list[PeerProcess]) -> None:
-    """Each publishes for some seconds, all at once, until everybody has the last of everything."""
+    """Have all processes publish at once for some seconds, and check that each has received everything once."""
     batches = round(RATE * SECONDS)
     names = [f"p{number}" for number in range(len(processes))]
     started = [
@@ -82,7 +84,7 @@ def test_three_processes_in_a_ring_have_every_sample_once(processes: Crowd) -> N
     send_in_turn(members)
     for member in members:
         (link,) = member.ask("facts")["links"]
-        # All of them hear each other directly, and nobody passes on what is for everybody.
+        # All of them hear each other directly, so none passes anything on.
         assert link["duplicates"] == 0
         assert link["sent_samples"] == link["received_samples"] / 2
 
@@ -110,14 +112,14 @@ def test_a_late_joiner_has_all_static_frames(processes: Crowd, place: Place) -> 
     assert late.ask("facts")["moving"] == []
 
 
-def test_nobody_has_to_be_first(processes: Crowd, place: Place) -> None:
+def test_processes_may_start_in_any_order(processes: Crowd, place: Place) -> None:
     late = processes.add(place.other())
     late.ask("statics", names=["before"])
     first = processes.add(place.first())
     first.ask("until", static=["before"])
     first.ask("statics", names=["after"])
     late.ask("until", static=["after"])
-    # And whoever was first may go and come back.
+    # The first one may end and come back.
     first.kill()
     late.wait(event="PeerLost")
     again = processes.add(place.first(), backend="trio")
@@ -155,7 +157,7 @@ def test_a_killed_broadcaster_is_lost_and_refreshes_its_static_frames_when_it_is
     again.ask("until", static=["own"])
     again.ask("statics", names=["lidar", "camera"], x=2.0, authority="urdf")
     assert listener.wait(event="PeerJoined")["peer"] != joined["peer"]
-    # What is latched goes to whoever comes now, with the new value.
+    # A late joiner receives the new values.
     third = processes.add(place.other())
     for process in (listener, third):
         process.ask("until", static=["lidar", "camera"], x={"lidar": 2.0, "camera": 2.0})
@@ -165,7 +167,7 @@ def test_a_frozen_process_is_lost_and_comes_back_with_its_static_frames(processe
     listener = processes.add(place.first(lease=1.0, drop_lost=True))
     frozen = processes.add(place.other(lease=1.0))
     frozen.ask("statics", names=["lidar"], authority="urdf")
-    # Whoever comes later has it from the cache.
+    # The late joiner has it from the cache.
     other = processes.add(place.other(lease=1.0, drop_lost=True), backend="trio")
     for process in (listener, other):
         process.ask("until", static=["lidar"], peers=2)
@@ -181,8 +183,8 @@ def test_a_frozen_process_is_lost_and_comes_back_with_its_static_frames(processe
     frozen.ask("until", static=["meanwhile"], peers=2)
 
 
-def test_a_process_that_is_too_slow_and_one_that_is_frozen_delay_nobody(processes: Crowd, place: Place) -> None:
-    # A lease that does not end while this goes on, so that nobody is spared by being lost.
+def test_a_slow_and_a_frozen_process_delay_no_other(processes: Crowd, place: Place) -> None:
+    # The lease outlasts the test, so no peer is spared by being lost.
     broadcaster = processes.add(place.first(lease=60.0))
     reader, slow, frozen = (processes.add(place.other(lease=60.0), backend=backend) for backend in BACKENDS)
     meet(broadcaster, reader, slow, frozen)
@@ -192,7 +194,7 @@ def test_a_process_that_is_too_slow_and_one_that_is_frozen_delay_nobody(processe
     reader.ask("until", last={"wheels": 2_999})
     tally = reader.ask("facts")["tallies"]["wheels"]
     assert (tally["missing"], tally["not_in_order"], tally["not_whole"]) == (0, 0, 0)
-    # A put that waits for the others waits for seconds.
+    # A put that waited for the others would take seconds.
     assert sent["longest_call"] < 1.0
     assert broadcaster.ask("facts")["longest_pause"] < 1.0
     # All of it was kept for the slow one.
@@ -201,14 +203,14 @@ def test_a_process_that_is_too_slow_and_one_that_is_frozen_delay_nobody(processe
     facts = slow.ask("facts")
     assert facts["tallies"]["wheels"]["missing"] == 0
     assert facts["links"][0]["queue"]["dropped"] == 0
-    # And what stays true is not lost for the frozen one.
+    # Static frames are not lost for the frozen one.
     broadcaster.ask("statics", names=["lidar"])
     reader.ask("until", static=["lidar"])
     frozen.signal(signal.SIGCONT)
     frozen.ask("until", static=["lidar"])
 
 
-def test_a_process_that_is_much_too_slow_loses_the_oldest_and_says_so(processes: Crowd, place: Place) -> None:
+def test_a_process_that_is_much_too_slow_drops_and_counts_the_oldest_batches(processes: Crowd, place: Place) -> None:
     broadcaster = processes.add(place.first(lease=60.0))
     slow = processes.add(place.other(lease=60.0, capacity=100))
     meet(broadcaster, slow)
@@ -224,7 +226,7 @@ def test_a_process_that_is_much_too_slow_loses_the_oldest_and_says_so(processes:
     assert (tally["not_in_order"], tally["not_whole"]) == (0, 0)
 
 
-def test_when_the_first_one_dies_the_others_go_on_and_another_one_joins_them(processes: Crowd) -> None:
+def test_when_the_first_process_dies_the_others_go_on_and_another_one_joins_them(processes: Crowd) -> None:
     # At the meeting point, where other programs of this machine may be.
     domain = {"domain": new_domain()}
     first = processes.add(domain)
@@ -259,16 +261,14 @@ def test_a_lookup_in_one_process_is_answered_by_another(processes: Crowd, place:
     assert (found["x"], found["stamp"]) == (2.0, 1_500)
 
 
-def test_removed_frames_leave_everywhere_and_those_who_come_later_never_hear_of_them(
-    processes: Crowd, place: Place
-) -> None:
+def test_removed_frames_leave_everywhere_and_late_joiners_never_hear_of_them(processes: Crowd, place: Place) -> None:
     owner, other = processes.add(place.first()), processes.add(place.other(), backend="trio")
     meet(owner, other)
     owner.ask("statics", names=["lidar", "camera"])
     owner.ask("stream", authority="wheels", batches=3, rate=1_000, size=2)
     other.ask("until", static=["lidar", "camera"], last={"wheels": 2})
     owner.ask("remove", frame="lidar")
-    # Also by somebody who has not published it.
+    # A process that has not published a frame may remove it too.
     other.ask("remove", frame="wheels/0")
     for process in (owner, other):
         process.ask("until", lacks=["lidar", "wheels/0"], has=["wheels/1"])
@@ -290,7 +290,7 @@ def test_a_static_frame_that_comes_and_goes_is_there_at_last(processes: Crowd, p
         process.ask("until", x={"lidar": 1_000.0})
 
 
-# A loop that ends, and a program that does, without the end of its link; somebody sends to it all the time.
+# Event loops and programs that end without the end of their link, while messages keep coming.
 CRASHES = {
     "the loop is closed": "loop.close(); time.sleep(0.1)",
     "the loop is left": "",
@@ -367,7 +367,7 @@ Hosts = list[tuple[str, tuple[str, ...]]]
 
 @pytest.fixture
 def hosts() -> Iterator[Hosts]:
-    """Three hosts on one network: the address of each, and what to begin a command with so that it runs there."""
+    """Three hosts on one network: the address of each, and the prefix of a command that runs there."""
     ip = shutil.which("ip")
     if ip is None or os.geteuid() != 0:
         pytest.skip("network namespaces need root and the program ip")
@@ -404,7 +404,7 @@ def test_hosts_find_each_other_through_one_whose_address_they_know(hosts: Hosts,
     known = f"tcp/{hosts[0][0]}:17447"
     members = [
         processes.begin(
-            # Where it can be reached itself, so that the other two need the first one only to find each other.
+            # Each listens at its own address, so the other two need the first one only to find each other.
             {"domain": domain, "listen": known if number == 0 else f"tcp/{address}:0", "connect": [known][:number]},
             prefix=prefix,
             backend=BACKENDS[number],
@@ -443,7 +443,7 @@ def test_a_host_that_is_cut_off_is_lost_and_comes_back(hosts: Hosts, processes: 
     apart.ask("until", static=["map lidar"])
 
 
-def test_hosts_that_are_told_no_address_stay_by_themselves(hosts: Hosts, processes: Crowd) -> None:
+def test_hosts_without_an_address_hear_only_themselves(hosts: Hosts, processes: Crowd) -> None:
     domain = {"domain": new_domain()}
     (_, first), (_, second), _ = hosts
     apart, one, two = (processes.add(domain, prefix=prefix) for prefix in (first, second, second))
@@ -455,7 +455,7 @@ def test_hosts_that_are_told_no_address_stay_by_themselves(hosts: Hosts, process
     assert apart.ask("facts")["links"][0]["peers"] == 0
 
 
-def test_the_program_of_these_tests_says_what_is_wrong_with_it(processes: Crowd) -> None:
+def test_a_process_that_fails_to_start_shows_its_error(processes: Crowd) -> None:
     broken = processes.begin({"domain": "not a domain"})
     with pytest.raises(EOFError, match="not a domain"):
         broken.wait(event="ready")

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from itertools import groupby
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import strategies as some
 from support.samples import moving, static
@@ -136,6 +136,7 @@ def test_a_message_is_published_batch_by_batch_with_everything_that_was_said() -
 
 
 @given(samples=st.lists(some.samples(names=st.sampled_from("abc"), at=some.stamps(0, 2**60)), min_size=1, max_size=6))
+@settings(max_examples=25)
 def test_what_was_published_there_is_published_here_to_the_bit(samples: list[TransformStamped]) -> None:
     with receiver() as here, Bus(SimulatedClock()) as there:
         heard: list[Batch] = []
@@ -600,15 +601,15 @@ def test_many_damaged_messages_do_no_harm() -> None:
     payload, attachment = encode(samples), pack(1, entries)
     with receiver(max_frames=50) as here:
         here.bus.subscribe(lambda _: None, lambda _: None)
-        for _ in range(5_000):
+        for _ in range(2_000):
             parts = [bytearray(payload), bytearray(attachment)]
             for _ in range(chance.randrange(1, 4)):
                 part = parts[chance.randrange(2)]
                 part[chance.randrange(len(part))] = chance.randrange(256)
             here.receive_bytes(bytes(parts[0]), bytes(parts[1]), f"peer {chance.randrange(3)}")
         assert here.bus.statistics().callbacks_failed == 0
-        assert here.inbox.messages > 1_000
-        assert sum(here.peers.rejected.values()) > 1_000
+        assert here.inbox.messages > 400
+        assert sum(here.peers.rejected.values()) > 400
         assert here.bus.statistics().frames <= 150
 
 
@@ -629,6 +630,7 @@ any_removal = st.builds(RemovedFrame, st.sampled_from((ORIGIN, OTHER)), st.integ
     ),
     data=st.data(),
 )
+@settings(max_examples=20)
 def test_messages_of_any_content_do_no_harm(messages: list[tuple[list[Entry], int, str]], data: st.DataObject) -> None:
     with receiver(max_frames=2) as here:
         for entries, number, sender in messages:

@@ -2,6 +2,7 @@ import threading
 from collections import Counter
 from functools import partial
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -87,6 +88,7 @@ def test_an_item_larger_than_all_the_room_is_dropped() -> None:
     assert queue.statistics().dropped == 2
 
 
+@pytest.mark.thorough
 def test_the_number_of_items_without_content_is_bounded_too() -> None:
     queue = ReceiveQueue(1)
     for number in range(400_000):

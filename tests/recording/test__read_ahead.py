@@ -29,7 +29,7 @@ class Tape:
 
 
 @pytest.mark.parametrize("ahead", [0, 2])
-async def test_the_blocks_are_the_messages_in_their_order(ahead: int) -> None:
+async def test_the_blocks_contain_the_messages_in_their_order(ahead: int) -> None:
     tape = Tape()
     async with ReadAhead(tape.messages(), ahead) as blocks:
         found = [message.received for block in [block async for block in blocks] for message in block]
@@ -37,7 +37,7 @@ async def test_the_blocks_are_the_messages_in_their_order(ahead: int) -> None:
     assert tape.closed
 
 
-async def test_without_reading_ahead_nothing_goes_on_behind_the_back_of_who_uses_a_block() -> None:
+async def test_with_zero_ahead_nothing_is_read_while_a_block_is_used() -> None:
     tape = Tape()
     async with ReadAhead(tape.messages(), 0) as blocks:
         read = 0
@@ -49,7 +49,7 @@ async def test_without_reading_ahead_nothing_goes_on_behind_the_back_of_who_uses
     assert read == COUNT
 
 
-async def test_no_more_is_read_ahead_than_is_wanted() -> None:
+async def test_no_more_blocks_are_read_ahead_than_asked_for() -> None:
     tape = Tape()
     async with ReadAhead(tape.messages(), 2) as blocks:
         block = await anext(blocks)
@@ -61,7 +61,7 @@ async def test_no_more_is_read_ahead_than_is_wanted() -> None:
         assert tape.taken == 3 * len(block) < COUNT
 
 
-async def test_one_that_is_left_by_an_error_ends_the_reading() -> None:
+async def test_an_error_in_the_body_ends_the_reading() -> None:
     tape = Tape()
     with pytest.raises(LookupError, match="the body's own"):
         async with ReadAhead(tape.messages(), 2) as blocks:
@@ -71,7 +71,7 @@ async def test_one_that_is_left_by_an_error_ends_the_reading() -> None:
     assert tape.taken < COUNT
 
 
-async def test_what_reading_raises_comes_behind_what_could_be_read() -> None:
+async def test_an_error_of_reading_is_raised_after_the_last_good_block() -> None:
     def torn() -> Iterator[RecordedMessage]:
         yield from Tape().messages()
         raise OSError("the tape is torn")

@@ -106,7 +106,7 @@ class Listener:
                 await self.arrived.wait()
 
 
-async def test_everything_is_published_as_it_was_recorded(tmp_path: Path) -> None:
+async def test_samples_are_published_as_they_were_recorded(tmp_path: Path) -> None:
     batches: list[Batch] = [
         (static("map", "rig", authority="survey"),),
         (moving("map", "base", 7, 1.0, "odometry"), moving("base", "arm", 9, 2.0, "arm")),
@@ -171,7 +171,7 @@ def test_timed_tasks_see_the_same_in_each_run(tmp_path: Path, backend: str, runs
     assert found == [[0.0, *((look - 1) // 2 / 100 for look in range(1, 1_199))]] * runs
 
 
-async def test_a_lookup_of_what_comes_later_waits_in_simulated_time(tmp_path: Path) -> None:
+async def test_a_lookup_of_a_later_stamp_waits_in_simulated_time(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0, 2.0, 3.0)))
     with Bus(SimulatedClock(START)) as bus, Buffer(bus) as buffer:
         async with anyio.create_task_group() as tasks:
@@ -182,7 +182,7 @@ async def test_a_lookup_of_what_comes_later_waits_in_simulated_time(tmp_path: Pa
         assert isinstance(late.error, TimeoutError)
 
 
-async def test_a_loop_is_a_jump_back_that_drops_what_moves(tmp_path: Path) -> None:
+async def test_looping_jumps_back_and_drops_moving_samples(tmp_path: Path) -> None:
     entries = drive((0.0, 1.0, 2.0))
     path = write_recording(tmp_path / "run.mcap", (START, (static("base", "rig", 5.0),)), *entries)
     found: list[object] = []
@@ -210,7 +210,7 @@ async def test_a_loop_is_a_jump_back_that_drops_what_moves(tmp_path: Path) -> No
     assert told == [(START + 2 * SECOND, START)] * 2
 
 
-async def test_who_waits_for_the_last_sample_is_done_with_it_before_the_clock_jumps(tmp_path: Path) -> None:
+async def test_a_task_that_waited_for_the_last_sample_runs_before_the_clock_jumps(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0)))
     with Bus(SimulatedClock(START)) as bus, Buffer(bus) as buffer, anyio.fail_after(PATIENCE):
 
@@ -231,7 +231,7 @@ async def test_who_waits_for_the_last_sample_is_done_with_it_before_the_clock_ju
     assert isinstance(never.error, ClockResetError)
 
 
-async def test_on_a_clock_that_cannot_jump_a_loop_removes_what_moves(tmp_path: Path) -> None:
+async def test_on_a_clock_that_cannot_jump_looping_removes_moving_frames(tmp_path: Path) -> None:
     entries = drive((0.0, 100.0, 200.0))
     path = write_recording(tmp_path / "run.mcap", (START, (static("base", "rig", 5.0),)), *entries)
     with Bus() as bus, Buffer(bus) as buffer, bus.events(stale_after=None) as events:
@@ -256,7 +256,7 @@ async def test_on_a_clock_that_cannot_jump_a_loop_removes_what_moves(tmp_path: P
     assert expired == 0
 
 
-async def test_a_frame_that_somebody_else_has_removed_meanwhile_is_no_error(tmp_path: Path) -> None:
+async def test_a_frame_that_is_already_removed_is_no_error(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0)))
     with Bus() as bus:
         player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
@@ -266,7 +266,7 @@ async def test_a_frame_that_somebody_else_has_removed_meanwhile_is_no_error(tmp_
     assert (player.played, player.passes) == (4, 2)
 
 
-async def test_a_range_begins_with_what_was_static_before(tmp_path: Path) -> None:
+async def test_a_range_begins_with_the_static_transforms_from_before(tmp_path: Path) -> None:
     entries = drive(range(10))
     path = write_recording(
         tmp_path / "run.mcap",
@@ -382,7 +382,7 @@ async def test_a_loop_ends_where_there_is_nothing_to_play(tmp_path: Path) -> Non
     assert (player.played, player.passes) == (0, 2)
 
 
-async def test_as_fast_as_can_be_waits_for_nothing(tmp_path: Path) -> None:
+async def test_an_infinite_rate_waits_for_nothing(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive(3_600.0 * k for k in range(1_000)))
     with Bus() as bus, anyio.fail_after(PATIENCE):
         player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
@@ -402,7 +402,9 @@ def in_virtual_time(function: Callable[[], Awaitable[None]]) -> None:
     [(True, (0.0, 0.5, 0.501, 9.0)), (False, (0.0, 0.5, 0.501, 86_400.0))],
     ids=["simulated", "system"],
 )
-def test_each_message_comes_at_its_time(tmp_path: Path, rate: float, simulated: bool, times: tuple[float, ...]) -> None:
+def test_each_message_is_published_at_its_time(
+    tmp_path: Path, rate: float, simulated: bool, times: tuple[float, ...]
+) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive(times))
 
     async def play() -> None:
@@ -416,7 +418,7 @@ def test_each_message_comes_at_its_time(tmp_path: Path, rate: float, simulated: 
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-async def test_the_highest_rates_are_as_fast_as_can_be(tmp_path: Path, simulated: bool) -> None:
+async def test_the_highest_rates_wait_for_nothing(tmp_path: Path, simulated: bool) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
     for rate in (1e12, 1e300):
         with Bus(SimulatedClock() if simulated else None) as bus:
@@ -426,7 +428,7 @@ async def test_the_highest_rates_are_as_fast_as_can_be(tmp_path: Path, simulated
             assert player.played == 3
 
 
-def test_at_the_lowest_rates_a_simulated_clock_still_goes_on(tmp_path: Path) -> None:
+def test_at_the_lowest_rates_a_simulated_clock_still_advances(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 3e-9)))
     heard: list[float] = []
 
@@ -449,7 +451,7 @@ async def test_the_event_loop_does_not_read_the_file(tmp_path: Path, finish: boo
     assert threading.get_ident() not in readers
 
 
-def test_at_a_rate_a_simulated_clock_does_not_stand_still_between_messages(tmp_path: Path) -> None:
+def test_a_simulated_clock_advances_steadily_between_messages(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
     seen: list[float] = []
 
@@ -471,7 +473,7 @@ def test_at_a_rate_a_simulated_clock_does_not_stand_still_between_messages(tmp_p
     assert all(abs(number / 50.0 / 4.0 - (time - seen[0])) < 0.021 for number, time in enumerate(seen))
 
 
-def test_a_range_begins_at_its_beginning_though_the_first_message_comes_later(tmp_path: Path) -> None:
+def test_a_range_begins_at_since_even_if_the_first_message_is_later(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
 
     async def play() -> None:
@@ -484,7 +486,7 @@ def test_a_range_begins_at_its_beginning_though_the_first_message_comes_later(tm
     in_virtual_time(play)
 
 
-async def test_what_is_wrong_in_a_recording_is_counted_and_the_rest_is_played() -> None:
+async def test_problems_in_a_recording_are_counted_and_the_rest_is_played() -> None:
     with Bus(SimulatedClock()) as bus:
         player = Player(bus, SMALL, rate=AS_FAST_AS_POSSIBLE)
         await player.play()
@@ -494,7 +496,7 @@ async def test_what_is_wrong_in_a_recording_is_counted_and_the_rest_is_played() 
     assert player.played == statistics.samples + WRONG_IN_SMALL["cycle"]
 
 
-async def test_of_a_damaged_file_that_was_cut_off_what_is_left_is_played(tmp_path: Path) -> None:
+async def test_the_readable_part_of_a_damaged_file_is_played(tmp_path: Path) -> None:
     entries = drive(k / 100 for k in range(2_000))
     path = write_recording(tmp_path / "run.mcap", *entries)
     data = bytearray(path.read_bytes()[:-10_000])
@@ -525,7 +527,7 @@ async def test_recordings_of_all_formats_are_played(tmp_path: Path, storage: Sto
     assert buffer.lookup_nowait(*question) == tree.lookup(*question)
 
 
-async def test_what_is_played_can_be_recorded_again(tmp_path: Path) -> None:
+async def test_a_played_recording_can_be_recorded_again(tmp_path: Path) -> None:
     entries = [(START, (static("base", "rig", authority="survey"),)), *drive(k / 50 for k in range(500))]
     path, copy = write_recording(tmp_path / "run.mcap", *entries), tmp_path / "copy.mcap"
     with Bus(SimulatedClock()) as bus:
@@ -550,7 +552,7 @@ async def test_a_player_that_is_cancelled_can_play_again(tmp_path: Path) -> None
     assert heard.batches == [batch for _, batch in [entries[0], *entries]]
 
 
-def test_under_plain_asyncio_it_can_be_cancelled_too(tmp_path: Path) -> None:
+def test_play_can_be_cancelled_under_plain_asyncio(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 3_600.0)))
 
     async def main() -> None:
@@ -570,7 +572,7 @@ def test_under_plain_asyncio_it_can_be_cancelled_too(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-async def test_only_one_task_plays(tmp_path: Path) -> None:
+async def test_only_one_task_may_play(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 3_600.0)))
     with Bus() as bus:
         heard = Listener(bus)
@@ -583,7 +585,7 @@ async def test_only_one_task_plays(tmp_path: Path) -> None:
             tasks.cancel_scope.cancel()
 
 
-async def test_on_a_simulated_clock_nobody_else_may_keep_time(tmp_path: Path) -> None:
+async def test_another_task_must_not_advance_the_simulated_clock(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0)))
     clock = SimulatedClock()
     with Bus(clock) as bus:
@@ -596,7 +598,7 @@ async def test_on_a_simulated_clock_nobody_else_may_keep_time(tmp_path: Path) ->
     assert "another task is advancing" in str(asked.error)
 
 
-async def test_on_a_bus_that_is_closed_it_ends_with_the_buss_error(tmp_path: Path) -> None:
+async def test_a_closed_bus_ends_play_with_bus_closed_error(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive(range(1_000)))
     with Bus() as bus:
         bus.subscribe(lambda _: bus.close())
@@ -606,7 +608,7 @@ async def test_on_a_bus_that_is_closed_it_ends_with_the_buss_error(tmp_path: Pat
     assert player.played == 1
 
 
-async def test_a_file_that_cannot_be_read_any_more_ends_it_with_the_disks_error(tmp_path: Path) -> None:
+async def test_a_file_that_disappears_ends_play_with_its_oserror(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive(range(10)))
     with Bus(SimulatedClock()) as bus:
         bus.subscribe(lambda _: path.unlink(missing_ok=True))
@@ -617,7 +619,7 @@ async def test_a_file_that_cannot_be_read_any_more_ends_it_with_the_disks_error(
 
 
 @pytest.mark.parametrize(("content", "reason"), [(None, "missing"), ("", "empty"), ("no recording", "foreign")])
-async def test_what_is_no_recording_says_so(tmp_path: Path, content: str | None, reason: str) -> None:
+async def test_an_invalid_file_raises_recording_error(tmp_path: Path, content: str | None, reason: str) -> None:
     path = tmp_path / "run.mcap"
     if content is not None:
         path.write_text(content)
@@ -629,7 +631,7 @@ async def test_what_is_no_recording_says_so(tmp_path: Path, content: str | None,
             assert caught.value.reason == reason
 
 
-def test_arguments_are_checked_when_it_is_made(tmp_path: Path) -> None:
+def test_arguments_are_checked_by_the_constructor(tmp_path: Path) -> None:
     with Bus() as bus:
         for rate in (0.0, -1.0, math.nan):
             with pytest.raises(ValueError, match="greater than zero"):
@@ -649,7 +651,7 @@ def test_arguments_are_checked_when_it_is_made(tmp_path: Path) -> None:
     st.lists(st.integers(0, 20), min_size=1, max_size=30).map(sorted),
     st.dictionaries(st.integers(1, 40), st.integers(0, 22), max_size=6),
 )
-def test_whenever_it_is_made_to_seek_it_goes_on_from_there(
+def test_play_continues_where_seek_says_at_any_time(
     run: Run, tmp_path: Path, times: list[int], seeks: dict[int, int]
 ) -> None:
     """Against a model: a list, in which the n-th message that is heard makes it jump."""

@@ -119,7 +119,7 @@ def pipe(tmp_path: Path) -> Iterator[Pipe]:
         yield pipe
 
 
-async def test_what_is_latched_comes_first_and_then_what_is_published(tmp_path: Path) -> None:
+async def test_latched_samples_come_before_published_ones(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     clock = SimulatedClock(7 * SECOND)
     with Bus(clock) as bus:
@@ -217,7 +217,7 @@ async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(tmp_path:
         await recorder.flush()
 
 
-async def test_several_may_wait_for_a_flush(tmp_path: Path) -> None:
+async def test_several_tasks_may_wait_for_a_flush(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
             bus.publish(moving("map", "a", 1))
@@ -226,7 +226,7 @@ async def test_several_may_wait_for_a_flush(tmp_path: Path) -> None:
             assert recorder.statistics().samples == 1
 
 
-async def test_a_little_is_in_the_file_soon_without_being_asked_for(tmp_path: Path) -> None:
+async def test_a_few_samples_are_written_soon_without_a_flush(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, tmp_path / "run.mcap") as recorder:
             bus.publish(moving("map", "a", 1))
@@ -264,7 +264,7 @@ async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(t
     ]
 
 
-async def test_each_time_that_the_disk_falls_behind_is_told_once(tmp_path: Path) -> None:
+async def test_each_time_that_dropping_begins_there_is_one_event(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         async with Recorder(bus, tmp_path / "run.mcap", capacity=10) as recorder:
             for _ in range(2):
@@ -278,7 +278,7 @@ async def test_each_time_that_the_disk_falls_behind_is_told_once(tmp_path: Path)
     assert recorder.statistics().queue.dropped == 10
 
 
-async def test_a_disk_that_hangs_holds_up_nobody(pipe: Pipe) -> None:
+async def test_a_disk_that_hangs_does_not_block_publishers(pipe: Pipe) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         async with Recorder(bus, pipe.path, capacity=100, overwrite=True) as recorder:
             for sample in noise(5_000):
@@ -321,7 +321,7 @@ async def test_a_body_that_is_cancelled_in_the_middle_of_a_write_leaves_a_whole_
     assert pipe.messages() == 6_000
 
 
-async def test_what_the_body_raises_leaves_as_it_is_with_a_whole_file(tmp_path: Path) -> None:
+async def test_an_error_of_the_body_is_raised_as_it_is_and_the_file_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Bus(SimulatedClock()) as bus, pytest.raises(LookupError, match="the body's own"):
         async with Recorder(bus, path):
@@ -330,7 +330,9 @@ async def test_what_the_body_raises_leaves_as_it_is_with_a_whole_file(tmp_path: 
     assert len(recorded(path)) == 1
 
 
-async def test_a_disk_that_fails_is_an_event_and_the_body_goes_on(pipe: Pipe, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_disk_that_fails_causes_an_event_and_the_body_goes_on(
+    pipe: Pipe, caplog: pytest.LogCaptureFixture
+) -> None:
     heard: list[Event] = []
     with Bus(SimulatedClock(3 * SECOND)) as bus, bus.events() as events, anyio.fail_after(PATIENCE):
         async with Recorder(bus, pipe.path, overwrite=True) as recorder:
@@ -352,7 +354,7 @@ async def test_a_disk_that_fails_is_an_event_and_the_body_goes_on(pipe: Pipe, ca
     assert ["has ended early" in record.message for record in caplog.records] == [True]
 
 
-async def test_a_disk_that_fails_at_the_end_is_told_too_and_nothing_is_raised(pipe: Pipe) -> None:
+async def test_a_disk_that_fails_at_the_end_causes_an_event_and_raises_nothing(pipe: Pipe) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
         async with Recorder(bus, pipe.path, overwrite=True) as recorder:
             await recorder.flush()
@@ -362,7 +364,7 @@ async def test_a_disk_that_fails_at_the_end_is_told_too_and_nothing_is_raised(pi
     assert isinstance(recorder.error, BrokenPipeError)
 
 
-async def test_whoever_waits_for_a_flush_is_let_go_when_the_disk_fails(pipe: Pipe) -> None:
+async def test_flush_returns_when_the_disk_fails(pipe: Pipe) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, pipe.path, overwrite=True) as recorder:
             pipe.break_off()
@@ -396,7 +398,7 @@ anyio.run(main, backend=sys.argv[2])
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
-def test_what_was_written_before_the_disk_was_full_can_be_read(tmp_path: Path, backend: str) -> None:
+def test_samples_written_before_the_disk_was_full_can_be_read(tmp_path: Path, backend: str) -> None:
     path = tmp_path / "run.mcap"
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, path, backend], capture_output=True, text=True, timeout=PATIENCE, check=True
@@ -438,7 +440,7 @@ anyio.run(main, backend=sys.argv[2])
 @pytest.mark.thorough
 @pytest.mark.parametrize("backend", ["asyncio", "trio"])
 @pytest.mark.parametrize("lines", [1, 3])
-def test_after_sigkill_everything_but_the_last_moment_can_be_read(tmp_path: Path, backend: str, lines: int) -> None:
+def test_all_samples_but_the_last_ones_can_be_read_after_sigkill(tmp_path: Path, backend: str, lines: int) -> None:
     path = tmp_path / "run.mcap"
     command = [sys.executable, "-c", KILLED, str(path), backend]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -472,7 +474,7 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path: Path, backend: str) -> None:
     assert [batch[0].stamp for _, batch in recorded(path)][:written] == list(range(written))
 
 
-async def test_a_file_that_is_there_already_is_kept(tmp_path: Path) -> None:
+async def test_an_existing_file_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     with Bus(SimulatedClock()) as bus:
@@ -487,7 +489,7 @@ async def test_a_file_that_is_there_already_is_kept(tmp_path: Path) -> None:
     assert len(recorded(path)) == 1
 
 
-async def test_a_recording_that_cannot_begin_raises(tmp_path: Path) -> None:
+async def test_a_recorder_that_cannot_start_raises(tmp_path: Path) -> None:
     full = tmp_path / "full.mcap"
     full.symlink_to("/dev/full")
     with Bus(SimulatedClock()) as bus:
@@ -504,7 +506,7 @@ async def test_a_recording_that_cannot_begin_raises(tmp_path: Path) -> None:
     assert not (tmp_path / "run.mcap").exists()
 
 
-async def test_one_that_is_cancelled_while_the_file_is_opened_leaves_nothing_behind(tmp_path: Path) -> None:
+async def test_a_recorder_cancelled_while_opening_its_file_leaves_nothing_behind(tmp_path: Path) -> None:
     path = tmp_path / "pipe.mcap"
     os.mkfifo(path)
     with Bus(SimulatedClock()) as bus:
@@ -523,7 +525,7 @@ async def test_one_that_is_cancelled_while_the_file_is_opened_leaves_nothing_beh
     assert list(make_reader(BytesIO(data)).iter_messages()) == []
 
 
-async def test_a_recorder_is_entered_once_and_flushed_after_that(tmp_path: Path) -> None:
+async def test_a_recorder_is_entered_only_once_and_before_flush(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus:
         recorder = Recorder(bus, tmp_path / "run.mcap")
         with pytest.raises(RuntimeError, match="enter the recorder first"):
@@ -583,7 +585,7 @@ def test_under_plain_asyncio_a_timeout_leaves_a_whole_file(tmp_path: Path) -> No
     assert len(recorded(path)) == 5_000
 
 
-def test_under_plain_asyncio_one_that_is_cancelled_while_it_opens_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_under_plain_asyncio_a_recorder_cancelled_while_opening_leaves_nothing_behind(tmp_path: Path) -> None:
     path = tmp_path / "pipe.mcap"
     os.mkfifo(path)
 

@@ -33,7 +33,7 @@ def recording(tmp_path: Path) -> Path:
     return write_mcap(tmp_path / "run.mcap", LINES)
 
 
-def test_what_a_file_is_tells_its_content_not_its_name(tmp_path: Path, recording: Path) -> None:
+def test_the_content_of_a_file_decides_its_format_not_its_name(tmp_path: Path, recording: Path) -> None:
     (sqlite,) = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3")
     for source in (SMALL, recording, sqlite):
         renamed = tmp_path / "measurement.bin"
@@ -44,7 +44,7 @@ def test_what_a_file_is_tells_its_content_not_its_name(tmp_path: Path, recording
         assert unnamed == named
 
 
-def test_every_way_to_write_a_path_is_good(recording: Path) -> None:
+def test_a_path_may_be_a_str_or_a_path(recording: Path) -> None:
     for path in (recording, str(recording), os.fspath(recording)):
         with open_recording(path) as opened:
             assert opened.path == recording
@@ -60,12 +60,12 @@ def test_a_range_begins_with_the_newest_static_transform_of_each_frame_from_befo
     assert (fourth.received, fourth.batch) == (50, (static("base", "laser", 3.0),))
 
 
-def test_what_is_static_from_the_first_instant_of_a_range_is_not_from_before(recording: Path) -> None:
+def test_a_static_transform_at_the_start_of_a_range_comes_only_once(recording: Path) -> None:
     assert [message.received for message in messages_in(recording, 10)] == [10, 20, 30, 40, 50]
     assert [message.received for message in messages_in(recording, 11)] == [11, 11, 20, 30, 40, 50]
 
 
-def test_a_range_behind_the_end_is_what_is_static_then(recording: Path) -> None:
+def test_a_range_after_the_end_has_the_latest_static_transforms(recording: Path) -> None:
     batches = [message.batch for message in messages_in(recording, 10 * SECOND)]
     assert batches == [(static("base", "camera", 1.0),), (static("base", "laser", 3.0),)]
 
@@ -129,7 +129,9 @@ TEXT = b"Dear diary,\ntoday I have driven a robot.\n"
     ],
     ids=lambda value: repr(value[:24]),
 )
-def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, content: bytes, reason: str, says: str) -> None:
+def test_other_files_are_refused_with_an_error_of_one_line(
+    tmp_path: Path, content: bytes, reason: str, says: str
+) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(content)
     with pytest.raises(RecordingError) as raised:
@@ -140,14 +142,14 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path: Path, content: by
     assert "\n" not in str(raised.value)
 
 
-def test_what_is_not_there_is_missing(tmp_path: Path) -> None:
+def test_a_file_that_does_not_exist_is_missing(tmp_path: Path) -> None:
     for path in (tmp_path / "run.mcap", tmp_path / "no folder" / "run.mcap"):
         with pytest.raises(RecordingError, match="there is no such file") as raised:
             open_recording(path)
         assert raised.value.reason == "missing"
 
 
-def test_what_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
@@ -159,7 +161,7 @@ def test_what_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "package", ["mcap", *(pytest.param(name, marks=pytest.mark.thorough) for name in ("rosbags", "zstandard"))]
 )
-def test_without_its_extra_a_recording_says_which_it_is(package: str) -> None:
+def test_without_a_package_the_error_names_the_extra(package: str) -> None:
     program = (
         f"import sys; sys.modules[{package!r}] = None\n"
         "from tfbus.recording import RecordingError, open_recording\n"

@@ -51,18 +51,18 @@ def test_the_small_bag_has_what_its_script_sends() -> None:
     assert summary.messages == len(messages_in(SMALL))
 
 
-def test_of_a_single_moving_sample_there_is_no_rate(tmp_path: Path) -> None:
+def test_a_single_moving_sample_has_no_rate(tmp_path: Path) -> None:
     frame = frame_in(tmp_path, [moving("a", "b", 7)])
     assert (frame.oldest, frame.newest, frame.span, frame.rate, frame.longest_gap) == (7, 7, 0.0, None, None)
     assert frame.kind == "moving"
 
 
-def test_samples_out_of_order_or_at_one_stamp_make_no_gap_and_no_rate(tmp_path: Path) -> None:
+def test_order_and_repetition_of_stamps_change_neither_gap_nor_rate(tmp_path: Path) -> None:
     frame = frame_in(tmp_path, [moving("a", "b", stamp * SECOND) for stamp in (0, 3, 1, 2, 2, 2, 4)])
     assert (frame.moving, frame.rate, frame.longest_gap, frame.span) == (7, 1.0, 1.0, 4.0)
 
 
-def test_a_frame_of_both_kinds_is_told_as_such(tmp_path: Path) -> None:
+def test_a_frame_with_static_and_moving_samples_has_both_kinds(tmp_path: Path) -> None:
     frame = frame_in(tmp_path, [static("a", "b"), moving("c", "b", 5), moving("a", "b", 6)])
     assert (frame.kind, frame.static, frame.moving, frame.parents) == ("both", 1, 2, ("a", "c"))
 
@@ -73,7 +73,7 @@ def test_an_empty_recording_has_an_empty_summary(tmp_path: Path) -> None:
     assert summary_of(path).duration is None
 
 
-def test_what_was_not_finished_or_is_damaged_is_told(tmp_path: Path) -> None:
+def test_the_summary_shows_an_unfinished_and_damaged_file(tmp_path: Path) -> None:
     lines = [(time, "/tf", [moving("a", "b", time, 0.5 + time)]) for time in range(100)]
     path = write_mcap(tmp_path / "run.mcap", lines, finish=False)
     data = bytearray(path.read_bytes())
@@ -86,7 +86,7 @@ def test_what_was_not_finished_or_is_damaged_is_told(tmp_path: Path) -> None:
 
 
 @given(batches=st.lists(st.lists(any_samples("abcd", last=20), max_size=4), max_size=12))
-def test_what_closes_a_loop_is_left_out_as_it_is_in_a_loaded_tree(
+def test_the_samples_left_out_are_those_left_out_of_a_loaded_tree(
     tmp_path_factory: pytest.TempPathFactory, batches: list[list[TransformStamped]]
 ) -> None:
     lines = [
@@ -107,7 +107,7 @@ def test_what_closes_a_loop_is_left_out_as_it_is_in_a_loaded_tree(
         assert edge.parent in frame.parents
 
 
-def test_messages_may_be_watched_on_their_way() -> None:
+def test_summarise_reads_the_messages_that_are_given() -> None:
     with open_recording(SMALL) as recording:
         seen = []
 

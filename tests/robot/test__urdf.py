@@ -42,7 +42,7 @@ def test_names_links_and_joints_come_in_the_order_of_the_file() -> None:
     assert [each.name for each in found.joints] == ["2", "1"]
 
 
-def test_everything_that_a_joint_says_is_read() -> None:
+def test_all_fields_of_a_joint_are_read() -> None:
     found = only_joint(
         '<origin xyz="1 2 3" rpy="0 0 1.5707963267948966"/><axis xyz="0 0 2"/><mimic joint="k" multiplier="-2"'
         ' offset="0.5"/><limit lower="-1" upper="1e-1" effort="5" velocity="2"/><dynamics damping="1"/>'
@@ -56,7 +56,7 @@ def test_everything_that_a_joint_says_is_read() -> None:
     assert found.mimic == Mimic("k", -2.0, 0.5)
 
 
-def test_what_a_joint_does_not_say_is_what_the_specification_says() -> None:
+def test_missing_fields_of_a_joint_get_the_defaults_of_the_specification() -> None:
     assert only_joint(kind="continuous") == Joint("j", "continuous", "a", "b", Transform(), (1.0, 0.0, 0.0))
     assert only_joint('<mimic joint="k"/>', "continuous").mimic == Mimic("k", 1.0, 0.0)
     assert only_joint('<mimic joint="k" multiplier="0"/>', "continuous").mimic == Mimic("k", 0.0, 0.0)
@@ -67,7 +67,7 @@ def test_what_a_joint_does_not_say_is_what_the_specification_says() -> None:
 
 
 @pytest.mark.parametrize("kind", ["continuous", "planar", "floating", "fixed"])
-def test_limits_count_only_where_the_specification_has_them(kind: str) -> None:
+def test_limits_are_read_only_for_kinds_that_have_limits(kind: str) -> None:
     found = only_joint('<limit effort="1" velocity="1" lower="-1" upper="1"/>', kind)
     assert (found.lower, found.upper) == (None, None)
 
@@ -84,11 +84,11 @@ def test_roll_pitch_and_yaw_are_about_fixed_axes() -> None:
 
 
 @pytest.mark.parametrize("kind", ["fixed", "floating"])
-def test_the_zero_axis_that_exporters_write_for_joints_without_one_is_passed_over(kind: str) -> None:
+def test_the_zero_axis_of_a_joint_without_an_axis_is_ignored(kind: str) -> None:
     assert only_joint('<axis xyz="0 0 0"/>', kind) == only_joint("", kind)
 
 
-def test_text_has_a_bracket_and_a_path_has_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_source_with_a_bracket_is_text_and_any_other_a_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = robot('<link name="küche"/>')
     path = tmp_path / "robot.urdf"
     path.write_text(text, encoding="utf-8")
@@ -100,14 +100,14 @@ def test_text_has_a_bracket_and_a_path_has_none(tmp_path: Path, monkeypatch: pyt
     assert read_urdf(odd) == read_urdf(text)
 
 
-def test_a_file_has_the_encoding_that_it_says(tmp_path: Path) -> None:
+def test_the_declared_encoding_of_a_file_is_used(tmp_path: Path) -> None:
     path = tmp_path / "robot.urdf"
     path.write_text(robot('<link name="küche"/>').replace("?>", ' encoding="latin-1"?>'), encoding="latin-1")
     assert read_urdf(path).links == ("küche",)
 
 
 @pytest.mark.parametrize("name", ["missing.urdf", ""])
-def test_a_file_that_cannot_be_read_is_the_systems_error(
+def test_a_file_that_cannot_be_read_raises_the_oserror(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -125,7 +125,9 @@ PASSED_OVER = {
 
 
 @pytest.mark.parametrize("part", PASSED_OVER.values(), ids=PASSED_OVER)
-def test_what_is_neither_link_joint_nor_material_is_passed_over(part: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_elements_other_than_links_joints_and_materials_are_ignored(
+    part: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert read_urdf(robot(LINKS, part, joint())) == read_urdf(robot(LINKS, joint()))
     assert capfd.readouterr() == ("", "")
 
@@ -139,14 +141,12 @@ KNOWN_ELSEWHERE = [
 
 
 @pytest.mark.parametrize("inside", KNOWN_ELSEWHERE)
-def test_what_the_parser_does_not_know_inside_a_link_is_passed_over_in_silence(
-    inside: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_parts_of_a_link_are_ignored_silently(inside: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert read_urdf(robot(f'<link name="a" type="laser">{inside}</link>')).links == ("a",)
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_the_parser_does_not_know_inside_a_joint_is_passed_over_in_silence(
+def test_unknown_parts_of_a_joint_are_ignored_silently(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     assert only_joint('<hint x="1"/><origin xyz="1 0 0" frame="a"/>') == only_joint('<origin xyz="1 0 0"/>')
@@ -189,7 +189,7 @@ def test_a_namespace_for_all_elements_changes_nothing() -> None:
         ('<material name="m"><color rgba="1 1"/></material>', 'in <material name="m">: color'),
     ],
 )
-def test_a_malformed_element_is_named(parts: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_error_names_the_malformed_element(parts: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert problem(robot(parts)).startswith(message)
     assert capfd.readouterr() == ("", "")
 
@@ -208,14 +208,14 @@ def test_a_malformed_element_is_named(parts: str, message: str, capfd: pytest.Ca
         ('<robot name="r" version="2.0"/>', 'in <robot name="r">: Invalid version; only 1.0 is supported'),
     ],
 )
-def test_what_is_no_urdf_is_told_apart(text: str, message: str) -> None:
+def test_other_documents_than_urdf_are_refused(text: str, message: str) -> None:
     assert problem(text).startswith(message)
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"\x89PNG\r\n", b'<?xml version="1.0" encoding="none-such"?><robot/>', b"\xff\xfe<\x00", b"a: 1\n"]
 )
-def test_a_file_that_is_something_else_is_told_so(content: bytes, tmp_path: Path) -> None:
+def test_a_file_of_another_kind_is_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "robot.urdf"
     path.write_bytes(content)
     assert problem(path).startswith("it is not well-formed XML: ")
@@ -234,7 +234,7 @@ def test_a_file_that_is_something_else_is_told_so(content: bytes, tmp_path: Path
     ],
 )
 @pytest.mark.parametrize("namespace", ["http://www.ros.org/wiki/xacro", "http://ros.org/wiki/xacro"])
-def test_xacro_that_is_still_to_be_expanded_is_named(parts: str, message: str, namespace: str) -> None:
+def test_unexpanded_xacro_is_refused_by_name(parts: str, message: str, namespace: str) -> None:
     assert problem(robot(parts).replace("<robot", f'<robot xmlns:xacro="{namespace}"')).startswith(message)
 
 
@@ -249,11 +249,12 @@ DOCTYPES = {
 
 
 @pytest.mark.parametrize("text", DOCTYPES.values(), ids=DOCTYPES)
-def test_a_document_that_may_define_entities_is_not_read(text: str) -> None:
+def test_a_document_type_is_refused(text: str) -> None:
     assert problem(text) == "it has a <!DOCTYPE>, which can define entities without end: URDF needs none"
 
 
-def test_ten_megabytes_of_nesting_end_at_the_hundredth_element() -> None:
+@pytest.mark.thorough
+def test_ten_megabytes_of_nesting_are_refused_at_the_limit() -> None:
     assert problem("<robot>" * 1_500_000) == f"its elements are nested more than {MAX_DEPTH} deep"
 
 
@@ -274,7 +275,7 @@ def test_an_error_about_an_element_pickles() -> None:
     assert (str(twin), twin.element, twin.__cause__) == (str(caught.value), '<joint name="j">', None)
 
 
-def test_without_its_extra_reading_names_it() -> None:
+def test_without_urdf_parser_py_the_error_names_the_extra() -> None:
     hidden = (
         "import sys; sys.modules['urdf_parser_py'] = None\n"
         "import tfbus\n"
@@ -286,7 +287,7 @@ def test_without_its_extra_reading_names_it() -> None:
 
 
 @pytest.mark.thorough
-def test_what_it_reads_does_not_hang_on_pythons_asserts() -> None:
+def test_reading_does_not_depend_on_asserts() -> None:
     """The parser checks with ``assert``, which ``python -O`` leaves out."""
     script = (
         "import tfbus\n"

@@ -50,14 +50,14 @@ def assert_close(actual: Transform, expected: Matrix) -> None:
 
 
 @given(transforms(10.0), unit_vectors(), angles(), st.sampled_from(("revolute", "continuous")))
-def test_a_turning_joint_turns_about_its_axis_in_the_childs_frame(
+def test_a_revolute_joint_rotates_about_its_axis_in_the_childs_frame(
     origin: Transform, axis: Vector, angle: float, kind: str
 ) -> None:
     assert_close(joint(kind, axis, origin).transform(angle), origin.matrix() @ turn(axis, angle))
 
 
 @given(transforms(10.0), unit_vectors(), st.floats(-10.0, 10.0))
-def test_a_prismatic_joint_slides_along_its_axis_and_does_not_turn(
+def test_a_prismatic_joint_slides_along_its_axis_and_does_not_rotate(
     origin: Transform, axis: Vector, length: float
 ) -> None:
     x, y, z = axis
@@ -73,7 +73,7 @@ def test_a_planar_joint_about_z_is_x_y_and_yaw(origin: Transform, x: float, y: f
 
 
 @given(transforms(10.0), unit_vectors(), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0), angles())
-def test_a_planar_joint_stays_in_its_plane_and_turns_about_the_normal(
+def test_a_planar_joint_stays_in_its_plane_and_rotates_about_the_normal(
     origin: Transform, axis: Vector, x: float, y: float, angle: float
 ) -> None:
     there = np.linalg.inv(origin.matrix()) @ joint("planar", axis, origin).transform((x, y, angle)).matrix()
@@ -94,7 +94,7 @@ def test_a_planar_joint_stays_in_its_plane_and_turns_about_the_normal(
         ((1e-9, 0.0, -1.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ],
 )
-def test_the_x_and_y_of_a_plane_come_with_z_on_the_shortest_way_to_the_axis(
+def test_the_x_and_y_of_a_plane_are_rotated_the_shortest_way_from_z_to_the_axis(
     axis: Vector, along_x: Vector, along_y: Vector
 ) -> None:
     flat = joint("planar", axis, Transform())
@@ -103,7 +103,7 @@ def test_the_x_and_y_of_a_plane_come_with_z_on_the_shortest_way_to_the_axis(
 
 
 @pytest.mark.parametrize("tilt", [1e-12, 1e-9, 1e-8, 1e-6, 1e-3])
-def test_a_plane_that_faces_down_but_for_a_little_is_as_exact_as_any(tilt: float) -> None:
+def test_a_plane_that_faces_almost_down_is_exact_too(tilt: float) -> None:
     axis = (math.sin(tilt), 0.0, -math.cos(tilt))
     x, y, z = joint("planar", axis, Transform()).transform((1.0, 0.0, 0.0)).translation
     assert (x, y, z) == pytest.approx((-math.cos(tilt), 0.0, -math.sin(tilt)), abs=1e-15)
@@ -117,7 +117,7 @@ def test_a_floating_joint_takes_seven_numbers_or_a_transform(origin: Transform, 
 
 
 @given(transforms())
-def test_a_fixed_joint_is_its_origin_whatever_the_position(origin: Transform) -> None:
+def test_a_fixed_joint_ignores_its_position(origin: Transform) -> None:
     assert joint("fixed", origin=origin).transform() == origin
     assert joint("fixed", origin=origin).transform(math.nan) == origin
 
@@ -129,13 +129,13 @@ def test_at_zero_every_joint_is_at_its_origin(origin: Transform, axis: Vector, k
 
 
 @given(vectors(1.0).filter(lambda axis: math.hypot(*axis) > 0.1), st.sampled_from((1e-200, 1e-9, 3.0, 1e100)))
-def test_an_axis_of_any_length_is_made_one_long(axis: Vector, length: float) -> None:
+def test_an_axis_of_any_length_is_normalised(axis: Vector, length: float) -> None:
     made = joint("prismatic", [length * part for part in axis], Transform())
     assert math.hypot(*made.axis) == pytest.approx(1.0, abs=1e-15)
     assert made.transform(2.0).translation == pytest.approx([2.0 * part / math.hypot(*axis) for part in axis])
 
 
-def test_a_quarter_turn_of_an_elbow_is_known_by_hand() -> None:
+def test_a_quarter_turn_of_an_elbow_has_the_closed_form() -> None:
     bent = joint("revolute", (0.0, 1.0, 0.0)).transform(math.pi / 2)
     # The forearm's x points down, and its y, by the quarter turn of the origin, backwards.
     assert bent.apply((1.0, 0.0, 0.0)) == pytest.approx((1.0, 2.0, 2.0))
@@ -167,7 +167,7 @@ def test_a_position_may_be_any_real_number(one: Any) -> None:
         ("planar", (1.7e308, 1.7e308, 0.0), "not finite"),
     ],
 )
-def test_a_position_that_is_none_is_refused_by_the_name_of_the_joint(kind: Any, position: Any, reason: str) -> None:
+def test_an_invalid_position_is_refused_with_the_name_of_the_joint(kind: Any, position: Any, reason: str) -> None:
     with pytest.raises(InvalidTransformError, match=r"^joint 'elbow': ") as caught:
         joint(kind).transform(position)
     assert (caught.value.reason, caught.value.parent, caught.value.child) == (reason, "upper_arm", "forearm")
@@ -175,7 +175,7 @@ def test_a_position_that_is_none_is_refused_by_the_name_of_the_joint(kind: Any, 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "fixed"])
 @pytest.mark.parametrize("position", ["1.0", None, Decimal(1), [object()] * 3, ["a"] * 7, object()])
-def test_a_position_of_a_useless_type_is_refused_by_the_name_of_the_joint(kind: Any, position: Any) -> None:
+def test_a_position_of_a_wrong_type_is_refused_with_the_name_of_the_joint(kind: Any, position: Any) -> None:
     with pytest.raises((TypeError, InvalidTransformError), match=r"^joint 'elbow': position must be "):
         joint(kind).transform(position)
 
@@ -183,7 +183,7 @@ def test_a_position_of_a_useless_type_is_refused_by_the_name_of_the_joint(kind: 
 @pytest.mark.parametrize(
     ("kind", "position"), [("planar", 1.0), ("floating", 1.0), ("floating", 1), ("revolute", (1,))]
 )
-def test_a_number_where_several_belong_is_a_type_error_and_the_other_way_round(kind: Any, position: Any) -> None:
+def test_one_number_for_several_or_several_for_one_is_a_type_error(kind: Any, position: Any) -> None:
     with pytest.raises(TypeError, match=r"^joint 'elbow': position must be "):
         joint(kind).transform(position)
 
@@ -201,7 +201,7 @@ def test_a_number_where_several_belong_is_a_type_error_and_the_other_way_round(k
         ({"mimic": Mimic("other", 1.0, math.nan)}, "a limit or the mimic is NaN"),
     ],
 )
-def test_a_joint_that_cannot_be_is_refused_by_its_name(change: dict[str, Any], problem: str) -> None:
+def test_an_invalid_joint_is_refused_with_its_name(change: dict[str, Any], problem: str) -> None:
     with pytest.raises(InvalidRobotError) as caught:
         joint(**{"kind": "revolute", **change})
     assert str(caught.value) == f'in <joint name="elbow">: {problem}'
@@ -209,7 +209,7 @@ def test_a_joint_that_cannot_be_is_refused_by_its_name(change: dict[str, Any], p
 
 
 @pytest.mark.parametrize("kind", ["fixed", "floating"])
-def test_a_joint_without_an_axis_takes_no_notice_of_it(kind: Any) -> None:
+def test_a_fixed_or_floating_joint_ignores_its_axis(kind: Any) -> None:
     assert joint(kind, (0.0, 0.0, 0.0)) == joint(kind, (0.0, 0.0, 1.0))
 
 

@@ -77,19 +77,19 @@ def test_the_transforms_are_the_fixed_ones_and_then_the_moving_ones() -> None:
     ]
 
 
-def test_joints_that_nobody_gave_a_position_are_left_out() -> None:
+def test_joints_without_a_position_are_left_out() -> None:
     model = gripper(follower=Mimic("left"))
     assert xs(model.transforms({}, 0)) == {}
     assert xs(model.transforms({"third": 0.25}, 0)) == {"third": 0.25}
 
 
-def test_positions_of_fixed_joints_and_of_unknown_names_count_for_nothing() -> None:
+def test_positions_of_fixed_and_of_unknown_joints_are_ignored() -> None:
     model = gripper()
     assert model.transforms({"mount": 9.0, "elbow": math.nan}, 0) == model.transforms({}, 0)
     assert model.unknown_joints({"mount": 9.0, "elbow": 0.0, "left": 0.0}) == ["elbow"]
 
 
-def test_the_pure_function_leaves_the_positions_alone_and_gives_the_same_again() -> None:
+def test_transforms_do_not_change_the_positions_and_can_be_repeated() -> None:
     model, positions = gripper(), {"left": 0.25}
     assert model.transforms(positions, 0) == model.transforms(positions, 0)
     assert positions == {"left": 0.25}
@@ -98,23 +98,23 @@ def test_the_pure_function_leaves_the_positions_alone_and_gives_the_same_again()
 # Mimicking
 
 
-def test_a_joint_that_mimics_follows_and_so_does_one_that_mimics_it() -> None:
+def test_a_chain_of_mimics_follows_its_leader() -> None:
     assert xs(gripper().transforms({"left": 0.25}, 0)) == {"left": 0.25, "right": -0.25, "third": 2.0 * -0.25 + 0.5}
 
 
-def test_a_position_of_its_own_counts_more_and_is_what_others_follow() -> None:
+def test_a_position_of_its_own_overrides_the_mimic_and_is_followed_by_others() -> None:
     """As in robot_state_publisher."""
     assert xs(gripper().transforms({"left": 0.25, "right": 1.0}, 0)) == {"left": 0.25, "right": 1.0, "third": 2.5}
     assert xs(gripper().transforms({"right": 1.0}, 0)) == {"right": 1.0, "third": 2.5}
 
 
-def test_a_joint_may_follow_a_fixed_one_that_somebody_gives_a_position() -> None:
+def test_a_joint_may_mimic_a_fixed_joint_with_a_position() -> None:
     model = gripper(follower=Mimic("mount", 2.0))
     assert xs(model.transforms({"mount": 1.0}, 0)) == {"right": 2.0, "third": 4.5}
     assert xs(model.transforms({"left": 1.0}, 0)) == {"left": 1.0}
 
 
-def test_a_thousand_joints_may_follow_each_other() -> None:
+def test_a_thousand_joints_may_mimic_each_other_in_a_chain() -> None:
     links = ["root", *(f"l{i}" for i in range(1_000))]
     joints = [slide(f"j{i}", "root", f"l{i}", mimic=Mimic(f"j{i + 1}") if i < 999 else None) for i in range(1_000)]
     assert set(xs(RobotModel("r", links, joints).transforms({"j999": 0.5}, 0)).values()) == {0.5}
@@ -123,7 +123,7 @@ def test_a_thousand_joints_may_follow_each_other() -> None:
 # Zero and limits
 
 
-def test_zeros_move_every_joint_and_put_it_at_its_origin() -> None:
+def test_zeros_put_every_joint_at_its_origin() -> None:
     joints = [
         Joint("turn", "continuous", "a", "b"),
         Joint("plane", "planar", "a", "c", axis=UP),
@@ -142,13 +142,13 @@ def test_zeros_move_every_joint_and_put_it_at_its_origin() -> None:
 
 
 @pytest.mark.parametrize(("position", "beyond"), [(-0.6, True), (-0.5, False), (0.0, False), (0.5, False), (0.6, True)])
-def test_a_position_beyond_the_limits_is_told_and_not_changed(position: float, beyond: bool) -> None:
+def test_a_position_outside_of_the_limits_is_reported_and_not_changed(position: float, beyond: bool) -> None:
     model = gripper(third=Mimic("right", 0.0))
     assert model.violations({"left": position}) == ([LimitViolation("left", position, -0.5, 0.5)] if beyond else [])
     assert xs(model.transforms({"left": position}, 0))["left"] == position
 
 
-def test_the_limits_of_a_joint_that_mimics_count_too_and_one_of_them_may_be_missing() -> None:
+def test_a_mimicking_joint_has_limits_too_of_which_one_may_be_missing() -> None:
     [violation] = gripper().violations({"left": -0.4})
     assert violation == LimitViolation("third", 1.3, None, 1.0)
     assert str(violation) == "joint 'third': position 1.3 is outside its limits, to 1"
@@ -168,7 +168,7 @@ def test_the_limits_of_a_joint_that_mimics_count_too_and_one_of_them_may_be_miss
         ({"right": 1e308}, "third"),
     ],
 )
-def test_a_position_that_is_not_finite_is_refused_by_the_name_of_the_joint(
+def test_a_position_that_is_not_finite_is_refused_with_the_name_of_the_joint(
     call: str, positions: dict[str, float], joint: str
 ) -> None:
     with pytest.raises(InvalidTransformError, match=f"^joint '{joint}': position .* is not finite") as caught:
@@ -241,19 +241,19 @@ SEVERAL = [fixed("1", "a", "b"), fixed("2", "c", "d")]
         ),
     ],
 )
-def test_what_is_no_robot_is_refused_by_the_element(links: Any, joints: list[Joint], message: str) -> None:
+def test_an_invalid_robot_is_refused_with_the_element(links: Any, joints: list[Joint], message: str) -> None:
     with pytest.raises(InvalidRobotError) as caught:
         RobotModel("r", links, joints)
     assert str(caught.value) == message
 
 
-def test_a_name_that_is_none_is_a_type_error() -> None:
+def test_a_name_that_is_not_a_str_is_a_type_error() -> None:
     with pytest.raises(TypeError, match="a frame name must be a str"):
         RobotModel("r", [5], [])  # type: ignore[list-item]
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3)), min_size=2, max_size=4))
-def test_only_what_makes_one_tree_is_a_robot(edges: list[tuple[int, int]]) -> None:
+def test_only_links_that_form_one_tree_are_a_robot(edges: list[tuple[int, int]]) -> None:
     """Against the obvious rule: one link reaches every other in exactly one way."""
     links = [f"l{i}" for i in range(4)]
     joints = [fixed(f"{i}: {a} {b}", f"l{a}", f"l{b}") for i, (a, b) in enumerate(edges)]
@@ -297,7 +297,7 @@ def test_a_model_comes_from_the_text_of_a_urdf() -> None:
     assert sample == TransformStamped("base", "hook", 7, Transform((2.0, 0.0, 3.5)))
 
 
-def test_a_urdf_whose_elements_make_no_robot_is_refused_by_the_element() -> None:
+def test_a_urdf_with_an_invalid_robot_is_refused_with_the_element() -> None:
     with pytest.raises(InvalidRobotError) as caught:
         RobotModel.from_urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
     assert caught.value.element == '<robot name="r">'

@@ -48,7 +48,7 @@ def batches_of(bus: Bus) -> list[tuple[TransformStamped, ...]]:
     return got
 
 
-def test_making_one_sends_the_fixed_joints_once_as_statics() -> None:
+def test_the_constructor_publishes_the_fixed_joints_once_as_statics() -> None:
     bus = Bus(SimulatedClock(start=42))
     got = batches_of(bus)
     robot = RobotStatePublisher(bus, CRANE)
@@ -65,7 +65,7 @@ def test_a_buffer_that_joins_later_gets_the_fixed_joints_too() -> None:
     assert Buffer(bus).lookup_nowait("boom", "lamp").transform.translation == (0.5, 0.0, 0.0)
 
 
-def test_a_robot_without_fixed_joints_sends_nothing_until_it_moves() -> None:
+def test_a_robot_without_fixed_joints_publishes_nothing_at_first() -> None:
     bus = Bus(SimulatedClock())
     got = batches_of(bus)
     RobotStatePublisher(bus, RobotModel("r", ["a", "b"], [Joint("j", "continuous", "a", "b")])).publish({"j": 1.0})
@@ -86,7 +86,7 @@ def test_a_message_is_one_batch_with_its_own_stamp_and_by_default_with_the_clock
     assert {sample.authority for batch in got for sample in batch} == {"crane driver"}
 
 
-def test_the_hook_is_where_the_closed_form_says() -> None:
+def test_the_pose_of_the_hook_has_the_closed_form() -> None:
     with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
         RobotStatePublisher(bus, CRANE).publish({"swing": 0.5, "rope": 1.5})
         hook = buffer.lookup_nowait("base", "hook").transform.translation
@@ -117,7 +117,7 @@ def test_several_robots_share_a_bus_under_prefixes() -> None:
         assert "base" not in buffer.tree.frames()
 
 
-def test_unknown_joints_are_counted_and_told_once_each(caplog: pytest.LogCaptureFixture) -> None:
+def test_unknown_joints_are_counted_and_logged_once_each(caplog: pytest.LogCaptureFixture) -> None:
     robot = RobotStatePublisher(Bus(SimulatedClock()), CRANE)
     with caplog.at_level(logging.WARNING, "tfbus"):
         for _ in range(3):
@@ -126,7 +126,9 @@ def test_unknown_joints_are_counted_and_told_once_each(caplog: pytest.LogCapture
     assert caplog.messages == ["robot 'crane' has no joint 'elbow'", "robot 'crane' has no joint 'wrist'"]
 
 
-def test_limits_are_counted_and_told_once_a_joint_and_nothing_is_clamped(caplog: pytest.LogCaptureFixture) -> None:
+def test_violations_are_counted_and_logged_once_a_joint_and_nothing_is_clamped(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
         robot = RobotStatePublisher(bus, CRANE)
         with caplog.at_level(logging.WARNING, "tfbus"):
@@ -141,7 +143,7 @@ def test_limits_are_counted_and_told_once_a_joint_and_nothing_is_clamped(caplog:
     "positions",
     [[0.5, 1.5], (0.5, 1.5), np.array([0.5, 1.5]), np.array([0.5, 1.5], np.float32), [np.float64(0.5), 1.5]],
 )
-def test_names_and_positions_may_come_side_by_side_as_in_ros(positions: Any) -> None:
+def test_names_and_positions_may_be_parallel_sequences_as_in_ros(positions: Any) -> None:
     bus = Bus(SimulatedClock())
     robot = RobotStatePublisher(bus, CRANE)
     got = batches_of(bus)
@@ -160,7 +162,7 @@ def test_names_and_positions_may_come_side_by_side_as_in_ros(positions: Any) -> 
         (["rope", "swing", "rope"], [1.0, 2.0, 3.0], "a joint has one position, but there are several of 'rope'"),
     ],
 )
-def test_a_message_that_does_not_fit_together_is_refused(names: Any, positions: Any, message: str) -> None:
+def test_inconsistent_names_and_positions_are_refused(names: Any, positions: Any, message: str) -> None:
     bus = Bus(SimulatedClock())
     robot = RobotStatePublisher(bus, CRANE)
     got = batches_of(bus)
@@ -170,7 +172,7 @@ def test_a_message_that_does_not_fit_together_is_refused(names: Any, positions: 
     assert got == []
 
 
-def test_of_a_message_with_one_bad_position_nothing_is_sent_or_counted() -> None:
+def test_nothing_is_published_or_counted_if_one_position_is_bad() -> None:
     bus = Bus(SimulatedClock())
     robot = RobotStatePublisher(bus, CRANE)
     got = batches_of(bus)
@@ -181,14 +183,14 @@ def test_of_a_message_with_one_bad_position_nothing_is_sent_or_counted() -> None
     assert robot.statistics() == RobotStatistics(messages=0, unknown_joints=0, violations={})
 
 
-def test_an_empty_message_is_one_that_moves_nothing() -> None:
+def test_an_empty_message_moves_nothing() -> None:
     bus = Bus(SimulatedClock())
     robot = RobotStatePublisher(bus, CRANE)
     robot.publish_state([], [])
     assert robot.statistics().messages == 1
 
 
-def test_what_the_bus_refuses_is_refused() -> None:
+def test_a_refusal_of_the_bus_is_raised() -> None:
     bus = Bus(SimulatedClock())
     bus.publish(static("lamp", "boom"))
     with pytest.raises(InvalidTransformError) as caught:
@@ -209,7 +211,7 @@ def test_a_prefix_with_a_leading_slash_is_refused_before_anything_is_sent(prefix
     assert bus.statistics().samples == 0
 
 
-def test_a_closed_bus_takes_no_robot_and_no_message() -> None:
+def test_a_closed_bus_refuses_the_robot_and_its_messages() -> None:
     bus = Bus(SimulatedClock())
     robot = RobotStatePublisher(bus, CRANE)
     bus.close()

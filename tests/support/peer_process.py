@@ -1,4 +1,4 @@
-"""A process with a bus and its links, which does what lines of JSON on its standard input say, and answers with lines.
+"""A process with a bus and its links that reads commands as lines of JSON, and writes its answers as such lines.
 
 Its only argument is JSON too: ``{"backend": .., "links": [{"domain": .., ..}, ..]}``, with the arguments of each link.
 A line ``{"id": 7, "do": "publish", ..}`` is answered by ``{"id": 7, ..}`` when it is done; what happens on the bus
@@ -40,7 +40,7 @@ def tell(**facts: Any) -> None:
 
 
 class Tally:
-    """What has come of one authority: numbered batches, each with its number as the stamp of all its samples."""
+    """Counts the batches of one authority, which are numbered by the stamps of their samples."""
 
     def __init__(self) -> None:
         self.batches = 0
@@ -105,7 +105,7 @@ class Program:
                 self._changed.set()
 
     async def watch_pauses(self) -> None:
-        """How long the event loop was not there for others, at worst."""
+        """Measure the longest time for which the event loop was busy."""
         while True:
             due = time.monotonic() + _PROBE
             await anyio.sleep(_PROBE)
@@ -121,13 +121,13 @@ class Program:
         self.bus.publish([as_sample(**sample) for sample in samples])
 
     async def do_statics(self, names: list[str], x: float = 0.0, authority: str = "") -> None:
-        """Some static frames under the map, as one batch."""
+        """Publish static frames under the map, as one batch."""
         self.bus.publish([as_sample("map", name, 0, x, authority, static=True) for name in names])
 
     async def do_stream(
         self, authority: str, batches: int, rate: float, size: int = 20, start: int = 0
     ) -> dict[str, Any]:
-        """Numbered batches, `rate` of them a second; frames that are called like the authority."""
+        """Publish numbered batches, `rate` of them a second, of frames named after the authority."""
         began = time.monotonic()
         longest_call = 0.0
         for number in range(start, start + batches):
@@ -142,7 +142,7 @@ class Program:
         return {"longest_call": longest_call, "seconds": time.monotonic() - began}
 
     async def do_churn(self, frame: str, times: int) -> None:
-        """Publish a static frame and remove it again, over and over; at last it is there, at x = `times`."""
+        """Publish and remove a static frame many times; at last it exists, at x = `times`."""
         broadcaster = TransformBroadcaster(self.bus, "churn")
         for turn in range(times):
             broadcaster.send_static("map", frame, Transform((float(turn), 0.0, 0.0)))
@@ -168,10 +168,9 @@ class Program:
         x: dict[str, float] | None = None,
         link: int = 0,
     ) -> dict[str, Any]:
-        """Wait until all of this holds.
+        """Wait until some frames exist, do not exist, or are static, and all other conditions hold.
 
-        Frames that are there, that are not, and that are static; how many peers; numbers of last batches; and where
-        some frames are.
+        `peers` is a number of peers; `last` has numbers of last batches by authority, and `x` positions by frame.
         """
 
         def holds() -> bool:
@@ -205,7 +204,7 @@ class Program:
             await anyio.sleep(max(0.0, began + (number + 1) / rate - time.monotonic()))
 
     async def do_delays(self, authority: str, messages: int) -> dict[str, Any]:
-        """How many ns after their stamps these come, behind the buffer."""
+        """Measure how many ns after their stamps samples are published here."""
         delays: list[int] = []
 
         def note(batch: Batch) -> None:

@@ -1,4 +1,4 @@
-"""Processes that run `peer_process.py`, told what to do and asked how it went."""
+"""Processes that run `peer_process.py` and answer its commands."""
 
 import json
 import os
@@ -18,14 +18,14 @@ from uuid import uuid4
 import anyio
 
 PATIENCE = 60.0
-"""s; far more than anything takes."""
+"""Seconds; far more than anything takes."""
 
 _PROGRAM = Path(__file__).parent / "peer_process.py"
 _numbers = count()
 
 
 def free_ports(how_many: int) -> list[int]:
-    """Ports of the loopback at which nobody listens."""
+    """Free ports of the loopback."""
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(how_many)]
     ports = [taken.getsockname()[1] for taken in sockets]
     for taken in sockets:
@@ -34,12 +34,12 @@ def free_ports(how_many: int) -> list[int]:
 
 
 def new_domain() -> str:
-    """A domain that nobody else uses."""
+    """The name of a domain that no other test uses."""
     return f"test-{uuid4().hex}"
 
 
 class PeerProcess:
-    """One of them; what it says is kept until somebody asks for it."""
+    """One such process; its output is kept until a test asks for it."""
 
     def __init__(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> None:
         command = [*prefix, sys.executable, str(_PROGRAM), json.dumps({"backend": backend, "links": links})]
@@ -58,7 +58,7 @@ class PeerProcess:
         return self._process.pid
 
     def start(self, do: str, **arguments: Any) -> int:
-        """Have it begin something; the number is for `finish`."""
+        """Send a command; returns its number for `finish`."""
         number = next(_numbers)
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"id": number, "do": do, **arguments}) + "\n")
@@ -66,15 +66,15 @@ class PeerProcess:
         return number
 
     def finish(self, number: int) -> dict[str, Any]:
-        """Wait until it has done that."""
+        """Wait for the answer to a command."""
         return self.wait(id=number)
 
     def ask(self, do: str, **arguments: Any) -> dict[str, Any]:
-        """Have it do something, and wait for its answer."""
+        """Send a command, and wait for its answer."""
         return self.finish(self.start(do, **arguments))
 
     def wait(self, **facts: Any) -> dict[str, Any]:
-        """The first thing it says, or has said and nobody waited for, of which all of `facts` is true."""
+        """The first line of its output, kept or new, that has all of `facts`."""
         for said in self._kept:
             if facts.items() <= said.items():
                 self._kept.remove(said)
@@ -91,7 +91,7 @@ class PeerProcess:
             self._kept.append(news)
 
     def said(self, **facts: Any) -> list[dict[str, Any]]:
-        """What it has said by now, and nobody waited for."""
+        """The lines of its output that nobody has waited for, with all of `facts`."""
         self.ask("facts")
         return [said for said in self._kept if facts.items() <= said.items()]
 
@@ -99,12 +99,12 @@ class PeerProcess:
         self._process.send_signal(number)
 
     def kill(self) -> None:
-        """End it without a word."""
+        """Kill it."""
         self._process.kill()
         self._process.wait(PATIENCE)
 
     def end(self) -> int:
-        """Let it end by itself; its exit status."""
+        """Let it end by itself; returns its exit status."""
         if self._process.stdin is not None and not self._process.stdin.closed:
             self._process.stdin.close()
         try:
@@ -138,19 +138,19 @@ class PeerProcess:
 
 
 class Crowd:
-    """Processes that are all gone when the test is over."""
+    """Processes that end with the test."""
 
     def __init__(self) -> None:
         self.members: list[PeerProcess] = []
 
     def add(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> PeerProcess:
-        """Begin one, and wait until its links are there."""
+        """Start a process, and wait until its links are open."""
         process = self.begin(*links, backend=backend, prefix=prefix)
         process.wait(event="ready")
         return process
 
     def begin(self, *links: dict[str, Any], backend: str = "asyncio", prefix: tuple[str, ...] = ()) -> PeerProcess:
-        """Begin one."""
+        """Start a process."""
         process = PeerProcess(*links, backend=backend, prefix=prefix)
         self.members.append(process)
         return process
@@ -167,7 +167,7 @@ def crowd() -> Iterator[Crowd]:
 
 
 async def until(holds: Callable[[], bool]) -> None:
-    """Wait for what happens in this process."""
+    """Wait until something holds in this process."""
     with anyio.fail_after(PATIENCE):
-        while not holds():  # noqa: ASYNC110 - what zenoh's threads bring rings no bell here
+        while not holds():  # noqa: ASYNC110 - zenoh's threads wake no event here
             await anyio.sleep(0.002)

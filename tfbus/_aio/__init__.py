@@ -1,1 +1,1 @@
-"""What anyio lacks: small tools for tasks, streams and threads."""
+"""Tools that anyio lacks: for tasks, streams and threads."""

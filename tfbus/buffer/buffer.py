@@ -110,7 +110,7 @@ class Buffer:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> TransformStamped:
-        """Where `source` is, seen from `target`, or an error at once. See `TransformTree.lookup`.
+        """The transform from `source` to `target`, or an error at once. See `TransformTree.lookup`.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Buffer:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> TransformStamped:
-        """Where `source` is, seen from `target`, as soon as that can be answered.
+        """The transform from `source` to `target`, as soon as it is known.
 
         If the answer is known, it comes after one checkpoint. If waiting cannot help, the lookup fails at once: a stamp
         older than an edge's window raises `PastExtrapolationError`. Otherwise it waits; for a frame that nobody
@@ -354,7 +354,7 @@ class Buffer:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> Explanation:
-        """How `lookup_nowait` with these arguments finds its answer, or everything that blocks it.
+        """An explanation of the answer of `lookup_nowait`, or of everything that blocks it.
 
         See `TransformTree.explain`; ages are counted from the clock's now.
         """

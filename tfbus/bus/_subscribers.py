@@ -74,7 +74,7 @@ class Subscribers:
             )
 
     def deliver(self, batch: Batch) -> None:
-        """Call everybody with a batch, now or, inside a callback, after the batches before it."""
+        """Call every subscriber with a batch: now or, inside a callback, after the batches before it."""
         self._backlog.append(batch)
         if self._calling is not None:
             self._queued += 1
@@ -82,7 +82,7 @@ class Subscribers:
         self._deliver_backlog()
 
     def discard_moving(self) -> None:
-        """Deliver no moving sample of what was published so far to anybody any more: the clock has jumped back."""
+        """Take the moving samples out of the batches that are not delivered yet: the clock has jumped back."""
         self._keep_only(lambda sample: sample.static)
 
     def forget(self, child: str) -> None:

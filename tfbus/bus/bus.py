@@ -212,7 +212,7 @@ class Bus:
         self._announcer.announce(event)
 
     def reserve(self, frame: str, authority: str) -> Registration:
-        """Let only `authority` publish a frame, whatever `on_conflict` says, until the registration is closed.
+        """Let only `authority` publish a frame, for any `on_conflict`, until the registration is closed.
 
         Earlier samples of another authority stay; later ones are refused with ``reason="reserved"``. One authority may
         reserve a frame several times.

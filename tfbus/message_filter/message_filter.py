@@ -51,7 +51,8 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     buffer : Buffer
     target : str or sequence of str
         The frame into which the transforms lead. With a sequence, all of them are needed, and the pair holds a tuple of
-        transforms in that order. A message that is in the target already is ready at once, whatever the buffer knows.
+        transforms in that order. A message that is in the target already is ready at
+        once, also if the buffer does not know it.
     frame, stamp : callable, optional
         Give the frame and the stamp (ns, or `LATEST`) of a message; by default its attributes `frame` and `stamp`.
     tolerance : float

@@ -38,7 +38,7 @@ class CopiedPath(NamedTuple):
         return all(edge.stamps and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
 
     def covered(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
-        """Which of the stamps all edges cover, shape (n,)."""
+        """A mask of the stamps that all edges cover, shape (n,)."""
         covered = np.ones(len(stamps), np.bool_)
         for samples in self.moving:
             if not samples.stamps:

@@ -271,7 +271,7 @@ def _climb(steps: Sequence[Segments | Row], part: slice) -> Columns:
 def _read_with_policy(
     path: CopiedPath, stamps: Stamps, policy: Policy
 ) -> tuple[npt.NDArray[np.bool_], list[Stamps], Stamps]:
-    """Which stamps have an answer, where each edge is read for it, and `extrapolated_by` and `gap`, shape (2, n)."""
+    """A mask of the answered stamps, the stamps at which each edge is read, and (`extrapolated_by`, `gap`)."""
     answered = np.ones(len(stamps), np.bool_)
     read_at: list[Stamps] = []
     extrapolation = np.zeros((2, len(stamps)), np.int64)

@@ -1,4 +1,4 @@
-"""How fast a frame moves: the analytic derivative of what the lookup interpolates.
+"""The velocity of a frame: the analytic derivative of the interpolation.
 
 Between two samples the origin moves on a straight line at a constant velocity, and slerp turns at a constant angular
 velocity about an axis that stands still in the parent. At a sample the derivative is the one from before; at the first

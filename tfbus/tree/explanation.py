@@ -20,7 +20,7 @@ from tfbus.tree.rendering import format_rate
 
 @dataclass(frozen=True, slots=True)
 class ExplainedEdge:
-    """How one edge contributes to an answer.
+    """The contribution of one edge to an answer.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class ExplainedEdge:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """How a lookup finds its answer, or what blocks it. ``str`` gives a text of several lines.
+    """The path and the samples behind an answer, or the errors that block it. ``str`` gives a text of several lines.
 
     Attributes
     ----------

@@ -29,7 +29,7 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """How far an answer may depart from its stamp; all in ns. `policy_of` makes one from what users write.
+    """The limits of how far an answer may depart from its stamp; all in ns. Made by `policy_of`.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Policy:
 
     @property
     def longest_hold(self) -> int:
-        """How long a sample may stand in for later stamps, by `tolerance` or by `hold`, in ns."""
+        """The longest time that a sample may stand in for later stamps, by `tolerance` or by `hold`, in ns."""
         return max(self.tolerance, self.hold)
 
 

@@ -32,7 +32,7 @@ def describe(edges: Sequence[Edge], now: int | None = None) -> str:
 
 
 def facts(edge: Edge, now: int) -> dict[str, str]:
-    """The rate, age, span and authority of an edge as texts; what an edge does not have is left out."""
+    """The rate, age, span and authority of an edge as texts, as far as the edge has them."""
     known = {"rate": _rate(edge)}
     if edge.oldest is not None and edge.newest is not None:
         known["age"] = f"age {format_duration(now - edge.newest)}"

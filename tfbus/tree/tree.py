@@ -115,45 +115,45 @@ class TransformTree:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> TransformStamped:
-        """Where `source` is, seen from `target`: the transform that maps source's data into target.
+        """The transform from `source` to `target`: it maps the coordinates of source into target.
 
         Parameters
         ----------
         target, source : str
         at : int or LATEST
             ns. `LATEST` is the newest stamp that every moving edge on the path can answer; with `extrapolate`, the
-            newest stamp of any of them, as far as the lagging one may be held.
+            newest stamp of any of them, as far as the lagging edge may be held.
         source_at : int or LATEST, optional
             Take source at this stamp instead, and carry it to `at` through `fixed`.
         fixed : str, optional
-            The frame that is held still between the two stamps.
+            The frame that stands still between the two stamps.
         not_before : int, optional
             Count a `LATEST` answer older than this (ns) as not yet arrived.
         tolerance : float
-            Where an edge does not cover the stamp, or only by a gap that is too long, let its nearest sample within so
-            many s stand in.
+            In s. If an edge does not cover the stamp, or only by a gap that is too long, its nearest sample within this
+            distance stands in.
         max_gap : float, optional
-            Refuse to interpolate between samples that are more than so many s apart.
+            In s. Samples that are further apart are not interpolated.
         extrapolate : Hold, optional
-            Where an edge has no sample after the stamp, or none that `max_gap` lets it interpolate to, let the one
-            before it stand in, for a while.
+            If an edge has no sample after the stamp, or `max_gap` forbids to interpolate to it, the sample before the
+            stamp stands in for some time.
 
         Returns
         -------
         TransformStamped
             Parent is target and child is source; its stamp is `at`, or the one that `LATEST` found. An answer whose
             whole path is static has ``static=True`` and, for `LATEST`, the newest stamp among its samples. In time
-            travel, a `LATEST` that only static edges answer takes the stamp of source. With a tolerance, a gap or
-            a hold, `extrapolated_by` and `gap` say what was done.
+            travel, a `LATEST` that only static edges answer takes the stamp of source. With a policy, `extrapolated_by`
+            and `gap` say how far the answer departs from its stamp.
 
         Raises
         ------
         UnknownFrameError, DisconnectedError, FutureExtrapolationError
-            If it cannot be answered now, but may be later.
+            If there is no answer now, but there may be one later.
         PastExtrapolationError
-            If it is older than an edge's window.
+            If the stamp is older than an edge's window.
         GapError
-            If it lies in a gap that is too long.
+            If the stamp lies in a gap that is too long.
         TypeError
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
             `not_before` comes without a `LATEST`.
@@ -181,19 +181,19 @@ class TransformTree:
         extrapolate: Hold | None = None,
         now: int | None = None,
     ) -> Explanation:
-        """How `lookup` with these arguments comes to its answer, or all that keeps it from one; made to be printed.
+        """An explanation of the answer of `lookup`, or of everything that blocks it; made to be printed.
 
         Parameters
         ----------
         target, source, at, not_before, tolerance, max_gap, extrapolate
-            As `lookup`. Each leg of a time travel is a question of its own.
+            As `lookup`. Time travel has two halves; explain each of them.
         now : int, optional
             The stamp that ages are counted from, in ns; by default the newest in the tree.
 
         Raises
         ------
         TypeError
-            As `lookup`. What a lookup has no answer to is no error here.
+            As `lookup`. A lookup without an answer is no error here.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         if not_before is not None and at is not LATEST:
@@ -216,7 +216,7 @@ class TransformTree:
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
     ) -> TransformArray:
-        """As `lookup`, at many stamps at once.
+        """The transforms from `source` to `target` at many stamps.
 
         Parameters
         ----------
@@ -226,22 +226,23 @@ class TransformTree:
         source_at : int, or integer array of shape (n,), optional
             Take source at these stamps instead, and carry it to `stamps` through `fixed`.
         fixed : str, optional
-            The frame that is held still between the two stamps.
+            The frame that stands still between the two stamps.
         out_of_range : {"raise", "nan"}
-            What becomes of stamps without an answer: an error that names the first, or NaN in their places.
+            Stamps without an answer raise an error that names the first, or give NaN.
         tolerance, max_gap, extrapolate
             As `lookup`.
 
         Returns
         -------
         TransformArray
-            One transform a stamp, in the order of `stamps`; its `extrapolated_by` and `gap` say what was done.
+            One transform for each stamp, in the order of `stamps`. With a policy, its `extrapolated_by` and `gap` say
+            how far each answer departs from its stamp.
 
         Raises
         ------
         UnknownFrameError
         DisconnectedError
-            If there is no path at some stamp; with ``"nan"``, only if there is none at any.
+            If there is no path at some stamp; with ``"nan"``, only if there is none at all stamps.
         ExtrapolationError
             If a stamp is outside an edge's window; `index` says which.
         TypeError
@@ -257,21 +258,22 @@ class TransformTree:
         return lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
 
     def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
-        """A cloud from a moving sensor, as if all points had been seen at once, at the stamp of the cloud.
+        """A cloud from a moving sensor, corrected as if all points had been seen at the stamp of the cloud.
 
-        Each point goes by the transform of its own stamp into `fixed`, and from there into `target` at the stamp of the
-        cloud.
+        Each point is moved into `fixed` by the transform at its own stamp, and from there into `target` by the
+        transform at the stamp of the cloud.
 
         Parameters
         ----------
         cloud : PointCloud
-            With a stamp for each point. If its own is `LATEST`, that of the newest point is meant.
+            With a stamp for each point. If the stamp of the cloud is `LATEST`, that of the newest point is used.
         target : str
             The frame of the result; often that of the cloud.
         fixed : str
             The frame that stands still meanwhile, such as ``"odom"``.
         out_of_range : {"raise", "nan"}
-            As for `lookup_many`; points without an answer become NaN. The stamp of the cloud itself has to be covered.
+            As for `lookup_many`; points without an answer become NaN. The stamp of the cloud itself must have an
+            answer.
 
         Returns
         -------
@@ -288,23 +290,23 @@ class TransformTree:
         return deskew(self._forest, cloud, target, fixed, out_of_range)
 
     def twist(self, frame: str, reference: str, at: At = LATEST, *, expressed_in: str | None = None) -> TwistStamped:
-        """How `frame` moves, seen from `reference`: the derivative of what `lookup` interpolates.
+        """The velocity of `frame` in `reference`: the derivative of the interpolation of `lookup`.
 
         Parameters
         ----------
         frame, reference : str
         at : int or LATEST
-            ns. `LATEST` is the newest stamp at which all that is needed can be answered.
+            ns. `LATEST` is the newest stamp that every moving edge on the paths can answer.
         expressed_in : str, optional
-            The frame along whose axes the velocities are told; by default `reference`.
+            The frame along whose axes the velocities are given; by default `reference`.
 
         Returns
         -------
         TwistStamped
-            Its frame is `expressed_in`, but `linear` is the velocity of the origin of `frame` in m/s, whatever the
-            axes; `angular` is the angular velocity in rad/s. At a sample it is the derivative from before, at the first
-            of an edge's window or of a new parent that from after. From the last sample with one parent to the first
-            with another an edge stands still.
+            Its frame is `expressed_in`. For any axes, `linear` is the velocity of the origin of `frame` in m/s;
+            `angular` is the angular velocity in rad/s. At a sample it is the derivative from before; at the first
+            sample of a window or of a new parent, the one from after. Between the last sample with one parent and the
+            first with another, an edge stands still.
 
         Raises
         ------
@@ -312,14 +314,13 @@ class TransformTree:
             As `lookup`; and `FutureExtrapolationError` at an edge's newest sample if it is the only one, or the only
             one with its parent.
 
-        Notes
-        -----
-        Move only an answer with ``expressed_in=frame`` by `do_transform`: it is the twist of the body that the frame is
-        fixed to, told at the frame's own origin, and can be told at other frames of that body. In other axes, as by
-        default, it is not told at the origin of its frame, and `do_transform` would give a wrong velocity.
+        Notes ----- Use `do_transform` only on an answer with ``expressed_in=frame``. That answer is the twist of a
+        rigid body at the origin of `frame`, and `do_transform` gives it at another frame of the body. In other axes, as
+        by default, the twist does not refer to the origin of its own frame, and `do_transform` would give a wrong
+        velocity.
 
-        tf2's `lookupVelocity` gives other numbers: it rotates what is in the observer's axes once more by the body's
-        rotation.
+        tf2's `lookupVelocity` gives other numbers: it rotates a velocity that is in the observer's axes once more by
+        the rotation of the body.
         """
         axes = reference if expressed_in is None else expressed_in
         if at is not LATEST:
@@ -329,7 +330,7 @@ class TransformTree:
         return TwistStamped(axes, stamp, linear, angular)
 
     def latest_common_stamp(self, target: str, source: str) -> int | None:
-        """The stamp that `LATEST` means for these two frames, in ns; None where the whole path is static.
+        """The stamp that `LATEST` means for two frames, in ns; None if the whole path is static.
 
         Raises
         ------
@@ -438,7 +439,7 @@ class TransformTree:
 
 
 def tree_of(forest: Forest, keep: float | None) -> TransformTree:
-    """The tree over a forest that a bus fills; nobody else may change it, because that would wake no waiting lookup."""
+    """The tree over a forest that a bus fills. It cannot be changed, because a change would wake no waiting lookup."""
     tree = TransformTree(keep)
     tree._forest = forest
     tree._filled_by_bus = True

@@ -1,6 +1,6 @@
-"""Who waits for which data: the lookups and watches that an insertion concerns, found without looking at the others.
+"""Waiting lookups and open watches: an insertion finds the ones that it concerns without looking at the others.
 
-No event loop: whoever waits brings along a function that wakes it.
+There is no event loop here: each waiter brings along the function that wakes it.
 """
 
 from tfbus.waiting.waiting_index import PendingLookup

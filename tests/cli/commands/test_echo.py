@@ -118,7 +118,7 @@ def test_it_prints_what_programs_on_the_domain_send_and_notices_their_death(back
             assert "from 'robot_tf_publisher'" in echo.errors.expect("waiting for 'base_laser' in 'camera': frame")
         assert echo.end() == 130
     assert waiting == f"waiting for transforms on domain '{domain}' …"
-    assert missing == "waiting for 'base_laser' in 'camera': frame 'base_laser' is not known"
+    assert missing == "waiting for 'base_laser' in 'camera': frame 'base_laser' is not known, did you mean 'base_link'?"
     assert len(echo.errors.text.splitlines()) == 3
 
 

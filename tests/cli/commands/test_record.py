@@ -20,9 +20,7 @@ from tfbus.statistics import QueueStatistics, RecorderStatistics
 BACKENDS = ["asyncio", "trio"]
 
 
-def recorder_statistics(
-    samples: int, dropped: int = 0, conflated: int = 0, unattributed: int = 0
-) -> RecorderStatistics:
+def counters(samples: int, dropped: int = 0, conflated: int = 0, unattributed: int = 0) -> RecorderStatistics:
     queue = QueueStatistics("recorder", "drop_oldest", 1, 0, dropped, conflated)
     return RecorderStatistics(samples, 1, unattributed, {}, queue)
 
@@ -88,13 +86,13 @@ def test_samples_that_ros_cannot_hold_are_counted(tmp_path: Path, tfbus: Command
 @pytest.mark.parametrize(
     ("statistics", "lines"),
     [
-        (recorder_statistics(samples=1_234), ["1,234 samples in run.mcap"]),
+        (counters(samples=1_234), ["1,234 samples in run.mcap"]),
         (
-            recorder_statistics(samples=5, dropped=1_000, conflated=2),
+            counters(samples=5, dropped=1_000, conflated=2),
             ["5 samples in run.mcap", "tfbus: 1,002 samples were lost, because the disk was too slow or failed"],
         ),
         (
-            recorder_statistics(samples=5, unattributed=1),
+            counters(samples=5, unattributed=1),
             ["5 samples in run.mcap", "tfbus: 1 samples are recorded without their authority: too many of them"],
         ),
     ],

@@ -155,6 +155,7 @@ def listening(pid: int, kind: str) -> set[str]:
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="needs /proc/net")
 def test_without_an_address_a_process_can_be_reached_over_the_loopback_only() -> None:
     with crowd() as processes:

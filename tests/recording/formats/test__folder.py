@@ -18,7 +18,13 @@ EXPECTED = [(time, tuple(samples)) for time, _, samples in LINES]
 
 @pytest.mark.parametrize("storage", StoragePlugin)
 @pytest.mark.parametrize(
-    "options", [{}, {"mode": CompressionMode.FILE, **ZSTD}, {"mode": CompressionMode.MESSAGE, **ZSTD}], ids=str
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.thorough),
+        {"mode": CompressionMode.FILE, **ZSTD},
+        {"mode": CompressionMode.MESSAGE, **ZSTD},
+    ],
+    ids=str,
 )
 def test_what_ros_2_records_is_read_compressed_or_not(
     tmp_path: Path, storage: StoragePlugin, options: dict[str, Any]

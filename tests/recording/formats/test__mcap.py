@@ -69,19 +69,19 @@ def records_in(data: bytes | bytearray) -> Iterator[tuple[int, int]]:
     ],
     ids=str,
 )
-def test_all_is_read_however_a_file_is_laid_out(write: Write, options: dict[str, Any], finish: bool) -> None:
+def test_all_messages_are_read_in_every_layout_of_a_file(write: Write, options: dict[str, Any], finish: bool) -> None:
     path = write(LINES, finish=finish, **options)
     assert batches_in(path) == EXPECTED
     with open_recording(path) as recording:
         assert (recording.start, recording.end, recording.finished) == (10, 99 + COUNT, finish)
 
 
-def test_the_index_tells_how_many_messages_of_transforms_there_are(write: Write) -> None:
+def test_a_file_with_an_index_knows_the_count_of_its_messages(write: Write) -> None:
     with open_recording(write(LINES)) as recording:
         assert facts(recording) == (10, 99 + COUNT, COUNT + 1, True)
 
 
-def test_without_an_index_nobody_knows_how_many_messages_there_are(write: Write) -> None:
+def test_a_file_without_an_index_does_not_know_the_count_of_its_messages(write: Write) -> None:
     with open_recording(write(LINES, finish=False)) as recording:
         assert facts(recording) == (10, 99 + COUNT, None, False)
 
@@ -95,7 +95,7 @@ def test_a_message_at_log_time_zero_counts(write: Write) -> None:
 
 
 @pytest.mark.parametrize("finish", [True, False])
-def test_a_message_whose_log_time_is_no_stamp_is_told_and_the_others_are_read(write: Write, finish: bool) -> None:
+def test_a_message_whose_log_time_is_no_stamp_is_reported_and_the_others_are_read(write: Write, finish: bool) -> None:
     late = [(2**63 + 5, "/tf", [moving("a", "b", 6)]), (2**64 - 1, "/tf", [moving("a", "b", 7)])]
     path = write([(5, "/tf", [moving("a", "b", 5)]), *late], finish=finish)
     found = [
@@ -111,7 +111,7 @@ def test_a_finished_file_without_messages_is_an_empty_recording(write: Write) ->
         assert list(recording.messages()) == []
 
 
-def test_what_is_on_other_topics_or_of_other_types_is_left_alone(write: Write) -> None:
+def test_messages_on_other_topics_or_of_other_types_are_ignored(write: Write) -> None:
     other = [moving("x", "y", 0)]
     lines = [
         (5, "/camera", b"\xff" * 5_000),
@@ -132,7 +132,7 @@ def test_what_is_on_other_topics_or_of_other_types_is_left_alone(write: Write) -
     chunk_size=st.integers(1, 2_000),
     ends=st.tuples(*[st.integers(0, 30)] * 2),
 )
-def test_messages_come_by_log_time_wherever_they_are_in_the_file(
+def test_messages_are_ordered_by_log_time_wherever_they_are_in_the_file(
     tmp_path_factory: pytest.TempPathFactory, times: list[int], chunk_size: int, ends: tuple[int, int]
 ) -> None:
     lines = [(time, "/tf", [moving("a", "b", place)]) for place, time in enumerate(times)]
@@ -145,7 +145,7 @@ def test_messages_come_by_log_time_wherever_they_are_in_the_file(
     assert within == [(time, place) for time, place in by_time if since <= time <= until]
 
 
-def test_of_a_part_only_the_chunks_are_read_that_it_needs(write: Write) -> None:
+def test_only_the_chunks_of_the_range_are_read(write: Write) -> None:
     path = write(LINES)
     # A chunk has ten messages or less: these are far from the first and the last one.
     for stamp in (0, COUNT - 1):
@@ -157,7 +157,7 @@ def test_of_a_part_only_the_chunks_are_read_that_it_needs(write: Write) -> None:
 
 
 @pytest.mark.parametrize("finish", [True, False])
-def test_a_damaged_chunk_is_told_and_the_others_are_read(write: Write, finish: bool) -> None:
+def test_a_damaged_chunk_is_reported_and_the_others_are_read(write: Write, finish: bool) -> None:
     path = write(LINES, finish=finish)
     damage(path, encode(EXPECTED[15][1]))
     messages = messages_in(path)
@@ -173,7 +173,7 @@ def test_a_damaged_chunk_is_told_and_the_others_are_read(write: Write, finish: b
     assert messages.index(lost) == missing[0]
 
 
-def test_of_a_range_that_begins_in_a_damaged_chunk_the_loss_is_told_at_its_beginning(write: Write) -> None:
+def test_damage_before_a_range_is_reported_at_the_start_of_the_range(write: Write) -> None:
     path = write(LINES)
     damage(path, encode(EXPECTED[15][1]))
     lost = {
@@ -187,14 +187,14 @@ def test_of_a_range_that_begins_in_a_damaged_chunk_the_loss_is_told_at_its_begin
     assert all(since <= received <= 114 for since, received in lost.items() if since <= 114)
 
 
-def test_a_chunk_without_transforms_is_not_even_looked_at(write: Write) -> None:
+def test_a_chunk_without_transforms_is_not_read(write: Write) -> None:
     first, second = [moving("a", "b", 1)], [moving("a", "b", 3)]
     path = write([(1, "/tf", first), (2, "/camera", b"picture" * 1_000), (3, "/tf", second)], chunk_size=1)
     damage(path, b"picturepicture")
     assert [received for received, _ in batches_in(path)] == [1, 3]
 
 
-def test_a_record_that_goes_on_behind_the_end_of_a_finished_file_is_told(write: Write) -> None:
+def test_a_record_beyond_the_end_of_a_finished_file_is_reported(write: Write) -> None:
     path = write(LINES, use_statistics=False)
     data = bytearray(path.read_bytes())
     second = [place for place, opcode in records_in(data) if opcode == Opcode.CHUNK][1]
@@ -206,7 +206,7 @@ def test_a_record_that_goes_on_behind_the_end_of_a_finished_file_is_told(write: 
     assert [error.reason for error in lost.errors] == ["damaged"]
 
 
-def test_damage_in_the_index_costs_nothing_but_the_index(write: Write) -> None:
+def test_damage_in_the_index_loses_no_messages(write: Write) -> None:
     path = write(LINES)
     data = path.read_bytes()
     index = data.rindex(b"/tf_static")
@@ -219,7 +219,7 @@ def test_damage_in_the_index_costs_nothing_but_the_index(write: Write) -> None:
             assert recording.count is None
 
 
-def test_an_index_that_points_behind_the_end_costs_only_that_chunk(write: Write) -> None:
+def test_an_index_entry_beyond_the_end_loses_only_its_chunk(write: Write) -> None:
     path = write(LINES, enable_crcs=False)
     data = bytearray(path.read_bytes())
     place = next(place for place, opcode in records_in(data) if opcode == Opcode.CHUNK_INDEX)
@@ -232,7 +232,7 @@ def test_an_index_that_points_behind_the_end_costs_only_that_chunk(write: Write)
     assert [(message.received, message.batch) for message in read] == EXPECTED[-len(read) :]
 
 
-def test_where_the_records_make_no_sense_any_more_the_rest_is_lost_and_told(write: Write) -> None:
+def test_unreadable_records_end_the_reading_and_are_reported(write: Write) -> None:
     path = write(LINES, finish=False)
     data = path.read_bytes()
     nonsense = b"\x04" + (100).to_bytes(8, "little") + b"\xff" * 100
@@ -249,9 +249,7 @@ def test_where_the_records_make_no_sense_any_more_the_rest_is_lost_and_told(writ
         *(pytest.param(kind, marks=pytest.mark.thorough) for kind in (CompressionType.LZ4, CompressionType.ZSTD)),
     ],
 )
-def test_a_file_that_is_cut_anywhere_gives_what_comes_before_the_cut(
-    write: Write, compression: CompressionType
-) -> None:
+def test_a_file_cut_at_any_byte_gives_the_messages_before_the_cut(write: Write, compression: CompressionType) -> None:
     path = write(LINES[:10], compression=compression)
     found, shortest = EXPECTED[:10], 10
     for size in reversed(range(path.stat().st_size)):
@@ -269,7 +267,7 @@ def test_a_file_that_is_cut_anywhere_gives_what_comes_before_the_cut(
 
 
 @given(data=st.data())
-def test_whatever_bytes_are_turned_over_nothing_but_what_was_recorded_comes_out(
+def test_changed_bytes_never_lead_to_other_samples_than_the_recorded_ones(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     path = tmp_path_factory.mktemp("recording") / "run.mcap"
@@ -344,7 +342,7 @@ def test_the_official_reader_finds_the_same_messages(write: Write) -> None:
     assert ours == official
 
 
-def test_half_read_messages_can_be_left_and_read_anew(write: Write) -> None:
+def test_several_iterations_are_independent(write: Write) -> None:
     with open_recording(write(LINES)) as recording:
         first, second = recording.messages(), recording.messages()
         assert next(first) == next(second)

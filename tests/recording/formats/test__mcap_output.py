@@ -54,7 +54,7 @@ def test_the_schema_is_the_definition_that_ros_2_has() -> None:
     assert store.hash_rihs01(SCHEMA_NAME) == TYPE_HASH
 
 
-def test_the_official_reader_finds_topics_times_and_transforms(tmp_path: Path) -> None:
+def test_the_official_reader_reads_topics_times_and_transforms(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     turned = TransformStamped("map", "b", 12 * SECOND + 7, Transform((1.0, 2.0, 3.0), (0.0, 0.6, 0.0, 0.8)), "slam")
     written(path, (5, (static("map", "c", x=3.0),)), (9, (moving("map", "a", 3, x=0.1), turned)))
@@ -133,7 +133,7 @@ def test_transforms_come_back_bit_for_bit(tmp_path: Path, batch: list[TransformS
     assert output.samples == len(batch)
 
 
-def test_what_a_message_cannot_hold_is_left_out_and_counted_by_reason(tmp_path: Path) -> None:
+def test_samples_that_a_message_cannot_hold_are_counted_by_reason(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     late, long = moving("map", "a", 2**31 * SECOND), moving("map", "a" * 2_000, 1)
     output = written(path, (5, (late, moving("map", "b", 1), long)), (6, (late,)))
@@ -162,7 +162,7 @@ def authorities_in(path: Path) -> list[tuple[str | None, list[str]]]:
         ]
 
 
-def test_a_message_is_on_a_channel_that_tells_its_authorities(tmp_path: Path) -> None:
+def test_the_channel_of_a_message_has_its_authorities(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     a, b, c = (moving("map", child, 1, authority=who) for child, who in (("a", "x"), ("b", "x"), ("c", "y")))
     written(path, (1, (a,)), (2, (a, b)), (3, (a, b, c)), (4, (moving("map", "d", 1),)))
@@ -174,7 +174,7 @@ def test_a_message_is_on_a_channel_that_tells_its_authorities(tmp_path: Path) ->
     ]
 
 
-def test_a_message_of_too_many_authorities_is_divided(tmp_path: Path) -> None:
+def test_a_message_with_too_many_authorities_is_split(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     crowd = tuple(moving("map", f"f{number}", 1, authority=f"a{number // 2}") for number in range(100))
     output = written(path, (1, crowd))
@@ -192,7 +192,7 @@ def test_with_a_thousand_authorities_the_rest_is_recorded_without_and_counted(tm
     assert (output.samples, output.unattributed) == (1_010, 10)
 
 
-def test_what_counts_as_written_can_be_read_at_any_moment(tmp_path: Path) -> None:
+def test_samples_counted_as_written_can_be_read_at_any_moment(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     seen = set()
     with closing(McapOutput(str(path), overwrite=False)) as output:
@@ -209,7 +209,7 @@ def test_what_counts_as_written_can_be_read_at_any_moment(tmp_path: Path) -> Non
         assert output.samples == readable(path) == 2_000
 
 
-def test_a_new_channel_that_ends_a_chunk_counts_nothing_too_early(tmp_path: Path) -> None:
+def test_a_chunk_ended_by_a_new_channel_is_not_counted_too_early(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with closing(McapOutput(str(path), overwrite=False)) as output:
         counted = 0
@@ -221,7 +221,7 @@ def test_a_new_channel_that_ends_a_chunk_counts_nothing_too_early(tmp_path: Path
         assert counted > 0
 
 
-def test_a_file_that_is_there_is_kept_unless_it_may_be_lost(tmp_path: Path) -> None:
+def test_an_existing_file_is_kept_unless_overwrite_is_set(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     with pytest.raises(FileExistsError):
@@ -232,7 +232,7 @@ def test_a_file_that_is_there_is_kept_unless_it_may_be_lost(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("make", [Path.mkdir, lambda path: path.symlink_to("/dev/full")], ids=["folder", "full disk"])
-def test_what_cannot_be_written_at_all_raises_at_once(tmp_path: Path, make: Callable[[Path], None]) -> None:
+def test_a_file_that_cannot_be_written_raises_at_once(tmp_path: Path, make: Callable[[Path], None]) -> None:
     path = tmp_path / "run.mcap"
     make(path)
     with pytest.raises(OSError, match=r"directory|space"):

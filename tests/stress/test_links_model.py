@@ -1,0 +1,112 @@
+"""Random lives of networks of links: in the end all buses agree, whatever was lost, late or repeated."""
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.link_model import Model, Step, frames_of, steps_of
+from support.wires import CHAIN, CIRCLE, MESH, RING, RING_WITH_A_TAIL, TWO_BRIDGES, Graph, Network, latched
+
+from tfbus import Buffer
+
+pytestmark = pytest.mark.thorough
+
+
+@given(graph=st.sampled_from((MESH, CHAIN, RING, CIRCLE)), steps=steps_of("takeover", "banish"))
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_without_loss_everybody_hears_every_batch_once_whole_and_in_order(graph: Graph, steps: list[Step]) -> None:
+    with Network(graph) as net:
+        model = Model(net)
+        buffers = [Buffer(bus, keep=None) for bus in net.buses]
+        for step in steps:
+            model.do(*step)
+        net.settle()
+        model.check_nothing_went_wrong()
+        members = range(len(net.buses))
+        for member in members:
+            for origin in members:
+                if origin != member:
+                    assert net.received(member, origin) == net.published(origin)
+            assert len(net.heard[member]) == sum(len(net.published(origin)) for origin in members)
+        assert len({frozenset(latched(bus).values()) for bus in net.buses}) == 1
+        assert len({frozenset(frames_of(bus)) for bus in net.buses}) == 1
+        for child in frames_of(net.buses[0]):
+            assert len({buffer.tree.parent(child) for buffer in buffers}) == 1
+        assert sum(end.endpoint.inbox.lost for end in net.ends) == 0
+        for end in net.ends:
+            end.carrier.drop_tombstones()
+        late = net.add_bus()
+        net.domains[-1].join(late)
+        net.settle()
+        assert latched(late) == latched(net.buses[0])
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of("overtake", "overtake", "drop", "repeat", "join"),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_with_loss_nothing_older_comes_and_in_the_end_all_agree_on_what_is_static(
+    graph: Graph, steps: list[Step]
+) -> None:
+    with Network(graph) as net:
+        model = Model(net)
+        for step in steps:
+            model.do(*step)
+        net.settle()
+        net.recover()
+        model.check_nothing_went_wrong()
+        model.check_nothing_older_came()
+        model.check_no_echo()
+        model.move_on()
+        model.check_all_agree()
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of("part", "part", "meet"),
+    drop_lost=st.booleans(),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_when_peers_are_lost_and_found_all_agree_in_the_end_whether_their_frames_leave_or_not(
+    graph: Graph, steps: list[Step], drop_lost: bool
+) -> None:
+    with Network(graph, drop_lost) as net:
+        Model(net).live(steps)
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of("part", "part", "meet", "overtake", "drop", "repeat", "join"),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_when_messages_are_lost_besides_all_agree_in_the_end(graph: Graph, steps: list[Step]) -> None:
+    with Network(graph) as net:
+        Model(net).live(steps)
+
+
+@given(
+    graph=st.sampled_from((MESH, CHAIN, RING, CIRCLE, RING_WITH_A_TAIL, TWO_BRIDGES)),
+    steps=steps_of(),
+    more=steps_of(),
+    which=st.integers(0, 3),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_whatever_is_on_its_way_when_a_bus_dies_its_frames_leave_everywhere(
+    graph: Graph, steps: list[Step], more: list[Step], which: int
+) -> None:
+    with Network(graph, drop_lost=True) as net:
+        model = Model(net)
+        for step in steps:
+            model.do(*step)
+        dead = net.buses[which % len(net.buses)]
+        for domain in net.domains:
+            for end in [end for end in domain.ends if end.bus is dead]:
+                domain.kill(end)
+        for step in more:
+            model.do(*step)
+        net.settle()
+        model.check_nothing_went_wrong()
+        model.check_nothing_older_came()
+        alive = [bus for bus in net.buses if bus is not dead]
+        for bus in alive:
+            assert not any(frame.startswith(f"{net.buses.index(dead)}.") for frame in frames_of(bus))
