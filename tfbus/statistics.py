@@ -46,7 +46,8 @@ class QueueStatistics:
     dropped : int
         Items that were discarded unread: the queue was full, the frame was removed, or the clock jumped back.
     conflated : int
-        Moving samples that gave way to another sample of the same child; only with the overflow ``"conflate"``.
+        Samples that gave way to another sample of the same child: moving ones of a queue with the overflow
+        ``"conflate"``, static ones of a full recorder.
     """
 
     kind: str
