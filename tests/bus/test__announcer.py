@@ -14,7 +14,7 @@ class Recorder:
         self.events.append(event)
 
 
-def test_each_event_goes_to_the_listeners_of_the_moment() -> None:
+def test_an_event_goes_to_the_listeners_registered_when_it_is_announced() -> None:
     early, late = Recorder(), Recorder()
     listeners: deque[Recorder] = deque()
     announcer = Announcer(lambda: 7, listeners)
@@ -30,7 +30,7 @@ def test_each_event_goes_to_the_listeners_of_the_moment() -> None:
     assert announcer.now() == 7
 
 
-def test_has_listeners_follows_the_list() -> None:
+def test_has_listeners_follows_registrations() -> None:
     listeners: list[Recorder] = []
     announcer = Announcer(lambda: 0, listeners)
     assert not announcer.has_listeners

@@ -26,7 +26,7 @@ def added(frame: str) -> FrameAdded:
     return FrameAdded(0, frame, "map", "", static=False)
 
 
-def test_events_come_out_in_the_order_in_which_they_happened() -> None:
+def test_events_are_given_in_order() -> None:
     queue = EventQueue(10)
     happened: list[Event] = [added("a"), FrameRemoved(1, "a"), added("a"), ClockReset(0, 9)]
     for event in happened:
@@ -36,7 +36,7 @@ def test_events_come_out_in_the_order_in_which_they_happened() -> None:
     assert queue.dropped == 0
 
 
-def test_when_there_are_too_many_the_oldest_go_and_are_counted() -> None:
+def test_a_full_queue_drops_and_counts_the_oldest_events() -> None:
     queue = EventQueue(2)
     for name in "abcde":
         queue.put(FrameRemoved(0, name))
@@ -44,7 +44,7 @@ def test_when_there_are_too_many_the_oldest_go_and_are_counted() -> None:
     assert emptied(queue) == [FrameRemoved(0, "d"), FrameRemoved(0, "e")]
 
 
-def test_what_was_known_at_the_beginning_comes_first_and_is_never_dropped() -> None:
+def test_the_initial_events_come_first_and_are_never_dropped() -> None:
     known = [added(f"frame {number}") for number in range(50)]
     queue = EventQueue(1, known)
     queue.put(FrameRemoved(0, "frame 7"))
@@ -53,7 +53,7 @@ def test_what_was_known_at_the_beginning_comes_first_and_is_never_dropped() -> N
     assert emptied(queue) == [*known, FrameRemoved(0, "frame 8")]
 
 
-def test_a_pair_of_authorities_is_told_once_a_frame_until_it_is_removed() -> None:
+def test_a_conflict_of_two_authorities_is_given_once_for_a_frame_until_it_is_removed() -> None:
     queue = EventQueue(100)
     one, two = AuthorityConflict(1, "a", "x", "y"), AuthorityConflict(1, "a", "y", "x")
     third, elsewhere = AuthorityConflict(2, "a", "x", "z"), AuthorityConflict(3, "b", "x", "y")
@@ -69,7 +69,7 @@ def test_a_pair_of_authorities_is_told_once_a_frame_until_it_is_removed() -> Non
     assert emptied(queue) == [ClockReset(0, 5), elsewhere]
 
 
-def test_in_a_quarrel_each_parent_and_kind_that_an_authority_claims_is_told_once() -> None:
+def test_in_a_conflict_each_parent_and_kind_of_an_authority_is_given_once() -> None:
     queue = EventQueue(100)
     queue.put(AuthorityConflict(0, "a", "x", "y"))
     to_p, to_q = Reparented(1, "a", "p", "q", "x"), Reparented(1, "a", "q", "p", "y")
@@ -82,7 +82,7 @@ def test_in_a_quarrel_each_parent_and_kind_that_an_authority_claims_is_told_once
     assert emptied(queue)[1:] == [to_p, to_q, still, moves, new]
 
 
-def test_one_authority_that_hands_a_frame_to_and_fro_is_told_of_each_time() -> None:
+def test_every_change_of_parent_by_a_single_authority_is_given() -> None:
     queue = EventQueue(100)
     queue.put(AuthorityConflict(0, "elsewhere", "x", "y"))
     taken, put_down = Reparented(1, "cup", "hand", "table", "x"), Reparented(2, "cup", "table", "hand", "x")
@@ -96,7 +96,7 @@ def rejected(frame: str | None, authority: str | None, reason: str = "authority"
     return SampleRejected(1, reason, frame, "map", authority, ValueError())
 
 
-def test_a_rejection_is_told_once_a_frame_authority_and_reason_until_it_is_removed_added_or_the_clock_reset() -> None:
+def test_a_rejection_is_given_once_for_a_frame_authority_and_reason_until_the_frame_is_removed_added_or_reset() -> None:
     queue = EventQueue(100)
     different: list[Event] = [
         rejected("a", "x"),
@@ -118,7 +118,7 @@ def test_a_rejection_is_told_once_a_frame_authority_and_reason_until_it_is_remov
         assert emptied(queue) == [end, *again]
 
 
-def test_a_rejection_is_no_quarrel() -> None:
+def test_a_rejection_is_no_conflict_of_authorities() -> None:
     queue = EventQueue(100)
     events: list[Event] = [rejected("cup", "x"), *[Reparented(1, "cup", "hand", "table", "y")] * 3]
     for event in events:
@@ -126,7 +126,7 @@ def test_a_rejection_is_no_quarrel() -> None:
     assert emptied(queue) == events
 
 
-def test_rejections_of_ever_new_frames_and_authorities_fill_no_memory() -> None:
+def test_memory_is_bounded_for_rejections_of_new_frames_and_authorities() -> None:
     queue = EventQueue(1)
     for number in range(3_000):
         queue.put(rejected(f"frame {number}", "x"))
@@ -139,7 +139,7 @@ def test_rejections_of_ever_new_frames_and_authorities_fill_no_memory() -> None:
     assert queue.dropped == dropped + 1, "forgotten in favour of later ones"
 
 
-def test_a_frame_that_is_handed_to_and_fro_for_ever_pushes_nobody_else_out() -> None:
+def test_a_frame_that_changes_its_parent_all_the_time_does_not_displace_events_of_others() -> None:
     queue = EventQueue(5)
     others: list[Event] = [added("a"), Reparented(0, "b", "map", "odom", "x"), FrameRemoved(0, "a")]
     for event in others:
@@ -153,7 +153,7 @@ def test_a_frame_that_is_handed_to_and_fro_for_ever_pushes_nobody_else_out() -> 
     assert emptied(queue) == [*others, *moves[-2:]]
 
 
-def test_news_for_the_reader_come_next_and_are_never_dropped() -> None:
+def test_staleness_events_come_next_and_are_never_dropped() -> None:
     queue = EventQueue(1)
     news = [FrameStale(5, f"frame {number}", 0, "") for number in range(10)]
     queue.put_staleness(news)
@@ -163,7 +163,7 @@ def test_news_for_the_reader_come_next_and_are_never_dropped() -> None:
     assert emptied(queue) == [*news, FrameRemoved(7, "frame 2")]
 
 
-def test_who_quarrels_under_ever_new_names_fills_no_memory() -> None:
+def test_memory_is_bounded_for_conflicts_of_new_authorities() -> None:
     queue = EventQueue(1)
     for number in range(1_000):
         queue.put(AuthorityConflict(0, "a", f"process {number}", f"process {number + 1}"))
@@ -175,6 +175,6 @@ def test_who_quarrels_under_ever_new_names_fills_no_memory() -> None:
 
 
 @pytest.mark.parametrize("capacity", [0, -1, 1.5, True])
-def test_a_bad_capacity_is_refused(capacity: int) -> None:
+def test_a_bad_capacity_is_an_error(capacity: int) -> None:
     with pytest.raises((TypeError, ValueError), match="capacity"):
         EventQueue(capacity)

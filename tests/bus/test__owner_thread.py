@@ -14,7 +14,7 @@ def in_thread(call: Callable[[], object]) -> BaseException | None:
         return pool.submit(call).exception()
 
 
-def test_without_a_loop_it_is_the_thread_that_made_it() -> None:
+def test_without_a_loop_the_owner_is_the_thread_that_made_the_bus() -> None:
     claim = OwnerThread()
     claim.check()
     error = in_thread(claim.check)
@@ -23,7 +23,7 @@ def test_without_a_loop_it_is_the_thread_that_made_it() -> None:
     claim.check()
 
 
-def test_the_first_loop_takes_it_over_and_keeps_it(run: Run) -> None:
+def test_the_thread_of_the_first_loop_becomes_and_stays_the_owner(run: Run) -> None:
     claim = OwnerThread()
 
     async def use() -> None:
@@ -34,7 +34,7 @@ def test_the_first_loop_takes_it_over_and_keeps_it(run: Run) -> None:
         claim.check()
 
 
-def test_made_on_a_loop_it_is_that_loop_s(run: Run) -> None:
+def test_made_on_a_loop_the_owner_is_the_thread_of_that_loop(run: Run) -> None:
     claims: list[OwnerThread] = []
 
     async def make() -> None:

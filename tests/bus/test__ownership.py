@@ -17,7 +17,7 @@ class Known:
     newest: int | None = 0
 
 
-def test_under_last_everybody_may_publish_everything() -> None:
+def test_under_last_every_authority_may_publish_every_child() -> None:
     ownership = Ownership("last")
     assert not ownership.restricts
     batch = (moving("a", "b", 0, authority="odometry"), moving("a", "b", 1, authority="slam"))
@@ -40,7 +40,7 @@ def test_under_reject_the_first_authority_keeps_the_child() -> None:
     assert str(error) == "frame 'b' comes from 'odometry', who was first: no sample of it is taken from 'slam'"
 
 
-def test_of_a_new_child_the_first_in_the_batch_counts() -> None:
+def test_under_reject_the_first_sample_of_a_new_child_in_a_batch_decides() -> None:
     batch = (
         moving("a", "b", 1, authority="one"),
         static("a", "b", authority="two"),
@@ -52,7 +52,7 @@ def test_of_a_new_child_the_first_in_the_batch_counts() -> None:
 
 
 @pytest.mark.parametrize("first", ["", "odometry"])
-def test_what_is_remembered_is_kept_for_its_authority_until_it_is_forgotten(first: str) -> None:
+def test_under_reject_a_remembered_child_stays_with_its_authority_until_it_is_forgotten(first: str) -> None:
     ownership = Ownership("reject")
     ownership.remember({"b": Known(first)})
     mine, other = moving("a", "b", 1, authority=first), moving("a", "b", 2, authority="slam")
@@ -74,7 +74,7 @@ def test_under_last_nothing_is_remembered() -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), [("", "slam"), ("slam", "")])
-def test_no_authority_is_one_like_any_other(first: str, second: str) -> None:
+def test_the_empty_authority_is_an_authority_like_any_other(first: str, second: str) -> None:
     ownership = Ownership("reject")
     (_, refused) = ownership.split((moving("a", "b", 1, authority=second),), {"b": Known(first)})
     assert [(error.owner, error.authority) for error in refused] == [(first, second)]
@@ -83,7 +83,7 @@ def test_no_authority_is_one_like_any_other(first: str, second: str) -> None:
 
 
 @pytest.mark.parametrize("policy", POLICIES)
-def test_a_reserved_frame_is_for_one_authority_only_whoever_was_first(policy: OnConflict) -> None:
+def test_a_reserved_frame_is_for_one_authority_only_even_if_another_was_first(policy: OnConflict) -> None:
     ownership = Ownership(policy)
     known = {"b": Known("odometry")}
     old, new = moving("a", "b", 1, authority="odometry"), moving("a", "b", 1, authority="slam")
@@ -98,7 +98,7 @@ def test_a_reserved_frame_is_for_one_authority_only_whoever_was_first(policy: On
     assert ownership.split((old,), known) == ((old,), [])
 
 
-def test_what_somebody_else_has_reserved_cannot_be_reserved_and_the_error_names_both() -> None:
+def test_reserving_a_frame_of_another_authority_is_an_error_that_names_both() -> None:
     ownership = Ownership("last")
     with ownership.reserve("b", "slam"):
         with pytest.raises(InvalidTransformError) as caught:
@@ -120,7 +120,7 @@ def test_one_authority_may_reserve_a_frame_twice_and_has_it_until_both_end() -> 
     assert not ownership.restricts
 
 
-def test_only_a_good_name_and_a_good_authority_can_have_a_reservation() -> None:
+def test_reserving_a_bad_name_or_for_a_bad_authority_is_an_error() -> None:
     ownership = Ownership("last")
     for name in ("", "/odom"):
         with pytest.raises(InvalidTransformError, match="frame name"):
@@ -132,6 +132,6 @@ def test_only_a_good_name_and_a_good_authority_can_have_a_reservation() -> None:
     assert not ownership.restricts
 
 
-def test_a_misspelt_policy_is_refused() -> None:
+def test_an_unknown_policy_is_an_error() -> None:
     with pytest.raises(ValueError, match="on_conflict must be 'last' or 'reject', not 'first'"):
         Ownership("first")  # type: ignore[arg-type]

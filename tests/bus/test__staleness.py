@@ -40,7 +40,7 @@ class World:
         self.staleness.forget(frame)
 
 
-def test_a_frame_is_stale_once_it_is_more_than_the_limit_behind_and_says_so_once() -> None:
+def test_a_frame_older_than_the_limit_is_announced_stale_once() -> None:
     world = World()
     world.send("a", 100)
     assert world.staleness.due() == 111
@@ -50,7 +50,7 @@ def test_a_frame_is_stale_once_it_is_more_than_the_limit_behind_and_says_so_once
     assert world.staleness.due() is None
 
 
-def test_samples_that_keep_coming_keep_it_live() -> None:
+def test_regular_samples_keep_a_frame_live() -> None:
     world = World()
     for stamp in range(100, 200, 9):
         world.send("a", stamp)
@@ -58,7 +58,7 @@ def test_samples_that_keep_coming_keep_it_live() -> None:
     assert world.staleness.due() == 199 + LIMIT + 1
 
 
-def test_it_is_live_again_when_its_newest_is_not_too_old_any_more() -> None:
+def test_a_stale_frame_is_live_again_with_a_sample_that_is_recent_enough() -> None:
     world = World()
     world.send("a", 100)
     world.staleness.changes(200)
@@ -69,7 +69,7 @@ def test_it_is_live_again_when_its_newest_is_not_too_old_any_more() -> None:
     assert world.staleness.due() == 201
 
 
-def test_a_late_sample_of_a_stale_frame_is_nothing_new() -> None:
+def test_a_late_sample_of_a_stale_frame_changes_nothing() -> None:
     world = World()
     world.send("a", 100)
     world.staleness.changes(200)
@@ -95,7 +95,7 @@ def test_a_stale_frame_that_becomes_static_is_live() -> None:
     assert world.staleness.changes(200) == [FrameLive(200, "a", None, "")]
 
 
-def test_a_static_frame_that_moves_is_watched_from_its_own_stamp() -> None:
+def test_a_static_frame_that_becomes_moving_is_checked_from_its_newest_stamp() -> None:
     world = World()
     world.send("a", 100)
     world.send("a", None)
@@ -104,14 +104,14 @@ def test_a_static_frame_that_moves_is_watched_from_its_own_stamp() -> None:
     assert world.staleness.changes(61) == [FrameStale(61, "a", 50, "")]
 
 
-def test_several_go_stale_in_the_order_of_their_newest_stamps_however_often_they_were_heard() -> None:
+def test_frames_turn_stale_in_the_order_of_their_newest_stamps() -> None:
     world = World()
     for name, stamp in (("a", 1), ("b", 3), ("c", 3), ("a", 5)):
         world.send(name, stamp)
     assert [event.frame for event in world.staleness.changes(100)] == ["b", "c", "a"]
 
 
-def test_a_frame_that_was_removed_is_neither_stale_nor_live_and_may_come_back() -> None:
+def test_a_removed_frame_is_neither_stale_nor_live_and_may_return() -> None:
     world = World()
     world.send("a", 100)
     world.remove("a")
@@ -125,7 +125,7 @@ def test_a_frame_that_was_removed_is_neither_stale_nor_live_and_may_come_back() 
     assert world.staleness.changes(311) == [FrameStale(311, "a", 300, "")]
 
 
-def test_after_a_reset_nothing_is_known() -> None:
+def test_clear_forgets_every_frame() -> None:
     world = World()
     world.send("a", 100)
     world.send("b", 100)
@@ -136,7 +136,7 @@ def test_after_a_reset_nothing_is_known() -> None:
     assert (len(world.staleness), world.staleness.due(), world.staleness.changes(500)) == (0, None, [])
 
 
-def test_names_that_come_and_go_while_the_clock_stands_fill_no_memory() -> None:
+def test_memory_is_bounded_for_frames_that_are_added_and_removed_at_one_time() -> None:
     world = World()
     world.send("base", 100)
     for number in range(10_000):
@@ -146,7 +146,7 @@ def test_names_that_come_and_go_while_the_clock_stands_fill_no_memory() -> None:
     assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
 
 
-def test_a_sample_of_a_live_frame_costs_no_entry() -> None:
+def test_a_sample_of_a_live_frame_adds_no_entry() -> None:
     world = World()
     world.send("a", 0)
     for stamp in range(1, 1_000):
@@ -162,7 +162,7 @@ STEPS = st.one_of(
 
 
 @given(st.lists(STEPS, max_size=30))
-def test_what_is_told_adds_up_to_what_is_stale(steps: list[tuple[str, str, int | None]]) -> None:
+def test_the_events_add_up_to_the_set_of_stale_frames(steps: list[tuple[str, str, int | None]]) -> None:
     world = World()
     told: set[str] = set()
     now = 0

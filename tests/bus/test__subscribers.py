@@ -23,7 +23,7 @@ def test_a_subscriber_gets_each_batch_as_a_tuple_until_it_is_closed() -> None:
     assert got == [(moving("map", "a", 1),), (moving("map", "a", 2), moving("map", "b", 2))]
 
 
-def test_an_empty_batch_calls_nobody() -> None:
+def test_an_empty_batch_calls_no_subscriber() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
     bus.subscribe(got.append)
@@ -31,7 +31,7 @@ def test_an_empty_batch_calls_nobody() -> None:
     assert got == []
 
 
-def test_the_buffers_have_a_batch_before_a_subscriber_is_called() -> None:
+def test_buffers_have_a_batch_before_subscribers_are_called() -> None:
     bus = Bus(SimulatedClock())
     stamps = []
     bus.subscribe(lambda _: stamps.append(buffer.lookup_nowait("map", "a").stamp))
@@ -41,7 +41,7 @@ def test_the_buffers_have_a_batch_before_a_subscriber_is_called() -> None:
     assert stamps == [1, 2]
 
 
-def test_who_subscribes_late_gets_the_latched_statics_first() -> None:
+def test_a_late_subscriber_gets_the_latched_static_samples_first() -> None:
     bus = Bus(SimulatedClock())
     bus.publish([static("map", "a"), static("map", "b"), moving("map", "c", 1)])
     bus.publish(static("map", "b", x=2.0))
@@ -61,7 +61,7 @@ def test_subscribers_are_called_in_the_order_of_their_registration() -> None:
     assert calls == [0, 1, 2, 3, 4]
 
 
-def test_a_subscriber_that_raises_disturbs_nobody_and_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_exception_of_a_subscriber_is_isolated_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
 
@@ -81,7 +81,7 @@ def test_a_subscriber_that_raises_disturbs_nobody_and_is_logged_once(caplog: pyt
     assert str(record.exc_info[1]) == "spilt the coffee"
 
 
-def test_what_is_no_exception_is_not_swallowed_and_the_bus_goes_on() -> None:
+def test_a_base_exception_of_a_subscriber_is_raised_and_the_bus_stays_usable() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
 
@@ -112,7 +112,7 @@ def test_a_subscriber_may_close_itself() -> None:
     assert bus.statistics().callbacks_failed == 0
 
 
-def test_a_subscriber_that_another_one_closes_is_not_called_any_more() -> None:
+def test_a_subscriber_that_another_one_closes_is_no_longer_called() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
     bus.subscribe(lambda _: victim.close())
@@ -121,7 +121,7 @@ def test_a_subscriber_that_another_one_closes_is_not_called_any_more() -> None:
     assert got == []
 
 
-def test_a_subscriber_may_subscribe_another_which_sees_every_batch_from_the_next_one_on() -> None:
+def test_a_subscriber_registered_in_a_callback_gets_every_batch_from_the_next_one_on() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
 
@@ -136,7 +136,7 @@ def test_a_subscriber_may_subscribe_another_which_sees_every_batch_from_the_next
     assert children(got) == ["s", "b"]
 
 
-def test_what_a_subscriber_publishes_is_buffered_at_once_and_delivered_behind_the_current_batch() -> None:
+def test_a_batch_published_in_a_callback_is_buffered_at_once_and_delivered_after_the_current_one() -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus)
     echoes = {"a": ["b", "c"], "b": ["d"]}
@@ -156,7 +156,7 @@ def test_what_a_subscriber_publishes_is_buffered_at_once_and_delivered_behind_th
     assert bus.statistics().callbacks_failed == 0
 
 
-def test_what_a_subscriber_publishes_on_being_registered_reaches_everybody_at_once() -> None:
+def test_a_batch_published_during_registration_reaches_every_subscriber_at_once() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
     bus.subscribe(got.append)
@@ -170,7 +170,7 @@ def test_what_a_subscriber_publishes_on_being_registered_reaches_everybody_at_on
     assert children(got) == ["a", "b"]
 
 
-def test_a_subscriber_that_publishes_without_end_is_stopped_by_an_error_that_names_it(
+def test_endless_publishing_in_a_callback_is_stopped_by_an_error_that_names_it(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     bus = Bus(SimulatedClock())
@@ -194,7 +194,7 @@ def test_a_subscriber_that_publishes_without_end_is_stopped_by_an_error_that_nam
     assert len(errors) == 2
 
 
-def test_a_thousand_batches_from_inside_a_callback_are_still_fine() -> None:
+def test_a_callback_may_publish_a_thousand_batches() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
 
@@ -212,7 +212,7 @@ def test_a_thousand_batches_from_inside_a_callback_are_still_fine() -> None:
     assert bus.statistics().callbacks_failed == 0
 
 
-def test_a_subscriber_that_closes_the_bus_ends_publishing_but_not_the_batch() -> None:
+def test_a_subscriber_that_closes_the_bus_does_not_stop_the_delivery_of_the_batch() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
     bus.subscribe(lambda _: bus.close())
@@ -233,7 +233,7 @@ def test_only_callables_can_subscribe_and_only_on_an_open_bus() -> None:
         bus.subscribe(print)
 
 
-def test_an_async_subscriber_is_refused_because_nobody_would_await_it() -> None:
+def test_an_async_subscriber_is_a_type_error() -> None:
     async def callback(batch: object) -> None: ...
 
     with Bus() as bus, pytest.raises(TypeError, match=r"must not be async.*bus\.stream"):
@@ -241,7 +241,7 @@ def test_an_async_subscriber_is_refused_because_nobody_would_await_it() -> None:
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_a_frame_that_a_subscriber_removes_is_not_brought_back_by_those_behind_it(together: bool) -> None:
+def test_a_frame_removed_in_a_callback_is_left_out_for_later_subscribers(together: bool) -> None:
     bus = Bus(SimulatedClock())
     front: list[Batch] = []
     behind: list[Batch] = []
@@ -260,7 +260,7 @@ def test_a_frame_that_a_subscriber_removes_is_not_brought_back_by_those_behind_i
     assert behind == ([(a,)] if together else []) + [(c,)]
 
 
-def test_when_a_subscriber_turns_the_clock_back_those_behind_it_get_what_is_static() -> None:
+def test_later_subscribers_get_only_static_samples_if_a_callback_sets_the_clock_back() -> None:
     clock = SimulatedClock(start=10)
     bus = Bus(clock)
     got: list[Batch] = []
@@ -271,7 +271,7 @@ def test_when_a_subscriber_turns_the_clock_back_those_behind_it_get_what_is_stat
     assert got == [(static("map", "s"),)]
 
 
-def test_what_a_subscriber_publishes_anew_after_a_removal_reaches_those_behind_it() -> None:
+def test_samples_published_in_a_callback_after_a_removal_reach_later_subscribers() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
 
@@ -286,7 +286,7 @@ def test_what_a_subscriber_publishes_anew_after_a_removal_reaches_those_behind_i
     assert got == [(moving("map", "a", 2),)]
 
 
-def test_what_waits_for_subscribers_when_the_clock_jumps_back_is_dropped() -> None:
+def test_undelivered_moving_samples_are_dropped_when_the_clock_jumps_back() -> None:
     clock = SimulatedClock(start=10)
     seen: list[str] = []
     with Bus(clock) as bus:
@@ -311,7 +311,7 @@ def noting(bus: Bus, log: list[object]) -> Registration:
     return bus.subscribe(lambda batch: log.append([sample.child for sample in batch]), log.append)
 
 
-def test_a_subscriber_is_told_of_removals_in_order_with_the_batches_until_it_is_closed() -> None:
+def test_removals_are_delivered_in_order_with_the_batches_until_the_subscriber_is_closed() -> None:
     bus = Bus(SimulatedClock())
     log: list[object] = []
     with noting(bus, log):
@@ -326,7 +326,7 @@ def test_a_subscriber_is_told_of_removals_in_order_with_the_batches_until_it_is_
     assert log == [["a", "b"], "a", ["a"], "b", "a", ["c"]]
 
 
-def test_only_what_is_removed_while_one_is_there_is_told() -> None:
+def test_a_removal_before_the_registration_is_not_delivered() -> None:
     bus = Bus(SimulatedClock())
     bus.publish([static("map", "a"), static("map", "b")])
     bus.remove_frame("a")
@@ -338,7 +338,7 @@ def test_only_what_is_removed_while_one_is_there_is_told() -> None:
     assert log == [["b"], "b"]
 
 
-def test_a_frame_that_only_a_buffer_still_lists_is_told_of_when_it_goes() -> None:
+def test_the_removal_of_a_frame_that_only_a_buffer_lists_is_delivered() -> None:
     clock = SimulatedClock(start=10)
     bus = Bus(clock)
     buffer = Buffer(bus)
@@ -352,7 +352,7 @@ def test_a_frame_that_only_a_buffer_still_lists_is_told_of_when_it_goes() -> Non
 
 
 @pytest.mark.parametrize("first", [True, False], ids=["in front", "behind"])
-def test_a_removal_inside_a_callback_is_told_between_what_was_and_what_is_published_anew(first: bool) -> None:
+def test_a_removal_in_a_callback_is_delivered_between_the_older_and_the_newer_samples(first: bool) -> None:
     bus = Bus(SimulatedClock())
     log: list[object] = []
     stamps: list[int] = []
@@ -374,7 +374,7 @@ def test_a_removal_inside_a_callback_is_told_between_what_was_and_what_is_publis
     assert stamps == [1, 2, 4]
 
 
-def test_what_is_published_on_hearing_of_a_removal_comes_behind_it_for_everybody() -> None:
+def test_a_batch_published_in_a_removal_callback_is_delivered_after_the_removal() -> None:
     bus = Bus(SimulatedClock())
     logs: list[list[object]] = [[], []]
     noting(bus, logs[0])
@@ -391,7 +391,7 @@ def test_what_is_published_on_hearing_of_a_removal_comes_behind_it_for_everybody
     assert logs[0] == logs[1] == [["a"], "a", ["a"], ["b"]]
 
 
-def test_what_is_removed_on_hearing_of_a_removal_is_told_to_everybody() -> None:
+def test_a_removal_in_a_removal_callback_is_delivered_to_every_subscriber() -> None:
     bus = Bus(SimulatedClock())
     logs: list[list[object]] = [[], []]
     noting(bus, logs[0])
@@ -404,7 +404,7 @@ def test_what_is_removed_on_hearing_of_a_removal_is_told_to_everybody() -> None:
     assert bus.statistics().callbacks_failed == 0
 
 
-def test_one_that_raises_on_a_removal_disturbs_nobody_and_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_exception_of_a_removal_callback_is_isolated_and_announced(caplog: pytest.LogCaptureFixture) -> None:
     bus = Bus(SimulatedClock())
     log: list[object] = []
 
@@ -426,7 +426,7 @@ def test_one_that_raises_on_a_removal_disturbs_nobody_and_is_told_of(caplog: pyt
     assert "clumsy" in record.getMessage()
 
 
-def test_what_is_no_exception_is_not_swallowed_on_a_removal_either() -> None:
+def test_a_base_exception_of_a_removal_callback_is_raised() -> None:
     bus = Bus(SimulatedClock())
     log: list[object] = []
 
@@ -444,7 +444,7 @@ def test_what_is_no_exception_is_not_swallowed_on_a_removal_either() -> None:
     assert log == [["a"], "a", ["b"], ["c"]]
 
 
-def test_a_registration_that_ends_on_a_removal_ends_both() -> None:
+def test_a_registration_closed_in_a_removal_callback_ends_both_callbacks() -> None:
     bus = Bus(SimulatedClock())
     log: list[object] = []
     other: list[object] = []
@@ -464,7 +464,7 @@ def test_a_registration_that_ends_on_a_removal_ends_both() -> None:
     assert other == [["a", "b"]]
 
 
-def test_one_that_publishes_without_end_on_removals_is_stopped_by_an_error_that_names_it() -> None:
+def test_endless_publishing_in_a_removal_callback_is_stopped_by_an_error_that_names_it() -> None:
     bus = Bus(SimulatedClock())
     errors: list[RuntimeError] = []
 
@@ -485,7 +485,7 @@ def test_one_that_publishes_without_end_on_removals_is_stopped_by_an_error_that_
     assert len(got) == 1_002
 
 
-def test_what_hears_of_removals_must_be_callable_and_not_async() -> None:
+def test_a_removal_callback_must_be_callable_and_not_async() -> None:
     async def callback(frame: str) -> None: ...
 
     with Bus() as bus:

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.anyio
 HERE = Transform((1.0, 2.0, 3.0))
 
 
-def test_a_sample_carries_the_clock_s_stamp_and_the_authority() -> None:
+def test_a_sample_has_the_stamp_of_the_clock_and_the_authority() -> None:
     clock = SimulatedClock(start=42)
     bus = Bus(clock)
     got: list[TransformStamped] = []
@@ -39,14 +39,14 @@ def test_a_sample_carries_the_clock_s_stamp_and_the_authority() -> None:
     }
 
 
-def test_stamp_zero_is_a_stamp_like_any_other() -> None:
+def test_stamp_zero_is_an_ordinary_stamp() -> None:
     bus = Bus(SimulatedClock(start=42))
     buffer = Buffer(bus)
     TransformBroadcaster(bus).send("odom", "base", HERE, at=0)
     assert buffer.lookup_nowait("odom", "base").stamp == 0
 
 
-def test_the_authority_shows_in_the_errors_about_its_frames() -> None:
+def test_errors_about_a_frame_name_its_authority() -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus)
     TransformBroadcaster(bus, "odometry").send("odom", "base", HERE, at=1)
@@ -54,7 +54,7 @@ def test_the_authority_shows_in_the_errors_about_its_frames() -> None:
         buffer.lookup_nowait("odom", "base", 2)
 
 
-def test_send_all_gives_one_stamp_to_all_and_lets_samples_keep_theirs() -> None:
+def test_send_all_stamps_all_transforms_alike_and_keeps_the_stamps_of_samples() -> None:
     bus = Bus(SimulatedClock(start=42))
     got: list[tuple[TransformStamped, ...]] = []
     bus.subscribe(got.append)
@@ -70,7 +70,7 @@ def test_send_all_gives_one_stamp_to_all_and_lets_samples_keep_theirs() -> None:
     assert got[1][0].stamp == 50
 
 
-def test_send_all_is_seen_whole_or_not_at_all() -> None:
+def test_send_all_is_stored_whole_or_not_at_all() -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus)
     with pytest.raises(InvalidTransformError):
@@ -78,7 +78,7 @@ def test_send_all_is_seen_whole_or_not_at_all() -> None:
     assert buffer.tree.frames() == []
 
 
-def test_send_static_holds_at_every_stamp_and_can_be_sent_again() -> None:
+def test_send_static_holds_at_every_stamp_and_can_be_repeated() -> None:
     bus = Bus(SimulatedClock())
     broadcaster = TransformBroadcaster(bus)
     broadcaster.send_static("base", "laser", HERE)
@@ -124,7 +124,7 @@ MISTAKES: dict[str, Callable[[TransformBroadcaster], None]] = {
     [pytest.param(call, InvalidTransformError, id=name) for name, call in BAD_CALLS.items()]
     + [pytest.param(call, TypeError, id=name) for name, call in MISTAKES.items()],
 )
-def test_bad_input_raises_at_its_own_call_stores_nothing_and_leaves_the_bus_working(
+def test_bad_input_raises_stores_nothing_and_leaves_the_bus_usable(
     call: Callable[[TransformBroadcaster], None], error: type[Exception]
 ) -> None:
     bus = Bus(SimulatedClock())
@@ -144,7 +144,7 @@ def test_bad_input_raises_at_its_own_call_stores_nothing_and_leaves_the_bus_work
         assert len(got) == 1
 
 
-async def test_a_broadcaster_does_not_die_of_somebody_else_s_bad_samples() -> None:
+async def test_bad_samples_of_another_sender_do_not_disturb_a_broadcaster() -> None:
     clock = SimulatedClock()
     bus = Bus(clock)
     buffer = Buffer(bus)
@@ -175,12 +175,12 @@ async def test_a_broadcaster_does_not_die_of_somebody_else_s_bad_samples() -> No
     assert bus.statistics().rejected["not a sample"] == 101
 
 
-def test_a_broadcaster_needs_a_name_that_is_text() -> None:
+def test_an_authority_that_is_no_str_is_an_error() -> None:
     with pytest.raises(TypeError, match="authority"):
         TransformBroadcaster(Bus(SimulatedClock()), 5)  # type: ignore[arg-type]
 
 
-def test_a_closed_bus_refuses_every_way_of_sending() -> None:
+def test_sending_on_a_closed_bus_raises() -> None:
     bus = Bus(SimulatedClock())
     broadcaster = TransformBroadcaster(bus)
     bus.publish(static("map", "s"))
@@ -196,7 +196,7 @@ def test_a_closed_bus_refuses_every_way_of_sending() -> None:
 # Owning
 
 
-def test_an_owned_frame_is_reserved_meanwhile_and_removed_at_the_end() -> None:
+def test_an_owned_frame_is_reserved_in_the_block_and_removed_at_its_end() -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus)
     arm, other = TransformBroadcaster(bus, "arm"), TransformBroadcaster(bus, "other")
@@ -214,7 +214,7 @@ def test_an_owned_frame_is_reserved_meanwhile_and_removed_at_the_end() -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, GeneratorExit])
-def test_whatever_ends_the_block_the_frame_is_gone(error: type[BaseException]) -> None:
+def test_an_error_in_the_block_removes_the_owned_frame(error: type[BaseException]) -> None:
     bus = Bus(SimulatedClock())
     arm = TransformBroadcaster(bus, "arm")
     with pytest.raises(error), arm.owning("tool0"):
@@ -224,7 +224,7 @@ def test_whatever_ends_the_block_the_frame_is_gone(error: type[BaseException]) -
     bus.reserve("tool0", "other").close()
 
 
-async def test_cancellation_removes_the_frame_too() -> None:
+async def test_cancellation_removes_the_owned_frame() -> None:
     bus = Bus(SimulatedClock())
     arm = TransformBroadcaster(bus, "arm")
 
@@ -241,7 +241,7 @@ async def test_cancellation_removes_the_frame_too() -> None:
     assert bus.statistics().frames == 0
 
 
-def test_a_frame_that_was_never_published_or_is_gone_already_makes_no_trouble() -> None:
+def test_an_owned_frame_may_be_unpublished_or_already_removed_at_the_end() -> None:
     bus = Bus(SimulatedClock())
     arm = TransformBroadcaster(bus, "arm")
     with arm.owning("tool0", "tool1", "tool2"):
@@ -251,7 +251,7 @@ def test_a_frame_that_was_never_published_or_is_gone_already_makes_no_trouble() 
     assert bus.statistics().frames == 0
 
 
-def test_the_bus_may_be_closed_before_the_block_ends() -> None:
+def test_the_bus_may_be_closed_before_the_block_of_owning_ends() -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus)
     arm = TransformBroadcaster(bus, "arm")
@@ -277,7 +277,7 @@ def test_owning_needs_a_frame() -> None:
         pytest.fail("the block began")
 
 
-def test_nothing_is_owned_before_the_block_begins() -> None:
+def test_owning_reserves_nothing_before_the_block_is_entered() -> None:
     bus = Bus(SimulatedClock())
     block = TransformBroadcaster(bus, "arm").owning("tool0")
     with bus.reserve("tool0", "other"), pytest.raises(InvalidTransformError), block:

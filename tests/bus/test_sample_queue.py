@@ -2,7 +2,7 @@ import copy
 from collections.abc import Iterable
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, static
 
@@ -38,7 +38,7 @@ def test_drop_oldest_drops_the_oldest_whole_batches_and_counts_their_samples() -
     assert queue.dropped == 2
 
 
-def test_the_newest_batch_stays_even_if_it_is_larger_than_the_queue() -> None:
+def test_the_newest_batch_stays_even_if_it_exceeds_the_capacity() -> None:
     queue = SampleQueue(2, "drop_oldest")
     large = tuple(moving("map", f"joint_{number}", 1) for number in range(5))
     queue.put((moving("map", "a", 0),))
@@ -47,7 +47,7 @@ def test_the_newest_batch_stays_even_if_it_is_larger_than_the_queue() -> None:
     assert queue.dropped == 1
 
 
-def test_the_newest_static_sample_of_each_child_outlives_its_batch() -> None:
+def test_drop_oldest_keeps_the_newest_static_sample_of_each_child() -> None:
     queue = SampleQueue(1, "drop_oldest")
     queue.put((static("map", "a", x=1.0), moving("map", "b", 1)))
     queue.put((static("map", "a", x=2.0), static("map", "c"), moving("map", "b", 2)))
@@ -58,7 +58,7 @@ def test_the_newest_static_sample_of_each_child_outlives_its_batch() -> None:
     assert queue.dropped == 2
 
 
-def test_static_samples_that_are_sent_again_and_again_do_not_fill_the_queue() -> None:
+def test_repeated_static_samples_do_not_fill_the_queue() -> None:
     queue = SampleQueue(10, "drop_oldest")
     for time in range(1_000):
         queue.put((static("map", "a", stamp=time),))
@@ -67,7 +67,7 @@ def test_static_samples_that_are_sent_again_and_again_do_not_fill_the_queue() ->
     assert (queue.dropped, queue.conflated, len(queue)) == (0, 0, 0)
 
 
-def test_a_static_sample_that_outlived_its_batch_is_removed_with_its_frame_only() -> None:
+def test_a_kept_static_sample_is_removed_only_with_its_frame() -> None:
     queue = SampleQueue(1, "drop_oldest")
     queue.put((static("map", "a"), static("map", "b"), moving("map", "c", 1)))
     queue.put((moving("map", "c", 2),))
@@ -88,7 +88,7 @@ def test_conflate_keeps_the_newest_sample_of_each_child_and_gives_all_as_one_bat
     assert queue.dropped == 0
 
 
-def test_conflate_goes_by_stamp_and_the_last_of_equal_stamps_wins() -> None:
+def test_conflate_keeps_the_newest_stamp_and_the_last_of_equal_stamps() -> None:
     queue = SampleQueue(10, "conflate")
     for sample in (moving("map", "a", 5, 1.0), moving("map", "a", 4, 2.0), moving("map", "a", 5, 3.0)):
         queue.put((sample,))
@@ -96,7 +96,7 @@ def test_conflate_goes_by_stamp_and_the_last_of_equal_stamps_wins() -> None:
 
 
 @pytest.mark.parametrize("first_static", [True, False])
-def test_conflate_keeps_the_last_kind_of_a_child_whatever_the_stamps(first_static: bool) -> None:
+def test_conflate_keeps_the_last_kind_of_a_child_for_any_stamps(first_static: bool) -> None:
     pair = [static("map", "a", stamp=9), moving("map", "a", 1)]
     first, last = pair if first_static else pair[::-1]
     queue = SampleQueue(1, "conflate")
@@ -107,7 +107,7 @@ def test_conflate_keeps_the_last_kind_of_a_child_whatever_the_stamps(first_stati
     assert queue.dropped == first_static
 
 
-def test_conflate_drops_the_children_that_have_waited_longest_but_nothing_static() -> None:
+def test_conflate_drops_the_moving_children_that_have_waited_longest() -> None:
     queue = SampleQueue(2, "conflate")
     queue.put((static("map", "s"), moving("map", "a", 1), moving("map", "b", 1)))
     queue.put((moving("map", "a", 2), static("map", "t")))
@@ -117,7 +117,7 @@ def test_conflate_drops_the_children_that_have_waited_longest_but_nothing_static
     assert queue.dropped == 1
 
 
-def test_an_emptied_queue_has_its_whole_capacity_again() -> None:
+def test_an_emptied_queue_has_its_full_capacity_again() -> None:
     for overflow in ("conflate", "drop_oldest"):
         queue = SampleQueue(2, overflow)
         for _ in range(3):
@@ -127,7 +127,7 @@ def test_an_emptied_queue_has_its_whole_capacity_again() -> None:
 
 
 @pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])
-def test_of_a_forgotten_child_the_moving_samples_count_as_dropped(overflow: Overflow) -> None:
+def test_moving_samples_of_a_forgotten_child_count_as_dropped(overflow: Overflow) -> None:
     queue = SampleQueue(2, overflow)
     queue.put((moving("map", "a", 1), static("map", "s")))
     queue.put((moving("map", "b", 1),))
@@ -150,7 +150,7 @@ def test_discarded_moving_samples_count_as_dropped_and_static_ones_stay(overflow
     assert queue.dropped == 2
 
 
-def test_statistics_say_what_the_queue_is_and_holds() -> None:
+def test_statistics_have_the_kind_and_the_counters_of_the_queue() -> None:
     queue = SampleQueue(1, "drop_oldest")
     queue.put((moving("map", "a", 1),))
     queue.put((moving("map", "a", 2),))
@@ -158,7 +158,7 @@ def test_statistics_say_what_the_queue_is_and_holds() -> None:
     assert queue.statistics("stream") == expected
 
 
-def test_moving_samples_that_give_way_to_another_of_their_child_are_counted_apart() -> None:
+def test_conflated_moving_samples_are_counted_separately() -> None:
     queue = SampleQueue(1, "conflate")
     queue.put((moving("map", "a", 2), moving("map", "a", 3), moving("map", "a", 1)))
     queue.put((static("map", "a"), static("map", "a")))
@@ -173,7 +173,7 @@ def test_moving_samples_that_give_way_to_another_of_their_child_are_counted_apar
     ("capacity", "overflow", "error"),
     [(0, "conflate", ValueError), (True, "conflate", TypeError), (1.5, "conflate", TypeError), (1, "grow", ValueError)],
 )
-def test_bad_bounds_are_refused(capacity: int, overflow: Overflow, error: type[Exception]) -> None:
+def test_a_bad_capacity_or_overflow_is_an_error(capacity: int, overflow: Overflow, error: type[Exception]) -> None:
     with pytest.raises(error):
         SampleQueue(capacity, overflow)
 
@@ -189,7 +189,6 @@ def count_moving(batch: Iterable[TransformStamped]) -> int:
     return sum(not sample.static for sample in batch)
 
 
-@settings(deadline=None)
 @given(capacity=st.integers(1, 6), steps=st.lists(BATCHES | st.none(), max_size=40))
 def test_drop_oldest_accounts_for_every_sample_and_loses_no_newest_static(
     capacity: int, steps: list[tuple[TransformStamped, ...] | None]
@@ -219,9 +218,8 @@ def _pending_moving(queue: SampleQueue) -> int:
     return sum(map(count_moving, emptied(twin)))
 
 
-@settings(deadline=None)
 @given(steps=st.lists(BATCHES | st.none(), max_size=40))
-def test_conflate_gives_what_a_dict_of_the_newest_samples_would(
+def test_conflate_equals_a_dict_of_the_newest_samples(
     steps: list[tuple[TransformStamped, ...] | None],
 ) -> None:
     queue = SampleQueue(4, "conflate")
@@ -240,7 +238,6 @@ def test_conflate_gives_what_a_dict_of_the_newest_samples_would(
     assert queue.dropped == 0
 
 
-@settings(deadline=None)
 @given(capacity=st.integers(1, 3), batches=st.lists(BATCHES, max_size=20))
 def test_conflate_never_holds_more_moving_children_than_its_capacity(
     capacity: int, batches: list[tuple[TransformStamped, ...]]

@@ -60,7 +60,7 @@ async def test_a_thread_wakes_a_lookup_on_a_loop_that_has_nothing_else_to_do() -
         assert asked.answer.transform.translation == (5.0, 0.0, 0.0)
 
 
-async def test_the_order_of_each_thread_is_kept_and_nothing_is_lost() -> None:
+async def test_the_samples_of_each_thread_arrive_in_order_and_without_loss() -> None:
     bus = Bus()
     seen: dict[str, list[int]] = {"a": [], "b": [], "c": [], "d": []}
     everything = anyio.Event()
@@ -83,7 +83,7 @@ async def test_the_order_of_each_thread_is_kept_and_nothing_is_lost() -> None:
     assert bus.statistics().samples == 8_000
 
 
-async def test_a_batch_from_a_thread_is_seen_whole() -> None:
+async def test_a_batch_from_a_thread_arrives_whole() -> None:
     bus = Bus()
     got: list[tuple[TransformStamped, ...]] = []
     with bus.subscribe(got.append), bus.threadsafe() as publish:
@@ -91,7 +91,7 @@ async def test_a_batch_from_a_thread_is_seen_whole() -> None:
     assert got == [tuple(moving("map", name, 1) for name in "abc")]
 
 
-async def test_what_a_blocked_loop_has_no_room_for_is_dropped_and_counted() -> None:
+async def test_samples_beyond_the_capacity_while_the_loop_is_blocked_are_dropped_and_counted() -> None:
     bus = Bus()
     got: list[int] = []
 
@@ -107,7 +107,7 @@ async def test_what_a_blocked_loop_has_no_room_for_is_dropped_and_counted() -> N
         assert got == list(range(15, 25))
 
 
-async def test_the_end_of_the_with_publishes_what_is_still_queued() -> None:
+async def test_the_end_of_the_with_publishes_the_queued_samples() -> None:
     bus = Bus()
     buffer = Buffer(bus)
     with bus.threadsafe() as publish:
@@ -136,7 +136,7 @@ async def test_publishing_to_a_closed_bus_raises_in_the_thread() -> None:
         bus.threadsafe()
 
 
-async def test_samples_that_the_bus_was_closed_upon_are_not_published() -> None:
+async def test_queued_samples_are_not_published_after_the_bus_was_closed() -> None:
     bus = Bus()
     with bus.threadsafe() as publish:
         in_thread(lambda: publish(moving("map", "a", 1)))
@@ -145,7 +145,7 @@ async def test_samples_that_the_bus_was_closed_upon_are_not_published() -> None:
     assert bus.statistics().samples == 0
 
 
-def test_publishing_when_the_loop_has_gone_raises_and_hangs_nothing(run: Run) -> None:
+def test_publishing_after_the_end_of_the_loop_raises(run: Run) -> None:
     bus = Bus()
     publishers: list[ThreadPublisher] = []
 
@@ -183,7 +183,7 @@ async def test_bad_values_raise_in_the_thread_and_store_nothing() -> None:
     assert bus.statistics().samples == 1
 
 
-async def test_what_only_the_bus_can_judge_is_dropped_and_counted_there() -> None:
+async def test_samples_that_close_a_loop_are_dropped_and_counted_on_the_bus() -> None:
     bus = Bus()
     buffer = Buffer(bus)
     with bus.threadsafe() as publish:
@@ -216,7 +216,7 @@ async def test_a_jump_forward_discards_nothing() -> None:
     assert bus.statistics().samples == 1
 
 
-async def test_samples_of_a_frame_that_is_removed_meanwhile_do_not_bring_it_back() -> None:
+async def test_queued_samples_of_a_removed_frame_are_discarded() -> None:
     bus = Bus()
     buffer = Buffer(bus)
     bus.publish(moving("map", "a", 1))
@@ -226,7 +226,7 @@ async def test_samples_of_a_frame_that_is_removed_meanwhile_do_not_bring_it_back
     assert buffer.tree.frames() == ["b", "map"]
 
 
-async def test_plain_publish_from_another_thread_is_an_error_that_names_the_way() -> None:
+async def test_bus_publish_from_another_thread_is_an_error_that_names_threadsafe() -> None:
     bus = Bus()
     errors = in_thread(lambda: bus.publish(moving("map", "a", 1)))
     errors += await anyio.to_thread.run_sync(lambda: in_thread(lambda: bus.publish(moving("map", "a", 1))))
@@ -243,7 +243,7 @@ USES: list[Callable[[Bus, Buffer], object]] = [
 
 
 @pytest.mark.parametrize("use", USES, ids=["publish", "threadsafe"])
-def test_a_bus_that_is_made_before_the_loop_belongs_to_the_thread_whose_loop_uses_it_first(
+def test_a_bus_made_before_a_loop_belongs_to_the_thread_of_its_first_loop(
     run: Run, use: Callable[[Bus, Buffer], object]
 ) -> None:
     bus = Bus()
@@ -257,7 +257,7 @@ def test_a_bus_that_is_made_before_the_loop_belongs_to_the_thread_whose_loop_use
         bus.publish(moving("map", "a", 2))
 
 
-async def test_a_bus_that_is_made_on_a_loop_is_not_taken_over_by_another_one() -> None:
+async def test_a_bus_made_on_a_loop_belongs_to_the_thread_of_that_loop() -> None:
     bus = Bus()
 
     async def intrude() -> None:
@@ -269,7 +269,7 @@ async def test_a_bus_that_is_made_on_a_loop_is_not_taken_over_by_another_one() -
     assert bus.statistics().samples == 1
 
 
-def test_threads_reach_a_bus_that_was_made_in_another_thread_than_its_loop_runs_in(run: Run) -> None:
+def test_threads_can_publish_to_a_bus_made_outside_the_thread_of_its_loop(run: Run) -> None:
     bus = Bus()
     buffer = Buffer(bus)
     ready, done = threading.Event(), threading.Event()
@@ -291,7 +291,7 @@ def test_threads_reach_a_bus_that_was_made_in_another_thread_than_its_loop_runs_
     assert found[0].transform.translation == (7.0, 0.0, 0.0)
 
 
-async def test_lookups_that_must_wait_are_for_the_thread_of_the_bus() -> None:
+async def test_awaited_lookups_in_another_thread_are_an_error() -> None:
     bus = Bus()
     buffer = Buffer(bus)
     bus.publish(moving("map", "a", 1))
@@ -327,7 +327,7 @@ async def test_worker_threads_may_read_while_the_loop_publishes() -> None:
 
 @pytest.mark.parametrize("names", [{}, {"prefix": "robot/", "shared": {"map"}}], ids=["whole names", "prefix"])
 @pytest.mark.thorough
-async def test_all_that_only_reads_may_be_asked_by_threads_while_lookups_wait_and_are_woken(names: Any) -> None:
+async def test_threads_may_call_every_reading_method_while_lookups_wait_and_wake(names: Any) -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus, keep=1e-6, **names)
     frame = names.get("prefix", "") + "a"
@@ -336,10 +336,10 @@ async def test_all_that_only_reads_may_be_asked_by_threads_while_lookups_wait_an
     def ask() -> None:
         seen = buffer.lookup_nowait("map", "a", max_age=1.0)
         moved = buffer.transform_nowait(PointStamped("a", LATEST, (0.0, 0.0, 0.0)), "map")
-        told = buffer.explain("map", "a")
+        calls = buffer.explain("map", "a")
         assert seen.transform.translation[0] == seen.stamp
         assert moved.point[0] == moved.stamp
-        assert told.answerable
+        assert calls.answerable
         assert buffer.can_transform("map", "a", tolerance=0.1)
         assert not buffer.can_transform("map", "b")
         waiting = buffer.pending()
@@ -356,16 +356,16 @@ async def test_all_that_only_reads_may_be_asked_by_threads_while_lookups_wait_an
 
 
 @pytest.mark.parametrize("closes", ["buffer", "bus"])
-async def test_what_has_to_be_told_of_the_end_on_the_loop_keeps_other_threads_from_closing(closes: str) -> None:
+async def test_closing_from_another_thread_is_an_error_while_an_on_close_callback_is_registered(closes: str) -> None:
     bus = Bus()
     buffer = Buffer(bus)
-    told: list[str] = []
-    registration = buffer.on_close(lambda: told.append("the end"))
+    calls: list[str] = []
+    registration = buffer.on_close(lambda: calls.append("closed"))
     (error,) = in_thread(buffer.close if closes == "buffer" else bus.close)
     assert isinstance(error, RuntimeError)
-    assert told == []
+    assert calls == []
     bus.publish(moving("map", "a", 1))
     assert buffer.can_transform("map", "a", 1)
     registration.close()
     assert in_thread(buffer.close if closes == "buffer" else bus.close) == []
-    assert told == []
+    assert calls == []
