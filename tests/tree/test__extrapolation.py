@@ -61,7 +61,7 @@ policies = st.builds(Policy, st.integers(0, 12), st.none() | st.integers(0, 20),
 
 
 @given(stamp_sets, policies)
-def test_an_edge_is_read_where_the_rule_says(stamps: set[int], policy: Policy) -> None:
+def test_the_stamp_read_for_a_question_follows_the_rule(stamps: set[int], policy: Policy) -> None:
     edge = history(sorted(stamps))
     for at in range(-60, 61):
         expected = rule(sorted(stamps), at, policy)
@@ -73,7 +73,7 @@ def test_an_edge_is_read_where_the_rule_says(stamps: set[int], policy: Policy) -
 
 
 @given(stamp_sets, policies, st.lists(st.integers(-60, 60)), st.sampled_from((None, 20)))
-def test_many_stamps_are_placed_as_one_by_one(
+def test_the_stamps_read_for_many_questions_equal_those_for_single_ones(
     stamps: set[int], policy: Policy, asked: list[int], keep: int | None
 ) -> None:
     edge = history(sorted(stamps), keep)
@@ -88,7 +88,7 @@ def test_many_stamps_are_placed_as_one_by_one(
 
 
 @given(st.dictionaries(st.integers(-30, 30), st.sampled_from(("odom", "map")), max_size=8), policies)
-def test_no_sample_with_another_parent_stands_in(parents: dict[int, str], policy: Policy) -> None:
+def test_a_sample_with_another_parent_is_never_read_instead(parents: dict[int, str], policy: Policy) -> None:
     edge = history(dict(sorted(parents.items())))
     asked = np.arange(-60, 61)
     read_at, away, _ = read_stamps_at_many(samples_around(edge, asked.tolist()), asked, policy)
@@ -103,7 +103,7 @@ def test_no_sample_with_another_parent_stands_in(parents: dict[int, str], policy
             assert parents[found.stamp] == edge.parent_at(at)
 
 
-def test_stamps_further_apart_than_a_signed_number_says_are_not_near() -> None:
+def test_distances_beyond_64_bits_are_not_within_a_tolerance() -> None:
     edge = history([STAMP_MIN, STAMP_MAX])
     policy = Policy(tolerance=5, max_gap=5)
     with pytest.raises(GapError):
@@ -118,7 +118,7 @@ def test_stamps_further_apart_than_a_signed_number_says_are_not_near() -> None:
         ]
 
 
-def test_of_many_stamps_a_gap_is_told_as_far_as_a_signed_number_says() -> None:
+def test_gaps_beyond_64_bits_are_clipped_in_lookups_of_many_stamps() -> None:
     edge = history([STAMP_MIN, STAMP_MAX])
     assert read_stamp(edge, 0, Policy()).gap == STAMP_MAX - STAMP_MIN
     assert read_stamps_at_many(edge.samples_between(0, 0), np.array([0]), Policy())[2].tolist() == [STAMP_MAX]
@@ -128,7 +128,7 @@ def test_of_many_stamps_a_gap_is_told_as_far_as_a_signed_number_says() -> None:
     ("at", "kind", "slack"),
     [(4, PastExtrapolationError, 5), (10 - 6, PastExtrapolationError, 5), (41, FutureExtrapolationError, 20)],
 )
-def test_an_edge_that_nothing_stands_in_for_says_how_far_it_was_looked(
+def test_the_error_of_an_edge_without_a_near_sample_has_the_slack(
     at: int, kind: type[ExtrapolationError], slack: int
 ) -> None:
     edge = history([10, 20])
@@ -138,7 +138,7 @@ def test_an_edge_that_nothing_stands_in_for_says_how_far_it_was_looked(
     assert (caught.value.oldest, caught.value.newest, caught.value.authority) == (10, 20, "odometry")
 
 
-def test_a_gap_is_refused_with_its_two_samples() -> None:
+def test_a_gap_error_has_the_stamps_of_both_samples() -> None:
     edge = history([0, SECOND, 4 * SECOND])
     with pytest.raises(GapError) as caught:
         read_stamp(edge, 2 * SECOND, Policy(max_gap=SECOND))
@@ -152,7 +152,7 @@ def test_a_gap_is_refused_with_its_two_samples() -> None:
 
 
 @pytest.mark.parametrize(("policy", "slack"), [((0, 0), 0), ((5, 0), 5), ((5, 8), 8), ((0, 8), 8), ((8, 5), 8)])
-def test_a_gap_that_nothing_stands_in_for_says_how_far_it_was_looked(policy: tuple[int, int], slack: int) -> None:
+def test_the_error_of_a_gap_without_a_near_sample_has_the_slack(policy: tuple[int, int], slack: int) -> None:
     edge = history([0, 100])
     with pytest.raises(GapError) as caught:
         read_stamp(edge, 50, Policy(tolerance=policy[0], hold=policy[1], max_gap=20))
@@ -188,7 +188,7 @@ def seconds(value: float) -> int:
         (2.0, {"tolerance": 9.0, "extrapolate": Hold(9.0)}, 2.0 + 20.0 + 0.5, 0.0, 4.0),
     ],
 )
-def test_the_answer_says_what_was_done(
+def test_the_answer_has_its_extrapolation_and_gap(
     tree: TransformTree, at: float, policy: dict[str, Any], x: float, extrapolated_by: float, gap: float
 ) -> None:
     for target, source, sign in (("odom", "tool", 1.0), ("tool", "odom", -1.0)):
@@ -199,7 +199,7 @@ def test_the_answer_says_what_was_done(
         assert ("extrapolated by" in str(found)) == (extrapolated_by > 0.0)
 
 
-def test_without_a_policy_nothing_is_said_to_have_been_done(tree: TransformTree) -> None:
+def test_an_answer_without_a_policy_has_no_extrapolation_and_gap(tree: TransformTree) -> None:
     found = tree.lookup("odom", "tool", seconds(3.0))
     assert (found.extrapolated_by, found.gap) == (0, None)
     assert found == tree.lookup("odom", "tool", seconds(3.0), tolerance=0.1)
@@ -215,7 +215,7 @@ def test_without_a_policy_nothing_is_said_to_have_been_done(tree: TransformTree)
         (5.0, {"max_gap": 3.9}, GapError, "base"),
     ],
 )
-def test_the_error_names_the_edge_that_decides(
+def test_the_error_names_the_deciding_edge(
     tree: TransformTree, at: float, policy: dict[str, Any], kind: type[ExtrapolationError], child: str
 ) -> None:
     with pytest.raises(kind) as caught:
@@ -229,7 +229,7 @@ def test_static_paths_need_no_policy(tree: TransformTree) -> None:
     assert (found.static, found.extrapolated_by, found.gap) == (True, 0, 0)
 
 
-def test_latest_waits_until_it_is_out_of_the_gap_of_another_edge(tree: TransformTree) -> None:
+def test_latest_in_the_gap_of_another_edge_waits_for_the_end_of_the_gap(tree: TransformTree) -> None:
     with pytest.raises(FutureExtrapolationError) as caught:
         tree.lookup("odom", "tool", max_gap=3.9)
     assert (caught.value.child, caught.value.stamp) == ("arm", seconds(6.0))
@@ -255,7 +255,7 @@ def test_latest_goes_as_far_as_the_lagging_edge_may_be_held_but_not_beyond_the_n
     assert found.extrapolated_by == seconds(extrapolated_by)
 
 
-def test_time_travel_tells_the_worse_of_both_legs(tree: TransformTree) -> None:
+def test_time_travel_has_the_greater_extrapolation_and_gap_of_both_legs(tree: TransformTree) -> None:
     found = tree.lookup("base", "base", seconds(6.5), source_at=seconds(1.5), fixed="odom", extrapolate=Hold(1.0))
     assert found.transform.translation == pytest.approx((1.5 - 6.0, 0.0, 0.0))
     assert (found.extrapolated_by, found.gap) == (seconds(0.5), seconds(1.0))
@@ -274,7 +274,7 @@ tenths = st.integers(-20, 90).map(lambda tenth: tenth * SECOND // 10)
 
 
 @given(keywords, st.lists(tenths, max_size=60), st.sampled_from((("odom", "tool"), ("tool", "odom"), ("base", "arm"))))
-def test_many_answers_are_those_of_one_by_one(
+def test_many_lookups_under_a_policy_equal_single_lookups(
     policy: dict[str, Any], asked: list[int], frames: tuple[str, str]
 ) -> None:
     tree = TransformTree(keep=None)
@@ -307,7 +307,7 @@ def test_many_answers_are_those_of_one_by_one(
         tree.lookup_many(*frames, asked, **policy)
 
 
-def test_many_in_time_travel_tell_the_worse_of_both_legs(tree: TransformTree) -> None:
+def test_many_time_travels_have_the_greater_extrapolation_and_gap_of_both_legs(tree: TransformTree) -> None:
     found = tree.lookup_many(
         "base", "base", [seconds(6.5)] * 2, source_at=[seconds(1.5), seconds(6.25)], fixed="odom", extrapolate=Hold(1.0)
     )
@@ -318,6 +318,6 @@ def test_many_in_time_travel_tell_the_worse_of_both_legs(tree: TransformTree) ->
     assert found[1:].extrapolated_by.tolist() == [seconds(0.5)]
 
 
-def test_many_without_a_policy_say_nothing(tree: TransformTree) -> None:
+def test_many_lookups_without_a_policy_have_no_extrapolation_and_gap(tree: TransformTree) -> None:
     found = tree.lookup_many("odom", "tool", [seconds(3.0)])
     assert (found.extrapolated_by.tolist(), found.gap) == ([0], None)

@@ -34,7 +34,7 @@ def test_a_frame_is_known_as_long_as_a_sample_names_it(history: list[Change]) ->
 
 
 @given(changes(), changes())
-def test_a_copy_goes_its_own_way(history: list[Change], more: list[Change]) -> None:
+def test_a_copy_is_independent(history: list[Change], more: list[Change]) -> None:
     names = KnownFrames()
     named: dict[str, tuple[str, ...]] = {}
     for change in history:

@@ -56,7 +56,7 @@ def edges(draw: st.DrawFn) -> FrameHistory:
 
 
 @given(edges(), st.data())
-def test_a_curve_is_what_the_scalar_kernel_is_at_every_stamp(frame: FrameHistory, data: st.DataObject) -> None:
+def test_a_curve_equals_the_python_kernel_at_every_stamp(frame: FrameHistory, data: st.DataObject) -> None:
     low, high = frame.stamps[0], frame.stamps[-1]
     inside = st.integers(low, high) | st.sampled_from(frame.stamps)
     beside = st.sampled_from(frame.stamps).map(lambda stamp: min(max(stamp + 1, low), high))
@@ -66,13 +66,13 @@ def test_a_curve_is_what_the_scalar_kernel_is_at_every_stamp(frame: FrameHistory
 
 
 @given(st.lists(transforms(), min_size=1, max_size=5))
-def test_a_sample_is_read_back_bit_for_bit_at_its_stamp(poses: list[Transform]) -> None:
+def test_the_row_at_the_stamp_of_a_sample_is_the_sample_bit_for_bit(poses: list[Transform]) -> None:
     rows = at(edge(enumerate(poses)), range(len(poses)))
     assert rows == [[*pose.translation, *pose.rotation] for pose in poses]
 
 
 @given(unit_vectors(), st.floats(-3.1, 3.1) | small_angles(), st.sampled_from([1.0, -1.0]))
-def test_a_turn_about_a_fixed_axis_is_steady_whatever_its_size_and_its_sign(
+def test_the_angle_of_an_interpolated_turn_is_linear_in_time_for_any_angle_and_sign(
     axis: Vector, angle: float, sign: float
 ) -> None:
     turned = Transform.from_axis_angle(axis, angle, (8.0, 0.0, -4.0))
@@ -84,25 +84,27 @@ def test_a_turn_about_a_fixed_axis_is_steady_whatever_its_size_and_its_sign(
 
 
 @pytest.mark.parametrize("angle", [1e-12, 1e-9, 2e-8, 4e-8])
-def test_a_turn_too_small_for_its_cosine_is_still_halved(angle: float) -> None:
+def test_half_of_a_turn_whose_cosine_rounds_to_one_is_half_the_angle(angle: float) -> None:
     frame = edge([(0, Transform()), (2, Transform.from_axis_angle((0.0, 0.0, 1.0), angle))])
     assert at(frame, [1])[0][5] == pytest.approx(angle / 4, rel=1e-9)
 
 
 @given(rotations(), st.sampled_from([1.0, -1.0]))
-def test_what_does_not_turn_stays_as_it_is(rotation: tuple[float, ...], sign: float) -> None:
+def test_equal_rotations_are_not_changed_between_samples(rotation: tuple[float, ...], sign: float) -> None:
     first, last = Transform((1.0, 0.0, 0.0), rotation), Transform((3.0, 0.0, 0.0), [sign * part for part in rotation])
     assert at(edge([(0, first), (2 * SECOND, last)]), [SECOND])[0] == near([2.0, 0.0, 0.0, *first.rotation], 1e-15)
 
 
-def test_half_a_turn_goes_the_way_the_sign_of_the_second_says() -> None:
+def test_half_a_turn_has_the_direction_of_the_sign_of_the_second_quaternion() -> None:
     for w in (1e-17, -1e-17):
         frame = edge([(0, Transform()), (2, Transform(rotation=(0.0, 0.0, 1.0, w)))])
         assert at(frame, [1])[0][5] == pytest.approx(math.copysign(math.sqrt(0.5), w))
 
 
 @pytest.mark.parametrize("rotation", [(0.0, 0.0, 0.0, 1.0), NOT_QUITE_ONE])
-def test_the_older_value_is_held_until_the_new_parent_begins(rotation: tuple[float, ...]) -> None:
+def test_the_last_value_under_the_old_parent_is_held_until_the_first_under_the_new_one(
+    rotation: tuple[float, ...],
+) -> None:
     poses = [Transform((x, 0.0, 0.0), rotation) for x in (0.0, 10.0, 100.0, 110.0)]
     frame = edge([(stamp * SECOND, pose) for stamp, pose in enumerate(poses)], ["old", "old", "new", "new"])
     halves = at(frame, [stamp * SECOND // 2 for stamp in range(7)])
@@ -110,17 +112,17 @@ def test_the_older_value_is_held_until_the_new_parent_begins(rotation: tuple[flo
     assert halves[3] == [10.0, 0.0, 0.0, *poses[1].rotation]
 
 
-def test_parents_are_told_apart_to_the_last_character() -> None:
+def test_parents_that_differ_in_the_last_character_are_different() -> None:
     frame = edge([(0, Transform()), (10, Transform((10.0, 0.0, 0.0)))], ["odom", "odom\0"])
     assert at(frame, [9])[0][0] == 0.0
 
 
-def test_a_single_sample_is_where_it_is() -> None:
+def test_a_single_sample_is_the_row_at_its_stamp() -> None:
     pose = Transform((1.0, 2.0, 3.0), NOT_QUITE_ONE)
     assert at(edge([(TODAY, pose)]), [TODAY, TODAY]) == [[*pose.translation, *pose.rotation]] * 2
 
 
-def test_neighbouring_nanoseconds_of_today_are_told_apart() -> None:
+def test_neighbouring_nanoseconds_of_today_have_different_rows() -> None:
     places = {TODAY: 0.0, TODAY + 3: 3.0, TODAY + 4: 10.0}
     frame = edge([(stamp, Transform((x, 0.0, 0.0))) for stamp, x in places.items()])
     assert [row[0] for row in at(frame, range(TODAY, TODAY + 5))] == near([0.0, 1.0, 2.0, 3.0, 10.0])
@@ -133,7 +135,7 @@ def test_the_whole_range_of_stamps_is_one_segment() -> None:
 
 
 @pytest.mark.parametrize("samples", [3, 300])
-def test_a_part_of_a_curve_is_that_part_of_its_answers(samples: int) -> None:
+def test_a_slice_of_a_curve_equals_the_slice_of_its_rows(samples: int) -> None:
     frame = edge((stamp, Transform((float(stamp), 0.0, 0.0))) for stamp in range(samples))
     stamps = [number % samples for number in range(100)]
     part = curve(frame, stamps).at(slice(40, 60))

@@ -83,7 +83,7 @@ INSTANTS = [0.0, 0.1, 0.25, 1.0, 1.625, 3.999, 4.0]
 
 
 @pytest.mark.parametrize("time", INSTANTS)
-def test_a_body_carried_round_the_unit_circle_has_the_velocity_of_the_textbook(time: float) -> None:
+def test_a_body_on_the_unit_circle_has_the_textbook_velocity(time: float) -> None:
     tree = tree_of(*trajectory("map", "arm", turning(1.0)), placed("arm", "body", (1.0, 0.0, 0.0)))
     twist = tree.twist("body", "map", round(time * SECOND))
     check_twist(twist, (-math.sin(time), math.cos(time), 0.0), Z)
@@ -119,7 +119,7 @@ def test_dense_samples_of_a_circle_give_the_velocity_of_the_circle() -> None:
         ("ahead", "map", (-2.0 * math.sin(1.0), 2.0 * math.cos(1.0), 0.0)),
     ],
 )
-def test_where_lookup_velocity_of_tf2_is_wrong_the_exact_values_come_out(frame: str, axes: str, linear: Vector) -> None:
+def test_twists_are_exact_where_lookup_velocity_of_tf2_is_wrong(frame: str, axes: str, linear: Vector) -> None:
     tree = tree_of(
         *trajectory("map", "arm", turning(1.0)),
         placed("arm", "body", (1.0, 0.0, 0.0)),
@@ -129,7 +129,7 @@ def test_where_lookup_velocity_of_tf2_is_wrong_the_exact_values_come_out(frame: 
 
 
 @pytest.mark.parametrize("time", INSTANTS)
-def test_a_rotating_observer_sees_what_stands_still_go_round_the_other_way(time: float) -> None:
+def test_a_rotating_observer_sees_a_resting_point_circle_in_the_opposite_direction(time: float) -> None:
     rate, radius = 0.7, 3.0
     tree = tree_of(*trajectory("map", "observer", turning(rate)), placed("map", "post", (radius, 0.0, 0.0)))
     angle, speed = rate * time, rate * radius
@@ -140,7 +140,7 @@ def test_a_rotating_observer_sees_what_stands_still_go_round_the_other_way(time:
     check_twist(tree.twist("post", "observer", at, expressed_in="map"), (0.0, -speed, 0.0), (0.0, 0.0, -rate))
 
 
-def test_an_observer_that_turns_with_the_body_sees_it_stand_still() -> None:
+def test_an_observer_that_turns_with_the_body_sees_it_at_rest() -> None:
     tree = tree_of(
         *trajectory("map", "table", turning(2.0, (1.0, 2.0, 3.0))),
         placed("table", "cup", (1.0, 0.0, 0.5)),
@@ -150,7 +150,7 @@ def test_an_observer_that_turns_with_the_body_sees_it_stand_still() -> None:
     check_twist(tree.twist("cup", "plate", SECOND // 3, expressed_in="map"), STILL, STILL)
 
 
-def test_two_rates_about_one_axis_add_up_and_the_inner_one_carries_no_origin() -> None:
+def test_two_rates_about_one_axis_add_up_and_the_inner_one_moves_no_origin() -> None:
     tree = tree_of(
         *trajectory("map", "boom", turning(0.5)),
         placed("boom", "tip", (2.0, 0.0, 0.0)),
@@ -162,7 +162,7 @@ def test_two_rates_about_one_axis_add_up_and_the_inner_one_carries_no_origin() -
     check_twist(tree.twist("wheel", "tip", at), STILL, (0.0, 0.0, 3.0))
 
 
-def test_a_walk_on_a_turntable_has_the_walk_and_the_turn_in_it() -> None:
+def test_a_walk_on_a_turntable_has_radial_and_tangential_velocity() -> None:
     """In the rotating axes v = (walk, rate * radius, 0), as for any polar coordinates."""
     rate, walk = 0.8, 0.5
     tree = tree_of(
@@ -180,7 +180,7 @@ def test_a_walk_on_a_turntable_has_the_walk_and_the_turn_in_it() -> None:
     st.booleans(),
     st.floats(0.01, 0.99),
 )
-def test_a_turn_has_one_rate_in_the_parent_whatever_the_signs_of_its_quaternions(
+def test_a_turn_has_a_constant_rate_in_the_parent_for_any_quaternion_signs(
     start: Quaternion, axis: Vector, angle: float, flipped: bool, fraction: float
 ) -> None:
     first = Transform(rotation=start)
@@ -191,7 +191,7 @@ def test_a_turn_has_one_rate_in_the_parent_whatever_the_signs_of_its_quaternions
 
 
 @given(rotations(), unit_vectors())
-def test_a_half_turn_goes_the_way_that_the_lookup_goes(start: Quaternion, axis: Vector) -> None:
+def test_a_half_turn_has_the_direction_of_the_interpolation(start: Quaternion, axis: Vector) -> None:
     first = Transform(rotation=start)
     second = Transform.from_axis_angle(axis, math.pi) @ first
     tree = tree_of(TransformStamped("map", "body", 0, first), TransformStamped("map", "body", SECOND, second))
@@ -204,7 +204,7 @@ def test_a_half_turn_goes_the_way_that_the_lookup_goes(start: Quaternion, axis: 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0, 0.3])
 @pytest.mark.parametrize("at", [QUARTER // 3, SECOND, 4 * SECOND, LATEST])
-def test_a_steady_straight_motion_has_its_speed_at_every_instant(speed: float, at: int | Latest) -> None:
+def test_a_uniform_straight_motion_has_its_speed_at_every_stamp(speed: float, at: int | Latest) -> None:
     tree = tree_of(*trajectory("map", "body", lambda time: Transform((speed * time, 0.0, 0.0))))
     check_twist(tree.twist("body", "map", at), (speed, 0.0, 0.0), STILL)
 
@@ -239,7 +239,7 @@ def stepping(velocities: list[tuple[float, Vector]], pose: Callable[[Vector], Tr
 
 @pytest.mark.parametrize(("time", "velocity"), SIDES)
 @pytest.mark.parametrize("observer", ["foo", "stationary_offset_child", "stationary_offset_parent"])
-def test_a_straight_motion_looks_the_same_from_three_frames_that_stand_still(
+def test_a_straight_motion_is_the_same_seen_from_three_resting_frames(
     time: float, velocity: Vector, observer: str
 ) -> None:
     tree = tree_of(
@@ -251,7 +251,7 @@ def test_a_straight_motion_looks_the_same_from_three_frames_that_stand_still(
 
 
 @pytest.mark.parametrize(("time", "velocity"), TURNS)
-def test_a_turn_alone_moves_no_origin_but_that_of_an_offset_child(time: float, velocity: Vector) -> None:
+def test_a_pure_rotation_moves_only_the_origin_of_an_offset_child(time: float, velocity: Vector) -> None:
     tree = tree_of(
         *stepping(TURNS, lambda rpy: Transform.from_xyz_rpy(STILL, rpy)),
         placed("bar", "stationary_offset_child", (1.0, 0.0, 0.0)),
@@ -315,7 +315,7 @@ def test_twist_is_the_limit_of_differences(drawn: tuple[TransformTree, int, list
 
 
 @given(trees(), st.data())
-def test_what_b_sees_of_a_is_what_a_sees_of_b_reversed_about_the_lever_arm(
+def test_the_twist_of_b_seen_from_a_is_the_reverse_of_a_seen_from_b_about_the_lever_arm(
     drawn: tuple[TransformTree, int, list[str]], data: st.DataObject
 ) -> None:
     tree, at, frames = drawn
@@ -327,7 +327,7 @@ def test_what_b_sees_of_a_is_what_a_sees_of_b_reversed_about_the_lever_arm(
 
 
 @given(trees(), st.data(), transforms(2.0))
-def test_the_body_twist_carried_to_another_frame_of_the_body_is_that_frames_own(
+def test_do_transform_of_a_body_twist_gives_the_twist_of_another_frame_of_the_body(
     drawn: tuple[TransformTree, int, list[str]], data: st.DataObject, mount: Transform
 ) -> None:
     tree, at, frames = drawn
@@ -340,9 +340,7 @@ def test_the_body_twist_carried_to_another_frame_of_the_body_is_that_frames_own(
 
 
 @given(trees(), st.data())
-def test_the_axes_turn_the_numbers_and_leave_the_motion_as_it_is(
-    drawn: tuple[TransformTree, int, list[str]], data: st.DataObject
-) -> None:
+def test_expressed_in_rotates_the_twist(drawn: tuple[TransformTree, int, list[str]], data: st.DataObject) -> None:
     tree, at, frames = drawn
     frame, reference, axes = (data.draw(st.sampled_from(frames)) for _ in range(3))
     plain = tree.twist(frame, reference, at)
@@ -353,9 +351,7 @@ def test_the_axes_turn_the_numbers_and_leave_the_motion_as_it_is(
 
 
 @given(trees(), st.data())
-def test_a_frame_does_not_move_seen_from_itself(
-    drawn: tuple[TransformTree, int, list[str]], data: st.DataObject
-) -> None:
+def test_a_frame_is_at_rest_seen_from_itself(drawn: tuple[TransformTree, int, list[str]], data: st.DataObject) -> None:
     tree, at, frames = drawn
     frame, axes = (data.draw(st.sampled_from(frames)) for _ in range(2))
     check_twist(tree.twist(frame, frame, at, expressed_in=axes), STILL, STILL)
@@ -377,20 +373,20 @@ def speed(tree: TransformTree, at: int | Latest) -> float:
     return twist.linear[0]
 
 
-def test_at_a_sample_the_derivative_is_the_one_from_before() -> None:
+def test_at_a_sample_the_velocity_is_that_of_the_segment_before() -> None:
     tree = tree_of(*on_a_line((0, 0.0), (1, 1.0), (2, 3.0), (3, 6.0)))
     assert [speed(tree, second * SECOND) for second in (1, 2, 3)] == [1.0, 2.0, 3.0]
     assert [speed(tree, second * SECOND + 1) for second in (0, 1, 2)] == [1.0, 2.0, 3.0]
     assert speed(tree, LATEST) == 3.0
 
 
-def test_at_the_first_sample_it_is_the_one_from_after() -> None:
+def test_at_the_first_sample_the_velocity_is_that_of_the_segment_after() -> None:
     tree = tree_of(*on_a_line((0, 0.0), (1, 1.0), (2, 3.0)))
     assert speed(tree, 0) == 1.0
 
 
 @pytest.mark.parametrize("newest", [41, 42, 45])
-def test_what_has_left_the_window_is_not_differentiated(newest: int) -> None:
+def test_samples_outside_the_window_are_not_differentiated(newest: int) -> None:
     tree = TransformTree(keep=40.0)
     tree.insert_many(on_a_line(*((second, float(second**2)) for second in range(newest + 1))))
     oldest = newest - 40
@@ -414,7 +410,7 @@ def test_a_segment_of_any_length_has_a_velocity(ends: set[int]) -> None:
 
 
 @pytest.mark.parametrize("at", [5 * SECOND, LATEST])
-def test_a_lone_sample_says_where_a_frame_is_but_not_where_it_goes(at: int | Latest) -> None:
+def test_a_single_sample_has_a_transform_but_no_velocity(at: int | Latest) -> None:
     tree = tree_of(moving("map", "body", 5 * SECOND, 1.0, authority="odometry"))
     with pytest.raises(FutureExtrapolationError) as caught:
         tree.twist("body", "map", at)
@@ -443,13 +439,13 @@ def reparented() -> TransformTree:
     ("time", "expected"),
     [(0.0, 1.0), (0.5, 1.0), (1.0, 1.0), (1.000000001, 0.0), (2.999999999, 0.0), (3.0, 2.0), (3.5, 2.0), (4.0, 2.0)],
 )
-def test_across_a_change_of_parent_a_frame_stands_still_and_the_new_parent_begins_from_after(
+def test_across_a_change_of_parent_a_frame_rests_and_the_first_sample_of_the_new_parent_has_the_velocity_after_it(
     time: float, expected: float
 ) -> None:
     assert speed(reparented(), round(time * SECOND)) == expected
 
 
-def test_while_it_is_held_a_frame_goes_with_its_old_parent() -> None:
+def test_a_held_frame_moves_with_its_old_parent() -> None:
     tree = tree_of(
         *trajectory("map", "crane", turning(0.5)),
         moving("crane", "box", 0, 1.0),
@@ -460,7 +456,7 @@ def test_while_it_is_held_a_frame_goes_with_its_old_parent() -> None:
     check_twist(tree.twist("box", "crane", 2 * SECOND), STILL, STILL)
 
 
-def test_a_single_sample_between_two_parents_begins_to_be_held() -> None:
+def test_a_single_sample_between_two_parents_is_at_rest() -> None:
     tree = tree_of(
         static("map", "left", 10.0),
         *on_a_line((0, 0.0), parent="left"),
@@ -471,7 +467,7 @@ def test_a_single_sample_between_two_parents_begins_to_be_held() -> None:
 
 
 @pytest.mark.parametrize("at", [3 * SECOND, LATEST])
-def test_the_first_sample_of_a_new_parent_waits_for_the_second(at: int | Latest) -> None:
+def test_a_single_newest_sample_of_a_new_parent_has_no_velocity(at: int | Latest) -> None:
     tree = tree_of(*on_a_line((0, 0.0), (1, 1.0)), static("map", "lift"), *on_a_line((3, 0.0), parent="lift"))
     with pytest.raises(FutureExtrapolationError) as caught:
         tree.twist("body", "map", at)
@@ -482,7 +478,7 @@ def test_the_first_sample_of_a_new_parent_waits_for_the_second(at: int | Latest)
 
 
 @pytest.mark.parametrize("at", [-SECOND, 0, 7, TODAY])
-def test_what_is_static_stands_still_at_any_stamp(at: int) -> None:
+def test_a_static_frame_is_at_rest_at_any_stamp(at: int) -> None:
     tree = tree_of(static("map", "base", 1.0, stamp=5), static("base", "lidar", 2.0, stamp=9))
     assert tree.twist("lidar", "map", at) == TwistStamped("map", at, STILL, STILL)
 
@@ -490,13 +486,13 @@ def test_what_is_static_stands_still_at_any_stamp(at: int) -> None:
 @pytest.mark.parametrize(
     ("frame", "reference"), [("lidar", "base"), ("base", "lidar"), ("lidar", "lidar"), ("base", "base"), ("map", "map")]
 )
-def test_what_is_static_has_the_stamp_that_lookup_gives_it(frame: str, reference: str) -> None:
+def test_the_twist_of_a_static_frame_has_the_stamp_of_the_lookup(frame: str, reference: str) -> None:
     tree = tree_of(*on_a_line((0, 0.0), (8, 1.0)), static("body", "base", stamp=5), static("base", "lidar", stamp=7))
     tree.insert_many([moving("body", "arm", 0), moving("body", "arm", 3)])
     assert tree.twist(frame, reference).stamp == tree.lookup(reference, frame).stamp
 
 
-def test_seen_from_a_moving_frame_what_is_fixed_to_it_has_the_stamp_of_the_fixture() -> None:
+def test_the_twist_of_a_frame_fixed_to_a_moving_one_has_the_stamp_of_the_static_edge() -> None:
     tree = tree_of(*on_a_line((0, 0.0), (8, 1.0)), static("body", "lidar", stamp=5))
     assert tree.twist("lidar", "body") == TwistStamped("body", 5, STILL, STILL)
 
@@ -523,7 +519,7 @@ def slow_and_fast() -> TransformTree:
         ("post", "post", "slow", 3),
     ],
 )
-def test_latest_is_the_newest_stamp_that_all_three_frames_can_answer(
+def test_latest_is_the_newest_common_stamp_of_frame_reference_and_axes(
     frame: str, reference: str, axes: str | None, seconds: int
 ) -> None:
     tree = slow_and_fast()
@@ -533,7 +529,7 @@ def test_latest_is_the_newest_stamp_that_all_three_frames_can_answer(
 
 
 @pytest.mark.parametrize("last", [2.0, 4.0, 6.0])
-def test_the_axes_count_as_they_are_at_the_stamp(last: float) -> None:
+def test_the_axes_are_those_at_the_stamp(last: float) -> None:
     tree = tree_of(
         *trajectory("map", "axes", turning(0.5), last),
         *trajectory("map", "body", lambda time: Transform((time, 0.0, 0.0))),
@@ -542,7 +538,7 @@ def test_the_axes_count_as_they_are_at_the_stamp(last: float) -> None:
     check_twist(tree.twist("body", "map", expressed_in="axes"), (math.cos(angle), -math.sin(angle), 0.0), STILL)
 
 
-def test_late_samples_change_the_velocity_on_both_sides() -> None:
+def test_a_late_sample_changes_the_velocity_on_both_sides() -> None:
     tree = tree_of(*on_a_line((0, 0.0), (2, 2.0)))
     tree.insert(moving("map", "body", SECOND, 3.0))
     assert (speed(tree, QUARTER), speed(tree, 7 * QUARTER)) == (3.0, -1.0)
@@ -560,7 +556,7 @@ def lines_of_two_trees() -> TransformTree:
     [(("bodi", "map", "post"), "bodi"), (("body", "mop", "post"), "mop"), (("body", "map", "pots"), "pots")],
 )
 @pytest.mark.parametrize("at", [SECOND, LATEST])
-def test_unknown_frames_are_named_wherever_they_stand(
+def test_an_unknown_frame_is_named_in_any_argument(
     frames: tuple[str, str, str], unknown: str, at: int | Latest
 ) -> None:
     frame, reference, axes = frames
@@ -574,7 +570,7 @@ def test_unknown_frames_are_named_wherever_they_stand(
     [("body", "elsewhere", "map"), ("elsewhere", "map", "map"), ("body", "map", "elsewhere")],
 )
 @pytest.mark.parametrize("at", [SECOND, LATEST])
-def test_frames_of_another_tree_are_disconnected(frame: str, reference: str, axes: str, at: int | Latest) -> None:
+def test_a_frame_of_another_tree_is_disconnected(frame: str, reference: str, axes: str, at: int | Latest) -> None:
     with pytest.raises(DisconnectedError):
         lines_of_two_trees().twist(frame, reference, at, expressed_in=axes)
 
@@ -598,7 +594,7 @@ def gap(axes_first: bool) -> TransformTree:
 
 
 @pytest.mark.parametrize("axes_first", [True, False])
-def test_latest_without_a_common_stamp_waits_for_the_frame_that_lags(axes_first: bool) -> None:
+def test_latest_without_a_common_stamp_waits_for_the_lagging_frame(axes_first: bool) -> None:
     with pytest.raises(FutureExtrapolationError) as caught:
         gap(axes_first).twist("body", "map", expressed_in="axes")
     assert (caught.value.child, caught.value.stamp) == ("axes" if axes_first else "body", 5 * SECOND)

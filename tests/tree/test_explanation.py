@@ -58,10 +58,10 @@ def robot() -> TransformTree:
     )
 
 
-# What an edge tells
+# One edge
 
 
-def test_an_edge_tells_the_samples_round_the_instant_and_how_far_it_is_between_them() -> None:
+def test_an_edge_has_the_samples_around_the_stamp_and_the_fraction_between_them() -> None:
     tree = tree_of(*over("map", "a", (100, 200, 300)))
     assert tree.explain("map", "a", 250).edges == (
         ExplainedEdge("map", "a", False, 200, 300, 0.5, 0, 300, 0.0, 2 / (200 / SECOND)),
@@ -70,7 +70,7 @@ def test_an_edge_tells_the_samples_round_the_instant_and_how_far_it_is_between_t
     assert tree.explain("map", "a", 200).edges[0].fraction == 0.0
 
 
-def test_outside_its_window_an_edge_tells_the_sample_that_is_next_to_the_instant() -> None:
+def test_outside_its_window_an_edge_has_the_sample_nearest_to_the_stamp() -> None:
     tree = tree_of(*over("map", "a", (100, 200)))
     (past,) = tree.explain("map", "a", 50).edges
     (future,) = tree.explain("map", "a", 250).edges
@@ -80,20 +80,20 @@ def test_outside_its_window_an_edge_tells_the_sample_that_is_next_to_the_instant
     assert isinstance(future.error, FutureExtrapolationError)
 
 
-def test_samples_that_have_left_the_window_are_not_round_anything() -> None:
+def test_samples_outside_the_window_are_not_shown() -> None:
     tree = tree_of(*over("map", "a", range(100, 201)), keep=50 * NANO)
     assert tree.explain("map", "a", 149).edges[0].after == 150
     assert tree.explain("map", "a", 149).edges[0].before is None
 
 
-def test_a_static_edge_tells_who_sent_it_and_no_stamps() -> None:
+def test_a_static_edge_has_its_authority_and_no_stamps() -> None:
     tree = tree_of(static("base", "laser", authority="calibration"))
     found = tree.explain("base", "laser", 5)
     assert found.edges == (ExplainedEdge("base", "laser", True, authority="calibration"),)
     assert (found.stamp, found.answerable) == (5, True)
 
 
-def test_across_a_change_of_parent_the_older_sample_is_held() -> None:
+def test_between_samples_of_two_parents_the_fraction_is_zero() -> None:
     tree = tree_of(moving("map", "a", 100), moving("odom", "a", 200), static("map", "odom"))
     (edge,) = tree.explain("map", "a", 175).edges
     assert (edge.parent, edge.before, edge.after, edge.fraction) == ("map", 100, 200, 0.0)
@@ -111,17 +111,17 @@ def test_ages_are_counted_from_the_newest_stamp_in_the_tree_or_from_a_given_one(
     assert buffer.explain("map", "a").edges[0].age == 7.0
 
 
-def test_a_rate_needs_two_samples() -> None:
+def test_an_edge_with_a_single_sample_has_no_rate() -> None:
     tree = tree_of(*at_hz("map", "a", 50, 1.0, "odometry"), moving("a", "b", SECOND))
     a, b = tree.explain("map", "b").edges
     assert a.rate == pytest.approx(50.0)
     assert (a.authority, b.rate, b.authority) == ("odometry", None, "")
 
 
-# The whole
+# The whole path
 
 
-def test_the_chain_runs_from_target_to_source_and_an_edge_stands_between_each_two_frames() -> None:
+def test_the_chain_goes_from_target_to_source_with_an_edge_between_each_two_frames() -> None:
     tree = robot()
     found = tree.explain("camera", "gripper", from_seconds(12.45))
     assert found.chain == ("camera", "base_link", "torso", "arm", "gripper")
@@ -134,7 +134,7 @@ def test_the_chain_runs_from_target_to_source_and_an_edge_stands_between_each_tw
     assert found.chain == tuple(tree.chain("camera", "gripper"))
 
 
-def test_latest_is_explained_at_the_stamp_that_it_comes_to() -> None:
+def test_latest_is_explained_at_the_stamp_of_its_answer() -> None:
     found = robot().explain("map", "gripper")
     assert (found.at, found.stamp) == (LATEST, from_seconds(12.4))
     assert [edge.before for edge in found.edges if not edge.static] == [
@@ -145,19 +145,19 @@ def test_latest_is_explained_at_the_stamp_that_it_comes_to() -> None:
     assert found.edges[3].fraction == pytest.approx(0.35)
 
 
-def test_latest_is_explained_along_the_path_of_that_stamp() -> None:
+def test_latest_is_explained_on_the_path_at_the_stamp_of_its_answer() -> None:
     tree = tree_of(*over("map", "odom", (10, 30)), moving("map", "a", 10), moving("odom", "a", 50))
     found = tree.explain("map", "a")
     assert (found.stamp, found.chain) == (30, ("map", "a"))
     assert [(edge.parent, edge.before, edge.after, edge.fraction) for edge in found.edges] == [("map", 10, 50, 0.0)]
 
 
-def test_a_frame_in_itself_needs_no_edge() -> None:
+def test_the_explanation_of_a_frame_in_itself_has_no_edges() -> None:
     found = robot().explain("map", "map", 7)
     assert (found.chain, found.edges, found.errors, found.stamp) == (("map",), (), (), 7)
 
 
-def test_every_edge_that_is_too_late_or_too_early_has_its_error() -> None:
+def test_every_edge_that_does_not_cover_the_stamp_has_its_error() -> None:
     tree = tree_of(*over("map", "a", (10, 20)), *over("a", "b", (30, 40)), *over("b", "c", (10, 40)))
     found = tree.explain("map", "c", 25)
     assert [type(edge.error) for edge in found.edges] == [
@@ -169,7 +169,7 @@ def test_every_edge_that_is_too_late_or_too_early_has_its_error() -> None:
     assert (found.answerable, found.stamp) == (False, None)
 
 
-def test_at_latest_all_that_lag_behind_the_one_with_the_shortest_past_are_to_blame() -> None:
+def test_for_latest_every_edge_that_lags_behind_the_oldest_common_stamp_has_an_error() -> None:
     tree = tree_of(*over("map", "a", (1, 10)), *over("a", "b", (1, 20)), *over("b", "c", (30, 40)))
     found = tree.explain("map", "c")
     assert [facts(error) for error in found.errors] == [
@@ -180,7 +180,7 @@ def test_at_latest_all_that_lag_behind_the_one_with_the_shortest_past_are_to_bla
     assert [(edge.before, edge.after) for edge in found.edges] == [(10, 10), (1, 20), (None, 30)]
 
 
-def test_an_answer_that_is_too_old_is_the_fault_of_all_that_are() -> None:
+def test_for_an_answer_that_is_too_old_every_edge_that_is_too_old_has_an_error() -> None:
     found = robot().explain("map", "gripper", not_before=from_seconds(12.495))
     assert [edge.child for edge in found.edges if edge.error is not None] == ["odom", "arm"]
     assert [error.child for error in found.errors if isinstance(error, FutureExtrapolationError)] == ["odom", "arm"]
@@ -192,7 +192,7 @@ def test_an_answer_that_is_too_old_is_the_fault_of_all_that_are() -> None:
     assert not buffer.explain("map", "a", max_age=0.5).answerable
 
 
-def test_both_unknown_frames_are_named_with_what_resembles_them() -> None:
+def test_both_unknown_frames_have_errors_with_similar_names() -> None:
     found = robot().explain("mapp", "base_lnk")
     assert found.chain == ()
     first, second = found.errors
@@ -203,7 +203,7 @@ def test_both_unknown_frames_are_named_with_what_resembles_them() -> None:
     assert len(robot().explain("no", "no").errors) == 1
 
 
-def test_two_trees_are_shown_up_to_their_roots() -> None:
+def test_two_trees_are_explained_up_to_their_roots() -> None:
     tree = tree_of(moving("map", "a", 10), static("a", "b"), moving("world", "drone", 20, authority="pilot"))
     found = tree.explain("b", "drone", 15)
     assert found.half_chains == (("b", "a", "map"), ("drone", "world"))
@@ -218,7 +218,7 @@ def test_two_trees_are_shown_up_to_their_roots() -> None:
     assert error.roots == ("map", "world")
 
 
-def test_a_loop_in_the_past_is_shown_once_round() -> None:
+def test_a_loop_in_the_past_is_shown_once() -> None:
     tree = tree_of(moving("a", "b", 10), moving("map", "b", 30), moving("other", "x", 5))
     tree.insert_many([moving("b", "a", 10), moving("map", "a", 30)])
     found = tree.explain("x", "a", 20)
@@ -227,7 +227,7 @@ def test_a_loop_in_the_past_is_shown_once_round() -> None:
     assert "up from 'a' to 'a'" in str(found)
 
 
-def test_a_policy_is_explained_edge_by_edge() -> None:
+def test_under_a_policy_each_edge_has_its_extrapolation_or_error() -> None:
     tree = tree_of(*over("map", "a", (100, 200)), *over("a", "b", (100, 180)), *over("b", "c", (100, 300)))
     question: dict[str, Any] = {"extrapolate": Hold(40 * NANO), "max_gap": 100 * NANO}
     found = tree.explain("map", "c", 220, **question)
@@ -243,7 +243,7 @@ def test_a_policy_is_explained_edge_by_edge() -> None:
 
 
 @pytest.mark.parametrize("at", [1.5, None, True])
-def test_a_wrong_question_is_an_error_all_the_same(at: Any) -> None:
+def test_wrong_arguments_are_type_errors(at: Any) -> None:
     with pytest.raises(TypeError):
         robot().explain("map", "odom", at)
     with pytest.raises(TypeError):
@@ -254,7 +254,7 @@ def test_a_wrong_question_is_an_error_all_the_same(at: Any) -> None:
         robot().explain("map", "odom", 5, not_before=3)
 
 
-def test_an_explanation_stays_as_it_was_and_can_be_sent_elsewhere() -> None:
+def test_an_explanation_does_not_change_with_the_tree_and_pickles() -> None:
     tree = robot()
     found = tree.explain("map", "gripper", from_seconds(12.45))
     text = str(found)
@@ -266,7 +266,7 @@ def test_an_explanation_stays_as_it_was_and_can_be_sent_elsewhere() -> None:
 # The text
 
 
-def test_an_answer_is_a_heading_and_a_line_for_each_edge() -> None:
+def test_the_text_of_an_answer_is_a_heading_and_a_line_for_each_edge() -> None:
     assert str(robot().explain("camera", "gripper")).splitlines() == [
         "'gripper' in 'camera', latest: 12.493 s",
         "  camera -> base_link  static",
@@ -276,7 +276,7 @@ def test_an_answer_is_a_heading_and_a_line_for_each_edge() -> None:
     ]
 
 
-def test_what_blocks_an_answer_is_marked_in_its_line_and_told_below() -> None:
+def test_the_text_marks_edges_with_errors_and_lists_the_errors_below() -> None:
     assert str(robot().explain("map", "gripper", from_seconds(12.45))).splitlines() == [
         "'gripper' in 'map' at 12.450 s: no answer",
         "! map <- odom         10.0 Hz   age 100 ms  12.400 s ..                  from 'slam'",
@@ -288,7 +288,7 @@ def test_what_blocks_an_answer_is_marked_in_its_line_and_told_below() -> None:
     ]
 
 
-def test_what_lags_at_latest_is_told_with_the_reason_for_it() -> None:
+def test_the_text_of_latest_without_an_answer_gives_the_reason() -> None:
     tree = tree_of(moving("map", "a", 10 * SECOND), moving("a", "b", 30 * SECOND))
     assert str(tree.explain("map", "b")).splitlines() == [
         "'b' in 'map', latest: no answer",
@@ -299,14 +299,14 @@ def test_what_lags_at_latest_is_told_with_the_reason_for_it() -> None:
     ]
 
 
-def test_a_misspelt_frame_is_told_with_what_resembles_it() -> None:
+def test_the_text_of_an_unknown_frame_has_similar_names() -> None:
     assert str(robot().explain("map", "base_lnk")).splitlines() == [
         "'base_lnk' in 'map', latest: no answer",
         "! frame 'base_lnk' is not known, did you mean 'base_link'?",
     ]
 
 
-def test_two_trees_are_told_one_after_the_other() -> None:
+def test_the_text_of_two_trees_lists_one_after_the_other() -> None:
     tree = tree_of(moving("map", "a", 10 * SECOND, authority="slam"), static("drone", "eye"))
     assert str(tree.explain("a", "eye")).splitlines() == [
         "'eye' in 'a', latest: no answer",
@@ -324,7 +324,7 @@ def test_two_trees_are_told_one_after_the_other() -> None:
     ]
 
 
-def test_a_sample_that_stands_in_is_told_with_its_distance_and_an_emptied_edge_as_such() -> None:
+def test_the_text_has_the_distance_of_an_extrapolation_and_marks_an_edge_without_samples() -> None:
     tree = tree_of(moving("map", "a", SECOND))
     held = str(tree.explain("map", "a", 2 * SECOND, extrapolate=Hold(5.0)))
     assert held.splitlines()[1] == "  map <- a  one sample  age 0 ns  1.000 s .., 1 s off"
@@ -422,7 +422,7 @@ def assert_edges_make_the_answer(tree: TransformTree, found: Explanation, answer
 
 
 @given(batches, st.none() | st.integers(0, 5), policies)
-def test_at_a_stamp_the_edges_that_block_are_those_that_have_no_answer_of_their_own(
+def test_at_a_stamp_exactly_the_edges_without_an_answer_of_their_own_have_errors(
     samples: list[TransformStamped], keep: int | None, policy: dict[str, Any]
 ) -> None:
     tree = some_tree(samples, keep, cleared=False)
@@ -441,7 +441,7 @@ steady = st.lists(st.tuples(st.sampled_from("bcd"), st.integers(0, 9)), max_size
 
 
 @given(steady, st.none() | st.integers(0, 12), st.integers(0, 3).map(lambda n: n * NANO))
-def test_there_is_no_answer_before_all_that_was_named_has_come_and_then_there_is_one(
+def test_there_is_an_answer_exactly_once_every_edge_with_an_error_has_a_new_sample(
     arrivals: list[tuple[str, int]], not_before: int | None, tolerance: float
 ) -> None:
     tree = tree_of(*(moving(PARENT[child], child, stamp) for child, stamp in arrivals), keep=None)

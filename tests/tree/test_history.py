@@ -4,7 +4,7 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tfbus import LATEST, SECOND, FutureExtrapolationError, Latest, Outcome, PastExtrapolationError
@@ -33,7 +33,7 @@ def x_at(samples: FrameHistory, stamp: int) -> float:
 
 
 @pytest.mark.parametrize("order", ["ascending", "descending", "shuffled"])
-def test_every_sample_is_read_back_at_its_stamp_whatever_the_order_of_insertion(order: str) -> None:
+def test_every_sample_is_read_back_at_its_stamp_for_any_order_of_insertion(order: str) -> None:
     stamps = list(range(1, 100))
     if order == "descending":
         stamps.reverse()
@@ -49,7 +49,6 @@ def test_every_sample_is_read_back_at_its_stamp_whatever_the_order_of_insertion(
     assert (samples.parent, samples.authority) == ("parent 99", "sender 99")
 
 
-@settings(deadline=None)
 @given(st.permutations(range(12)), st.data())
 def test_out_of_order_inside_the_window_gives_the_same_as_in_order(order: list[int], data: st.DataObject) -> None:
     parents = data.draw(st.lists(st.sampled_from("pq"), min_size=12, max_size=12))
@@ -76,14 +75,14 @@ def test_a_sample_as_old_as_the_window_stays_and_one_nanosecond_older_goes() -> 
     assert not samples.covers(9)
 
 
-def test_late_data_are_taken_up_to_the_edge_of_the_window_and_expire_beyond_it() -> None:
+def test_late_samples_are_inserted_inside_the_window_and_expire_outside() -> None:
     samples = history(keep=10, stamps=[100])
     assert samples.insert("parent", 89, row(0.0), "") is EXPIRED
     assert samples.insert("parent", 90, row(90.0), "") is INSERTED
     assert (samples.oldest, len(samples)) == (90, 2)
 
 
-def test_what_expired_leaves_no_trace() -> None:
+def test_an_expired_sample_changes_nothing() -> None:
     samples = history(keep=10, stamps=[95, 100])
     before = samples.edge()
     assert samples.insert("other parent", 89, row(0.0), "late") is EXPIRED
@@ -121,7 +120,7 @@ def test_of_two_samples_at_one_stamp_the_last_one_wins(stamp: int) -> None:
     assert samples.authority == ("corrected" if stamp == 3 else "")
 
 
-def test_the_same_sample_a_hundred_times_is_one_sample() -> None:
+def test_a_repeated_sample_is_stored_once() -> None:
     samples = history()
     outcomes = [samples.insert("parent", 5, row(1.0), "") for _ in range(100)]
     assert outcomes == [INSERTED] + [REPLACED] * 99
@@ -154,7 +153,7 @@ def test_outside_the_window_the_parent_is_that_of_the_nearest_sample() -> None:
 
 # The window's slack, a sixteenth, is ten here: what has left the window is still in memory when the parent changes.
 @pytest.mark.parametrize("switch", [200, 165, 170, 175])
-def test_an_old_parent_is_forgotten_with_the_last_sample_in_the_window_that_names_it(switch: int) -> None:
+def test_a_parent_is_forgotten_with_the_last_sample_in_the_window_that_names_it(switch: int) -> None:
     samples = history(keep=160, stamps=range(switch))
     for stamp in range(switch, switch + 200):
         samples.insert("new", stamp, row(0.0), "")
@@ -164,7 +163,7 @@ def test_an_old_parent_is_forgotten_with_the_last_sample_in_the_window_that_name
         assert samples.parent_at(oldest) == ("parent" if oldest < switch else "new")
 
 
-def test_an_edge_that_changes_its_parent_says_that_paths_changed_and_one_that_goes_on_does_not() -> None:
+def test_a_new_parent_sets_changed_and_another_sample_of_the_same_parent_does_not() -> None:
     samples = history(keep=10, stamps=[0, 1])
     assert not samples.changed
     samples.insert("new", 2, row(0.0), "")
@@ -174,7 +173,7 @@ def test_an_edge_that_changes_its_parent_says_that_paths_changed_and_one_that_go
     assert samples.changed, "the last sample on the old parent has left the window"
 
 
-def test_a_longer_past_says_that_paths_changed() -> None:
+def test_an_older_oldest_sample_sets_changed() -> None:
     samples = history(stamps=[10, 20])
     samples.insert("parent", 15, row(0.0), "")
     assert not samples.changed
@@ -190,7 +189,7 @@ def test_a_static_sample_holds_at_every_stamp() -> None:
     assert samples.authority == "urdf"
 
 
-def test_a_new_static_sample_replaces_the_old_one_parent_included() -> None:
+def test_a_new_static_sample_replaces_the_old_one_and_its_parent() -> None:
     samples = FrameHistory("child", "parent", static=True, keep=10)
     samples.insert_static("parent", 0, row(1.0), "")
     assert samples.insert_static("parent", 1, row(1.0), "") is REPLACED
@@ -221,7 +220,7 @@ def test_a_moving_sample_drops_the_static_one() -> None:
     assert not samples.covers(50)
 
 
-def test_clear_drops_the_samples_and_remembers_the_newest_parent() -> None:
+def test_clear_drops_the_samples_and_keeps_the_newest_parent() -> None:
     samples = history(keep=10, stamps=[100])
     samples.insert("new", 105, row(0.0), "sender")
     samples.clear()
@@ -230,7 +229,7 @@ def test_clear_drops_the_samples_and_remembers_the_newest_parent() -> None:
     assert samples.insert("new", 3, row(1.0), "") is INSERTED, "the window starts anew, so time may run again"
 
 
-def test_an_extrapolation_has_all_facts() -> None:
+def test_an_extrapolation_error_has_all_facts() -> None:
     samples = history(stamps=[10, 20])
     samples.insert("parent", 30, row(0.0), "odometry")
     future = samples.extrapolation_error(31)
@@ -250,7 +249,7 @@ def test_one_sample_answers_only_at_its_own_stamp() -> None:
 
 
 @pytest.mark.parametrize("stamp", [5, LATEST])
-def test_an_empty_history_is_short_of_the_future(stamp: int | Latest) -> None:
+def test_an_empty_history_raises_a_future_extrapolation(stamp: int | Latest) -> None:
     error = history().extrapolation_error(stamp)
     assert type(error) is FutureExtrapolationError
     assert (error.oldest, error.newest) == (None, None)
@@ -263,12 +262,11 @@ def test_the_rate_is_the_mean_over_the_window() -> None:
     assert history().edge().rate is None
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 12), st.sampled_from("pq"), st.sampled_from(["", "sender"])), max_size=40),
     st.sampled_from([0, 5, 40, None]),
 )
-def test_the_short_cut_for_the_next_sample_does_what_an_insertion_does(
+def test_the_fast_path_for_the_next_sample_equals_an_insertion(
     steps: list[tuple[int, str, str]], keep: int | None
 ) -> None:
     slow, quick = history(keep), history(keep)
@@ -286,7 +284,7 @@ def test_the_short_cut_for_the_next_sample_does_what_an_insertion_does(
                 assert climb((quick,), at) == climb((slow,), at)
 
 
-def test_the_short_cut_refuses_what_is_not_just_the_next_sample() -> None:
+def test_the_fast_path_refuses_samples_that_are_not_the_next() -> None:
     samples = history(stamps=[10])
     assert not samples.append("parent", 10, row(0.0), "")
     assert not samples.append("parent", 9, row(0.0), "")
@@ -296,7 +294,7 @@ def test_the_short_cut_refuses_what_is_not_just_the_next_sample() -> None:
     assert samples.edge() == history(stamps=[10]).edge()
 
 
-def test_a_copy_shares_nothing() -> None:
+def test_a_copy_is_independent() -> None:
     samples = history(keep=100, stamps=[0, 10])
     samples.insert("other", 20, row(20.0), "sender")
     twin = samples.copy()
@@ -310,7 +308,7 @@ def test_a_copy_shares_nothing() -> None:
     assert samples.newest == 30
 
 
-def test_a_copy_with_another_window_begins_with_what_counts_and_forgets_by_its_own_window() -> None:
+def test_a_copy_with_another_window_has_the_valid_samples_and_expires_by_its_own_window() -> None:
     samples = history(keep=160, stamps=range(0, 170, 5))
     assert (samples.oldest, samples.stamps[0]) == (5, 0), "one sample that does not count any more is still there"
     long, short = samples.copy_within(None), samples.copy_within(100)
@@ -322,7 +320,7 @@ def test_a_copy_with_another_window_begins_with_what_counts_and_forgets_by_its_o
     assert (short.oldest, long.oldest, samples.newest) == (70, 1, 165)
 
 
-def test_a_copy_with_a_shorter_window_knows_no_parent_that_has_left_it() -> None:
+def test_a_copy_with_a_shorter_window_has_no_parent_outside_it() -> None:
     samples = history(keep=100, stamps=[0, 10])
     samples.insert("other", 20, row(20.0), "sender")
     both, one = samples.copy_within(20), samples.copy_within(5)
@@ -331,7 +329,7 @@ def test_a_copy_with_a_shorter_window_knows_no_parent_that_has_left_it() -> None
     assert set(samples.named_parents) == {"parent", "other"}
 
 
-def test_a_static_sample_and_an_empty_history_fit_any_window() -> None:
+def test_a_copy_of_a_static_or_empty_history_may_have_any_window() -> None:
     fixed = FrameHistory("child", "parent", static=True, keep=10)
     fixed.insert_static("parent", 3, row(1.0), "sender")
     assert fixed.copy_within(0).edge() == fixed.edge()
@@ -355,7 +353,7 @@ def test_a_million_samples_take_no_more_than_the_window_and_its_slack() -> None:
     assert len(samples.origins) == len(samples.stamps)
 
 
-def test_the_window_is_kept_after_a_clear_too_though_time_begins_again() -> None:
+def test_the_window_applies_to_earlier_stamps_after_a_clear() -> None:
     samples = history(keep=1_000, stamps=[10**6])
     samples.clear()
     for stamp in range(10_000):
@@ -363,7 +361,7 @@ def test_the_window_is_kept_after_a_clear_too_though_time_begins_again() -> None
         assert len(samples.stamps) < 1_100
 
 
-def test_parents_that_alternate_for_ever_take_no_more_than_the_window() -> None:
+def test_alternating_parents_take_no_more_memory_than_the_window() -> None:
     samples = history(keep=1_000, stamps=[0])
     for stamp in range(1, 20_000):
         samples.insert(f"parent {stamp % 2}", stamp, row(0.0), "")
@@ -374,7 +372,7 @@ def test_parents_that_alternate_for_ever_take_no_more_than_the_window() -> None:
 # What many lookups take
 
 
-def test_the_parent_changes_at_the_first_sample_that_names_another() -> None:
+def test_parent_changes_are_the_stamps_of_samples_with_another_parent_than_before() -> None:
     samples = history(stamps=[10, 20])
     assert samples.parent_changes() == []
     for stamp, parent in ((30, "p"), (40, "p"), (50, "q"), (60, "p")):
@@ -384,11 +382,10 @@ def test_the_parent_changes_at_the_first_sample_that_names_another() -> None:
     assert samples.parent_changes() == [25, 30, 50, 60]
 
 
-@settings(deadline=None)
 @given(
     st.lists(st.tuples(st.integers(0, 30), st.sampled_from("pq")), min_size=1, max_size=20), st.sampled_from([5, None])
 )
-def test_between_two_changes_the_parent_stays(samples: list[tuple[int, str]], keep: int | None) -> None:
+def test_between_two_parent_changes_the_parent_is_constant(samples: list[tuple[int, str]], keep: int | None) -> None:
     made = FrameHistory("child", "p", static=False, keep=keep)
     for stamp, parent in samples:
         made.insert(parent, stamp, row(0.0), "")
@@ -400,9 +397,8 @@ def numpy_rows(samples: Samples) -> npt.NDArray[np.float64]:
     return np.frombuffer(samples.records, np.float64).reshape(-1, 8)[:, 1:]
 
 
-@settings(deadline=None)
 @given(st.permutations(range(8)), st.integers(0, 70), st.integers(0, 70))
-def test_between_two_stamps_numpy_reads_what_was_put_in(order: list[int], one: int, other: int) -> None:
+def test_samples_between_are_read_by_numpy_as_inserted(order: list[int], one: int, other: int) -> None:
     low, high = sorted((one, other))
     samples = FrameHistory("child", "parent", static=False, keep=None)
     for number in order:
@@ -415,7 +411,7 @@ def test_between_two_stamps_numpy_reads_what_was_put_in(order: list[int], one: i
     assert taken.parents is None
 
 
-def test_what_is_taken_is_a_copy_so_that_the_history_can_grow_while_numpy_looks_at_it() -> None:
+def test_samples_between_are_copies() -> None:
     samples = history(stamps=[10, 20, 30])
     taken = samples.samples_between(10, 30)
     stamps, rows = np.frombuffer(taken.stamps, np.int64), numpy_rows(taken)
@@ -425,7 +421,7 @@ def test_what_is_taken_is_a_copy_so_that_the_history_can_grow_while_numpy_looks_
     assert (stamps.tolist(), rows[:, 0].tolist()) == ([10, 20, 30], [10.0, 20.0, 30.0])
 
 
-def test_each_sample_is_taken_with_its_parent_where_there_are_several() -> None:
+def test_samples_between_have_their_parents_if_there_are_several() -> None:
     samples = history(stamps=[10, 20])
     for stamp in (30, 40, 50):
         samples.insert("new", stamp, row(0.0), "")
@@ -433,7 +429,7 @@ def test_each_sample_is_taken_with_its_parent_where_there_are_several() -> None:
     assert (list(taken.stamps), taken.parents) == ([10, 20, 30, 40], ["parent", "parent", "new", "new"])
 
 
-def test_nothing_is_taken_that_has_left_the_window() -> None:
+def test_samples_between_are_inside_the_window() -> None:
     # The window's slack, a sixteenth, is ten here: what has left the window is still in memory.
     samples = history(keep=160, stamps=range(166))
     assert list(samples.samples_between(5, 6).stamps) == [5, 6]

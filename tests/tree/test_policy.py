@@ -14,7 +14,7 @@ def test_three_arguments_make_a_policy_in_nanoseconds() -> None:
     assert policy_of(0.05, 0.5, Hold(0.2)) == Policy(50_000_000, 500_000_000, 200_000_000)
 
 
-def test_what_allows_and_refuses_nothing_is_no_policy() -> None:
+def test_default_arguments_make_no_policy() -> None:
     assert policy_of(0.0, None, None) is None
 
 
@@ -27,12 +27,12 @@ def test_what_allows_and_refuses_nothing_is_no_policy() -> None:
         ((math.inf, None, Hold(math.inf)), Policy(tolerance=STAMP_MAX, hold=STAMP_MAX)),
     ],
 )
-def test_each_may_be_given_alone_and_be_endless(arguments: Any, policy: Policy) -> None:
+def test_each_argument_may_be_given_alone_and_be_infinite(arguments: Any, policy: Policy) -> None:
     assert policy_of(*arguments) == policy
 
 
 @pytest.mark.parametrize("bad", [-1.0, math.nan])
-def test_a_negative_duration_is_refused_with_its_name(bad: float) -> None:
+def test_a_negative_duration_is_an_error_that_names_the_argument(bad: float) -> None:
     with pytest.raises(ValueError, match="tolerance"):
         policy_of(bad, None, None)
     with pytest.raises(ValueError, match="max_gap"):
@@ -42,7 +42,7 @@ def test_a_negative_duration_is_refused_with_its_name(bad: float) -> None:
 
 
 @pytest.mark.parametrize("bad", ["1", None, True])
-def test_what_is_no_number_of_seconds_is_a_type_error(bad: Any) -> None:
+def test_an_argument_that_is_no_number_of_seconds_is_a_type_error(bad: Any) -> None:
     with pytest.raises(TypeError, match="tolerance"):
         policy_of(bad, None, None)
     with pytest.raises(TypeError, match="max_age"):

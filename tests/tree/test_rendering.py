@@ -30,7 +30,7 @@ def labels(picture: str) -> list[str]:
 # Text
 
 
-def test_the_picture_has_a_line_for_each_frame_with_its_facts() -> None:
+def test_the_text_has_a_line_with_the_facts_of_each_frame() -> None:
     assert describe(EDGES).split("\n") == [
         "map",
         "└── base_link  50.0 Hz  age 0 ns  span 2 s  from 'odometry'",
@@ -45,27 +45,27 @@ def test_ages_are_counted_from_now_if_it_is_given() -> None:
     assert "age 0 ns" in describe([MOVING])
 
 
-def test_a_branch_that_goes_on_is_marked_beside_what_hangs_below_it() -> None:
+def test_a_branch_that_continues_is_drawn_beside_its_descendants() -> None:
     picture = describe([edge("map", "a"), edge("a", "b"), edge("map", "c")])
     assert picture.split("\n") == ["map", "├── a      static", "│   └── b  static", "└── c      static"]
 
 
-def test_several_trees_are_drawn_one_after_the_other() -> None:
+def test_several_trees_are_drawn_one_below_the_other() -> None:
     assert labels(describe([edge("odom", "base"), edge("map", "anchor")])) == ["map", "anchor", "odom", "base"]
 
 
-def test_an_empty_tree_has_a_picture_too() -> None:
+def test_an_empty_tree_has_a_text_and_an_empty_yaml() -> None:
     tree = TransformTree()
     assert tree.describe() == "(no frames)"
     assert tree.to_yaml() == "{}\n"
     assert tree.to_dot() == "digraph tf {\n}\n"
 
 
-def test_a_loop_is_drawn_once_and_named() -> None:
+def test_a_loop_is_drawn_once_and_marked() -> None:
     assert labels(describe([edge("b", "a"), edge("a", "b"), edge("map", "c")])) == ["map", "c", "a (in a loop)", "b"]
 
 
-def test_what_hangs_below_a_loop_is_drawn_there_and_is_not_in_the_loop() -> None:
+def test_descendants_of_a_loop_are_drawn_below_it_and_not_marked_as_in_it() -> None:
     picture = describe([edge("c", "b"), edge("b", "c"), edge("c", "a"), edge("a", "tool")])
     assert labels(picture) == ["c (in a loop)", "b", "a", "tool"]
 
@@ -75,14 +75,14 @@ def test_a_frame_on_itself_is_a_loop() -> None:
 
 
 @given(st.dictionaries(st.sampled_from("abcdefgh"), st.sampled_from("abcdefgh"), max_size=8))
-def test_every_frame_of_any_graph_is_drawn_once_whatever_loops_there_are(parents: dict[str, str]) -> None:
+def test_every_frame_of_any_graph_is_drawn_once(parents: dict[str, str]) -> None:
     picture = describe([edge(parent, child) for child, parent in sorted(parents.items())])
     drawn = [label.removesuffix(" (in a loop)") for label in labels(picture)]
     assert sorted(drawn) == sorted({*parents, *parents.values()} or {"(no frames)"})
 
 
 @given(st.dictionaries(st.sampled_from("abcdefgh"), st.sampled_from("abcdefgh"), max_size=8))
-def test_only_a_frame_that_comes_back_to_itself_is_called_in_a_loop(parents: dict[str, str]) -> None:
+def test_only_frames_of_a_loop_are_marked_as_in_it(parents: dict[str, str]) -> None:
     picture = describe([edge(parent, child) for child, parent in sorted(parents.items())])
     named = {label.removesuffix(" (in a loop)") for label in labels(picture) if label.endswith(" (in a loop)")}
     for frame in named:
@@ -101,7 +101,7 @@ def test_a_chain_of_two_thousand_frames_is_drawn_without_recursion() -> None:
 # Graphviz
 
 
-def test_graphviz_gets_an_arrow_for_each_edge_with_rate_and_sender() -> None:
+def test_graphviz_has_an_arrow_for_each_edge_with_rate_and_authority() -> None:
     assert to_dot(EDGES).split("\n") == [
         "digraph tf {",
         '    "base_link" -> "arm" [label="one sample\\ndriver"];',
@@ -114,12 +114,12 @@ def test_graphviz_gets_an_arrow_for_each_edge_with_rate_and_sender() -> None:
 
 
 @pytest.mark.parametrize("name", ["küche", "腕", "🦾", "base link"])
-def test_graphviz_gets_names_of_every_alphabet_as_they_are(name: str) -> None:
+def test_graphviz_keeps_names_of_every_alphabet(name: str) -> None:
     assert f'    "{name}" -> "lidar" [' in to_dot([edge(name, "lidar")])
 
 
 @given(frame_names(), frame_names(), frame_names())
-def test_no_name_breaks_out_of_its_quotes_in_graphviz(parent: str, child: str, authority: str) -> None:
+def test_graphviz_escapes_every_name(parent: str, child: str, authority: str) -> None:
     text = to_dot([replace(STATIC, parent=parent, child=child, authority=authority)])
     quoted = r'"(?:[^"\\\n]|\\.)*"'
     assert re.fullmatch(
@@ -127,7 +127,7 @@ def test_no_name_breaks_out_of_its_quotes_in_graphviz(parent: str, child: str, a
     )
 
 
-def test_graphviz_gets_a_loop_too() -> None:
+def test_graphviz_draws_a_loop() -> None:
     assert to_dot([edge("b", "a"), edge("a", "b")]).count("->") == 2
 
 
@@ -190,7 +190,7 @@ def test_yaml_has_the_keys_of_tf2_and_stamps_in_seconds() -> None:
     }
 
 
-def test_yaml_keeps_every_nanosecond_of_todays_stamps() -> None:
+def test_yaml_keeps_the_nanoseconds_of_stamps_of_today() -> None:
     text = to_yaml([replace(MOVING, oldest=TODAY + 1, newest=TODAY + 2 * SECOND + 4)])
     seconds = TODAY // SECOND
     assert f"  oldest_transform: {seconds}.000000001\n" in text
@@ -198,20 +198,20 @@ def test_yaml_keeps_every_nanosecond_of_todays_stamps() -> None:
     assert "  buffer_length: 2.000000003\n" in text
 
 
-def test_yaml_writes_no_number_that_a_yaml_1_1_parser_takes_for_a_string() -> None:
+def test_yaml_numbers_are_numbers_for_a_yaml_1_1_parser() -> None:
     text = to_yaml([replace(MOVING, samples=2, oldest=0, newest=10_000)])
     assert "  buffer_length: 0.00001\n" in text
     assert "  most_recent_transform: 0.00001\n" in text
 
 
 @given(frame_names(), frame_names(), frame_names())
-def test_yaml_gives_back_every_name(parent: str, child: str, authority: str) -> None:
+def test_yaml_round_trips_every_name(parent: str, child: str, authority: str) -> None:
     text = to_yaml([replace(STATIC, parent=parent, child=child, authority=authority)])
     facts = parsed(text)[child]
     assert (facts["parent"], facts["broadcaster"]) == (parent, authority)
 
 
-def test_yaml_escapes_no_character_in_halves() -> None:
+def test_yaml_escapes_characters_outside_the_basic_plane_whole() -> None:
     assert '"🦾":\n' in to_yaml([edge("map", "🦾")])
 
 
@@ -232,6 +232,6 @@ def test_a_tree_draws_its_own_edges() -> None:
     assert set(parsed(tree.to_yaml())) == {"base_link", "lidar"}
 
 
-def test_a_slow_edge_does_not_look_like_a_dead_one() -> None:
+def test_the_rate_of_a_slow_edge_is_not_zero() -> None:
     slow = Edge("map", "dock", static=False, samples=2, oldest=0, newest=50 * SECOND, authority="")
     assert "0.02 Hz" in describe([slow])

@@ -2,7 +2,7 @@ from functools import partial
 from itertools import product
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.live_trees import live_tree, tree_over
 from support.samples import any_samples, moving, static
@@ -27,7 +27,7 @@ from tfbus.waiting.waiting_index import Waiter
 
 
 def park(live: LiveTree, target: str, source: str, at: int, woken: list[str]) -> None:
-    """Park a lookup that writes its source down when it is woken."""
+    """Park a lookup that appends its source to `woken` when it is woken."""
     with pytest.raises(TransformLookupError) as caught:
         tree_over(live).lookup(target, source, at)
     waiter = Waiter(Question(target, source, at), 0, lambda: woken.append(source))
@@ -38,7 +38,7 @@ def blockers(live: LiveTree) -> list[type[TransformLookupError]]:
     return [type(pending.blocked_by) for pending in live.waiting.pending()]
 
 
-def test_a_sample_wakes_those_whose_stamp_it_reaches_and_no_others() -> None:
+def test_a_sample_wakes_exactly_the_waiters_whose_stamp_it_covers() -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("map", "a", 1), moving("map", "b", 1)))
@@ -52,7 +52,7 @@ def test_a_sample_wakes_those_whose_stamp_it_reaches_and_no_others() -> None:
     assert [pending.question.at for pending in live.waiting.pending()] == [5, 3]
 
 
-def test_a_sample_that_expires_or_fills_the_past_wakes_nobody_who_waits_for_the_future() -> None:
+def test_an_expired_or_late_sample_does_not_wake_waiters_for_a_later_stamp() -> None:
     live = live_tree(1e-6)
     woken: list[str] = []
     live.insert((moving("map", "a", 9_000), moving("map", "a", 10_000)))
@@ -63,7 +63,7 @@ def test_a_sample_that_expires_or_fills_the_past_wakes_nobody_who_waits_for_the_
 
 
 @pytest.mark.parametrize("sample", [moving("map", "a", 1), moving("a", "child", 1), static("map", "a")])
-def test_a_frame_becomes_known_as_child_or_as_parent(sample: object) -> None:
+def test_the_first_sample_that_names_an_unknown_frame_wakes_its_waiters(sample: object) -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("map", "b", 1),))
@@ -76,7 +76,7 @@ def test_a_frame_becomes_known_as_child_or_as_parent(sample: object) -> None:
 
 
 @pytest.mark.parametrize("root", ["map", "world"])
-def test_two_trees_are_joined_by_a_sample_of_either_root(root: str) -> None:
+def test_a_sample_of_either_root_wakes_a_waiter_for_two_trees(root: str) -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("map", "a", 1), moving("world", "b", 1)))
@@ -96,7 +96,7 @@ def test_two_trees_are_joined_by_a_sample_of_either_root(root: str) -> None:
         pytest.param(moving("map", "a", 0), id="a longer past"),
     ],
 )
-def test_who_asks_below_a_frame_looks_again_when_it_changes_what_its_past_samples_said(sample: object) -> None:
+def test_a_change_of_parent_kind_or_oldest_sample_wakes_the_waiters_below(sample: object) -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("map", "a", 1), moving("map", "b", 1)))
@@ -106,13 +106,13 @@ def test_who_asks_below_a_frame_looks_again_when_it_changes_what_its_past_sample
     assert woken == ["a"]
 
 
-def test_a_removed_frame_wakes_who_asks_for_it_or_below_it() -> None:
+def test_removing_a_frame_wakes_the_waiters_for_it_and_its_descendants() -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("map", "a", 1), moving("map", "b", 1), moving("b", "c", 1)))
     for source in "abc":
         park(live, "map", source, 9, woken)
-    live.remove_frame("nobody")
+    live.remove_frame("unknown")
     assert woken == []
     live.remove_frame("b")
     assert sorted(woken) == ["b", "c"]
@@ -122,7 +122,7 @@ def test_a_removed_frame_wakes_who_asks_for_it_or_below_it() -> None:
     assert tree_over(live).frames() == ["b", "c"]
 
 
-def test_a_root_that_goes_with_its_last_child_wakes_who_asks_for_it() -> None:
+def test_removing_the_last_child_of_a_root_wakes_the_waiters_for_the_root() -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("map", "a", 1), moving("world", "b", 1)))
@@ -131,7 +131,7 @@ def test_a_root_that_goes_with_its_last_child_wakes_who_asks_for_it() -> None:
     assert woken == ["b"]
 
 
-def test_a_reset_drops_moving_samples_keeps_statics_and_wakes_everybody() -> None:
+def test_a_reset_drops_moving_samples_keeps_static_ones_and_wakes_every_waiter() -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("map", "a", 5), static("a", "camera")))
@@ -154,7 +154,7 @@ def test_two_equal_resets_are_two_objects() -> None:
     assert live.last_reset is not first
 
 
-def test_the_end_wakes_everybody_and_its_first_reason_stays() -> None:
+def test_the_end_wakes_every_waiter_and_keeps_its_first_reason() -> None:
     live = live_tree(None)
     woken: list[str] = []
     park(live, "map", "a", 9, woken)
@@ -164,7 +164,7 @@ def test_the_end_wakes_everybody_and_its_first_reason_stays() -> None:
     assert live.end_reason == "the buffer is closed"
 
 
-def test_every_sample_that_was_offered_is_counted_once() -> None:
+def test_statistics_count_every_offered_sample_once() -> None:
     live = live_tree(1.0)
     batch = (moving("map", "a", 5), moving("map", "a", 5, 1.0), static("map", "s"), static("map", "s", x=2.0))
     live.insert(batch)
@@ -185,9 +185,10 @@ def ask(live: LiveTree, question: Question) -> None:
     )
 
 
-@settings(deadline=None)
 @given(st.lists(st.lists(any_samples("abcd", 20), min_size=1, max_size=3), max_size=8), st.sampled_from([None, 8e-9]))
-def test_whoever_is_not_woken_still_has_no_answer(batches: list[list[TransformStamped]], keep: float | None) -> None:
+def test_a_waiter_that_is_not_woken_still_has_no_answer(
+    batches: list[list[TransformStamped]], keep: float | None
+) -> None:
     live, judge = live_tree(keep), TransformTree(keep)
     asleep: set[Question] = set()
     woken = list(QUESTIONS)
@@ -241,7 +242,7 @@ def test_whoever_is_not_woken_still_has_no_answer(batches: list[list[TransformSt
         ),
     ],
 )
-def test_late_data_wake_whom_they_answer(
+def test_late_samples_wake_the_waiters_that_they_answer(
     before: list[TransformStamped], then: TransformStamped, target: str, source: str, at: int | Latest
 ) -> None:
     live = live_tree(None)
@@ -256,7 +257,7 @@ def test_late_data_wake_whom_they_answer(
     assert woken == [source]
 
 
-def test_a_parent_that_flips_wakes_nobody_who_asks_elsewhere() -> None:
+def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "mount")))
     woken: list[str] = []
@@ -270,23 +271,23 @@ def test_a_parent_that_flips_wakes_nobody_who_asks_elsewhere() -> None:
     assert len(live.waiting) == 100
 
 
-def test_one_waiter_that_cannot_be_woken_does_not_keep_the_others_asleep() -> None:
+def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
     woken: list[str] = []
 
-    def gone() -> None:
+    def fail() -> None:
         raise RuntimeError("Event loop is closed")
 
     with pytest.raises(TransformLookupError) as caught:
         tree_over(live).lookup("map", "a", 9)
-    live.waiting.park(Waiter(Question("map", "a", 9), 0, gone), caught.value)
+    live.waiting.park(Waiter(Question("map", "a", 9), 0, fail), caught.value)
     park(live, "map", "a", 9, woken)
     live.insert((moving("map", "a", 9),))
     assert woken == ["a"]
 
 
-def test_only_its_bus_changes_the_tree_of_a_buffer() -> None:
+def test_changing_the_tree_of_a_buffer_directly_is_an_error() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
     for change in (
@@ -301,36 +302,36 @@ def test_only_its_bus_changes_the_tree_of_a_buffer() -> None:
     assert (tree_over(live).latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)
 
 
-def test_whoever_asks_hears_once_of_the_end_or_at_once_of_one_that_was() -> None:
+def test_an_end_callback_is_called_once_or_at_once_after_the_end() -> None:
     live = live_tree(10.0)
-    heard: list[str] = []
-    live.on_end(lambda: heard.append("early"))
-    live.on_end(lambda: heard.append("gone")).close()
+    calls: list[str] = []
+    live.on_end(lambda: calls.append("early"))
+    live.on_end(lambda: calls.append("closed")).close()
     assert live.has_waiters
     live.end("the bus is closed")
-    assert heard == []
+    assert calls == []
     live.call_end_callbacks()
     live.call_end_callbacks()
-    assert heard == ["early"]
-    live.on_end(lambda: heard.append("late"))
-    assert heard == ["early", "late"]
+    assert calls == ["early"]
+    live.on_end(lambda: calls.append("late"))
+    assert calls == ["early", "late"]
     assert not live.has_waiters
 
 
-def test_what_raises_at_the_end_is_logged_and_does_not_keep_it_from_the_others(
+def test_an_error_of_an_end_callback_is_logged_and_the_others_are_called(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     live = live_tree(10.0)
-    heard: list[str] = []
+    calls: list[str] = []
     live.on_end(lambda: 1 / 0)
-    live.on_end(lambda: heard.append("told"))
+    live.on_end(lambda: calls.append("called"))
     live.end("the bus is closed")
     live.call_end_callbacks()
-    assert heard == ["told"]
+    assert calls == ["called"]
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_an_emptied_loop_that_is_dropped_wakes_who_asked_through_it() -> None:
+def test_forgetting_edges_without_samples_that_form_a_loop_wakes_the_waiters_below() -> None:
     live = live_tree(None)
     woken: list[str] = []
     live.insert((moving("b", "c", 11), moving("a", "b", 10)))
@@ -338,7 +339,7 @@ def test_an_emptied_loop_that_is_dropped_wakes_who_asked_through_it() -> None:
     with pytest.raises(TransformLookupError) as caught:
         tree_over(live).lookup("c", "b")
     live.waiting.park(Waiter(Question("c", "b", LATEST), 0, lambda: woken.append("b")), caught.value)
-    # Now c hangs on a, and b, which hung on a and carried c, is an edge of the past.
+    # Now a is the parent of c, and the edges that the reset left without samples are contradicted.
     live.insert((static("a", "c"),))
     live.insert((moving("a", "b", 10),))
     assert tree_over(live).can_transform("c", "b")

@@ -31,7 +31,7 @@ def unknown(frame: str) -> UnknownFrameError:
     return UnknownFrameError(frame=frame)
 
 
-def apart(target_root: str, source_root: str) -> DisconnectedError:
+def disconnected(target_root: str, source_root: str) -> DisconnectedError:
     return DisconnectedError(target="t", source="s", roots=(target_root, source_root))
 
 
@@ -43,15 +43,15 @@ def parked(index: WaitingIndex, error: TransformLookupError) -> Waiter:
 
 @pytest.mark.parametrize(
     ("error", "frames"),
-    [(short_of("tool", 5), ("tool",)), (unknown("tool"), ("tool",)), (apart("map", "odom"), ("map", "odom"))],
+    [(short_of("tool", 5), ("tool",)), (unknown("tool"), ("tool",)), (disconnected("map", "odom"), ("map", "odom"))],
 )
-def test_what_blocks_a_lookup_names_the_frames_that_can_help(
+def test_blocking_frames_are_the_frames_whose_samples_can_help(
     error: TransformLookupError, frames: tuple[str, ...]
 ) -> None:
     assert blocking_frames(error) == frames
 
 
-def test_what_waiting_cannot_help_is_not_parked() -> None:
+def test_parking_with_an_error_that_waiting_cannot_help_is_a_type_error() -> None:
     index = WaitingIndex()
     with pytest.raises(TypeError, match="waiting cannot help"):
         index.park(waiter(), PastExtrapolationError(child="tool", stamp=1, oldest=2, newest=3))
@@ -59,37 +59,30 @@ def test_what_waiting_cannot_help_is_not_parked() -> None:
     assert index.pop_all() == []
 
 
-def test_an_edge_takes_whoever_needs_no_more_than_its_newest_stamp_in_order_of_stamp() -> None:
+def test_pop_unblocked_gives_the_waiters_up_to_the_newest_stamp_in_order_of_stamp() -> None:
     index = WaitingIndex()
     late, early, exact, first = (parked(index, short_of("tool", stamp)) for stamp in (11, 5, 10, 1))
+    assert index.pop_unblocked("base", 100) == []
     assert index.pop_unblocked("tool", 0) == []
     assert index.pop_unblocked("tool", 10) == [first, early, exact]
     assert index.pop_unblocked("tool", 10) == []
     assert index.pop_unblocked("tool", 11) == [late]
 
 
-def test_who_needs_the_same_stamp_is_taken_in_order_of_arrival() -> None:
+def test_waiters_for_one_stamp_are_given_in_order_of_arrival() -> None:
     index = WaitingIndex()
     waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
     assert index.pop_unblocked("tool", 7) == waiters
 
 
-def test_who_needs_any_sample_of_an_edge_is_taken_by_the_first_whatever_its_stamp() -> None:
+def test_a_waiter_for_any_sample_is_given_at_the_first_stamp() -> None:
     index = WaitingIndex()
-    anyone = parked(index, short_of("tool", LATEST))
+    waiting = parked(index, short_of("tool", LATEST))
     assert index.pop_unblocked("tool", None) == []
-    assert index.pop_unblocked("tool", -(2**63)) == [anyone]
+    assert index.pop_unblocked("tool", -(2**63)) == [waiting]
 
 
-def test_another_edge_takes_nobody() -> None:
-    index = WaitingIndex()
-    parked(index, short_of("tool", 1))
-    parked(index, unknown("camera"))
-    assert index.pop_unblocked("base", 100) == []
-    assert len(index) == 2
-
-
-def test_an_unknown_frame_takes_its_waiters_once_somebody_names_it() -> None:
+def test_a_waiter_for_an_unknown_frame_is_given_once_the_frame_is_named() -> None:
     index = WaitingIndex()
     waiting = parked(index, unknown("camera"))
     assert index.pop_unblocked("camera", None) == [waiting]
@@ -97,51 +90,51 @@ def test_an_unknown_frame_takes_its_waiters_once_somebody_names_it() -> None:
 
 
 @pytest.mark.parametrize(("first", "second"), [("map", "odom"), ("odom", "map")])
-def test_either_root_takes_who_waits_for_two_trees_to_join_and_only_once(first: str, second: str) -> None:
+def test_a_waiter_for_two_trees_is_given_once_by_either_root(first: str, second: str) -> None:
     index = WaitingIndex()
-    waiting = parked(index, apart("map", "odom"))
+    waiting = parked(index, disconnected("map", "odom"))
     assert index.pop_unblocked(first, 3) == [waiting]
     assert index.pop_unblocked(second, 3) == []
     assert not index.by_frame
 
 
-def test_who_waits_under_two_roots_leaves_the_other_waiters_there() -> None:
+def test_giving_a_waiter_for_two_trees_keeps_the_others_under_its_roots() -> None:
     index = WaitingIndex()
-    joined = parked(index, apart("map", "odom"))
-    other = parked(index, apart("odom", "robot"))
+    joined = parked(index, disconnected("map", "odom"))
+    other = parked(index, disconnected("odom", "robot"))
     stamped = parked(index, short_of("odom", 50))
     assert index.pop_unblocked("map", 1) == [joined]
     assert index.pop_unblocked("odom", 50) == [other, stamped]
 
 
-def test_a_removed_waiter_is_never_taken_and_removing_it_again_does_nothing() -> None:
+def test_a_removed_waiter_is_never_given_and_a_second_removal_does_nothing() -> None:
     index = WaitingIndex()
-    errors = (short_of("tool", 5), short_of("tool", LATEST), unknown("camera"), apart("map", "odom"))
+    errors = (short_of("tool", 5), short_of("tool", LATEST), unknown("camera"), disconnected("map", "odom"))
     waiters = [parked(index, error) for error in errors]
     stays = parked(index, short_of("tool", 5))
-    for gone in (*waiters, *waiters):
-        index.remove(gone)
+    for removed in (*waiters, *waiters):
+        index.remove(removed)
     assert len(index) == 1
     assert set(index.by_frame) == {"tool"}
     assert index.pop_all() == [stays]
 
 
-def test_removing_one_of_many_with_the_same_stamp_removes_that_one() -> None:
+def test_removing_one_of_several_waiters_for_one_stamp_keeps_the_others() -> None:
     index = WaitingIndex()
     waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
     index.remove(waiters[2])
     assert index.pop_unblocked("tool", 7) == waiters[:2] + waiters[3:]
 
 
-def test_take_all_takes_everybody_in_order_of_arrival_and_leaves_nothing() -> None:
+def test_pop_all_gives_every_waiter_in_order_of_arrival_and_empties_the_index() -> None:
     index = WaitingIndex()
-    errors = (unknown("camera"), short_of("tool", 9), apart("map", "odom"), short_of("tool", 1))
+    errors = (unknown("camera"), short_of("tool", 9), disconnected("map", "odom"), short_of("tool", 1))
     waiters = [parked(index, error) for error in errors]
     assert index.pop_all() == waiters
     assert (len(index), index.by_frame, index.pending(), index.pop_all()) == (0, {}, (), [])
 
 
-def test_a_taken_waiter_can_park_again_under_another_cause() -> None:
+def test_a_given_waiter_can_be_parked_again_with_another_error() -> None:
     index = WaitingIndex()
     waiting = parked(index, unknown("camera"))
     index.pop_unblocked("camera", None)
@@ -150,7 +143,7 @@ def test_a_taken_waiter_can_park_again_under_another_cause() -> None:
     assert index.pop_unblocked("camera", 20) == [waiting]
 
 
-def test_pending_tells_each_question_with_what_blocks_it() -> None:
+def test_pending_lists_each_question_with_its_error() -> None:
     index = WaitingIndex()
     question = Question("map", "camera", 5)
     error = unknown("camera")
@@ -160,14 +153,14 @@ def test_pending_tells_each_question_with_what_blocks_it() -> None:
     assert str(pending) == "'camera' in 'map': frame 'camera' is not known"
 
 
-def test_nobody_is_woken_by_the_index_itself() -> None:
+def test_the_index_wakes_no_waiter_itself() -> None:
     woken: list[str] = []
     index = WaitingIndex()
     for name in ("first", "second"):
         index.park(waiter(partial(woken.append, name)), unknown("camera"))
-    taken = index.pop_unblocked("camera", None)
+    given = index.pop_unblocked("camera", None)
     assert woken == []
-    for waiting in taken:
+    for waiting in given:
         waiting.wake()
     assert woken == ["first", "second"]
 
@@ -177,40 +170,40 @@ STAMPS = st.integers(-3, 3)
 ERRORS = st.one_of(
     st.builds(short_of, FRAMES, STAMPS | st.just(LATEST)),
     st.builds(unknown, FRAMES),
-    st.permutations("abc").map(lambda names: apart(names[0], names[1])),
+    st.permutations("abc").map(lambda names: disconnected(names[0], names[1])),
 )
 
 
 class IndexMachine(RuleBasedStateMachine):
-    """The index against one list that is searched from end to end."""
+    """The index compared with a list that is searched linearly."""
 
     def __init__(self) -> None:
         super().__init__()
         self.index = WaitingIndex()
         self.model: list[tuple[Waiter, TransformLookupError]] = []
-        self.gone: list[Waiter] = []
+        self.removed: list[Waiter] = []
 
     @rule(error=ERRORS)
     def park(self, error: TransformLookupError) -> None:
         self.model.append((parked(self.index, error), error))
 
-    @precondition(lambda self: self.gone)
+    @precondition(lambda self: self.removed)
     @rule(error=ERRORS, data=st.data())
     def park_again(self, error: TransformLookupError, data: st.DataObject) -> None:
-        again = data.draw(st.sampled_from(self.gone))
-        self.gone.remove(again)
+        again = data.draw(st.sampled_from(self.removed))
+        self.removed.remove(again)
         self.index.park(again, error)
         self.model.append((again, error))
 
-    @precondition(lambda self: self.model or self.gone)
+    @precondition(lambda self: self.model or self.removed)
     @rule(data=st.data())
     def remove(self, data: st.DataObject) -> None:
-        removed = data.draw(st.sampled_from([*(waiting for waiting, _ in self.model), *self.gone]))
+        removed = data.draw(st.sampled_from([*(waiting for waiting, _ in self.model), *self.removed]))
         self.index.remove(removed)
         self.leave([removed])
 
     @rule(frame=FRAMES, newest=STAMPS | st.none())
-    def take(self, frame: str, newest: int | None) -> None:
+    def pop_unblocked(self, frame: str, newest: int | None) -> None:
         for_any: list[Waiter] = []
         by_stamp: list[tuple[int | float, Waiter]] = []
         for waiting, error in self.model:
@@ -234,8 +227,8 @@ class IndexMachine(RuleBasedStateMachine):
 
     def leave(self, waiters: list[Waiter]) -> None:
         for waiting in waiters:
-            if waiting not in self.gone:
-                self.gone.append(waiting)
+            if waiting not in self.removed:
+                self.removed.append(waiting)
         self.model = [place for place in self.model if place[0] not in waiters]
 
     @invariant()

@@ -1,6 +1,6 @@
 from itertools import permutations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.live_trees import live_tree, tree_over
 from support.samples import any_samples, moving, static
@@ -11,7 +11,7 @@ from tfbus.waiting.watch_index import WatchState
 
 
 class Watcher:
-    """A watch that writes down how often it was woken."""
+    """A watch that counts how often it was woken."""
 
     def __init__(self, live: LiveTree, target: str, source: str) -> None:
         self.live = live
@@ -22,8 +22,8 @@ class Watcher:
     def _woken(self) -> None:
         self.woken += 1
 
-    def look(self) -> TransformStamped | None:
-        """The answer, which is followed from now on; None while there is none."""
+    def read(self) -> TransformStamped | None:
+        """Look the answer up and watch its path; None while there is no answer."""
         try:
             answer = tree_over(self.live).lookup(self.state.target, self.state.source)
         except TransformLookupError:
@@ -34,24 +34,24 @@ class Watcher:
         return answer
 
 
-def under(live: LiveTree) -> set[str]:
+def watched_frames(live: LiveTree) -> set[str]:
     return set(live.watching.by_frame)
 
 
-def test_an_answer_is_kept_under_the_edges_that_it_is_made_of() -> None:
+def test_an_answer_is_indexed_by_the_edges_of_its_path() -> None:
     live = live_tree(None)
     live.insert((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1), static("b", "c")))
     watcher = Watcher(live, "a", "c")
-    assert under(live) == set()
-    watcher.look()
-    assert under(live) == {"a", "b", "c"}
+    assert watched_frames(live) == set()
+    watcher.read()
+    assert watched_frames(live) == {"a", "b", "c"}
 
 
-def test_the_first_batch_wakes_and_those_that_follow_are_only_counted() -> None:
+def test_the_first_batch_on_the_path_wakes_and_later_ones_are_only_counted() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1), moving("a", "b", 1)))
     watcher = Watcher(live, "map", "b")
-    watcher.look()
+    watcher.read()
     live.insert((moving("map", "other", 2),))
     assert (watcher.woken, watcher.state.outdated, watcher.state.updates) == (0, False, 0)
     live.insert((moving("map", "a", 2), moving("a", "b", 2), moving("a", "b", 3)))
@@ -59,109 +59,109 @@ def test_the_first_batch_wakes_and_those_that_follow_are_only_counted() -> None:
     assert (watcher.woken, watcher.state.outdated, watcher.state.updates) == (1, True, 2)
 
 
-def test_who_has_no_answer_hears_of_no_sample() -> None:
+def test_a_watch_without_an_answer_is_woken_by_no_sample() -> None:
     live = live_tree(None)
     watcher = Watcher(live, "map", "a")
-    assert watcher.look() is None
+    assert watcher.read() is None
     live.insert((moving("map", "a", 1),))
     assert (watcher.woken, watcher.state.updates) == (0, 0)
-    watcher.look()
+    watcher.read()
     live.remove_frame("a")
     assert watcher.woken == 1
-    assert watcher.look() is None
-    assert under(live) == set()
+    assert watcher.read() is None
+    assert watched_frames(live) == set()
 
 
-def test_for_as_long_as_a_frame_has_had_two_parents_the_ways_by_both_are_followed() -> None:
+def test_the_paths_over_both_parents_are_watched_while_both_are_in_the_window() -> None:
     live = live_tree(5e-9)
     live.insert((moving("map", "left", 1), moving("map", "right", 1), moving("left", "box", 1)))
     watcher = Watcher(live, "map", "box")
     live.insert((moving("right", "box", 3),))
-    # The answer is that of stamp 1, when the box was on the left; how far to go, the newest samples say.
-    watcher.look()
-    assert under(live) == {"left", "right", "box"}
+    # The answer is that of stamp 1, under 'left'; the newest common stamp is that of the newest path.
+    watcher.read()
+    assert watched_frames(live) == {"left", "right", "box"}
     live.insert((moving("map", "left", 9), moving("map", "right", 9), moving("right", "box", 9)))
-    watcher.look()
-    assert under(live) == {"right", "box"}
+    watcher.read()
+    assert watched_frames(live) == {"right", "box"}
 
 
-def test_late_samples_that_close_a_loop_round_the_way_flag_it() -> None:
+def test_late_samples_that_form_a_loop_in_the_past_make_watches_outdated() -> None:
     live = live_tree(None)
     live.insert((moving("a", "c", 0),))
     live.insert((moving("a", "b", 0), moving("c", "b", 1), moving("d", "a", 1)))
-    # At stamp 0 b hung on a, and now a on b.
+    # At stamp 0, a is the parent of b, and soon b the parent of a.
     watchers = [Watcher(live, target, source) for target, source in permutations("abc", 2)]
-    answers = [watcher.look() for watcher in watchers]
+    answers = [watcher.read() for watcher in watchers]
     live.insert((moving("b", "a", 0, 1.0),))
-    flagged = [watcher for watcher in watchers if watcher.state.outdated]
-    changed = [watcher for watcher, answer in zip(watchers, answers, strict=True) if watcher.look() != answer]
+    outdated = [watcher for watcher in watchers if watcher.state.outdated]
+    changed = [watcher for watcher, answer in zip(watchers, answers, strict=True) if watcher.read() != answer]
     assert changed
-    assert set(changed) <= set(flagged)
-    assert {watcher.woken for watcher in flagged} == {1}
+    assert set(changed) <= set(outdated)
+    assert {watcher.woken for watcher in outdated} == {1}
 
 
-def test_another_parent_elsewhere_flags_nobody_whose_own_frames_have_kept_theirs() -> None:
+def test_a_change_of_parent_off_the_path_does_not_make_a_watch_outdated() -> None:
     live = live_tree(None)
     live.insert((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1)))
     watcher = Watcher(live, "map", "a")
-    watcher.look()
+    watcher.read()
     live.insert((moving("mars", "map", 2),))
     live.insert((moving("a", "b", 2),))
     live.insert((moving("map", "new", 2),))
     assert (watcher.woken, watcher.state.outdated) == (0, False)
 
 
-def test_a_reset_flags_and_wakes_everybody_and_keeps_them_in() -> None:
+def test_a_reset_makes_every_watch_outdated_and_keeps_it_registered() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 5),))
-    answered, waiting = Watcher(live, "map", "a"), Watcher(live, "map", "nobody")
-    answered.look()
+    answered, waiting = Watcher(live, "map", "a"), Watcher(live, "map", "unknown")
+    answered.read()
     live.reset(5, 2)
     for watcher in (answered, waiting):
         assert (watcher.woken, watcher.state.outdated) == (1, True)
         assert isinstance(watcher.state.reset, ClockResetError)
-    assert (len(live.watching), under(live)) == (2, set())
+    assert (len(live.watching), watched_frames(live)) == (2, set())
 
 
-def test_the_end_wakes_everybody_and_takes_them_out_for_good() -> None:
+def test_the_end_wakes_and_removes_every_watch() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 5),))
-    watchers = [Watcher(live, "map", "a"), Watcher(live, "map", "nobody")]
-    watchers[0].look()
+    watchers = [Watcher(live, "map", "a"), Watcher(live, "map", "unknown")]
+    watchers[0].read()
     live.end("the bus is closed")
     assert [(watcher.woken, watcher.state.ended) for watcher in watchers] == [(1, True), (1, True)]
-    assert watchers[0].look() is not None
-    assert (len(live.watching), under(live)) == (0, set())
+    assert watchers[0].read() is not None
+    assert (len(live.watching), watched_frames(live)) == (0, set())
 
 
-def test_a_watch_that_is_taken_out_leaves_the_others_under_the_same_frame() -> None:
+def test_removing_a_watch_keeps_the_others_under_its_frames() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
     going, staying = Watcher(live, "map", "a"), Watcher(live, "a", "map")
     for watcher in (going, staying):
-        watcher.look()
+        watcher.read()
     for _ in range(2):
         live.watching.remove(going.state)
     live.insert((moving("map", "a", 2),))
     assert (going.woken, staying.woken, len(live.watching)) == (0, 1, 1)
 
 
-def test_one_watch_that_cannot_be_woken_does_not_keep_the_others_asleep() -> None:
+def test_an_error_of_one_watch_does_not_keep_others_from_being_woken() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
 
-    def gone() -> None:
+    def fail() -> None:
         raise RuntimeError("Event loop is closed")
 
     first, second = Watcher(live, "map", "a"), Watcher(live, "map", "a")
-    first.state.wake = gone
+    first.state.wake = fail
     for watcher in (first, second):
-        watcher.look()
+        watcher.read()
     live.insert((moving("map", "a", 2),))
     assert second.woken == 1
 
 
-def test_whether_a_task_waits_here_is_known() -> None:
+def test_a_waiting_watch_counts_as_a_waiter() -> None:
     live = live_tree(None)
     watcher = Watcher(live, "map", "a")
     assert not live.has_waiters
@@ -169,14 +169,13 @@ def test_whether_a_task_waits_here_is_known() -> None:
     assert live.has_waiters
 
 
-@settings(deadline=None)
 @given(st.lists(st.lists(any_samples("abcd", 20), min_size=1, max_size=3), max_size=8), st.sampled_from([None, 8e-9]))
-def test_whoever_has_no_flag_has_the_same_answer_as_before(
+def test_a_watch_that_is_not_outdated_has_the_same_answer_as_before(
     batches: list[list[TransformStamped]], keep: float | None
 ) -> None:
     live, judge = live_tree(keep), TransformTree(keep)
     watchers = [Watcher(live, target, source) for target, source in permutations("abcd", 2)]
-    answers = [watcher.look() for watcher in watchers]
+    answers = [watcher.read() for watcher in watchers]
     for batch in batches:
         try:
             judge.insert_many(batch)
@@ -185,7 +184,6 @@ def test_whoever_has_no_flag_has_the_same_answer_as_before(
         live.insert(tuple(batch))
         for place, watcher in enumerate(watchers):
             if watcher.state.outdated:
-                answers[place] = watcher.look()
+                answers[place] = watcher.read()
             else:
-                # A frame in itself is left out: with its last child it can become unknown, which changes no answer.
                 assert tree_over(live).lookup(watcher.state.target, watcher.state.source) == answers[place]
