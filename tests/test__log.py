@@ -24,14 +24,14 @@ def test_info_is_logged_once_too(caplog: pytest.LogCaptureFixture) -> None:
     assert caplog.record_tuples == [("tests.once", logging.INFO, "first base")]
 
 
-def test_another_key_is_logged_even_with_the_same_words(caplog: pytest.LogCaptureFixture) -> None:
+def test_another_key_is_logged_even_with_the_same_message(caplog: pytest.LogCaptureFixture) -> None:
     once = OnceLogger(LOGGER)
     once.warning(("cycle", "base"), "dropped")
     once.warning(("cycle", "laser"), "dropped")
     assert caplog.messages == ["dropped", "dropped"]
 
 
-def test_two_loggers_do_not_share_what_they_have_seen(caplog: pytest.LogCaptureFixture) -> None:
+def test_two_loggers_do_not_share_their_keys(caplog: pytest.LogCaptureFixture) -> None:
     OnceLogger(LOGGER).warning("key", "first")
     OnceLogger(LOGGER).warning("key", "second")
     assert caplog.messages == ["first", "second"]

@@ -132,7 +132,7 @@ def documented_tree() -> Iterator[tuple[str, str | None, str | None, list[str]]]
             above[depth:] = [name]
 
 
-def test_the_samples_of_this_file_have_every_class() -> None:
+def test_the_examples_of_this_file_have_every_class() -> None:
     assert {type(error) for error, _ in ONE_OF_EACH} == set(CLASSES.values())
 
 
@@ -144,7 +144,7 @@ def test_the_classes_form_the_tree_that_the_docstring_draws() -> None:
         assert set(CLASSES[name].__bases__) == bases, name
 
 
-def test_the_tree_is_the_one_that_programs_catch_by() -> None:
+def test_subclasses_are_caught_by_their_documented_bases() -> None:
     assert issubclass(TransformLookupError, LookupError)
     assert issubclass(InvalidTransformError, ValueError)
     assert issubclass(LookupTimeoutError, TimeoutError)
@@ -154,7 +154,7 @@ def test_the_tree_is_the_one_that_programs_catch_by() -> None:
     assert not issubclass(BusClosedError, LookupError)
 
 
-def test_every_attribute_that_the_docstring_draws_is_there() -> None:
+def test_every_attribute_in_the_docstring_exists() -> None:
     drawn = {name: attributes for name, _, _, attributes in documented_tree()}
     for error, _ in ONE_OF_EACH:
         for kind in type(error).__mro__:
@@ -169,7 +169,7 @@ def test_every_error_class_is_exported() -> None:
 
 
 @pytest.mark.parametrize(("error", "text"), ONE_OF_EACH, ids=lambda value: type(value).__name__)
-def test_a_message_says_what_was_asked_what_there_is_and_the_gap(error: TransformError, text: str) -> None:
+def test_a_message_has_the_question_the_facts_and_the_difference(error: TransformError, text: str) -> None:
     assert str(error) == text
     assert repr(error) == f"{type(error).__name__}({text!r})"
 
@@ -203,7 +203,7 @@ def test_a_message_says_what_was_asked_what_there_is_and_the_gap(error: Transfor
         (BusClosedError("the buffer is closed"), "the buffer is closed"),
     ],
 )
-def test_a_message_leaves_out_what_is_not_known(error: TransformError, text: str) -> None:
+def test_a_message_omits_unknown_facts(error: TransformError, text: str) -> None:
     assert str(error) == text
 
 
@@ -262,7 +262,7 @@ class Names:
         return iter(("map", "base_link"))
 
 
-def test_similar_names_are_worked_out_once_and_only_when_somebody_looks() -> None:
+def test_similar_names_are_computed_once_when_first_read() -> None:
     names = Names()
     error = UnknownFrameError(frame="base_lnik", known=names)
     assert error.frame == "base_lnik"
@@ -279,7 +279,7 @@ def test_the_most_similar_name_comes_first() -> None:
     assert "map" not in error.close_matches
 
 
-def test_a_leading_slash_is_what_is_wrong_with_a_name() -> None:
+def test_the_message_of_an_unknown_frame_names_a_leading_slash() -> None:
     error = UnknownFrameError(frame="/map", known=("lidar", "map", "maps"))
     assert (error.frame, error.close_matches[0]) == ("/map", "map")
     assert str(error).startswith("frame '/map' is not known, a frame name has no leading slash, did you mean 'map'")
@@ -318,7 +318,7 @@ def test_of_thousands_of_names_only_the_likely_ones_are_compared_in_full(frame: 
     assert CountedName.compared <= errors.LOOKED_AT
 
 
-def test_many_errors_about_one_frame_look_for_similar_names_once() -> None:
+def test_many_errors_about_one_frame_compute_similar_names_once() -> None:
     known = frames_of_many_robots()
     CountedName.compared = 0
     texts = {str(UnknownFrameError(frame="robot5/joint_4_linkk", known=known)) for _ in range(1_000)}
@@ -363,7 +363,7 @@ def assert_same_error(twin: object, error: TransformError) -> None:
         assert twin.close_matches == error.close_matches
 
 
-def test_an_error_nobody_looked_at_pickles_with_its_similar_names() -> None:
+def test_an_unread_error_pickles_with_its_similar_names() -> None:
     names = (name for name in ("map", "base_link"))
     twin: UnknownFrameError = pickle.loads(pickle.dumps(UnknownFrameError(frame="base_lnik", known=names)))
     assert twin.close_matches == ("base_link",)
@@ -375,7 +375,7 @@ def test_notes_survive_pickling() -> None:
     assert pickle.loads(pickle.dumps(error)).__notes__ == ["while the robot drove"]
 
 
-def test_a_copy_without_a_cause_still_shows_what_it_was_raised_from() -> None:
+def test_a_copy_without_a_cause_keeps_its_context() -> None:
     twin = copy.copy(BusClosedError())
     try:
         try:
@@ -399,7 +399,7 @@ class SubclassError(FutureExtrapolationError):
     extra: str
 
 
-def test_a_timeout_is_caught_as_what_it_is_before_os_error() -> None:
+def test_a_timeout_is_caught_by_transform_lookup_error_before_os_error() -> None:
     with pytest.raises(TransformLookupError) as caught:
         raise LookupTimeoutError(target="map", source="tool0", timeout=1.0, missing=SHORT) from SHORT
     assert isinstance(caught.value, OSError)
@@ -410,7 +410,7 @@ LOOKUP_ERRORS = [error for error, _ in ONE_OF_EACH if isinstance(error, Transfor
 
 
 @pytest.mark.parametrize("error", LOOKUP_ERRORS, ids=lambda error: type(error).__name__)
-def test_where_many_stamps_were_asked_for_an_error_says_which_it_was(error: TransformLookupError) -> None:
+def test_the_message_of_an_error_of_many_lookups_has_the_index(error: TransformLookupError) -> None:
     assert error.index is None
     one_of_many = copy.copy(error)
     one_of_many.index = 17

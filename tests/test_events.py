@@ -67,17 +67,17 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
 ]
 
 
-def test_there_is_one_of_each() -> None:
+def test_the_examples_of_this_file_have_every_event() -> None:
     assert {type(event) for event, _ in ONE_OF_EACH} == set(get_args(Event))
 
 
 @pytest.mark.parametrize(("event", "text"), ONE_OF_EACH)
-def test_an_event_reads_as_one_line_that_begins_with_its_stamp(event: Event, text: str) -> None:
+def test_the_text_of_an_event_is_one_line_that_begins_with_its_stamp(event: Event, text: str) -> None:
     assert str(event) == f"12.500 s: {text}"
 
 
 @pytest.mark.parametrize(("event", "text"), ONE_OF_EACH)
-def test_an_event_is_a_value(event: Event, text: str) -> None:
+def test_events_are_frozen_values(event: Event, text: str) -> None:
     with pytest.raises(FrozenInstanceError):
         event.stamp = 0  # type: ignore[misc]
     assert not hasattr(event, "__dict__")

@@ -3,7 +3,7 @@ import pytest
 from tfbus import Registration
 
 
-def test_the_end_of_the_with_takes_it_back_once() -> None:
+def test_the_end_of_the_with_undoes_it_once() -> None:
     undone: list[str] = []
     with Registration(lambda: undone.append("undone")) as registration:
         assert undone == []
@@ -12,7 +12,7 @@ def test_the_end_of_the_with_takes_it_back_once() -> None:
     assert undone == ["undone"]
 
 
-def test_close_inside_the_with_takes_it_back_at_once() -> None:
+def test_close_inside_the_with_undoes_it_at_once() -> None:
     undone: list[str] = []
     with Registration(lambda: undone.append("undone")) as registration:
         registration.close()
@@ -20,14 +20,14 @@ def test_close_inside_the_with_takes_it_back_at_once() -> None:
     assert undone == ["undone"]
 
 
-def test_an_error_in_the_body_takes_it_back_and_passes_through() -> None:
+def test_an_error_in_the_body_undoes_it_and_is_raised() -> None:
     undone: list[str] = []
     with pytest.raises(KeyError), Registration(lambda: undone.append("undone")):
         raise KeyError
     assert undone == ["undone"]
 
 
-def test_closing_from_within_the_undoing_does_not_undo_twice() -> None:
+def test_closing_during_the_undo_does_not_undo_twice() -> None:
     undone: list[str] = []
 
     def undo() -> None:
@@ -39,7 +39,7 @@ def test_closing_from_within_the_undoing_does_not_undo_twice() -> None:
     assert undone == ["undone"]
 
 
-def test_an_undoing_that_fails_is_not_tried_again() -> None:
+def test_a_failed_undo_is_not_repeated() -> None:
     def undo() -> None:
         raise KeyError
 

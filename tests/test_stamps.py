@@ -74,13 +74,13 @@ def test_a_float_stamp_is_a_type_error_that_names_from_seconds(value: object) ->
 
 
 @pytest.mark.parametrize("value", [None, "1", True, np.True_, Fraction(1), Decimal(1), LATEST, np.float32(1), [1]])
-def test_what_is_not_an_integer_is_not_a_stamp(value: object) -> None:
+def test_a_value_that_is_no_integer_is_a_type_error(value: object) -> None:
     with pytest.raises(TypeError, match="int of nanoseconds"):
         as_stamp(value)
 
 
 @pytest.mark.parametrize("value", [-(2**63) - 1, 2**63, 10**30, np.uint64(2**63)])
-def test_a_stamp_fits_64_bits(value: object) -> None:
+def test_a_stamp_beyond_64_bits_is_a_value_error(value: object) -> None:
     with pytest.raises(ValueError, match="64-bit"):
         as_stamp(value)
 
@@ -116,12 +116,12 @@ def test_a_duration_that_is_no_number_is_a_type_error_that_names_the_argument(va
         (1_000_100_000, "1.0001 s"),
     ],
 )
-def test_a_stamp_is_written_with_milliseconds_at_least(stamp: int, text: str) -> None:
+def test_the_text_of_a_stamp_has_at_least_milliseconds(stamp: int, text: str) -> None:
     assert format_stamp(stamp) == text
 
 
 @given(stamps())
-def test_a_written_stamp_is_exact(stamp: int) -> None:
+def test_the_text_of_a_stamp_is_exact(stamp: int) -> None:
     number, unit = format_stamp(stamp).split(" ")
     assert unit == "s"
     assert Fraction(number) * SECOND == stamp
@@ -140,17 +140,17 @@ def test_a_written_stamp_is_exact(stamp: int) -> None:
         (-410_000_000, "-410 ms"),
     ],
 )
-def test_a_duration_is_written_in_the_unit_that_fits(nanoseconds: int, text: str) -> None:
+def test_the_text_of_a_duration_has_the_fitting_unit(nanoseconds: int, text: str) -> None:
     assert format_duration(nanoseconds) == text
 
 
 @given(st.integers(-(2**64), 2**64))
-def test_a_written_duration_is_right_to_three_digits(nanoseconds: int) -> None:
+def test_the_text_of_a_duration_has_three_correct_digits(nanoseconds: int) -> None:
     number, unit = format_duration(nanoseconds).split(" ")
     assert abs(Fraction(number) * UNITS[unit] - nanoseconds) <= abs(Fraction(nanoseconds)) * Fraction(5, 1000)
 
 
-def test_latest_stays_the_one_and_only_when_pickled_or_copied() -> None:
+def test_latest_pickles_and_copies_as_itself() -> None:
     assert pickle.loads(pickle.dumps(LATEST)) is LATEST
     assert copy.deepcopy(LATEST) is LATEST
     assert repr(LATEST) == "LATEST"
@@ -190,14 +190,14 @@ def test_any_integers_become_an_array_of_stamps(values: Any) -> None:
     assert found.tolist() == [int(value) for value in values]
 
 
-def test_what_is_an_array_of_stamps_already_is_not_copied() -> None:
+def test_an_array_of_stamps_is_not_copied() -> None:
     values = np.arange(5)
     assert as_stamps(values) is values
 
 
 @pytest.mark.parametrize("bad", [1.5, 1.0, None, "1", True, np.True_, LATEST, np.float64(1.0), [1]])
 @pytest.mark.parametrize("place", [0, 1, 2])
-def test_what_is_not_an_integer_is_no_stamp_beside_others_either(bad: object, place: int) -> None:
+def test_one_value_that_is_no_integer_makes_a_list_a_type_error(bad: object, place: int) -> None:
     values: list[Any] = [5, 6]
     values.insert(place, bad)
     for sequence in (values, tuple(values)):
@@ -206,23 +206,23 @@ def test_what_is_not_an_integer_is_no_stamp_beside_others_either(bad: object, pl
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32, np.bool_, np.complex128, "M8[s]", "U3"])
-def test_an_array_of_anything_else_is_no_array_of_stamps(dtype: Any) -> None:
+def test_an_array_of_another_type_is_a_type_error(dtype: Any) -> None:
     with pytest.raises(TypeError, match="int of nanoseconds"):
         as_stamps(np.array([1, 0], np.int64).astype(dtype))
 
 
-def test_the_float_among_many_is_named_with_the_way_to_convert_it() -> None:
+def test_a_float_among_many_stamps_is_named_with_from_seconds() -> None:
     with pytest.raises(TypeError, match=r"from_seconds\(2\.5\)"):
         as_stamps([1, 2.5])
 
 
 @pytest.mark.parametrize("values", [[2**63], [-1, 2**63], [2**64, 0], np.array([0, 2**63], np.uint64)])
-def test_many_stamps_fit_64_bits_each(values: Any) -> None:
+def test_one_stamp_beyond_64_bits_among_many_is_a_value_error(values: Any) -> None:
     with pytest.raises(ValueError, match="64-bit"):
         as_stamps(values)
 
 
 @pytest.mark.parametrize("values", [5, [[5], [6]], np.zeros((2, 0), np.int64), np.array(5)])
-def test_many_stamps_are_a_row(values: Any) -> None:
+def test_many_stamps_of_another_shape_are_a_value_error(values: Any) -> None:
     with pytest.raises(ValueError, match=r"shape \(n,\), got \("):
         as_stamps(values)

@@ -18,46 +18,46 @@ PATIENCE = 30.0
 """Real seconds after which a test that hangs is given up."""
 
 
-class Door:
-    """A waker, how often it was answered, and an event for the next time."""
+class CountedWaker:
+    """A waker with the number of its calls, and an event for the next call."""
 
     def __init__(self) -> None:
         self.waker = LoopWaker(self._answer)
-        self.answers = 0
+        self.calls = 0
         self.threads: set[int] = set()
-        self.opened = anyio.Event()
+        self.called = anyio.Event()
 
     def _answer(self) -> None:
-        self.answers += 1
+        self.calls += 1
         self.threads.add(threading.get_ident())
-        self.opened.set()
+        self.called.set()
 
 
-async def test_a_thread_wakes_a_loop_that_has_nothing_else_to_do() -> None:
-    loop = Door()
-    assert not loop.waker.bound
-    loop.waker.bind()
-    assert loop.waker.bound
+async def test_a_thread_wakes_an_idle_loop() -> None:
+    counted = CountedWaker()
+    assert not counted.waker.bound
+    counted.waker.bind()
+    assert counted.waker.bound
     for requests in range(1, 4):
-        loop.opened = anyio.Event()
+        counted.called = anyio.Event()
         with anyio.fail_after(PATIENCE):
             async with anyio.create_task_group() as tasks:
-                tasks.start_soon(anyio.to_thread.run_sync, loop.waker.wake)
-                await loop.opened.wait()
-        assert loop.answers == requests
-    assert loop.threads == {threading.get_ident()}
+                tasks.start_soon(anyio.to_thread.run_sync, counted.waker.wake)
+                await counted.called.wait()
+        assert counted.calls == requests
+    assert counted.threads == {threading.get_ident()}
 
 
 async def test_the_callback_runs_soon_and_once_for_many_requests() -> None:
-    loop = Door()
-    loop.waker.bind()
+    counted = CountedWaker()
+    counted.waker.bind()
     for _ in range(1_000):
-        loop.waker.wake()
-    assert loop.answers == 0
+        counted.waker.wake()
+    assert counted.calls == 0
     await settle()
-    assert loop.answers == 1
+    assert counted.calls == 1
     await settle()
-    assert loop.answers == 1
+    assert counted.calls == 1
 
 
 async def test_a_request_during_the_callback_leads_to_another_call() -> None:
@@ -76,7 +76,7 @@ async def test_a_request_during_the_callback_leads_to_another_call() -> None:
     assert answers == [0, 1, 2, 3, 4]
 
 
-async def test_nothing_that_threads_queue_before_a_request_is_left_behind() -> None:
+async def test_every_item_queued_before_a_wake_is_processed() -> None:
     queue: list[int] = []
     taken: list[int] = []
     everything = anyio.Event()
@@ -116,93 +116,93 @@ def test_an_unbound_waker_raises() -> None:
         LoopWaker(lambda: None).wake()
 
 
-def test_a_waker_is_bound_on_an_event_loop_only() -> None:
-    loop = Door()
+def test_binding_without_an_event_loop_raises() -> None:
+    counted = CountedWaker()
     with pytest.raises(RuntimeError):
-        loop.waker.bind()
-    assert not loop.waker.bound
+        counted.waker.bind()
+    assert not counted.waker.bound
 
 
 @pytest.mark.parametrize("requests", [0, 1])
-def test_every_request_after_the_end_of_the_loop_raises(run: Run, requests: int) -> None:
-    loop = Door()
+def test_every_wake_after_the_end_of_the_loop_raises(run: Run, requests: int) -> None:
+    counted = CountedWaker()
 
     async def leave_with_unanswered_requests() -> None:
-        loop.waker.bind()
+        counted.waker.bind()
         for _ in range(requests):
-            loop.waker.wake()
+            counted.waker.wake()
 
     run(leave_with_unanswered_requests)
-    answers = loop.answers
+    calls = counted.calls
     for _ in range(3):
         with pytest.raises(RuntimeError):
-            loop.waker.wake()
-    assert loop.answers == answers
+            counted.waker.wake()
+    assert counted.calls == calls
 
 
 @pytest.mark.parametrize("requests", [0, 1])
 def test_a_waker_may_be_bound_to_a_later_loop(run: Run, requests: int) -> None:
-    loop = Door()
+    counted = CountedWaker()
 
     async def leave_with_unanswered_requests() -> None:
-        loop.waker.bind()
+        counted.waker.bind()
         for _ in range(requests):
-            loop.waker.wake()
+            counted.waker.wake()
 
     async def answer() -> None:
-        loop.waker.bind()
-        before = loop.answers
-        loop.waker.wake()
+        counted.waker.bind()
+        before = counted.calls
+        counted.waker.wake()
         await settle()
-        assert loop.answers == before + 1
+        assert counted.calls == before + 1
 
     run(leave_with_unanswered_requests)
     for _ in range(2):
         run(answer)
 
 
-def test_a_ring_that_an_ended_loop_has_never_answered_is_told_of_at_the_next_and_forgotten_on_another_loop() -> None:
-    loop = Door()
+def test_a_wake_that_a_closed_loop_never_answered_makes_the_next_one_raise_until_the_waker_is_bound_again() -> None:
+    counted = CountedWaker()
 
     async def connect() -> None:
-        loop.waker.bind()
+        counted.waker.bind()
 
     for _ in range(2):
         native = asyncio.new_event_loop()
         native.run_until_complete(connect())
-        loop.waker.wake()
+        counted.waker.wake()
         native.close()
         for _ in range(2):
             with pytest.raises(RuntimeError):
-                loop.waker.wake()
-        assert loop.answers == 0
+                counted.waker.wake()
+        assert counted.calls == 0
 
     async def answer() -> None:
-        loop.waker.bind()
-        loop.waker.wake()
-        await asyncio.wait_for(loop.opened.wait(), PATIENCE)
+        counted.waker.bind()
+        counted.waker.wake()
+        await asyncio.wait_for(counted.called.wait(), PATIENCE)
 
     asyncio.run(answer())
-    assert loop.answers == 1
+    assert counted.calls == 1
 
 
-def test_a_thread_that_rings_while_the_loop_ends_is_told_of_it(run: Run) -> None:
-    loop = Door()
+def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:
+    counted = CountedWaker()
     begun = threading.Event()
-    told: list[Exception] = []
+    errors: list[Exception] = []
 
-    def ring_on() -> None:
-        while not told:
+    def keep_waking() -> None:
+        while not errors:
             try:
-                loop.waker.wake()
+                counted.waker.wake()
             except RuntimeError as error:
-                told.append(error)
+                errors.append(error)
             begun.set()
 
-    thread = threading.Thread(target=ring_on)
+    thread = threading.Thread(target=keep_waking)
 
     async def serve() -> None:
-        loop.waker.bind()
+        counted.waker.bind()
         thread.start()
         assert begun.wait(PATIENCE)
 

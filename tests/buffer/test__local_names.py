@@ -62,7 +62,9 @@ def two_robots(start: int = 0) -> tuple[SimulatedClock, Bus, list[TransformBroad
     ],
 )
 @pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
-def test_a_bad_prefix_is_refused(make: Callable[..., object], prefix: Any, shared: Any, error: type[Exception]) -> None:
+def test_a_bad_prefix_is_an_error(
+    make: Callable[..., object], prefix: Any, shared: Any, error: type[Exception]
+) -> None:
     bus = Bus(SimulatedClock())
     with pytest.raises(error):
         make(bus, prefix=prefix, shared=shared)
@@ -70,7 +72,7 @@ def test_a_bad_prefix_is_refused(make: Callable[..., object], prefix: Any, share
 
 
 @pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
-def test_who_forgets_the_prefix_is_told(make: Callable[..., object]) -> None:
+def test_shared_frames_without_a_prefix_are_a_type_error(make: Callable[..., object]) -> None:
     bus = Bus(SimulatedClock())
     with pytest.raises(TypeError, match="prefix"):
         make(bus, shared={"map"})
@@ -80,7 +82,7 @@ def test_who_forgets_the_prefix_is_told(make: Callable[..., object]) -> None:
 # Two robots
 
 
-def test_two_robots_with_the_same_frames_do_not_meet() -> None:
+def test_two_robots_with_the_same_local_names_are_separate() -> None:
     _, bus, _, (first, second) = two_robots()
     assert first.lookup_nowait("map", "arm").transform == at_x(1.5)
     assert second.lookup_nowait("map", "arm").transform == at_x(20.5)
@@ -99,7 +101,7 @@ def test_a_buffer_without_a_prefix_sees_one_robot_from_the_other_through_the_map
     assert x_of(everything.tree, "robot2/arm", "robot1/base") == -29.5
 
 
-async def test_answers_have_the_names_that_were_asked() -> None:
+async def test_answers_have_the_local_names_of_the_question() -> None:
     _, _, _, (robot, _) = two_robots()
     for answer in (
         robot.lookup_nowait("map", "arm"),
@@ -111,13 +113,13 @@ async def test_answers_have_the_names_that_were_asked() -> None:
         assert (answer.parent, answer.child, answer.stamp, answer.transform) == ("map", "arm", SECOND, at_x(1.5))
 
 
-def test_an_answer_still_says_what_a_policy_did() -> None:
+def test_an_answer_with_local_names_keeps_its_extrapolation_and_gap() -> None:
     _, _, _, (robot, _) = two_robots()
     found = robot.lookup_nowait("map", "arm", 3 * SECOND, extrapolate=Hold(5.0))
     assert (found.parent, found.child, found.extrapolated_by, found.gap) == ("map", "arm", 2 * SECOND, 0)
 
 
-async def test_data_are_in_local_frames_before_and_after() -> None:
+async def test_data_have_local_names_before_and_after_transform() -> None:
     _, _, _, (_, robot) = two_robots()
     point = PointStamped("arm", LATEST, (0.0, 0.0, 1.0))
     expected = PointStamped("map", SECOND, (20.5, 0.0, 1.0))
@@ -126,7 +128,7 @@ async def test_data_are_in_local_frames_before_and_after() -> None:
     assert robot.transform_nowait(expected, "arm", at=SECOND, fixed="base").point == (0.0, 0.0, 1.0)
 
 
-def test_all_ways_of_sending_take_local_names() -> None:
+def test_every_sending_method_takes_local_names() -> None:
     bus = Bus(SimulatedClock())
     got: list[TransformStamped] = []
     bus.subscribe(got.extend)
@@ -143,7 +145,7 @@ def test_all_ways_of_sending_take_local_names() -> None:
     assert [sample.transform.translation[0] for sample in got] == [1.0, 2.0, 3.0, 4.0]
 
 
-def test_a_robot_owns_its_own_frames_and_no_other_robots() -> None:
+def test_owning_a_local_name_reserves_the_frame_of_that_robot_only() -> None:
     _, bus, (first, second), (robot, other) = two_robots()
     with first.owning("tool"), second.owning("tool"):
         first.send_static("arm", "tool", at_x(0.25))
@@ -157,7 +159,7 @@ def test_a_robot_owns_its_own_frames_and_no_other_robots() -> None:
 
 
 @pytest.mark.parametrize("bad", ["", "/a"])
-def test_a_prefix_does_not_make_a_bad_name_good(bad: str) -> None:
+def test_a_bad_name_is_an_error_with_a_prefix_too(bad: str) -> None:
     _, bus, (robot, _), (buffer, _) = two_robots()
     before = bus.statistics().samples
     with pytest.raises(InvalidTransformError):
@@ -173,7 +175,7 @@ def test_a_prefix_does_not_make_a_bad_name_good(bad: str) -> None:
 
 
 @pytest.mark.parametrize("bad", ["", "/arm"])
-async def test_a_name_that_no_frame_can_have_fails_at_once(bad: str) -> None:
+async def test_an_invalid_name_raises_at_once(bad: str) -> None:
     _, _, _, (robot, _) = two_robots()
     with pytest.raises(UnknownFrameError) as caught:
         await robot.lookup("map", bad)
@@ -182,13 +184,13 @@ async def test_a_name_that_no_frame_can_have_fails_at_once(bad: str) -> None:
         pass
 
 
-def test_another_robots_frame_has_no_name_in_a_buffer_with_a_prefix() -> None:
+def test_a_buffer_with_a_prefix_cannot_name_frames_of_another_robot() -> None:
     _, _, _, (robot, _) = two_robots()
     for name in ("robot2/arm", "robot1/arm", "/robot2/arm"):
         assert not robot.can_transform("map", name)
 
 
-def test_errors_have_the_names_of_the_bus() -> None:
+def test_errors_have_bus_names() -> None:
     _, _, _, (robot, _) = two_robots()
     with pytest.raises(UnknownFrameError) as unknown:
         robot.lookup_nowait("map", "aarm")
@@ -198,7 +200,7 @@ def test_errors_have_the_names_of_the_bus() -> None:
     assert future.value.child == "robot1/base"
 
 
-async def test_a_lookup_waits_under_the_names_of_the_bus_and_is_listed_under_its_own() -> None:
+async def test_a_waiting_lookup_is_listed_with_local_names_and_blocked_by_bus_names() -> None:
     clock, _, (first, second), (robot, _) = two_robots()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, lambda: robot.lookup("map", "arm", 2 * SECOND))
@@ -225,7 +227,7 @@ async def test_a_lookup_waits_under_the_names_of_the_bus_and_is_listed_under_its
         assert (late.error.target, late.error.source) == ("map", "robot1/arm")
 
 
-async def test_who_waits_below_a_frame_looks_again_when_it_gets_another_parent() -> None:
+async def test_a_lookup_with_local_names_wakes_when_a_frame_of_its_path_becomes_static() -> None:
     _, bus, (first, _), (robot, _) = two_robots()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, lambda: robot.lookup("map", "arm", 0))
@@ -239,7 +241,7 @@ async def test_who_waits_below_a_frame_looks_again_when_it_gets_another_parent()
     assert bus.statistics().kind_changes == 1
 
 
-async def test_what_waits_long_is_logged_with_the_names_of_the_bus(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_long_wait_is_logged_with_bus_names(caplog: pytest.LogCaptureFixture) -> None:
     clock, _, _, (robot, _) = two_robots()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, lambda: robot.lookup("map", "aarm"))
@@ -271,7 +273,7 @@ async def test_a_watch_gives_local_names() -> None:
 # Pictures
 
 
-def test_a_picture_has_local_names_and_marks_what_is_somebody_elses() -> None:
+def test_describe_has_local_names_and_marks_frames_of_others() -> None:
     _, bus, _, (robot, _) = two_robots(SECOND)
     bus.publish([static("earth", "map"), driving("map", "base", 1.0)])
     assert robot.describe().splitlines() == [
@@ -286,7 +288,7 @@ def test_a_picture_has_local_names_and_marks_what_is_somebody_elses() -> None:
     assert "robot1/base" in robot.tree.describe()
 
 
-def test_an_explanation_has_local_names_and_errors_have_those_of_the_bus() -> None:
+def test_an_explanation_has_local_names_and_its_errors_have_bus_names() -> None:
     _, bus, _, (robot, _) = two_robots()
     found = robot.explain("map", "arm", 2 * SECOND)
     assert (found.target, found.source, found.chain) == ("map", "arm", ("map", "base", "arm"))

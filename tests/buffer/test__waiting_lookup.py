@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
         ({"max_gap": 1.0}, 9.9, 10.5, 10.0, 0.0),
     ],
 )
-async def test_a_wait_ends_at_the_first_answerable_moment(
+async def test_a_lookup_under_a_policy_wakes_at_the_first_sample_that_allows_an_answer(
     policy: dict[str, Any], too_early: float, enough: float, x: float, extrapolated_by: float
 ) -> None:
     with Bus() as bus, Buffer(bus) as buffer:
@@ -56,7 +56,7 @@ async def test_a_wait_ends_at_the_first_answerable_moment(
     assert asked.answer.extrapolated_by == from_seconds(extrapolated_by)
 
 
-async def test_a_sample_that_is_too_early_does_not_even_wake_the_lookup() -> None:
+async def test_a_sample_outside_the_tolerance_does_not_wake_the_lookup() -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         bus.publish(driving("map", "base", 9.0))
         async with anyio.create_task_group() as tasks:
@@ -71,7 +71,7 @@ async def test_a_sample_that_is_too_early_does_not_even_wake_the_lookup() -> Non
             bus.publish(driving("map", "base", 9.8))
 
 
-async def test_a_gap_that_has_closed_behind_a_wait_ends_it() -> None:
+async def test_a_gap_around_the_stamp_ends_the_wait_with_a_gap_error() -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         bus.publish(driving("map", "base", 9.0))
         async with anyio.create_task_group() as tasks:
@@ -86,7 +86,7 @@ async def test_a_gap_that_has_closed_behind_a_wait_ends_it() -> None:
 
 
 @pytest.mark.parametrize("end", ["the lagging edge comes out of the gap", "a late sample fills the gap"])
-async def test_latest_in_the_gap_of_another_edge_waits_for_either_end_of_it(end: str) -> None:
+async def test_latest_in_the_gap_of_another_edge_waits_for_either_end_of_the_gap(end: str) -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         # map -> base lags at 1.5 s, where base -> arm has a gap from 1 s to 2 s.
         bus.publish([driving("map", "base", 1.5), driving("base", "arm", 1.0), driving("base", "arm", 2.0)])
@@ -103,7 +103,7 @@ async def test_latest_in_the_gap_of_another_edge_waits_for_either_end_of_it(end:
     assert asked.answer.transform.translation[0] == pytest.approx(4.0 if asked.answer.stamp == 2 * SECOND else 3.0)
 
 
-async def test_a_held_edge_lets_the_others_make_the_latest_fresh_enough() -> None:
+async def test_under_a_hold_a_recent_sample_of_one_edge_satisfies_max_age() -> None:
     clock = SimulatedClock(from_seconds(100.0))
     with Bus(clock) as bus, Buffer(bus) as buffer:
         bus.publish([driving("map", "odom", 99.0), driving("odom", "base", 99.2), driving("base", "arm", 99.4)])
@@ -120,7 +120,7 @@ async def test_a_held_edge_lets_the_others_make_the_latest_fresh_enough() -> Non
             await clock.advance(1.0)
 
 
-async def test_a_timeout_says_how_near_a_sample_would_have_done() -> None:
+async def test_a_timeout_names_the_slack_of_the_policy() -> None:
     clock = SimulatedClock()
     with Bus(clock) as bus, Buffer(bus) as buffer:
         bus.publish(driving("map", "base", 9.0))
@@ -134,7 +134,7 @@ async def test_a_timeout_says_how_near_a_sample_would_have_done() -> None:
         assert "asked for 10.000 s within 200 ms, newest sample is 9.000 s (1 s short)" in str(asked.error)
 
 
-async def test_data_are_moved_under_a_policy_too() -> None:
+async def test_transform_takes_a_policy() -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         bus.publish(driving("map", "base", 9.0))
         point = PointStamped("base", from_seconds(9.25), (1.0, 0.0, 0.0))
@@ -145,7 +145,7 @@ async def test_data_are_moved_under_a_policy_too() -> None:
             buffer.transform_nowait(point, "map", max_gap=0.25)
 
 
-async def test_a_policy_that_makes_no_sense_is_refused_before_anything_waits() -> None:
+async def test_a_wrong_policy_raises_at_once() -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         with pytest.raises(TypeError, match="extrapolate must be a Hold"):
             await buffer.lookup("map", "base", extrapolate=0.5)  # type: ignore[arg-type]
@@ -154,7 +154,7 @@ async def test_a_policy_that_makes_no_sense_is_refused_before_anything_waits() -
 
 
 @pytest.mark.parametrize("source", ["base", "arm"])
-async def test_a_lookup_that_has_waited_leaves_nothing_to_the_garbage_collector(source: str) -> None:
+async def test_a_lookup_that_has_waited_leaves_no_reference_cycles(source: str) -> None:
     with Bus() as bus, Buffer(bus, keep=None) as buffer:
         bus.publish([driving("map", "base", 0.0), driving("base", "arm", 0.0), driving("base", "arm", 90.0)])
 

@@ -46,7 +46,7 @@ def make(start: int = 0, keep: float | None = 10.0) -> tuple[SimulatedClock, Bus
 
 
 @pytest.mark.every_loop
-async def test_what_can_be_answered_is_answered_after_one_checkpoint() -> None:
+async def test_an_available_answer_is_returned_after_one_checkpoint() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "a", 1.0), driving("map", "a", 2.0)])
     turns = 0
@@ -69,7 +69,7 @@ async def test_what_can_be_answered_is_answered_after_one_checkpoint() -> None:
     assert (found.parent, found.child, found.stamp) == ("map", "a", 1_500_000_000)
 
 
-async def test_even_what_can_be_answered_passes_a_checkpoint() -> None:
+async def test_an_available_answer_passes_a_checkpoint() -> None:
     _, bus, buffer = make()
     bus.publish(static("map", "a"))
     with anyio.CancelScope() as scope:
@@ -78,7 +78,7 @@ async def test_even_what_can_be_answered_passes_a_checkpoint() -> None:
     assert scope.cancelled_caught
 
 
-async def test_a_lookup_with_no_time_at_all_still_answers_what_it_can() -> None:
+async def test_a_lookup_with_timeout_zero_returns_an_available_answer() -> None:
     _, bus, buffer = make()
     bus.publish(driving("map", "a", 1.0))
     assert (await buffer.lookup("map", "a", timeout=0)).stamp == SECOND
@@ -86,7 +86,7 @@ async def test_a_lookup_with_no_time_at_all_still_answers_what_it_can() -> None:
         await buffer.lookup("map", "a", 2 * SECOND, timeout=0)
 
 
-async def test_the_past_fails_at_once_because_waiting_cannot_help() -> None:
+async def test_a_past_extrapolation_raises_at_once() -> None:
     _, bus, buffer = make(keep=2.0)
     bus.publish([driving("map", "a", 5.0), driving("map", "a", 9.0), static("a", "b")])
     with pytest.raises(PastExtrapolationError) as caught:
@@ -96,7 +96,7 @@ async def test_the_past_fails_at_once_because_waiting_cannot_help() -> None:
 
 @pytest.mark.parametrize("bad", ["", "/a"])
 @pytest.mark.parametrize("ask", [lambda bad: (bad, "a"), lambda bad: ("nowhere", bad)], ids=["target", "source"])
-async def test_a_name_that_no_frame_can_have_fails_at_once(bad: str, ask: Callable[[str], tuple[str, str]]) -> None:
+async def test_an_invalid_name_raises_at_once(bad: str, ask: Callable[[str], tuple[str, str]]) -> None:
     _, bus, buffer = make()
     bus.publish(moving("map", "a", 1))
     with pytest.raises(UnknownFrameError) as caught:
@@ -123,7 +123,7 @@ async def test_a_name_that_no_frame_can_have_fails_at_once(bad: str, ask: Callab
     ],
 )
 @pytest.mark.parametrize("target", ["map", "nowhere"])
-async def test_a_wrong_question_raises_at_once_whatever_is_known(
+async def test_wrong_arguments_raise_at_once_for_known_and_unknown_frames(
     target: str, arguments: dict[str, Any], error: type[Exception]
 ) -> None:
     _, bus, buffer = make()
@@ -133,7 +133,7 @@ async def test_a_wrong_question_raises_at_once_whatever_is_known(
     assert buffer.pending() == ()
 
 
-# Waiting, as tf2's tests have it
+# Waiting
 
 
 async def test_a_lookup_wakes_when_the_stamp_becomes_covered() -> None:
@@ -148,8 +148,8 @@ async def test_a_lookup_wakes_when_the_stamp_becomes_covered() -> None:
     assert asked.answer.stamp == 10 * SECOND
 
 
-async def test_an_old_stamp_fails_when_the_first_sample_is_newer_although_older_ones_might_follow() -> None:
-    """tf2 goes on waiting here (``waitForOldTransform``); out-of-order data that fill the past are no way to run."""
+async def test_a_waiting_lookup_raises_if_the_first_sample_is_newer_than_its_stamp() -> None:
+    """tf2 keeps waiting here (``waitForOldTransform``), for a late sample that may never arrive."""
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 1 * SECOND))
@@ -159,7 +159,7 @@ async def test_an_old_stamp_fails_when_the_first_sample_is_newer_although_older_
         assert isinstance(asked.error, PastExtrapolationError)
 
 
-async def test_out_of_order_samples_in_one_batch_are_one_arrival() -> None:
+async def test_a_lookup_sees_out_of_order_samples_of_one_batch_together() -> None:
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 1 * SECOND))
@@ -168,7 +168,7 @@ async def test_out_of_order_samples_in_one_batch_are_one_arrival() -> None:
     assert asked.answer.transform.translation == (1.0, 0.0, 0.0)
 
 
-async def test_what_arrived_between_asking_and_the_timeout_is_not_lost() -> None:
+async def test_a_lookup_woken_before_its_timeout_answers() -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 2 * SECOND, timeout=1.0))
@@ -178,7 +178,7 @@ async def test_what_arrived_between_asking_and_the_timeout_is_not_lost() -> None
     assert asked.answer.stamp == 2 * SECOND
 
 
-async def test_irrelevant_data_do_not_end_a_wait_and_the_timeout_does() -> None:
+async def test_a_timeout_raises_with_the_last_error_as_its_cause() -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5 * SECOND, timeout=2.0))
@@ -196,7 +196,7 @@ async def test_irrelevant_data_do_not_end_a_wait_and_the_timeout_does() -> None:
 
 
 @pytest.mark.parametrize("timeout", [0.25, 4.999, 5.0, 5.001, 10.0, 3600.0])
-async def test_a_timeout_runs_out_at_its_own_time_on_the_bus_s_clock(timeout: float) -> None:
+async def test_a_timeout_expires_on_the_clock_of_the_bus(timeout: float) -> None:
     clock, _, buffer = make()
 
     async def ask() -> int:
@@ -210,7 +210,7 @@ async def test_a_timeout_runs_out_at_its_own_time_on_the_bus_s_clock(timeout: fl
         assert asked.answer == round(timeout * SECOND)
 
 
-async def test_each_return_to_waiting_keeps_the_same_deadline() -> None:
+async def test_a_lookup_that_waits_again_keeps_its_deadline() -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "c", 9 * SECOND, timeout=8.0))
@@ -225,7 +225,7 @@ async def test_each_return_to_waiting_keeps_the_same_deadline() -> None:
         assert isinstance(asked.error, LookupTimeoutError)
 
 
-async def test_a_timeout_is_a_duration_that_survives_jumps() -> None:
+async def test_jumps_of_the_clock_do_not_change_a_timeout() -> None:
     clock, _, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=3.0))
@@ -237,7 +237,7 @@ async def test_a_timeout_is_a_duration_that_survives_jumps() -> None:
         assert isinstance(asked.error, LookupTimeoutError)
 
 
-async def test_an_infinite_timeout_is_none() -> None:
+async def test_an_infinite_timeout_never_expires() -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=math.inf))
@@ -251,7 +251,7 @@ async def test_an_infinite_timeout_is_none() -> None:
 @pytest.mark.parametrize("phase", ["before the report", "after the report"])
 @pytest.mark.parametrize("data_first", [True, False])
 @pytest.mark.parametrize("timeout", [None, 2.0, 7.0])
-async def test_data_that_come_in_the_turn_in_which_time_runs_out_still_answer(
+async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
     timeout: float | None, data_first: bool, phase: str
 ) -> None:
     clock = HandClock()
@@ -274,7 +274,7 @@ async def test_data_that_come_in_the_turn_in_which_time_runs_out_still_answer(
     assert buffer.pending() == ()
 
 
-async def test_fail_after_works_around_a_lookup_and_leaves_nothing_behind() -> None:
+async def test_fail_after_around_a_lookup_leaves_no_waiter() -> None:
     buffer = Buffer(Bus())
     with pytest.raises(TimeoutError) as caught, anyio.fail_after(0.001):
         await buffer.lookup("map", "a", timeout=3600.0)
@@ -312,7 +312,7 @@ async def test_a_lookup_waits_until_two_trees_are_joined() -> None:
     assert asked.answer.transform.translation == (10.0, 0.0, 0.0)
 
 
-async def test_lookups_wait_for_statics_too() -> None:
+async def test_a_lookup_wakes_when_a_static_sample_arrives() -> None:
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "base", "laser", 123))
@@ -321,7 +321,7 @@ async def test_lookups_wait_for_statics_too() -> None:
     assert (asked.answer.stamp, asked.answer.static) == (123, True)
 
 
-async def test_a_woken_lookup_reads_what_holds_when_its_turn_comes() -> None:
+async def test_a_woken_lookup_reads_the_tree_when_its_task_runs() -> None:
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
@@ -349,7 +349,7 @@ async def test_a_thousand_waiters_of_one_publish_are_all_answered() -> None:
 # LATEST and max_age
 
 
-async def test_latest_waits_until_every_edge_has_a_common_stamp() -> None:
+async def test_latest_waits_until_the_edges_have_a_common_stamp() -> None:
     _, bus, buffer = make(keep=2.0)
     bus.publish([driving("map", "slow", 1), driving("slow", "fast", 20), driving("slow", "fast", 22)])
     async with anyio.create_task_group() as tasks:
@@ -365,7 +365,7 @@ async def test_latest_waits_until_every_edge_has_a_common_stamp() -> None:
     assert asked.answer.stamp == 21 * SECOND
 
 
-async def test_a_dead_broadcaster_answers_for_ever_without_max_age_and_not_with_it() -> None:
+async def test_max_age_refuses_the_last_sample_of_a_dead_broadcaster() -> None:
     clock, bus, buffer = make()
     bus.publish(driving("map", "a", 0))
     await clock.advance(1.0)
@@ -379,7 +379,7 @@ async def test_a_dead_broadcaster_answers_for_ever_without_max_age_and_not_with_
     assert (caught.value.child, caught.value.stamp, caught.value.newest) == ("a", 1_000_000, 0)
 
 
-async def test_max_age_waits_for_a_sample_that_is_fresh_when_it_comes() -> None:
+async def test_a_lookup_with_max_age_waits_for_a_sample_that_is_recent_enough() -> None:
     clock, bus, buffer = make()
     bus.publish([driving("map", "a", 0), static("a", "b")])
     async with anyio.create_task_group() as tasks:
@@ -394,7 +394,7 @@ async def test_max_age_waits_for_a_sample_that_is_fresh_when_it_comes() -> None:
         assert asked.answer.stamp == 7_500_000_000
 
 
-async def test_max_age_judges_the_edge_that_lags_most() -> None:
+async def test_max_age_applies_to_the_most_lagging_edge() -> None:
     clock, bus, buffer = make()
     bus.publish([driving("map", "a", 0), driving("a", "b", 0), driving("a", "b", 2)])
     await clock.advance(2.0)
@@ -402,7 +402,7 @@ async def test_max_age_judges_the_edge_that_lags_most() -> None:
         buffer.lookup_nowait("map", "b", max_age=1.0)
 
 
-async def test_static_answers_have_no_age() -> None:
+async def test_max_age_does_not_apply_to_static_answers() -> None:
     clock, bus, buffer = make()
     bus.publish(static("map", "a"))
     await clock.advance(1e6)
@@ -410,23 +410,23 @@ async def test_static_answers_have_no_age() -> None:
     assert found.static
 
 
-async def test_an_infinite_max_age_is_none() -> None:
+async def test_an_infinite_max_age_refuses_nothing() -> None:
     clock, bus, buffer = make()
     bus.publish(driving("map", "a", 0))
     await clock.advance(1e6)
     assert (await buffer.lookup("map", "a", max_age=math.inf)).stamp == 0
 
 
-# Who is woken
+# Waking
 
 
 def waiting(bus: Bus) -> int:
-    """How many lookups are parked; one that was woken is not, until its turn comes and it parks again."""
+    """The number of parked lookups; a woken one is not parked until its task runs and it waits again."""
     return bus.statistics().buffers[0].waiting
 
 
 @pytest.mark.thorough
-async def test_ten_thousand_waiters_on_one_edge_sleep_through_samples_of_another_and_can_be_cancelled() -> None:
+async def test_samples_of_other_edges_wake_none_of_ten_thousand_waiters() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "quiet", 0), driving("map", "busy", 0), driving("map", "x", 0), static("map", "s")])
     async with anyio.create_task_group() as tasks:
@@ -445,7 +445,7 @@ async def test_ten_thousand_waiters_on_one_edge_sleep_through_samples_of_another
 
 
 @pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])
-async def test_cancelling_waiters_leaves_nothing_behind_whatever_they_wait_for(source: str) -> None:
+async def test_cancelled_lookups_leave_no_waiters_for_any_error(source: str) -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "edge", 0), driving("moon", "elsewhere", 0)])
     async with anyio.create_task_group() as tasks:
@@ -459,7 +459,7 @@ async def test_cancelling_waiters_leaves_nothing_behind_whatever_they_wait_for(s
     assert "waiting" not in buffer.describe()
 
 
-async def test_cancelling_one_waiter_leaves_the_others() -> None:
+async def test_cancelling_one_lookup_keeps_the_others_waiting() -> None:
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = [Asked(tasks, partial(buffer.lookup, "map", "a", 5)) for _ in range(3)]
@@ -473,7 +473,7 @@ async def test_cancelling_one_waiter_leaves_the_others() -> None:
 
 
 @pytest.mark.parametrize("data_first", [True, False])
-async def test_cancelling_and_waking_in_one_turn_leaves_nothing_behind(data_first: bool) -> None:
+async def test_a_lookup_cancelled_and_woken_in_one_turn_leaves_no_waiter(data_first: bool) -> None:
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
@@ -488,10 +488,10 @@ async def test_cancelling_and_waking_in_one_turn_leaves_nothing_behind(data_firs
     assert buffer.pending() == ()
 
 
-# What waits is visible
+# Pending lookups and the log
 
 
-async def test_pending_says_who_waits_since_when_and_what_for() -> None:
+async def test_pending_lists_questions_with_their_start_and_their_error() -> None:
     clock, bus, buffer = make()
     bus.publish([driving("map", "a", 1), driving("moon", "b", 1)])
     async with anyio.create_task_group() as tasks:
@@ -519,7 +519,7 @@ async def test_pending_says_who_waits_since_when_and_what_for() -> None:
         assert f"waiting: {pending}" in text.splitlines()
 
 
-async def test_a_long_wait_is_logged_once_a_cause(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_long_wait_is_logged_once_for_each_cause(caplog: pytest.LogCaptureFixture) -> None:
     clock, bus, buffer = make()
     bus.publish(driving("map", "base", 0))
     async with anyio.create_task_group() as tasks:
@@ -527,7 +527,7 @@ async def test_a_long_wait_is_logged_once_a_cause(caplog: pytest.LogCaptureFixtu
         await clock.advance(0.5)
         tasks.start_soon(buffer.lookup, "base", "basse", SECOND)
         tasks.start_soon(buffer.lookup, "map", "base", 60 * SECOND)
-        # This one is woken by every sample, and finds each of them too old.
+        # Every sample wakes this lookup, and each is too old.
         tasks.start_soon(partial(buffer.lookup, "map", "base", max_age=0.4))
         await clock.advance(4.499)
         assert caplog.messages == []
@@ -545,7 +545,7 @@ async def test_a_long_wait_is_logged_once_a_cause(caplog: pytest.LogCaptureFixtu
         tasks.cancel_scope.cancel()
 
 
-async def test_a_long_wait_that_finds_another_cause_logs_that_too(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_long_wait_with_a_new_cause_is_logged_again(caplog: pytest.LogCaptureFixture) -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(buffer.lookup, "map", "a", 60 * SECOND)
@@ -558,7 +558,7 @@ async def test_a_long_wait_that_finds_another_cause_logs_that_too(caplog: pytest
     assert "newest sample is 1.000 s" in second
 
 
-async def test_short_waits_are_nobody_s_business(caplog: pytest.LogCaptureFixture) -> None:
+async def test_short_waits_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         timed_out = Asked(tasks, partial(buffer.lookup, "map", "a", 60 * SECOND, timeout=5.0))
@@ -574,7 +574,7 @@ async def test_short_waits_are_nobody_s_business(caplog: pytest.LogCaptureFixtur
 # Clock jumps
 
 
-async def test_a_jump_back_ends_every_wait_with_both_stamps() -> None:
+async def test_a_jump_back_ends_every_wait_with_an_error_that_has_both_stamps() -> None:
     clock, bus, buffer = make(start=100 * SECOND)
     bus.publish(driving("map", "a", 100))
     async with anyio.create_task_group() as tasks:
@@ -593,7 +593,7 @@ async def test_a_jump_back_ends_every_wait_with_both_stamps() -> None:
     assert buffer.pending() == ()
 
 
-async def test_a_wait_that_is_answered_and_reset_in_one_turn_is_reset() -> None:
+async def test_a_lookup_woken_and_reset_in_one_turn_raises_the_reset() -> None:
     clock, bus, buffer = make(start=100)
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 101))
@@ -605,7 +605,7 @@ async def test_a_wait_that_is_answered_and_reset_in_one_turn_is_reset() -> None:
         assert isinstance(asked.error, ClockResetError)
 
 
-async def test_lookups_after_a_jump_back_are_of_the_new_time() -> None:
+async def test_a_lookup_after_a_jump_back_waits_for_new_samples() -> None:
     clock, bus, buffer = make(start=100 * SECOND)
     bus.publish(driving("map", "a", 100))
     clock.set(0)
@@ -617,7 +617,7 @@ async def test_lookups_after_a_jump_back_are_of_the_new_time() -> None:
     assert asked.answer.stamp == 1 * SECOND
 
 
-async def test_a_jump_forward_disturbs_no_wait() -> None:
+async def test_a_jump_forward_ends_no_wait() -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
@@ -639,7 +639,7 @@ async def test_a_jump_forward_disturbs_no_wait() -> None:
         pytest.param(lambda _, buffer: buffer.close(), "the buffer is closed", id="buffer"),
     ],
 )
-async def test_closing_ends_waits_and_what_is_buffered_can_still_be_looked_up(
+async def test_closing_ends_waits_and_buffered_samples_can_still_be_looked_up(
     close: Callable[[Bus, Buffer], None], message: str
 ) -> None:
     _, bus, buffer = make()
@@ -661,7 +661,7 @@ async def test_closing_ends_waits_and_what_is_buffered_can_still_be_looked_up(
         await buffer.lookup("map", "a", 0)
 
 
-async def test_a_closed_buffer_hears_nothing_more_and_the_others_do() -> None:
+async def test_a_closed_buffer_gets_no_more_samples_and_others_do() -> None:
     _, bus, closed = make()
     with Buffer(bus) as buffer:
         bus.publish(moving("map", "a", 1))
@@ -674,7 +674,7 @@ async def test_a_closed_buffer_hears_nothing_more_and_the_others_do() -> None:
     assert bus.statistics().buffers == ()
 
 
-async def test_what_was_answered_before_the_close_in_the_same_turn_stays_answered() -> None:
+async def test_a_lookup_woken_before_the_close_in_the_same_turn_answers() -> None:
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
@@ -686,7 +686,7 @@ async def test_what_was_answered_before_the_close_in_the_same_turn_stays_answere
 
 
 @pytest.mark.parametrize("keep", [-1.0, math.nan])
-def test_a_buffer_with_a_bad_window_is_not_attached(keep: float) -> None:
+def test_a_buffer_with_a_bad_window_is_an_error_and_not_attached(keep: float) -> None:
     bus = Bus(SimulatedClock())
     with pytest.raises(ValueError, match="keep"):
         Buffer(bus, keep)
@@ -694,7 +694,7 @@ def test_a_buffer_with_a_bad_window_is_not_attached(keep: float) -> None:
     assert bus.statistics().buffers == ()
 
 
-# Data, and the way from the broadcaster to the listener
+# Data
 
 
 async def test_transform_waits_for_the_stamp_of_the_data() -> None:
@@ -711,14 +711,14 @@ async def test_transform_waits_for_the_stamp_of_the_data() -> None:
     assert buffer.transform_nowait(point, "map") == asked.answer
 
 
-async def test_transformed_data_that_asked_for_the_latest_carry_its_stamp() -> None:
+async def test_data_stamped_latest_get_the_stamp_of_the_transform() -> None:
     _, bus, buffer = make()
     bus.publish(driving("map", "base", 4))
     moved = await buffer.transform(Vector3Stamped("base", LATEST, (1.0, 0.0, 0.0)), "map")
     assert moved == Vector3Stamped("map", 4 * SECOND, (1.0, 0.0, 0.0))
 
 
-async def test_transform_passes_its_limits_on() -> None:
+async def test_transform_passes_timeout_and_max_age_on() -> None:
     clock, bus, buffer = make()
     bus.publish(driving("map", "base", 0))
     await clock.advance(9.0)
@@ -729,7 +729,7 @@ async def test_transform_passes_its_limits_on() -> None:
         buffer.transform_nowait(point, "map", max_age=1.0)
 
 
-async def test_transform_moves_data_to_another_instant_through_a_fixed_frame() -> None:
+async def test_transform_moves_data_to_another_stamp_through_a_fixed_frame() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "base", 1), driving("map", "base", 6), static("base", "laser", x=0.5)])
     # Seen at 2 s, at 3.5 m in map; at 5 s the base has driven 3 m on.
@@ -741,7 +741,7 @@ async def test_transform_moves_data_to_another_instant_through_a_fixed_frame() -
     assert buffer.transform_nowait(back, "laser", at=2 * SECOND, fixed="map").point == (1.0, 0.0, 0.0)
 
 
-async def test_transform_moves_data_to_the_latest_and_says_which_stamp_that_was() -> None:
+async def test_transform_to_latest_gives_the_stamp_of_the_answer() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
     point = PointStamped("base", 2 * SECOND, (1.0, 0.0, 0.0))
@@ -750,7 +750,7 @@ async def test_transform_moves_data_to_the_latest_and_says_which_stamp_that_was(
     assert buffer.transform_nowait(point, "base", at=LATEST, fixed="map") == moved
 
 
-async def test_transform_moves_what_is_the_latest_to_a_given_stamp() -> None:
+async def test_transform_moves_data_stamped_latest_to_another_stamp() -> None:
     _, bus, buffer = make()
     bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
     newest = PointStamped("base", LATEST, (1.0, 0.0, 0.0))
@@ -759,7 +759,7 @@ async def test_transform_moves_what_is_the_latest_to_a_given_stamp() -> None:
 
 
 @pytest.mark.parametrize(("stamp", "at"), [(2, 5), (5, 2)], ids=["to the future", "to the past"])
-async def test_transform_to_another_instant_waits_for_both_ends(stamp: int, at: int) -> None:
+async def test_transform_to_another_stamp_waits_for_both_stamps(stamp: int, at: int) -> None:
     _, bus, buffer = make()
     bus.publish(driving("map", "base", 1))
     point = PointStamped("base", stamp * SECOND, (1.0, 0.0, 0.0))
@@ -776,7 +776,7 @@ async def test_transform_to_another_instant_waits_for_both_ends(stamp: int, at: 
     assert asked.answer == PointStamped("base", at * SECOND, (1.0 + stamp - at, 0.0, 0.0))
 
 
-async def test_transform_to_another_instant_keeps_its_limits() -> None:
+async def test_transform_to_another_stamp_passes_timeout_and_max_age_on() -> None:
     clock, bus, buffer = make()
     bus.publish([driving("map", "base", 0), driving("map", "base", 2)])
     await clock.advance(9.0)
@@ -864,7 +864,7 @@ async def test_a_listener_once_a_second_follows_a_broadcaster_at_100_hz() -> Non
     assert buffer.tree.edges()[0].samples == 1001
 
 
-def test_a_buffer_may_be_built_before_a_loop_and_waited_on_in_several(
+def test_a_buffer_may_be_made_before_a_loop_and_used_on_several_loops(
     run: Callable[[Callable[[], Awaitable[None]]], None],
 ) -> None:
     _, bus, buffer = make()
@@ -880,7 +880,7 @@ def test_a_buffer_may_be_built_before_a_loop_and_waited_on_in_several(
         run(partial(wait, stamp))
 
 
-async def test_a_name_that_no_frame_can_have_comes_with_close_matches() -> None:
+async def test_the_error_of_an_invalid_name_has_similar_names() -> None:
     with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
         bus.publish(moving("map", "base", 0))
         with pytest.raises(UnknownFrameError) as caught:

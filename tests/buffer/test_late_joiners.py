@@ -93,7 +93,7 @@ def everything(tree: TransformTree) -> Iterable[object]:
     st.integers(0, 12),
     st.sampled_from(["buffer", "closed buffer", "tree", "late joiner"]),
 )
-def test_one_that_joins_late_answers_as_one_that_was_there_from_the_start(
+def test_a_late_buffer_with_prefill_answers_as_an_early_one(
     before: list[Happening], after: list[Happening], keep: int | None, further: int, kind: str
 ) -> None:
     clock = SimulatedClock(1_000)
@@ -122,7 +122,7 @@ def test_one_that_joins_late_answers_as_one_that_was_there_from_the_start(
 # What is taken over
 
 
-def test_history_statics_and_old_parents_are_taken_over() -> None:
+def test_a_prefilled_buffer_has_history_static_samples_and_old_parents() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus)
     bus.publish(
@@ -136,13 +136,13 @@ def test_history_statics_and_old_parents_are_taken_over() -> None:
     assert late.tree.edges() == first.tree.edges()
 
 
-def test_without_a_prefill_there_is_nothing_but_what_is_latched() -> None:
+def test_without_prefill_a_late_buffer_has_only_latched_samples() -> None:
     bus = Bus(SimulatedClock())
     bus.publish([moving("map", "a", 10), static("a", "laser")])
     assert Buffer(bus).tree.frames() == ["a", "laser"]
 
 
-def test_no_more_is_taken_than_the_new_buffer_keeps() -> None:
+def test_a_prefilled_buffer_has_only_the_samples_inside_its_own_window() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus, 100 * NANO)
     bus.publish([*over("map", "a", range(0, 101, 10)), *over("old", "b", (0, 10)), *over("map", "b", (90, 100))])
@@ -153,7 +153,7 @@ def test_no_more_is_taken_than_the_new_buffer_keeps() -> None:
         late.lookup_nowait("map", "a", 79)
 
 
-def test_no_more_is_taken_than_the_other_has_and_from_then_on_more_is_kept() -> None:
+def test_a_prefilled_buffer_with_a_longer_window_keeps_more_from_then_on() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus, 20 * NANO)
     bus.publish(over("map", "a", range(101)))
@@ -166,7 +166,7 @@ def test_no_more_is_taken_than_the_other_has_and_from_then_on_more_is_kept() -> 
     assert x_of(late.tree, "map", "a", 75) == 75.0
 
 
-def test_the_two_are_independent_from_then_on() -> None:
+def test_a_prefilled_buffer_is_independent_of_the_other() -> None:
     clock = SimulatedClock()
     bus, elsewhere = Bus(clock), Bus(clock)
     first = Buffer(elsewhere)
@@ -179,7 +179,7 @@ def test_the_two_are_independent_from_then_on() -> None:
     assert x_of(late.tree, "map", "a", 12) == 2.0
 
 
-def test_what_is_latched_on_the_new_bus_comes_on_top() -> None:
+def test_latched_samples_of_the_bus_are_inserted_after_the_prefill() -> None:
     clock = SimulatedClock()
     bus, elsewhere = Bus(clock), Bus(clock)
     other = Buffer(elsewhere)
@@ -189,7 +189,7 @@ def test_what_is_latched_on_the_new_bus_comes_on_top() -> None:
     assert [x_of(late.tree, "base", frame, 15) for frame in ("laser", "imu", "arm")] == [5.0, 2.0, 6.0]
 
 
-def test_a_tree_that_nothing_feeds_can_be_taken_over_and_goes_on_by_itself() -> None:
+def test_a_tree_without_a_bus_can_be_the_prefill() -> None:
     tree = tree_of(*over("map", "a", (10, 20)))
     bus = Bus(SimulatedClock())
     late = Buffer(bus, prefill=tree)
@@ -199,14 +199,14 @@ def test_a_tree_that_nothing_feeds_can_be_taken_over_and_goes_on_by_itself() -> 
     assert x_of(late.tree, "map", "a", 30) == 40.0
 
 
-def test_a_frame_that_only_the_history_knows_can_be_removed() -> None:
+def test_a_frame_known_only_from_the_prefill_can_be_removed() -> None:
     bus = Bus(SimulatedClock())
     late = Buffer(bus, prefill=tree_of(*over("map", "a", (10, 20))))
     bus.remove_frame("a")
     assert late.tree.frames() == []
 
 
-def test_counters_begin_with_what_the_bus_gives() -> None:
+def test_the_counters_of_a_prefilled_buffer_start_with_samples_of_the_bus() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus)
     bus.publish([*over("map", "a", range(10)), static("a", "laser")])
@@ -217,7 +217,7 @@ def test_counters_begin_with_what_the_bus_gives() -> None:
     assert late.tree.edges() == first.tree.edges()
 
 
-def test_local_names_are_no_matter_to_what_is_taken_over() -> None:
+def test_a_prefill_copies_bus_names_between_buffers_with_prefixes() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus)
     bus.publish([moving("map", "robot1/base", 10, 3.0)])
@@ -230,7 +230,7 @@ def test_local_names_are_no_matter_to_what_is_taken_over() -> None:
 # Joining
 
 
-async def test_lookups_wait_and_answer_across_the_moment_of_joining() -> None:
+async def test_lookups_of_a_prefilled_buffer_use_samples_from_before_and_after() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus)
     bus.publish(moving("map", "a", 1 * SECOND, 1.0))
@@ -246,7 +246,7 @@ async def test_lookups_wait_and_answer_across_the_moment_of_joining() -> None:
         assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
 
 
-def test_one_that_joins_inside_a_subscriber_has_the_batch_that_is_being_delivered_once() -> None:
+def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus)
     joined: list[Buffer] = []
@@ -258,14 +258,14 @@ def test_one_that_joins_inside_a_subscriber_has_the_batch_that_is_being_delivere
 
 
 @pytest.mark.parametrize("prefill", [5, "map", [moving("map", "a", 1)]])
-def test_only_a_buffer_or_a_tree_can_be_taken_over(prefill: Any) -> None:
+def test_a_prefill_that_is_no_buffer_or_tree_is_a_type_error(prefill: Any) -> None:
     bus = Bus(SimulatedClock())
     with pytest.raises(TypeError, match="prefill"):
         Buffer(bus, prefill=prefill)
     assert bus.statistics().buffers == ()
 
 
-def test_a_closed_bus_can_be_joined_by_nobody() -> None:
+def test_a_buffer_on_a_closed_bus_is_an_error() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus)
     bus.close()

@@ -37,11 +37,11 @@ def timeout(cause: Any) -> LookupTimeoutError:
         (BusClosedError(), "closed"),
     ],
 )
-def test_every_error_that_ends_a_wait_has_its_reason(error: TransformError, reason: DropReason) -> None:
+def test_each_error_that_ends_a_wait_has_its_reason(error: TransformError, reason: DropReason) -> None:
     assert reason_of(error) == reason
 
 
-def test_drops_are_counted_by_reason_and_told() -> None:
+def test_dropped_messages_are_counted_by_reason_and_reported() -> None:
     told: list[tuple[str, DropReason, TransformError | None]] = []
     drops: DroppedMessages[str] = DroppedMessages(lambda *drop: told.append(drop))
     drops.drop("first", "timed out", FUTURE)
@@ -66,12 +66,12 @@ def test_an_exception_of_the_callback_is_counted_and_logged_once(caplog: pytest.
 
 
 @pytest.mark.parametrize("callback", ["print", 10])
-def test_a_callback_that_cannot_be_called_is_refused(callback: Any) -> None:
+def test_a_callback_that_is_not_callable_is_a_type_error(callback: Any) -> None:
     with pytest.raises(TypeError, match="on_drop must be callable"):
         DroppedMessages(callback)
 
 
-def test_only_an_exception_of_the_callback_is_isolated() -> None:
+def test_a_base_exception_of_the_callback_is_raised() -> None:
     def impatient(_message: str, _reason: DropReason, _error: TransformError | None) -> None:
         raise KeyboardInterrupt
 

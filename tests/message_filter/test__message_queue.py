@@ -54,7 +54,7 @@ def test_equal_stamps_leave_in_the_order_of_arrival() -> None:
     assert ready == [("message 4", "answer 2"), ("message 5", "answer 0"), ("message 5", "answer 1")]
 
 
-def test_latest_may_stand_in_any_order_but_that_of_stamps() -> None:
+def test_a_message_stamped_latest_is_allowed_in_the_orders_ready_and_arrival() -> None:
     for order in ("ready", "arrival"):
         queue: MessageQueue[str, str] = MessageQueue(10, order)
         pending = Pending("now", "laser", LATEST)
@@ -72,7 +72,7 @@ def test_the_queue_lists_waiting_messages_and_the_oldest() -> None:
     assert (second in queue, queue.is_waiting(second), first in queue) == (False, False, True)
 
 
-def test_the_queue_is_full_at_its_capacity_answered_or_not() -> None:
+def test_ready_and_waiting_messages_count_for_the_capacity() -> None:
     queue: MessageQueue[str, str] = MessageQueue(2, "ready")
     first, second = Pending("first", "laser", 1), Pending("second", "laser", 2)
     queue.append(first)
@@ -88,6 +88,6 @@ def test_the_queue_is_full_at_its_capacity_answered_or_not() -> None:
     ("capacity", "order", "error"),
     [(0, "ready", ValueError), (True, "ready", TypeError), (1.0, "ready", TypeError), (1, "size", ValueError)],
 )
-def test_a_queue_without_a_bound_or_an_order_is_refused(capacity: Any, order: Any, error: type[Exception]) -> None:
+def test_a_bad_capacity_or_order_is_an_error(capacity: Any, order: Any, error: type[Exception]) -> None:
     with pytest.raises(error):
         MessageQueue(capacity, order)

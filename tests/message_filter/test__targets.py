@@ -28,7 +28,7 @@ def make(target: Any, tolerance: float = 0.0) -> tuple[Bus, Targets[Any]]:
     return bus, Targets(Buffer(bus), target, tolerance)
 
 
-def test_one_target_is_answered_by_a_transform_and_several_by_a_tuple() -> None:
+def test_one_target_gives_a_transform_and_several_give_a_tuple() -> None:
     for target, expected in (("map", "map"), (["map"], ("map",)), (("map", "odom"), ("map", "odom"))):
         bus, targets = make(target)
         bus.publish([static("map", "odom"), moving("odom", "laser", 5)])
@@ -37,7 +37,7 @@ def test_one_target_is_answered_by_a_transform_and_several_by_a_tuple() -> None:
         assert parents == expected
 
 
-def test_the_frame_itself_is_nothing_to_ask_for() -> None:
+def test_a_target_that_is_the_frame_of_the_message_needs_no_lookup() -> None:
     bus, targets = make("laser", tolerance=1.0)
     assert list(targets.questions("laser", 5)) == []
     assert targets.lookup_nowait("laser", 5).stamp == 5
@@ -45,7 +45,7 @@ def test_the_frame_itself_is_nothing_to_ask_for() -> None:
     assert targets.lookup_nowait("laser", LATEST).stamp == 8
 
 
-def test_a_tolerance_asks_for_the_time_after_the_stamp_and_answers_at_the_stamp() -> None:
+def test_a_tolerance_requires_the_stamp_after_it_and_answers_at_the_stamp() -> None:
     bus, targets = make("map", tolerance=2.0)
     assert list(targets.questions("laser", 5)) == [("map", 5 + 2 * SECOND), ("map", 5)]
     assert list(targets.questions("laser", LATEST)) == [("map", LATEST)]
@@ -60,14 +60,14 @@ def test_a_tolerance_asks_for_the_time_after_the_stamp_and_answers_at_the_stamp(
     )
 
 
-def test_what_waiting_cannot_help_is_told_before_what_it_can() -> None:
+def test_the_blocker_is_an_error_that_waiting_cannot_help_before_one_that_it_may() -> None:
     bus, targets = make(["nowhere", "map"])
     bus.publish(moving("map", "laser", 5))
     assert isinstance(targets.blocker("laser", 6), UnknownFrameError)
     assert isinstance(targets.blocker("laser", 4), PastExtrapolationError)
 
 
-def test_the_last_time_what_may_still_come_is_a_timeout_that_names_its_target() -> None:
+def test_at_the_deadline_a_missing_transform_is_a_timeout_that_names_its_target() -> None:
     bus, targets = make(["odom", "map"])
     bus.publish([moving("odom", "laser", 5), static("map", "door")])
     with pytest.raises(LookupTimeoutError) as caught:
@@ -81,7 +81,7 @@ def test_the_last_time_what_may_still_come_is_a_timeout_that_names_its_target() 
 
 
 @pytest.mark.anyio
-async def test_waiting_ends_when_each_question_has_had_an_answer() -> None:
+async def test_waiting_ends_when_each_lookup_has_had_an_answer() -> None:
     bus, targets = make(["odom", "map"])
     async with anyio.create_task_group() as tasks:
         waiting = Asked(tasks, partial(targets.wait, "laser", 5))
@@ -93,7 +93,7 @@ async def test_waiting_ends_when_each_question_has_had_an_answer() -> None:
         assert waiting.answer is None
 
 
-def test_other_targets_are_of_the_same_shape() -> None:
+def test_targets_may_not_change_between_one_and_several() -> None:
     _, one = make("map")
     one.replace("odom")
     assert [target for target, _ in one.questions("laser", 5)] == ["odom"]

@@ -114,7 +114,7 @@ def put(send: MemoryObjectSendStream[Scan], *messages: Scan) -> None:
 # What tf2 tests of its own filter
 
 
-async def test_without_transforms_nothing_comes_out(buffer: Buffer, streams: Streams) -> None:
+async def test_without_transforms_no_message_is_delivered(buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     got: list[Pair] = []
     async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
@@ -127,7 +127,7 @@ async def test_without_transforms_nothing_comes_out(buffer: Buffer, streams: Str
         tasks.cancel_scope.cancel()
 
 
-async def test_a_message_in_the_target_frame_needs_no_transforms(buffer: Buffer, streams: Streams) -> None:
+async def test_a_message_in_the_target_frame_is_delivered_without_transforms(buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     put(send, Scan(5, "map"))
     async with MessageFilter(receive, buffer, "map") as pairs:
@@ -137,7 +137,7 @@ async def test_a_message_in_the_target_frame_needs_no_transforms(buffer: Buffer,
 
 
 @pytest.mark.every_loop
-async def test_a_message_whose_transform_is_there_comes_out(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_a_message_with_an_available_transform_is_delivered(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     bus.publish([moving("map", "laser", 4, x=4.0), moving("map", "laser", 6, x=6.0)])
     put(send, Scan(5))
@@ -148,7 +148,7 @@ async def test_a_message_whose_transform_is_there_comes_out(bus: Bus, buffer: Bu
     assert found.transform.translation == (5.0, 0.0, 0.0)
 
 
-async def test_a_message_comes_out_as_soon_as_its_transform_arrives(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_a_message_is_delivered_when_its_transform_arrives(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     put(send, Scan(5))
     got: list[Pair] = []
@@ -164,7 +164,7 @@ async def test_a_message_comes_out_as_soon_as_its_transform_arrives(bus: Bus, bu
         tasks.cancel_scope.cancel()
 
 
-async def test_a_full_queue_drops_the_messages_that_came_first(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_a_full_queue_drops_the_oldest_messages(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     drops = DroppedMessages()
     bus.publish(moving("map", "laser", 0))
@@ -204,7 +204,7 @@ async def test_the_target_can_be_changed_while_messages_wait(bus: Bus, buffer: B
         tasks.cancel_scope.cancel()
 
 
-async def test_what_is_ready_keeps_its_transform_when_the_target_changes(
+async def test_a_ready_message_keeps_its_transform_when_the_target_changes(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -218,7 +218,7 @@ async def test_what_is_ready_keeps_its_transform_when_the_target_changes(
         assert [(await anext(pairs))[1].parent for _ in range(2)] == ["map", "odom"]
 
 
-async def test_a_changed_target_that_is_the_frame_of_a_message_is_an_answer(buffer: Buffer, streams: Streams) -> None:
+async def test_changing_the_target_to_the_frame_of_a_message_delivers_it(buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     async with MessageFilter(receive, buffer, "map") as pairs:
         put(send, Scan(5))
@@ -227,7 +227,7 @@ async def test_a_changed_target_that_is_the_frame_of_a_message_is_an_answer(buff
         assert (await anext(pairs))[1].parent == "laser"
 
 
-async def test_of_several_targets_all_are_needed(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_a_message_needs_the_transforms_of_all_targets(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     got: list[tuple[Scan, tuple[TransformStamped, ...]]] = []
     pairs = MessageFilter(receive, buffer, ["world", "odom", "laser"])
@@ -251,7 +251,9 @@ async def test_of_several_targets_all_are_needed(bus: Bus, buffer: Buffer, strea
         tasks.cancel_scope.cancel()
 
 
-async def test_a_tolerance_needs_the_time_after_the_stamp_too(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_a_tolerance_requires_the_transform_after_the_stamp_too(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
     send, receive = streams
     got: list[Pair] = []
     async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map", tolerance=0.2) as pairs:
@@ -286,7 +288,7 @@ async def test_a_message_older_than_the_buffer_is_dropped_at_once(bus: Bus, buff
         assert (pairs.pending, pairs.dropped) == (0, {"too old": 1})
 
 
-async def test_a_message_that_waits_while_its_time_leaves_the_buffer_is_dropped(
+async def test_a_waiting_message_is_dropped_when_its_stamp_leaves_the_window(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -302,7 +304,7 @@ async def test_a_message_that_waits_while_its_time_leaves_the_buffer_is_dropped(
 
 
 @pytest.mark.parametrize("frame", ["", "/laser"])
-async def test_a_name_that_cannot_be_a_frames_is_dropped_at_once(frame: str, buffer: Buffer, streams: Streams) -> None:
+async def test_a_message_with_an_invalid_frame_is_dropped_at_once(frame: str, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     drops = DroppedMessages()
     async with MessageFilter(receive, buffer, "map", on_drop=drops) as pairs:
@@ -315,7 +317,7 @@ async def test_a_name_that_cannot_be_a_frames_is_dropped_at_once(frame: str, buf
         assert (pairs.arrived, pairs.pending) == (1, 0)
 
 
-async def test_transforms_from_a_thread_bring_every_message_out(streams: Streams) -> None:
+async def test_transforms_from_a_thread_deliver_every_message(streams: Streams) -> None:
     send, receive = streams
     bus = Bus()
     buffer = Buffer(bus)
@@ -354,9 +356,7 @@ async def test_a_callback_may_call_the_filter_and_the_bus(bus: Bus, buffer: Buff
         assert pairs.dropped == {"queue full": 1, "too old": 1}
 
 
-async def test_one_nanosecond_is_told_from_the_next_at_a_stamp_of_today(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
+async def test_stamps_of_today_are_exact_to_the_nanosecond(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     today = 1_000_000_000 * SECOND + 1
     got: list[Pair] = []
@@ -392,7 +392,7 @@ async def test_frame_and_stamp_may_come_from_callables(bus: Bus, buffer: Buffer)
     assert (found.stamp, found.transform.translation[0]) == (5, 2.0)
 
 
-async def test_any_stamped_data_are_messages_and_latest_is_a_stamp(bus: Bus, buffer: Buffer) -> None:
+async def test_stamped_data_are_messages_and_may_be_stamped_latest(bus: Bus, buffer: Buffer) -> None:
     bus.publish([moving("map", "laser", 5), moving("map", "laser", 7)])
     point = PointStamped("laser", LATEST, (1.0, 0.0, 0.0))
 
@@ -404,7 +404,7 @@ async def test_any_stamped_data_are_messages_and_latest_is_a_stamp(bus: Bus, buf
     assert (message, found.stamp) == (point, 7)
 
 
-async def test_latest_in_the_target_frame_is_stamped_with_now(
+async def test_a_message_stamped_latest_in_the_target_frame_gets_the_stamp_of_now(
     clock: SimulatedClock, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -421,7 +421,7 @@ async def test_latest_in_the_target_frame_is_stamped_with_now(
     ("order", "expected"),
     [("ready", [4, 2, 3, 1, 5]), ("stamp", [1, 2, 3, 4, 5]), ("arrival", [5, 3, 1, 4, 2])],
 )
-async def test_messages_come_out_in_the_order_that_was_asked_for(
+async def test_messages_are_delivered_in_the_given_order(
     order: Any, expected: list[int], bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -439,7 +439,7 @@ async def test_messages_come_out_in_the_order_that_was_asked_for(
         tasks.cancel_scope.cancel()
 
 
-async def test_messages_that_one_batch_makes_ready_come_out_as_they_came(
+async def test_messages_made_ready_by_one_batch_are_delivered_in_order_of_arrival(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -453,7 +453,7 @@ async def test_messages_that_one_batch_makes_ready_come_out_as_they_came(
         assert stamps([await anext(pairs) for _ in order]) == order
 
 
-async def test_messages_that_corrected_samples_make_ready_come_out_in_that_order(
+async def test_messages_made_ready_by_replaced_samples_are_delivered_in_the_order_of_readiness(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -469,7 +469,7 @@ async def test_messages_that_corrected_samples_make_ready_come_out_in_that_order
 
 
 @pytest.mark.parametrize("order", ["stamp", "arrival"])
-async def test_a_message_that_waits_holds_back_those_behind_it_until_it_is_dropped(
+async def test_a_waiting_message_holds_back_later_ones_until_it_is_dropped(
     order: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -486,7 +486,9 @@ async def test_a_message_that_waits_holds_back_those_behind_it_until_it_is_dropp
         tasks.cancel_scope.cancel()
 
 
-async def test_by_stamp_a_late_older_message_still_comes_out(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_in_the_order_of_stamps_a_late_older_message_is_delivered(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
     send, receive = streams
     bus.publish([moving("map", "laser", 1), moving("map", "laser", 9)])
     async with MessageFilter(receive, buffer, "map", order="stamp") as pairs:
@@ -499,7 +501,9 @@ async def test_by_stamp_a_late_older_message_still_comes_out(bus: Bus, buffer: B
 # Bounds
 
 
-async def test_drop_newest_refuses_what_arrives_at_a_full_queue(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_drop_newest_drops_the_messages_that_arrive_at_a_full_queue(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
     send, receive = streams
     drops = DroppedMessages()
     bus.publish(moving("map", "laser", 0))
@@ -513,7 +517,7 @@ async def test_drop_newest_refuses_what_arrives_at_a_full_queue(bus: Bus, buffer
         assert stamps([await anext(pairs) for _ in range(2)]) == [1, 2]
 
 
-async def test_a_full_queue_of_what_nobody_reads_drops_without_an_error(
+async def test_a_full_queue_of_ready_messages_drops_without_an_error(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -526,9 +530,7 @@ async def test_a_full_queue_of_what_nobody_reads_drops_without_an_error(
         assert stamps([await anext(pairs) for _ in range(2)]) == [4, 5]
 
 
-async def test_blocking_leaves_in_the_source_what_there_is_no_room_for(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
+async def test_block_reads_no_message_beyond_the_capacity(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     put(send, *map(Scan, range(1, 8)))
     bus.publish(moving("map", "laser", 0))
@@ -550,7 +552,7 @@ async def test_blocking_leaves_in_the_source_what_there_is_no_room_for(
         tasks.cancel_scope.cancel()
 
 
-async def test_a_replay_that_never_waits_is_delivered_whole_when_it_blocks(bus: Bus, buffer: Buffer) -> None:
+async def test_block_delivers_every_message_of_a_source_that_never_waits(bus: Bus, buffer: Buffer) -> None:
     bus.publish([moving("map", "laser", 0), moving("map", "laser", 1_000)])
 
     async def replay() -> AsyncIterator[Scan]:
@@ -563,7 +565,7 @@ async def test_a_replay_that_never_waits_is_delivered_whole_when_it_blocks(bus: 
     assert stamps(got) == list(range(1_000))
 
 
-async def test_a_message_that_is_dropped_as_its_transform_comes_stays_dropped(
+async def test_a_message_dropped_in_the_turn_of_its_transform_stays_dropped(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -581,7 +583,7 @@ async def test_a_message_that_is_dropped_as_its_transform_comes_stays_dropped(
         assert pairs.dropped == {"queue full": 1}
 
 
-async def test_what_is_dropped_on_arrival_takes_no_room(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_a_message_dropped_on_arrival_displaces_no_other(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     bus.publish(moving("map", "laser", 10))
     put(send, Scan(11), Scan(5), Scan(5, ""))
@@ -620,7 +622,7 @@ async def test_a_message_times_out_on_the_clock_of_the_bus(
             assert (error.target, error.timeout) == ("map", 2.0)
 
 
-async def test_the_target_that_a_message_timed_out_for_is_named(
+async def test_the_timeout_error_names_the_missing_target(
     clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -634,7 +636,7 @@ async def test_the_target_that_a_message_timed_out_for_is_named(
         assert (error.target, error.source) == ("map", "laser")
 
 
-async def test_a_timeout_of_zero_drops_what_cannot_be_answered_on_arrival(
+async def test_timeout_zero_drops_messages_without_a_transform_on_arrival(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -646,9 +648,7 @@ async def test_a_timeout_of_zero_drops_what_cannot_be_answered_on_arrival(
         assert pairs.dropped == {"timed out": 1}
 
 
-async def test_with_a_timeout_of_zero_what_cannot_be_answered_takes_no_room(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
+async def test_a_message_dropped_by_timeout_zero_displaces_no_other(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     bus.publish(moving("map", "laser", 5))
     put(send, Scan(5), Scan(6), Scan(5, "nobody"))
@@ -658,7 +658,7 @@ async def test_with_a_timeout_of_zero_what_cannot_be_answered_takes_no_room(
         assert (await anext(pairs))[0] == Scan(5)
 
 
-async def test_what_is_ready_does_not_time_out(
+async def test_a_ready_message_does_not_time_out(
     clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -670,7 +670,7 @@ async def test_what_is_ready_does_not_time_out(
         assert (await anext(pairs))[0] == Scan(5)
 
 
-async def test_changing_the_target_does_not_give_a_message_more_time(
+async def test_changing_the_target_does_not_extend_the_timeout(
     clock: SimulatedClock, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -682,7 +682,7 @@ async def test_changing_the_target_does_not_give_a_message_more_time(
         assert pairs.pending == 0
 
 
-async def test_data_that_come_in_the_turn_in_which_the_time_is_up_count(streams: Streams) -> None:
+async def test_a_transform_in_the_turn_in_which_the_timeout_expires_delivers_the_message(streams: Streams) -> None:
     send, receive = streams
     clock = HandClock()
     bus = Bus(clock)
@@ -696,7 +696,7 @@ async def test_data_that_come_in_the_turn_in_which_the_time_is_up_count(streams:
         assert dict(pairs.dropped) == {}
 
 
-async def test_a_jump_back_drops_what_waits_and_delivers_what_is_ready(
+async def test_a_jump_back_drops_waiting_messages_and_delivers_ready_ones(
     clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -731,7 +731,7 @@ async def test_a_jump_forward_drops_nothing(clock: SimulatedClock, bus: Bus, buf
 # The callback
 
 
-async def test_a_callback_that_raises_disturbs_nobody_and_is_logged_once(
+async def test_an_exception_of_the_callback_is_isolated_and_logged_once(
     bus: Bus, buffer: Buffer, streams: Streams, caplog: pytest.LogCaptureFixture
 ) -> None:
     send, receive = streams
@@ -752,7 +752,7 @@ async def test_a_callback_that_raises_disturbs_nobody_and_is_logged_once(
 # How it ends
 
 
-async def test_when_the_source_is_exhausted_what_waits_is_waited_for(
+async def test_waiting_messages_are_delivered_after_the_end_of_the_source(
     bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -772,7 +772,7 @@ async def test_when_the_source_is_exhausted_what_waits_is_waited_for(
             await anext(pairs)
 
 
-async def test_the_last_message_that_is_dropped_ends_the_iteration(
+async def test_dropping_the_last_message_after_the_end_of_the_source_ends_the_iteration(
     clock: SimulatedClock, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -785,7 +785,7 @@ async def test_the_last_message_that_is_dropped_ends_the_iteration(
 
 
 @pytest.mark.parametrize("closed", ["bus", "buffer"])
-async def test_closing_ends_the_iteration_after_what_is_ready(
+async def test_closing_ends_the_iteration_after_the_ready_messages(
     closed: str, bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -808,7 +808,7 @@ async def test_closing_ends_the_iteration_after_what_is_ready(
 
 @pytest.mark.parametrize("closed", ["bus", "buffer"])
 @pytest.mark.parametrize("before", [True, False])
-async def test_closing_ends_the_iteration_when_nothing_waits(
+async def test_closing_ends_the_iteration_without_waiting_messages(
     before: bool, closed: str, bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -858,7 +858,7 @@ async def test_a_filter_belongs_to_the_loop_of_its_bus(buffer: Buffer) -> None:
     assert [type(error) for error in errors] == [RuntimeError]
 
 
-async def test_leaving_drops_what_is_left_and_leaves_nothing_behind(
+async def test_leaving_the_filter_drops_the_remaining_messages_and_ends_its_tasks(
     clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
 ) -> None:
     send, receive = streams
@@ -881,7 +881,7 @@ async def test_leaving_drops_what_is_left_and_leaves_nothing_behind(
     assert pairs.arrived == 3
 
 
-async def test_a_filter_that_was_left_is_held_by_nobody(buffer: Buffer, streams: Streams) -> None:
+async def test_a_filter_that_was_left_is_freed(buffer: Buffer, streams: Streams) -> None:
     pairs = MessageFilter(streams[1], buffer, "map")
     async with pairs:
         await settle()
@@ -891,7 +891,7 @@ async def test_a_filter_that_was_left_is_held_by_nobody(buffer: Buffer, streams:
     assert held() is None
 
 
-async def test_a_generator_is_closed_where_it_was_read(buffer: Buffer) -> None:
+async def test_a_generator_is_closed_in_the_task_that_read_it(buffer: Buffer) -> None:
     closed: list[anyio.TaskInfo] = []
     read_in: list[anyio.TaskInfo] = []
 
@@ -931,7 +931,7 @@ class Source:
         raise self._error
 
 
-async def test_what_the_source_raises_comes_out_after_what_is_ready(bus: Bus, buffer: Buffer) -> None:
+async def test_an_error_of_the_source_is_raised_after_the_ready_messages(bus: Bus, buffer: Buffer) -> None:
     bus.publish(moving("map", "laser", 5))
     error = OSError("unplugged")
     got: list[Pair] = []
@@ -944,7 +944,7 @@ async def test_what_the_source_raises_comes_out_after_what_is_ready(bus: Bus, bu
     assert (pairs.dropped, buffer.pending()) == ({"closed": 1}, ())
 
 
-async def test_whoever_catches_what_the_source_raises_may_read_on(bus: Bus, buffer: Buffer) -> None:
+async def test_after_an_error_of_the_source_the_waiting_messages_can_be_read(bus: Bus, buffer: Buffer) -> None:
     got: list[Pair] = []
     async with MessageFilter(Source(OSError("unplugged"), Scan(5)), buffer, "map") as pairs:
         with pytest.raises(OSError, match="unplugged"):
@@ -954,13 +954,13 @@ async def test_whoever_catches_what_the_source_raises_may_read_on(bus: Bus, buff
     assert stamps(got) == [5]
 
 
-async def test_what_the_source_raises_is_not_lost_when_nobody_reads_on(buffer: Buffer) -> None:
+async def test_an_error_of_the_source_is_raised_at_the_end_if_it_was_not_read(buffer: Buffer) -> None:
     with pytest.raises(OSError, match="unplugged"):
         async with MessageFilter(Source(OSError("unplugged")), buffer, "map"):
             await settle()
 
 
-async def test_an_error_of_the_body_comes_before_one_of_the_source(buffer: Buffer) -> None:
+async def test_an_error_of_the_body_is_raised_instead_of_one_of_the_source(buffer: Buffer) -> None:
     with pytest.raises(ZeroDivisionError):
         async with MessageFilter(Source(OSError("unplugged")), buffer, "map"):
             await settle()
@@ -977,7 +977,7 @@ async def test_an_error_of_the_body_comes_before_one_of_the_source(buffer: Buffe
         ("no header", AttributeError),
     ],
 )
-async def test_a_message_without_a_frame_and_a_stamp_is_an_error_of_the_program(
+async def test_a_message_without_frame_and_stamp_is_an_error(
     message: Any, error: type[Exception], buffer: Buffer
 ) -> None:
     async def one() -> AsyncIterator[Any]:
@@ -989,7 +989,7 @@ async def test_a_message_without_a_frame_and_a_stamp_is_an_error_of_the_program(
     assert (pairs.arrived, balanced(pairs)) == (0, True)
 
 
-async def test_messages_without_a_stamp_of_their_own_have_no_order_by_stamp(buffer: Buffer) -> None:
+async def test_a_message_stamped_latest_has_no_order_by_stamp(buffer: Buffer) -> None:
     async def one() -> AsyncIterator[Scan]:
         yield Scan(LATEST)
 
@@ -999,7 +999,7 @@ async def test_messages_without_a_stamp_of_their_own_have_no_order_by_stamp(buff
     assert pairs.arrived == 0
 
 
-async def test_what_a_callable_raises_comes_out_as_it_is(buffer: Buffer, streams: Streams) -> None:
+async def test_an_error_of_a_frame_or_stamp_callable_is_raised_as_it_is(buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     put(send, Scan(0))
     with pytest.raises(ZeroDivisionError):
@@ -1007,7 +1007,7 @@ async def test_what_a_callable_raises_comes_out_as_it_is(buffer: Buffer, streams
             await anext(pairs)
 
 
-async def test_what_the_body_raises_comes_out_as_it_is(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_an_error_of_the_body_is_raised_as_it_is(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     bus.publish(moving("map", "laser", 5))
     put(send, Scan(5), Scan(6))
@@ -1018,7 +1018,7 @@ async def test_what_the_body_raises_comes_out_as_it_is(bus: Bus, buffer: Buffer,
     assert buffer.pending() == ()
 
 
-async def test_what_closing_a_generator_raises_is_not_lost(buffer: Buffer) -> None:
+async def test_an_error_of_closing_the_generator_is_raised(buffer: Buffer) -> None:
     async def fragile() -> AsyncIterator[Scan]:
         try:
             yield Scan(5)
@@ -1049,7 +1049,7 @@ async def ringing() -> AsyncIterator[Scan]:
 
 @pytest.mark.parametrize("where", ["source", "frame", "stamp", "on_drop", "on_drop of one that waits"])
 @pytest.mark.parametrize("reading", [True, False])
-async def test_what_is_no_exception_stops_the_body_and_comes_out_as_it_is(
+async def test_a_base_exception_stops_the_body_and_is_raised_as_it_is(
     where: str, reading: bool, clock: SimulatedClock, buffer: Buffer
 ) -> None:
     options: dict[str, dict[str, Any]] = {
@@ -1074,7 +1074,7 @@ async def test_what_is_no_exception_stops_the_body_and_comes_out_as_it_is(
     assert (buffer.pending(), balanced(pairs)) == ((), True)
 
 
-async def test_a_group_that_the_source_raises_stays_one(buffer: Buffer) -> None:
+async def test_an_exception_group_of_the_source_stays_a_group(buffer: Buffer) -> None:
     alarm = Alarm()
     with pytest.raises(BaseExceptionGroup, match="two or more") as caught:
         async with MessageFilter(Source(BaseExceptionGroup("two or more", [alarm])), buffer, "map") as pairs:
@@ -1082,7 +1082,7 @@ async def test_a_group_that_the_source_raises_stays_one(buffer: Buffer) -> None:
     assert caught.value.exceptions == (alarm,)
 
 
-def test_an_interrupt_in_the_source_comes_out_of_the_loop_as_it_is(
+def test_a_keyboard_interrupt_in_the_source_is_raised_as_it_is(
     run: Callable[[Callable[[], Any]], Any], buffer: Buffer
 ) -> None:
     seen: list[str] = []
@@ -1103,7 +1103,7 @@ def test_an_interrupt_in_the_source_comes_out_of_the_loop_as_it_is(
 # Cancellation
 
 
-async def test_a_cancelled_body_is_cancelled_and_leaves_nothing_behind(buffer: Buffer, streams: Streams) -> None:
+async def test_cancelling_the_body_ends_the_filter(buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     put(send, Scan(5), Scan(6))
     with anyio.CancelScope() as scope:
@@ -1115,7 +1115,7 @@ async def test_a_cancelled_body_is_cancelled_and_leaves_nothing_behind(buffer: B
     assert (buffer.pending(), pairs.dropped) == ((), {"closed": 2})
 
 
-async def test_a_reader_that_is_cancelled_loses_nothing(bus: Bus, buffer: Buffer, streams: Streams) -> None:
+async def test_a_cancelled_reader_loses_no_message(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
         reading = Asked(tasks, pairs.__anext__)
@@ -1133,7 +1133,7 @@ async def test_a_reader_that_is_cancelled_loses_nothing(bus: Bus, buffer: Buffer
         assert (pairs.arrived, pairs.delivered) == (1, 1)
 
 
-async def test_a_second_reader_is_told_and_the_first_goes_on(buffer: Buffer, streams: Streams) -> None:
+async def test_a_second_reader_is_busy_and_the_first_continues(buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     async with anyio.create_task_group() as tasks, MessageFilter(receive, buffer, "map") as pairs:
         first = Asked(tasks, pairs.__anext__)
@@ -1184,22 +1184,18 @@ async def no_callback(_message: Scan, _reason: DropReason, _error: TransformErro
         ({"messages": [Scan(1)]}, TypeError),
     ],
 )
-def test_an_argument_that_makes_no_sense_is_refused(
-    arguments: dict[str, Any], error: type[Exception], buffer: Buffer
-) -> None:
+def test_a_wrong_argument_is_an_error(arguments: dict[str, Any], error: type[Exception], buffer: Buffer) -> None:
     with pytest.raises(error):
         MessageFilter(**{"messages": Source(OSError()), "buffer": buffer, "target": "map", **arguments})
 
 
-def test_a_queue_size_behind_the_target_as_in_tf2_is_refused(buffer: Buffer) -> None:
+def test_a_positional_queue_size_as_in_tf2_is_an_error(buffer: Buffer) -> None:
     make: Any = MessageFilter
     with pytest.raises(TypeError, match="positional"):
         make(Source(OSError()), buffer, "map", 10)
 
 
-async def test_a_leading_slash_is_named_with_the_frame_that_was_meant(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
+async def test_the_error_of_a_leading_slash_names_the_similar_frame(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     send, receive = streams
     bus.publish(static("map", "laser"))
     pairs = MessageFilter(receive, buffer, "map", on_drop=(drops := DroppedMessages()))
@@ -1224,7 +1220,7 @@ async def test_a_leading_slash_is_named_with_the_frame_that_was_meant(
         (["map"], [], ValueError),
     ],
 )
-def test_a_changed_target_that_makes_no_sense_is_refused(
+def test_changing_to_a_wrong_target_is_an_error(
     target: Any, changed: Any, error: type[Exception], buffer: Buffer
 ) -> None:
     pairs: MessageFilter[Scan, Any] = MessageFilter(Source(OSError()), buffer, target)
@@ -1235,7 +1231,7 @@ def test_a_changed_target_that_makes_no_sense_is_refused(
 # Plain asyncio
 
 
-def test_a_filter_in_tasks_of_asyncio() -> None:
+def test_a_filter_works_in_asyncio_tasks() -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus)
     queue: asyncio.Queue[Scan] = asyncio.Queue()
@@ -1265,7 +1261,7 @@ def test_a_filter_in_tasks_of_asyncio() -> None:
 
 
 @pytest.mark.parametrize("around", ["timeout", "wait_for"])
-def test_a_timeout_of_asyncio_around_a_filter_is_a_timeout(around: str) -> None:
+def test_an_asyncio_timeout_around_a_filter_raises_a_timeout_error(around: str) -> None:
     buffer = Buffer(Bus())
     left: list[int] = []
 
@@ -1296,7 +1292,7 @@ def test_a_timeout_of_asyncio_around_a_filter_is_a_timeout(around: str) -> None:
 
 
 @pytest.mark.parametrize("where", ["waiting", "in the body", "with an answer"])
-def test_a_cancelled_task_of_asyncio_is_cancelled(where: str) -> None:
+def test_a_cancelled_asyncio_task_with_a_filter_is_cancelled(where: str) -> None:
     bus = Bus(SimulatedClock())
     buffer = Buffer(bus)
 
@@ -1321,7 +1317,7 @@ def test_a_cancelled_task_of_asyncio_is_cancelled(where: str) -> None:
     asyncio.run(main())
 
 
-def test_a_source_that_is_cancelled_in_its_own_right_is_no_quiet_end() -> None:
+def test_a_cancelled_error_of_the_source_itself_is_raised() -> None:
     buffer = Buffer(Bus(SimulatedClock()))
 
     async def main() -> None:

@@ -439,7 +439,7 @@ def reparented() -> TransformTree:
     ("time", "expected"),
     [(0.0, 1.0), (0.5, 1.0), (1.0, 1.0), (1.000000001, 0.0), (2.999999999, 0.0), (3.0, 2.0), (3.5, 2.0), (4.0, 2.0)],
 )
-def test_across_a_change_of_parent_a_frame_rests_and_the_first_sample_of_the_new_parent_has_the_velocity_after_it(
+def test_between_two_parents_a_frame_rests_and_the_new_parent_begins_with_the_velocity_after(
     time: float, expected: float
 ) -> None:
     assert speed(reparented(), round(time * SECOND)) == expected

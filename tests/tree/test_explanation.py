@@ -441,7 +441,7 @@ steady = st.lists(st.tuples(st.sampled_from("bcd"), st.integers(0, 9)), max_size
 
 
 @given(steady, st.none() | st.integers(0, 12), st.integers(0, 3).map(lambda n: n * NANO))
-def test_there_is_an_answer_exactly_once_every_edge_with_an_error_has_a_new_sample(
+def test_latest_has_an_answer_only_after_the_missing_sample_of_every_edge_with_an_error(
     arrivals: list[tuple[str, int]], not_before: int | None, tolerance: float
 ) -> None:
     tree = tree_of(*(moving(PARENT[child], child, stamp) for child, stamp in arrivals), keep=None)
