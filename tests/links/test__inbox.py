@@ -302,6 +302,7 @@ def test_of_very_many_removals_the_highest_number_is_remembered_for_live_message
         assert [[sample.child for sample in heard] for heard in here.heard] == [["new"], ["old"], ["10"]]
 
 
+@pytest.mark.thorough
 def test_removals_of_very_many_origins_are_not_remembered_without_end() -> None:
     with receiver() as here:
         for number in range(15_000):
