@@ -1,7 +1,7 @@
-"""Where stamps and sleeping come from.
+"""Clocks: the stamps and the timers of a bus.
 
-`SystemClock` is the machine's time. `SimulatedClock` stands still until somebody advances it, and then gives the same
-order of timed tasks on every event loop: that is what makes a test or a simulation repeatable.
+`SystemClock` is the time of the machine. `SimulatedClock` stands still until a task advances it, and then runs timed
+tasks in the same order on every event loop, which makes tests and simulations repeatable.
 """
 
 import math
@@ -20,31 +20,30 @@ from tfbus.registration import Registration
 from tfbus.stamps import SECOND, STAMP_MAX, as_duration, as_stamp, from_seconds, is_real
 
 JumpCallback = Callable[[int, int], object]
-"""Called with the stamps just before and just after a jump."""
+"""A function that is called with the stamps just before and just after a jump, in ns."""
 
 _SETTLING_CHECKPOINTS = 5
 
 
 class Ticks:
-    """The numbers 0, 1, 2, ... each at its time: tick k is due at start + k / hz, so the beat does not drift.
+    """An async iterator over the numbers 0, 1, 2, ...: tick k is due at start + k / hz, so the ticks do not drift.
 
-    Iterate it with ``async for``; the start is the first iteration, where tick 0 is due. A tick that is a whole period
-    late is counted in `skipped` and left out: after a hold-up the newest due tick comes at once and the others never,
-    so there is no burst.
+    The first iteration is the start, where tick 0 is due. A tick that is late by a whole period is skipped and counted
+    in `skipped`: after a delay the newest due tick is given at once, and the older ones are never given.
 
     Parameters
     ----------
     hz : float
         Ticks per second; greater than zero.
     elapsed : callable
-        A clock in ns that never goes back.
-    sleep_until : callable
-        Sleeps until that clock has reached a time.
+        Returns a monotonic time in ns.
+    sleep_until : async callable
+        Sleeps until that time has reached its argument.
 
     Attributes
     ----------
     skipped : int
-        How many ticks have been left out.
+        Number of skipped ticks.
     """
 
     def __init__(self, hz: float, elapsed: Callable[[], int], sleep_until: Callable[[int], Awaitable[None]]) -> None:
@@ -74,44 +73,44 @@ class Ticks:
 
 
 class Clock(Protocol):
-    """What the rest of tfbus needs of a clock."""
+    """The protocol of clocks: now, sleeping, ticks, timeouts and jumps."""
 
     def now(self) -> int:
-        """The present stamp, in ns."""
+        """The current stamp, in ns."""
 
     async def sleep(self, seconds: float) -> None:
-        """Sleep for a duration; jumps do not change it."""
+        """Sleep for a duration in s; jumps do not change it."""
 
     async def sleep_until(self, stamp: int) -> None:
-        """Sleep until `now` has reached a stamp; a jump back raises `ClockResetError`."""
+        """Sleep until `now` has reached a stamp in ns; a jump back raises `ClockResetError`."""
 
     def ticks(self, hz: float) -> Ticks:
-        """A beat of `hz` ticks per second, counted in durations."""
+        """Ticks at `hz` per second; jumps do not change their times."""
 
     def move_on_after(self, seconds: float) -> AbstractContextManager[anyio.CancelScope]:
-        """A ``with`` that cancels its body after a duration and goes on behind it; see `anyio.move_on_after`."""
+        """A ``with`` that cancels its body after a duration in s, as `anyio.move_on_after`."""
 
     def on_jump(self, callback: JumpCallback) -> Registration:
         """Call `callback` with the stamps before and after each jump, until the registration is closed."""
 
 
 class SystemClock:
-    """The machine's time: stamps are ``time.time_ns()``, sleeping is monotonic. It never announces a jump."""
+    """The time of the machine: stamps are ``time.time_ns()``, sleeps are monotonic. It never announces a jump."""
 
     def now(self) -> int:
         """Nanoseconds since 1970."""
         return time.time_ns()
 
     async def sleep(self, seconds: float) -> None:
-        """Sleep for a duration, at least one checkpoint long."""
+        """Sleep for a duration in s; zero passes a checkpoint."""
         await anyio.sleep(as_duration(seconds, "seconds"))
 
     async def sleep_until(self, stamp: int) -> None:
-        """Sleep until a stamp, as far as it is away now."""
+        """Sleep until a stamp in ns, by its distance from now; later changes of the machine's clock have no effect."""
         await anyio.sleep(max(0, as_stamp(stamp) - self.now()) / SECOND)
 
     def ticks(self, hz: float) -> Ticks:
-        """A beat on the monotonic clock.
+        """Ticks at `hz` per second on the monotonic clock.
 
         Raises
         ------
@@ -121,11 +120,11 @@ class SystemClock:
         return Ticks(hz, self._elapsed, self._sleep_until_elapsed)
 
     def move_on_after(self, seconds: float) -> AbstractContextManager[anyio.CancelScope]:
-        """`anyio.move_on_after`."""
+        """A ``with`` that cancels its body after a duration in s; see `anyio.move_on_after`."""
         return anyio.move_on_after(as_duration(seconds, "seconds"))
 
     def on_jump(self, callback: JumpCallback) -> Registration:  # noqa: ARG002 - the protocol's signature
-        """Never calls `callback`."""
+        """Return a registration that never calls `callback`."""
         return Registration(lambda: None)
 
     def _elapsed(self) -> int:
@@ -136,12 +135,12 @@ class SystemClock:
 
 
 class SimulatedClock:
-    """Time that stands still until `advance` moves it.
+    """A clock that stands still until `advance` or `set` moves it.
 
-    Between two timed tasks that are due, `advance` lets everything run until all tasks are blocked, so timed tasks run
-    in order of their time, and of registration where that is equal, on every event loop. The order of several tasks
-    that one publish or one `set` wakes, or that are started together, is the loop's own; trio shuffles it on purpose.
-    Worker threads and sockets count as blocked: simulated time is for one process.
+    Between two due timers `advance` lets all tasks run until they are blocked. On every event loop, timed tasks
+    therefore run in the order of their times and, at equal times, in the order of registration. Tasks that are started
+    together, or woken by one publish or one `set`, run in the order of the event loop, which trio shuffles on purpose.
+    A task that waits for a worker thread or a socket counts as blocked: simulated time is for one process.
 
     Parameters
     ----------
@@ -169,23 +168,23 @@ class SimulatedClock:
         self._advancing = False
 
     def now(self) -> int:
-        """The simulated stamp, in ns."""
+        """The current simulated stamp, in ns."""
         return self._now
 
     async def sleep(self, seconds: float) -> None:
-        """Sleep for a simulated duration; zero is one checkpoint."""
+        """Sleep for a simulated duration in s; zero passes a checkpoint."""
         duration = as_duration(seconds, "seconds")
         if duration * SECOND >= STAMP_MAX:
             await anyio.sleep_forever()
         await self._sleep_until_elapsed(self._elapsed + from_seconds(duration))
 
     async def sleep_until(self, stamp: int) -> None:
-        """Sleep until the clock has reached a stamp, by advancing or by a jump.
+        """Sleep until `advance` or `set` has brought the clock to a stamp, in ns.
 
         Raises
         ------
         ClockResetError
-            If the clock jumps back meanwhile.
+            If the clock jumps back before that.
         """
         sleeper = _StampSleeper(as_stamp(stamp), anyio.Event())
         if sleeper.stamp <= self._now:
@@ -203,7 +202,7 @@ class SimulatedClock:
             raise sleeper.reset
 
     def ticks(self, hz: float) -> Ticks:
-        """A beat in simulated time.
+        """Ticks at `hz` per second of simulated time.
 
         Raises
         ------
@@ -214,7 +213,7 @@ class SimulatedClock:
 
     @contextmanager
     def move_on_after(self, seconds: float) -> Iterator[anyio.CancelScope]:
-        """As `anyio.move_on_after`, in simulated time."""
+        """A ``with`` that cancels its body after a simulated duration in s; see `anyio.move_on_after`."""
         duration = as_duration(seconds, "seconds")
         with anyio.CancelScope() as scope:
             if duration * SECOND >= STAMP_MAX:
@@ -235,10 +234,10 @@ class SimulatedClock:
         return Registration(lambda: self._callbacks.pop(key, None))
 
     async def advance(self, seconds: float) -> None:
-        """Let simulated time pass.
+        """Move the clock forward by a duration in s, and run the timed tasks that become due.
 
-        First everything that can run runs; then time goes from one timed task to the next that is due, and everything
-        that can run runs again. A task that never blocks stalls this for ever.
+        All tasks run until they are blocked. Then the clock moves to the next due timer, fires it, and all tasks run
+        again, and so on. A task that never blocks keeps `advance` from returning.
 
         Raises
         ------
@@ -264,7 +263,11 @@ class SimulatedClock:
             self._advancing = False
 
     def set(self, stamp: int) -> None:
-        """Jump to a stamp. Durations go on undisturbed; sleepers on a stamp wake, or learn of a jump back."""
+        """Jump to a stamp, in ns.
+
+        Sleeps of a duration are not changed. `sleep_until` ends if the stamp is reached, and raises `ClockResetError`
+        after a jump back.
+        """
         before, after = self._now, as_stamp(stamp)
         self._now = after
         error = ClockResetError(before=before, after=after) if after < before else None
@@ -281,7 +284,7 @@ class SimulatedClock:
             callback(before, after)
 
     async def _settle(self) -> None:
-        # On asyncio, waiting for blocked tasks sleeps 0.1 s when it finds one that can run; few are left by then.
+        # On asyncio, `wait_all_tasks_blocked` sleeps 0.1 s while a task can run; after the checkpoints few can.
         for _ in range(_SETTLING_CHECKPOINTS):
             await anyio.lowlevel.checkpoint()
         await anyio.wait_all_tasks_blocked()
@@ -314,7 +317,7 @@ class SimulatedClock:
 
 
 class _Timer:
-    """Something to do at a time; ordered by that, then by registration."""
+    """A function to call at a time; timers are ordered by time, then by registration."""
 
     __slots__ = ("due", "fire", "order")
 
@@ -328,7 +331,7 @@ class _Timer:
 
 
 class _StampSleeper:
-    """A task that sleeps until a stamp."""
+    """A task that sleeps until a stamp; `reset` is the error of a jump back."""
 
     __slots__ = ("event", "reset", "stamp", "timer")
 

@@ -1,4 +1,4 @@
-"""Every error that tfbus raises of its own.
+"""The error classes of tfbus.
 
 ::
 
@@ -10,15 +10,15 @@
                 FutureExtrapolationError                                      waiting may help
                 PastExtrapolationError                                        waiting cannot help: raised at once
                 GapError                   .before .after .max_gap            waiting cannot help: raised at once
-            LookupTimeoutError (TimeoutError)  __cause__ says what was still missing
+            LookupTimeoutError (TimeoutError)  __cause__ is the last lookup error
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         InvalidRobotError (ValueError)         .element
         RecordingError (ValueError)            .path .reason
         ClockResetError                        .before .after
         BusClosedError
 
-Each error is built from facts and keeps them as attributes; the message is made from them, so nobody has to parse one.
-They pickle and copy, cause included. Arguments of the wrong type raise `TypeError`, as everywhere in Python.
+Each error keeps its facts as attributes and builds its message from them, so programs need not parse messages. Errors
+can be pickled and copied, with their cause. Arguments of the wrong type raise `TypeError`, as everywhere in Python.
 """
 
 import difflib
@@ -30,13 +30,13 @@ from typing import Any
 from tfbus.stamps import Latest, format_duration, format_stamp
 
 LOOKED_AT = 30
-"""How many names are compared in full with one that is not known: each takes tens of microseconds."""
+"""The number of known names that are compared in full with an unknown one; a comparison takes tens of microseconds."""
 
 
 def _restore(
     cls: type["TransformError"], args: tuple[Any, ...], facts: dict[str, Any], cause: BaseException | None
 ) -> "TransformError":
-    # `cls.__new__` of a timeout is that of LookupError, which refuses to make what is an OSError too.
+    # LookupTimeoutError inherits `__new__` from LookupError, which refuses subclasses of OSError.
     make = OSError.__new__ if issubclass(cls, OSError) else cls.__new__
     error: TransformError = make(cls, *args)
     error.args = args
@@ -47,7 +47,7 @@ def _restore(
 
 
 class TransformError(Exception):
-    """Base of every error of tfbus."""
+    """Base class of all tfbus errors."""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self)!r})"
@@ -57,12 +57,12 @@ class TransformError(Exception):
 
 
 class TransformLookupError(TransformError, LookupError):
-    """A transform was asked for that cannot be given, at least not now.
+    """A lookup has no answer, at least not now.
 
     Attributes
     ----------
     index : int or None
-        Which of the stamps it was, where many were asked for at once.
+        The index of the stamp without an answer in a lookup of many stamps; None for a lookup of one.
     """
 
     index: int | None = None
@@ -80,9 +80,9 @@ class UnknownFrameError(TransformLookupError):
     Attributes
     ----------
     frame : str
-        The frame that was asked for.
+        The unknown frame.
     close_matches : tuple of str
-        Known frames with a similar name, the most similar first; worked out when it is first read.
+        Known frames with a similar name, the most similar first; computed when first read.
     """
 
     def __init__(self, *, frame: str, known: Iterable[str] = ()) -> None:
@@ -105,7 +105,7 @@ class UnknownFrameError(TransformLookupError):
         return _restore, (type(self), self.args, facts, self.__cause__)
 
 
-# Many lookups may wait for one frame, each with an error of its own.
+# Many lookups may wait for one frame, and each has its own error.
 @lru_cache(maxsize=128)
 def _close_matches(frame: str, known: tuple[str, ...]) -> tuple[str, ...]:
     length = len(frame)
@@ -120,18 +120,19 @@ def _close_matches(frame: str, known: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class DisconnectedError(TransformLookupError):
-    """Both frames are known, but no chain of samples joins them. Waiting may help.
+    """Both frames are known, but no path of samples connects them. Waiting may help.
 
     Attributes
     ----------
     target, source : str
-        The question.
+        The two frames of the lookup.
     roots : tuple of str
         The root of target's tree and the root of source's.
     stamp : int or None
-        The instant at which they are apart, in ns; None where the newest samples were asked.
+        The stamp at which they are not connected, in ns; None for a lookup of the newest samples.
     loop : tuple of str
-        Frames that hang on each other in a circle, where out-of-order samples formed one; else empty.
+        Frames that form a loop of parents at that stamp, the first one repeated at the end; empty if there is none.
+        Only out-of-order samples can form one.
     """
 
     def __init__(
@@ -157,20 +158,20 @@ class DisconnectedError(TransformLookupError):
 
 
 class ExtrapolationError(TransformLookupError):
-    """A frame on the path has samples, but none that cover the stamp.
+    """The samples of an edge on the path do not cover the stamp.
 
     Attributes
     ----------
     child : str
-        The frame whose edge to its parent does not cover the stamp.
+        The child frame of the edge.
     stamp : int or Latest
-        What was asked of that edge, in ns.
+        The stamp that the edge does not cover, in ns.
     oldest, newest : int or None
-        The edge's window in ns; None when it is empty.
+        The stamps of the edge's oldest and newest sample, in ns; None if it has no samples.
     authority : str
-        Who sent its newest sample; may be empty.
+        The sender of the edge's newest sample; may be empty.
     slack : int
-        How far from a sample the answer was allowed to be, in ns.
+        The greatest distance between the stamp and a sample that the policy allowed, in ns.
     """
 
     def __init__(
@@ -203,12 +204,12 @@ class ExtrapolationError(TransformLookupError):
 
 
 class FutureExtrapolationError(ExtrapolationError):
-    """The stamp is newer than the edge's newest sample, or the edge has none. Waiting may help.
+    """The stamp is newer than the edge's newest sample, or the edge has no samples. Waiting may help.
 
     Attributes
     ----------
     others : tuple of str
-        Other frames of which a sample may help as well; only for `LATEST` under a policy.
+        Other child frames whose next sample may also give an answer; empty unless a policy is used with `LATEST`.
     """
 
     others: tuple[str, ...] = ()
@@ -221,7 +222,7 @@ class FutureExtrapolationError(ExtrapolationError):
 
 
 class PastExtrapolationError(ExtrapolationError):
-    """The stamp is older than the edge's oldest sample. Waiting cannot help, so nothing waits on it."""
+    """The stamp is older than the edge's oldest sample. Waiting cannot help, so it is raised at once."""
 
     def _gap(self) -> str:
         if self.oldest is None or isinstance(self.stamp, Latest):
@@ -231,14 +232,14 @@ class PastExtrapolationError(ExtrapolationError):
 
 
 class GapError(ExtrapolationError):
-    """The stamp lies between two samples that are further apart than `max_gap`. Waiting cannot help.
+    """The stamp is between two samples that are further apart than `max_gap`. Waiting cannot help.
 
     Attributes
     ----------
     before, after : int
         The stamps of the two samples, in ns.
     max_gap : int
-        In ns.
+        The greatest gap that the lookup allowed, in ns.
     """
 
     def __init__(self, *, before: int, after: int, max_gap: int, **facts: Any) -> None:
@@ -255,17 +256,17 @@ class GapError(ExtrapolationError):
 
 
 class LookupTimeoutError(TransformLookupError, TimeoutError):
-    """An awaited lookup ran out of time; ``__cause__`` is the error that it still had.
+    """The timeout of an awaited lookup expired; ``__cause__`` is the lookup error at that moment.
 
-    The mistake to avoid: `TimeoutError` is an `OSError`, so an ``except OSError`` around a socket loop swallows this.
-    Put ``except TransformLookupError`` before it.
+    `TimeoutError` is an `OSError`, so an ``except OSError`` around a socket loop catches this error too. Put
+    ``except TransformLookupError`` before it.
 
     Attributes
     ----------
     target, source : str
-        The question.
+        The two frames of the lookup.
     timeout : float
-        How long was waited, in s on the bus's clock.
+        The timeout, in s on the bus's clock.
     """
 
     def __init__(self, *, target: str, source: str, timeout: float, missing: TransformLookupError) -> None:
@@ -276,19 +277,19 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
 
 
 class InvalidTransformError(TransformError, ValueError):
-    """A sample that is wrong, or that its sender has no right to; nothing of it was stored.
+    """A sample is invalid, or its authority may not publish the child; nothing was stored.
 
     Attributes
     ----------
     reason : str
-        The rule that it broke, in a few fixed words (``"cycle"``, ``"not finite"``, ``"frame name"``): rejections are
-        counted by it.
+        The broken rule as a fixed text (``"cycle"``, ``"not finite"``, ``"frame name"``); statistics count rejected
+        samples by it.
     parent, child, authority : str or None
-        The sample, as far as it is known where the error is raised.
+        Those of the sample; None if not known where the error is raised.
     loop : tuple of str
-        For ``"cycle"``, the whole loop from child to parent, its first frame repeated at the end.
+        For ``"cycle"``, the whole loop from child to parent, with its first frame repeated at the end.
     owner : str or None
-        For ``"authority"`` and ``"reserved"``, the authority that has the right to the child.
+        For ``"authority"`` and ``"reserved"``, the only authority that may publish the child.
     """
 
     def __init__(
@@ -312,12 +313,12 @@ class InvalidTransformError(TransformError, ValueError):
 
 
 class InvalidRobotError(TransformError, ValueError):
-    """A robot's description cannot be used.
+    """A robot description cannot be used.
 
     Attributes
     ----------
     element : str
-        The part of it that is wrong, such as ``<joint name="elbow">``; empty where it is the whole.
+        The invalid element, such as ``<joint name="elbow">``; empty if the error is about the whole description.
     """
 
     def __init__(self, problem: str, *, element: str = "") -> None:
@@ -331,25 +332,26 @@ class RecordingError(TransformError, ValueError):
     Attributes
     ----------
     path : str
+        The file.
     reason : str
-        ``"missing"``, ``"empty"``, ``"truncated"`` (before its first message), ``"foreign"``, ``"damaged"``,
-        ``"unreadable"`` or ``"missing extra"``.
+        ``"missing"``, ``"empty"``, ``"truncated"`` (before its first message), ``"foreign"`` (no recording),
+        ``"damaged"``, ``"unreadable"`` or ``"missing extra"``.
     """
 
     def __init__(self, problem: str, *, path: str, reason: str) -> None:
-        # What other packages say of a file may have several lines.
+        # Messages of other packages may have several lines.
         super().__init__(f"recording {path!r}: {' '.join(problem.split()).rstrip('.')}")
         self.path = path
         self.reason = reason
 
 
 class ClockResetError(TransformError):
-    """The clock jumped back while something waited for a stamp of the old time.
+    """The clock jumped back during a wait for a stamp.
 
     Attributes
     ----------
     before, after : int
-        The clock just before and just after the jump, in ns.
+        The clock's stamps just before and just after the jump, in ns.
     """
 
     def __init__(self, *, before: int, after: int) -> None:
@@ -359,11 +361,11 @@ class ClockResetError(TransformError):
 
 
 class BusClosedError(TransformError):
-    """The bus, or this buffer, was closed: nothing more will arrive."""
+    """The bus or the buffer is closed, so no more samples will arrive."""
 
     def __init__(self, message: str = "the bus is closed") -> None:
         super().__init__(message)
 
 
 MAY_COME = (UnknownFrameError, DisconnectedError, FutureExtrapolationError)
-"""The errors that waiting may help against."""
+"""The lookup errors that a later sample may resolve."""

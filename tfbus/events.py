@@ -1,7 +1,8 @@
-"""What happens on a bus besides samples, as frozen data; ``str`` gives one line for people.
+"""The events of a bus, as frozen dataclasses; ``str(event)`` is one line for people.
 
-``stamp`` is always the bus's clock when it happened, in ns. What the events say adds up: a frame is added and removed
-in turns, and stale and live in turns. `ClockReset` forgets every moving frame, so those are added anew afterwards.
+``stamp`` is the time of the event on the bus's clock, in ns. `FrameAdded` and `FrameRemoved` of one frame alternate,
+and so do `FrameStale` and `FrameLive`. After a `ClockReset` the first sample of each moving frame is announced by a new
+`FrameAdded`.
 """
 
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from tfbus.stamps import format_duration, format_stamp
 
 @dataclass(frozen=True, slots=True)
 class FrameAdded:
-    """A frame got its first sample, so it has a parent now; a stream begins with those that have one already."""
+    """A frame has a parent, because its first sample arrived or because it had one when the event stream was opened."""
 
     stamp: int
     frame: str
@@ -26,7 +27,7 @@ class FrameAdded:
 
 @dataclass(frozen=True, slots=True)
 class FrameRemoved:
-    """A frame was taken off its parent, and its samples are forgotten everywhere."""
+    """A frame was removed: the bus and its buffers have forgotten its parent and its samples."""
 
     stamp: int
     frame: str
@@ -37,7 +38,7 @@ class FrameRemoved:
 
 @dataclass(frozen=True, slots=True)
 class Reparented:
-    """A frame's newest sample has another parent than the one before."""
+    """The newest sample of a frame names another parent than the newest sample before it."""
 
     stamp: int
     frame: str
@@ -52,7 +53,7 @@ class Reparented:
 
 @dataclass(frozen=True, slots=True)
 class KindChanged:
-    """A moving frame has become static, or the other way round; `static` is what it is now."""
+    """A moving frame became static, or a static frame moving; `static` is the new kind."""
 
     stamp: int
     frame: str
@@ -66,7 +67,7 @@ class KindChanged:
 
 @dataclass(frozen=True, slots=True)
 class AuthorityConflict:
-    """A sample of a frame came from `authority`, the one before it from `other`."""
+    """A sample of a frame came from `authority`, the sample before it from `other`."""
 
     stamp: int
     frame: str
@@ -80,20 +81,21 @@ class AuthorityConflict:
 
 @dataclass(frozen=True, slots=True)
 class SampleRejected:
-    """The bus refused a sample, whether its sender was told or not.
+    """The bus rejected a sample, by raising an error or by dropping the sample.
 
-    A stream tells it once for each frame, authority and reason, until the frame is removed or added or the clock jumps
-    back; ``statistics().rejected`` counts every sample.
+    An event stream gives it once for each frame, authority and reason, until the frame is removed or added or the clock
+    jumps back; ``statistics().rejected`` counts every sample.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     reason : str
-        As that of `InvalidTransformError`, or ``"not a sample"``: what ``statistics().rejected`` counts it by.
+        The key in ``statistics().rejected``: `InvalidTransformError.reason`, or ``"not a sample"``.
     frame, parent, authority : str or None
-        The sample: its child, its parent and who sent it. None if it was not a sample.
+        The child, the parent and the authority of the sample; None if the object was not a sample.
     error : Exception
-        What the sender was told, or would have been.
+        The error that was raised, or that the dropped sample would have raised.
     """
 
     stamp: int
@@ -110,12 +112,14 @@ class SampleRejected:
 
 @dataclass(frozen=True, slots=True)
 class FrameStale:
-    """A moving frame has had nothing new for longer than the stream's `stale_after`.
+    """The newest sample of a moving frame is older than the event stream's `stale_after`.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     frame, authority : str
+        The frame, and the sender of its newest sample.
     newest : int
         The stamp of its newest sample, in ns.
     """
@@ -134,14 +138,16 @@ class FrameStale:
 
 @dataclass(frozen=True, slots=True)
 class FrameLive:
-    """A frame that was stale has new data.
+    """A stale frame has a newer sample.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     frame, authority : str
+        The frame, and the sender of its newest sample.
     newest : int or None
-        The stamp of its newest sample, in ns; None if it has become static.
+        The stamp of its newest sample, in ns; None if it became static.
     """
 
     stamp: int
@@ -155,9 +161,9 @@ class FrameLive:
 
 @dataclass(frozen=True, slots=True)
 class ClockReset:
-    """The clock jumped back, from `before` to `stamp` (ns); every moving frame is forgotten.
+    """The clock jumped back from `before` to `stamp` (ns), and the bus forgot every moving frame.
 
-    With ``on_conflict="reject"`` its first authority keeps it all the same, until it is removed.
+    With ``on_conflict="reject"`` each of these frames stays with its first authority until it is removed.
     """
 
     stamp: int
@@ -169,7 +175,7 @@ class ClockReset:
 
 @dataclass(frozen=True, slots=True)
 class SubscriberFailed:
-    """A callback raised an `Exception`; `subscriber` is its name."""
+    """A subscriber's callback raised an `Exception`; `subscriber` is the callback's name."""
 
     stamp: int
     subscriber: str
@@ -181,15 +187,16 @@ class SubscriberFailed:
 
 @dataclass(frozen=True, slots=True)
 class PeerJoined:
-    """Another bus was found over a link.
+    """A link found another bus.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     link : str
         The domain of the link.
     peer : str
-        The other end's own name for itself, made anew whenever it starts.
+        The identifier of the other bus, a new one each time it starts.
     """
 
     stamp: int
@@ -202,17 +209,18 @@ class PeerJoined:
 
 @dataclass(frozen=True, slots=True)
 class PeerLost:
-    """Another bus has gone with its process or its link, is frozen, or cannot be reached any more.
+    """A link lost another bus: its process or its link ended, or it no longer responds.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     link, peer : str
         As in `PeerJoined`.
     authorities : tuple of str
-        Whom it spoke for, sorted.
+        The authorities whose samples came from the peer, sorted.
     frames : tuple of str
-        What it was the last to publish, sorted; they leave the bus if the link drops what is lost.
+        The frames whose newest sample came from the peer, sorted; a link that drops lost frames removes them.
     """
 
     stamp: int
@@ -228,16 +236,18 @@ class PeerLost:
 
 @dataclass(frozen=True, slots=True)
 class PeerRejected:
-    """Something that another bus sent was refused; told once for each peer and reason.
+    """A link rejected a message or a sample of another bus; announced once for each peer and reason.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     link, peer : str
         As in `PeerJoined`.
     reason : str
-        What the link's statistics count it by.
+        The key in the `rejected` of the link's statistics.
     error : Exception
+        Why it was rejected.
     """
 
     stamp: int
@@ -252,15 +262,18 @@ class PeerRejected:
 
 @dataclass(frozen=True, slots=True)
 class RecordingDropped:
-    """The disk is too slow for a recorder, which begins to lose samples; told again once it has caught up meanwhile.
+    """A recorder begins to lose samples because the disk is too slow.
+
+    It is announced again if the recorder catches up and then falls behind once more.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     path : str
         The recording.
     dropped : int
-        How many samples it has lost so far.
+        Number of samples that were lost so far.
     """
 
     stamp: int
@@ -273,15 +286,16 @@ class RecordingDropped:
 
 @dataclass(frozen=True, slots=True)
 class RecordingFailed:
-    """A recording could not be written any further; what is in the file can be read, and the program goes on.
+    """A recording ended early because of a write error; the file can be read up to there, and the program goes on.
 
     Attributes
     ----------
     stamp : int
+        Time of the event, in ns.
     path : str
         The recording.
     error : Exception
-        What the disk said.
+        The write error.
     """
 
     stamp: int
@@ -309,7 +323,7 @@ Event = (
     | RecordingDropped
     | RecordingFailed
 )
-"""What `Bus.events` gives."""
+"""Any event of `Bus.events`."""
 
 
 def _line(stamp: int, text: str) -> str:

@@ -1,11 +1,17 @@
-"""Something that was registered somewhere, until it is closed."""
+"""The handle that a registering call returns."""
 
 from collections.abc import Callable
 from types import TracebackType
 
 
 class Registration:
-    """What a call that registers something gives back; the end of its ``with``, or `close`, takes it back."""
+    """The result of a call that registers something; `close` or the end of its ``with`` ends the registration.
+
+    Parameters
+    ----------
+    undo : callable
+        Ends the registration; called once.
+    """
 
     __slots__ = ("_undo",)
 
@@ -13,7 +19,7 @@ class Registration:
         self._undo: Callable[[], object] | None = undo
 
     def close(self) -> None:
-        """Take it back; a second call does nothing."""
+        """End the registration; a second call does nothing."""
         undo, self._undo = self._undo, None
         if undo is not None:
             undo()

@@ -1,7 +1,7 @@
-"""Instants and durations.
+"""Stamps in nanoseconds and durations in seconds.
 
-An instant is an ``int`` of nanoseconds, because a stamp is a key: 99.6 % of today's nanosecond stamps do not survive a
-round trip through a float. A duration is a ``float`` of seconds, because nobody wants to type nine zeros.
+A stamp is an ``int`` of nanoseconds, because it is a key: 99.6 % of today's stamps change in a round trip through a
+float. A duration is a ``float`` of seconds, because it is easier to write and read.
 """
 
 import math
@@ -20,7 +20,7 @@ STAMP_MIN: Final = -(2**63)
 STAMP_MAX: Final = 2**63 - 1
 
 Stamps = npt.NDArray[np.int64]
-"""Many stamps in ns."""
+"""An array of stamps in ns, shape (n,)."""
 
 
 class Latest(Enum):
@@ -33,7 +33,7 @@ class Latest(Enum):
 
 
 LATEST: Final = Latest.LATEST
-"""Ask for the newest stamp that every moving edge on the path can answer."""
+"""In place of a stamp: the newest stamp that every moving edge on the path can answer."""
 
 
 def from_seconds(seconds: float) -> int:
@@ -42,7 +42,7 @@ def from_seconds(seconds: float) -> int:
     Parameters
     ----------
     seconds : float
-        Seconds; an ``int`` is taken exactly, a ``float`` is converted without any error beyond its own.
+        An ``int`` is converted exactly, a ``float`` to the nanosecond nearest to its exact value.
 
     Raises
     ------
@@ -64,12 +64,12 @@ def to_seconds(stamp: int) -> float:
 
 
 def as_stamp(value: object) -> int:
-    """The stamp that `value` is, as a plain ``int``.
+    """Check that `value` is a stamp, and return it as a plain ``int``.
 
     Raises
     ------
     TypeError
-        If `value` is not an integer. A float is the usual mistake: convert it with `from_seconds`.
+        If `value` is not an integer. The usual mistake is a float of seconds: convert it with `from_seconds`.
     ValueError
         If it does not fit a signed 64-bit integer.
     """
@@ -89,14 +89,16 @@ def as_stamp(value: object) -> int:
 
 
 def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """Many stamps as an array of shape (n,), in ns; an array that is one already is not copied.
+    """Check that all values are stamps, and return them as an int64 array of shape (n,), in ns.
+
+    An int64 array is returned without a copy.
 
     Raises
     ------
     TypeError
-        If one is not an integer. Floats are the usual mistake: convert each with `from_seconds`.
+        If a value is not an integer. The usual mistake is a float of seconds: convert it with `from_seconds`.
     ValueError
-        If the shape is not (n,), or one does not fit a signed 64-bit integer.
+        If the shape is not (n,), or a value does not fit a signed 64-bit integer.
     """
     if isinstance(values, (list, tuple)):
         if set(map(type, values)) == {int}:
@@ -104,7 +106,7 @@ def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
                 return np.array(values, np.int64)
             except OverflowError:
                 pass
-        # In any other list, numpy would turn what stands beside an integer into one too, or all into floats.
+        # numpy would convert a bool beside an int to an int, and all integers beside a float to floats.
         array = np.asarray(values, object)
     else:
         array = np.asarray(values)
@@ -116,12 +118,14 @@ def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
 
 
 def as_duration(seconds: float, name: str) -> float:
-    """A duration in seconds that is neither negative nor NaN; infinity is allowed.
+    """Check that `seconds` is a duration, and return it as a ``float``; infinity is allowed.
 
     Raises
     ------
-    TypeError, ValueError
-        If it is not a number, or negative or NaN. The message names `name` and the value.
+    TypeError
+        If it is not a real number. The message has `name`, the name of the argument, and the value.
+    ValueError
+        If it is negative or NaN.
     """
     if not is_real(seconds):
         raise TypeError(f"{name} must be a number of seconds, not {seconds!r}")
@@ -131,14 +135,14 @@ def as_duration(seconds: float, name: str) -> float:
 
 
 def is_real(value: object) -> bool:
-    """Whether `value` is a real number of any type, numpy's included; a ``bool`` is none."""
+    """Whether `value` is a real number of any type, including those of numpy, and not a ``bool``."""
     kind = type(value)
-    # Nearly always one of these, and asking the abstract class takes ten times as long.
+    # Nearly always one of these; the check of the abstract class takes ten times as long.
     return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, bool))
 
 
 def format_stamp(stamp: int) -> str:
-    """A stamp for people, exact: ``12.500 s``, ``12.500000001 s``."""
+    """The exact text of a stamp, in seconds: ``12.500 s``, ``12.500000001 s``."""
     sign = "-" if stamp < 0 else ""
     whole, rest = divmod(abs(stamp), SECOND)
     digits = f"{rest:09d}"
@@ -146,7 +150,7 @@ def format_stamp(stamp: int) -> str:
 
 
 def format_duration(nanoseconds: int) -> str:
-    """A duration for people, three digits or so: ``410 ms``, ``1 ns``, ``2.5 s``."""
+    """The text of a duration with about three digits: ``410 ms``, ``1 ns``, ``2.5 s``."""
     size = abs(nanoseconds)
     for unit, name in ((SECOND, "s"), (1_000_000, "ms"), (1_000, "us")):
         if size >= unit:

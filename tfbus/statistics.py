@@ -1,4 +1,4 @@
-"""Counters, as plain frozen data: ``dataclasses.asdict`` makes them JSON."""
+"""Statistics as frozen dataclasses; ``dataclasses.asdict`` gives data for JSON."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class BufferStatistics:
-    """One buffer since it was attached: ``offered == inserted + replaced + expired``."""
+    """The samples of one buffer since it was attached, and its waiting lookups.
+
+    ``offered == inserted + replaced + expired``
+
+    Attributes
+    ----------
+    offered : int
+        Samples that the bus gave to the buffer.
+    inserted, replaced, expired : int
+        Samples by their `Outcome`.
+    waiting : int
+        Lookups that wait now.
+    """
 
     offered: int
     inserted: int
@@ -17,10 +29,25 @@ class BufferStatistics:
 
 @dataclass(frozen=True, slots=True)
 class QueueStatistics:
-    """One bounded queue: a stream, the samples of other threads, or events.
+    """One bounded queue: of a stream, of events, or of samples from other threads.
 
-    Of moving samples, what was offered is what was read, is pending, was dropped, or gave way to another sample of the
-    same child (`conflated`, with that overflow only).
+    Every moving sample that was put into the queue was read, or is counted as pending, dropped or conflated.
+
+    Attributes
+    ----------
+    kind : str
+        What the queue is for, such as ``"stream"`` or ``"events"``.
+    overflow : str
+        Its rule for a full queue.
+    capacity : int
+        The bound on pending items; pending static samples are kept beyond it.
+    pending : int
+        Items that were not read yet.
+    dropped : int
+        Items that were discarded unread: the queue was full, the frame was removed, or the clock jumped back.
+    conflated : int
+        Samples that gave way to another sample of the same child: moving ones of a queue with the overflow
+        ``"conflate"``, static ones of a full recorder.
     """
 
     kind: str
@@ -33,26 +60,26 @@ class QueueStatistics:
 
 @dataclass(frozen=True, slots=True)
 class BusStatistics:
-    """A bus since it was made.
+    """One bus since it was made.
 
     Attributes
     ----------
     samples : int
-        Published and accepted.
+        Accepted samples.
     rejected : mapping of str to int
-        Samples that were refused, by reason.
+        Rejected samples, by reason.
     reparented : int
-        Samples that gave a child another newest parent.
+        Samples that changed the newest parent of a child.
     kind_changes : int
-        Samples that turned a static child into a moving one, or back.
+        Samples that made a static child moving, or a moving child static.
     authority_conflicts : int
-        Samples of a child that followed one from another authority.
+        Samples whose authority differs from that of the sample before of the same child.
     clock_resets : int
         Jumps back of the clock.
     callbacks_failed : int
         Exceptions that subscribers raised.
     frames : int
-        Children that the bus knows now.
+        Child frames that the bus knows now.
     buffers : tuple of BufferStatistics
     queues : tuple of QueueStatistics
     """
@@ -76,21 +103,22 @@ class LinkStatistics:
     Attributes
     ----------
     peers : int
-        Other ends that are there now.
+        Connected peers now.
     sent_messages, sent_samples : int
-        What was handed to the network live. Static frames go out once more by themselves, for those who join late.
+        Messages and samples that were sent as they were published. The static frames that are kept for late joiners
+        are not counted again.
     received_messages, received_samples : int
-        What was taken from it and published on the bus.
+        Messages and samples that were received and published on the bus.
     lost : int
-        Messages of peers that never came, by their numbers.
+        Messages of peers that did not arrive, found by gaps in their sequence numbers.
     duplicates : int
-        Samples that had come before, or were overtaken by newer ones on another way.
+        Samples that had arrived before, or that arrived after a newer one by another route.
     not_sent : mapping of str to int
-        Samples and removals of this bus that cannot be put into a message, by reason.
+        Samples and removals of this bus that a message cannot hold, by reason.
     rejected : mapping of str to int
-        Messages and samples of peers that were refused, by reason.
+        Rejected messages and samples of peers, by reason.
     queue : QueueStatistics
-        The messages that wait for the event loop.
+        The received messages that wait for the event loop.
     """
 
     peers: int
@@ -109,19 +137,20 @@ class LinkStatistics:
 class RecorderStatistics:
     """One recorder since it was entered.
 
-    What it was offered is ``samples + sum(refused.values()) + queue.pending + queue.dropped + queue.conflated``.
+    The number of samples that the bus gave to it is
+    ``samples + sum(refused.values()) + queue.pending + queue.dropped + queue.conflated``.
 
     Attributes
     ----------
     samples, messages : int
-        What is in the file by now, and survives if the process is killed.
+        Samples and messages that are in the file, and remain there if the process is killed.
     unattributed : int
-        Of the samples, those whose authority is not in the file, because there were too many.
+        Those of the samples whose authority is not in the file, because there were too many authorities.
     refused : mapping of str to int
-        Samples that a message of ROS cannot hold, by reason.
+        Samples that a ROS message cannot hold, by reason.
     queue : QueueStatistics
-        What waits for the disk. Dropped is what it was too slow for, or failed to take; conflated are static samples
-        that gave way to a newer one of the same child when there was too much.
+        The samples that wait for the disk. Dropped samples were lost because the disk was too slow or failed; a
+        conflated sample is a static one that a newer one of the same child replaced in a full queue.
     """
 
     samples: int
@@ -133,16 +162,16 @@ class RecorderStatistics:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatistics:
-    """One publisher of a robot since it was made.
+    """One robot state publisher since it was made.
 
     Attributes
     ----------
     messages : int
-        Sets of positions that were published.
+        Sets of joint positions that were published.
     unknown_joints : int
         Positions in them for joints that the robot does not have.
     violations : mapping of str to int
-        Positions in them beyond the limits of a joint, by its name.
+        Positions in them beyond the limits of the joint, by joint name.
     """
 
     messages: int

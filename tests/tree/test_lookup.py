@@ -34,35 +34,37 @@ def forest(*batch: TransformStamped) -> Forest:
     return forest_of(tree_of(*batch))
 
 
+# Stamp, row and kind of an answer
+
+
 @pytest.mark.parametrize(
-    ("target", "source", "at", "stamp", "x", "still"),
+    ("target", "source", "at", "stamp", "x", "is_static"),
     [
         ("a", "b", 5, 5, 5.0, False),
         ("a", "b", LATEST, 30, 30.0, False),
         ("b", "c", LATEST, 20, 20.0, False),
         ("a", "d", LATEST, 20, 140.0, False),
         ("c", "d", 77, 77, 100.0, True),
-        ("c", "d", LATEST, 4, 100.0, True),
-        ("d", "d", LATEST, 4, 0.0, True),
+        ("c", "d", LATEST, 40, 100.0, True),
+        ("d", "d", LATEST, 40, 0.0, True),
         ("b", "b", LATEST, 30, 0.0, True),
         ("a", "a", LATEST, 0, 0.0, True),
         ("a", "a", 77, 77, 0.0, True),
     ],
 )
-def test_a_question_amounts_to_a_stamp_a_row_and_whether_it_holds_for_ever(
-    target: str, source: str, at: int | Latest, stamp: int, x: float, still: bool
+def test_find_gives_stamp_row_and_whether_the_answer_is_static(
+    target: str, source: str, at: int | Latest, stamp: int, x: float, is_static: bool
 ) -> None:
-    known = forest(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]), static("c", "d", 100.0, stamp=4))
+    known = forest(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]), static("c", "d", 100.0, stamp=40))
     found = find(known, target, source, at, None)
-    assert (found[0], found[1][0], found[2]) == (stamp, x, still)
+    assert (found[0], found[1][0], found[2]) == (stamp, x, is_static)
     assert type(found[0]) is int
-    again = find(known, target, source, at, None)
-    assert again == found, "now with a path that is remembered"
+    assert find(known, target, source, at, None) == found, "the same with the cached path"
 
 
 @pytest.mark.parametrize("at", [-1, 31, LATEST])
 @pytest.mark.parametrize(("target", "source"), ["ac", "ca"])
-def test_whether_the_path_is_remembered_changes_no_error(target: str, source: str, at: int | Latest) -> None:
+def test_a_cached_path_gives_the_same_error(target: str, source: str, at: int | Latest) -> None:
     known = forest(*over("a", "b", [0, 30]), *over("b", "c", [40, 50]))
     facts = []
     for _ in range(2):
@@ -72,42 +74,55 @@ def test_whether_the_path_is_remembered_changes_no_error(target: str, source: st
     assert facts[0] == facts[1]
 
 
-def test_latest_is_looked_up_on_the_path_that_holds_then() -> None:
+def test_latest_is_looked_up_on_the_path_at_the_newest_common_stamp() -> None:
     known = forest(*over("map", "base", [0, 15]), *over("map", "tool", [0, 10], 3.0), *over("base", "tool", [20, 30]))
-    stamp, row, still = find(known, "map", "tool", LATEST, None)
-    assert (stamp, row[0], still) == (15, 30.0, False), "the new parent begins only at 20"
+    stamp, row, is_static = find(known, "map", "tool", LATEST, None)
+    assert (stamp, row[0], is_static) == (15, 30.0, False), "the new parent begins only at 20"
 
 
-@pytest.mark.parametrize("not_before", [20, 21])
-def test_a_newest_common_stamp_that_is_too_old_is_what_the_lagging_edge_is_short_of(not_before: int) -> None:
-    known = forest(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]))
-    if not_before <= 20:
-        assert find(known, "a", "c", LATEST, not_before)[0] == 20
-        return
-    with pytest.raises(FutureExtrapolationError) as caught:
-        find(known, "a", "c", LATEST, not_before)
-    assert (caught.value.child, caught.value.stamp) == ("c", 21)
+# Time travel
 
 
 @pytest.mark.parametrize(
-    ("at", "source_at", "stamp", "x"),
-    [(8, 3, 8, -5.0), (LATEST, 3, 10, -7.0), (8, LATEST, 8, 2.0), (LATEST, LATEST, 10, 0.0)],
+    ("target", "at", "source_at", "stamp", "x"),
+    [
+        ("cart", 8, 3, 8, -5.0),
+        ("cart", LATEST, 3, 10, -7.0),
+        ("cart", 8, LATEST, 8, 2.0),
+        ("cart", LATEST, LATEST, 10, 0.0),
+        ("map", 8, 3, 8, 3.0),
+    ],
 )
-def test_in_time_travel_the_stamp_is_that_of_the_target(
-    at: int | Latest, source_at: int | Latest, stamp: int, x: float
+def test_time_travel_has_the_stamp_of_the_target(
+    target: str, at: int | Latest, source_at: int | Latest, stamp: int, x: float
 ) -> None:
     known = forest(*over("map", "cart", [0, 10]))
-    found = find_in_time_travel(known, "cart", "cart", at, source_at, "map", None)
+    found = find_in_time_travel(known, target, "cart", at, source_at, "map", None)
     assert (found[0], found[1][0], found[2]) == (stamp, x, False)
 
 
+@pytest.mark.parametrize("target", ["wall", "map"])
 @pytest.mark.parametrize(("source_at", "stamp"), [(3, 3), (LATEST, 10)])
-def test_in_time_travel_to_a_latest_that_only_static_edges_answer_the_stamp_is_that_of_the_source(
-    source_at: int | Latest, stamp: int
+def test_time_travel_to_latest_of_a_static_target_has_the_stamp_of_the_source(
+    target: str, source_at: int | Latest, stamp: int
 ) -> None:
     known = forest(*over("map", "cart", [0, 10]), static("map", "wall", stamp=7))
-    assert find_in_time_travel(known, "wall", "cart", LATEST, source_at, "map", None)[0] == stamp
+    found = find_in_time_travel(known, target, "cart", LATEST, source_at, "map", None)
+    assert (found[0], found[1][0], found[2]) == (stamp, float(stamp), False)
     assert find_in_time_travel(known, "wall", "map", LATEST, source_at, "map", None)[::2] == (7, True)
+
+
+def test_time_travel_is_static_only_if_both_legs_are() -> None:
+    tree = tree_of(*over("map", "cart", [0, 10]), static("map", "wall", 50.0), static("map", "door", 20.0))
+    assert tree.lookup("wall", "door", 3, source_at=99, fixed="map").static
+    assert not tree.lookup("wall", "cart", 99, source_at=3, fixed="map").static
+    assert not tree.lookup("cart", "wall", 3, source_at=99, fixed="map").static
+
+
+def test_a_leg_from_the_fixed_frame_to_itself_holds_at_any_stamp() -> None:
+    tree = tree_of(*over("map", "cart", [0, 10]))
+    assert x_of(tree, "map", "cart", 10**6, source_at=4, fixed="map") == 4.0
+    assert x_of(tree, "map", "cart", 4, source_at=10**6, fixed="cart") == 4.0
 
 
 @pytest.mark.parametrize(
@@ -117,6 +132,8 @@ def test_in_time_travel_to_a_latest_that_only_static_edges_answer_the_stamp_is_t
         ("a", 5, "b", 99, FutureExtrapolationError, "b"),
         ("a", 99, "b", 99, FutureExtrapolationError, "b"),
         ("a", 99, "b", -1, PastExtrapolationError, "b"),
+        ("a", 5, "b", -1, PastExtrapolationError, "b"),
+        ("a", -1, "b", 5, PastExtrapolationError, "a"),
         ("a", -1, "b", 99, PastExtrapolationError, "a"),
         ("a", -1, "b", -1, PastExtrapolationError, "a"),
         ("y", 5, "b", 99, DisconnectedError, None),
@@ -125,7 +142,7 @@ def test_in_time_travel_to_a_latest_that_only_static_edges_answer_the_stamp_is_t
         ("a", -1, "y", 5, PastExtrapolationError, "a"),
     ],
 )
-def test_of_two_legs_without_an_answer_the_one_that_waiting_cannot_help_decides(
+def test_of_two_failed_legs_the_one_that_waiting_cannot_help_raises(
     target: str, at: int, source: str, source_at: int, kind: type[TransformLookupError], child: str | None
 ) -> None:
     known = forest(*over("map", "a", [0, 10]), *over("map", "b", [0, 10]), *over("x", "y", [0, 10]))
@@ -135,20 +152,15 @@ def test_of_two_legs_without_an_answer_the_one_that_waiting_cannot_help_decides(
 
 
 @pytest.mark.parametrize("names", [("nobody", "b", "a"), ("a", "nobody", "b"), ("a", "b", "nobody")])
-def test_unknown_frames_come_before_all_else(names: tuple[str, str, str]) -> None:
+def test_an_unknown_frame_raises_before_any_leg_is_looked_up(names: tuple[str, str, str]) -> None:
     target, source, fixed = names
     with pytest.raises(UnknownFrameError) as caught:
         find_in_time_travel(forest(moving("a", "b", 5)), target, source, -1, 99, fixed, None)
     assert caught.value.frame == "nobody"
 
 
-@pytest.mark.parametrize(("source_at", "fixed"), [(5, None), (None, "a"), (1.5, "a"), (True, "a")])
-def test_what_is_no_second_instant_is_a_type_error(source_at: Any, fixed: str | None) -> None:
-    with pytest.raises(TypeError):
-        find_in_time_travel(forest(moving("a", "b", 5)), "a", "b", 5, source_at, fixed, None)
-
-
 # The configurations of tf2's own tests: each child with its parent and its distance from it
+
 
 CONFIGURATIONS = {
     "one link": {"2": ("1", 1.0)},
@@ -159,7 +171,7 @@ CONFIGURATIONS = {
 
 
 def positions(edges: dict[str, tuple[str, float]]) -> dict[str, float]:
-    """How far each frame is from the root."""
+    """The distance of each frame from the root."""
     places: dict[str, float] = {}
     for child, (parent, distance) in edges.items():
         places[child] = places.setdefault(parent, 0.0) + distance
@@ -169,7 +181,7 @@ def positions(edges: dict[str, tuple[str, float]]) -> dict[str, float]:
 @pytest.mark.parametrize("name", CONFIGURATIONS)
 @pytest.mark.parametrize("stamp", [0, SECOND, 10 * SECOND, TODAY])
 @pytest.mark.parametrize("space", [2, 1_000, 2 * SECOND])
-def test_every_pair_of_a_configuration_is_answered_between_two_samples(name: str, stamp: int, space: int) -> None:
+def test_every_pair_of_frames_is_answered_between_two_samples(name: str, stamp: int, space: int) -> None:
     edges = CONFIGURATIONS[name]
     tree = TransformTree()
     for child, (parent, distance) in edges.items():
@@ -182,7 +194,7 @@ def test_every_pair_of_a_configuration_is_answered_between_two_samples(name: str
         assert_close(found, Transform((places[source] - places[target], 0.0, 0.0)))
 
 
-def test_two_trees_in_one_answer_inside_each_and_not_across() -> None:
+def test_lookups_inside_each_of_two_trees_answer_and_lookups_across_are_disconnected() -> None:
     one, v = CONFIGURATIONS["one link"], CONFIGURATIONS["v"]
     tree = tree_of(*(moving(parent, child, 5, distance) for child, (parent, distance) in {**one, **v}.items()))
     inside = positions(one), positions(v)
@@ -211,7 +223,7 @@ def test_a_ring_of_45_degrees_each_way_closes_after_eight_links() -> None:
     assert_close(tree.lookup("0", "8", 5), Transform())
 
 
-def test_a_compound_of_turned_links_is_the_product_of_their_matrices() -> None:
+def test_a_lookup_over_rotated_links_is_the_product_of_their_matrices() -> None:
     links = {
         "a": ("root", Transform.from_xyz_rpy((1, 2, 3), (0.1, 0.2, 0.3))),
         "b": ("root", Transform.from_xyz_rpy((-1, 0, 2), (-1.2, 0.4, 2.0))),
@@ -228,7 +240,7 @@ def test_a_compound_of_turned_links_is_the_product_of_their_matrices() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_random_balanced_tree_has_its_frames_at_their_depth(seed: int) -> None:
+def test_frames_of_a_random_tree_are_at_their_depth(seed: int) -> None:
     rng = random.Random(seed)
     depths = {"root": 0}
     tree = TransformTree()
@@ -240,7 +252,7 @@ def test_a_random_balanced_tree_has_its_frames_at_their_depth(seed: int) -> None
         assert x_of(tree, target, source) == depths[source] - depths[target]
 
 
-# A carriage climbs at 0.5 m/s; on it an arm of 2 m turns at 0.3 rad/s: its tip runs on a helix.
+# A carriage climbs at 0.5 m/s; on it an arm of 2 m turns at 0.3 rad/s: its tip moves on a helix
 
 
 def carriage(seconds: float) -> Transform:
@@ -268,20 +280,20 @@ def helix() -> TransformTree:
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.25, 7.5, 19.875, 20.0])
-def test_the_tip_of_a_turning_arm_on_a_climbing_carriage_runs_on_a_helix(helix: TransformTree, seconds: float) -> None:
+def test_the_tip_of_the_arm_moves_on_a_helix(helix: TransformTree, seconds: float) -> None:
     at = int(seconds * SECOND)
     assert_close(helix.lookup("world", "tip", at), tip_in_world(seconds))
     assert_close(helix.lookup("tip", "world", at), tip_in_world(seconds).inverse())
 
 
 @pytest.mark.parametrize(("then", "now"), [(2.5, 11.25), (11.25, 2.5), (4.0, 4.0)])
-def test_a_fixed_frame_joins_two_instants(helix: TransformTree, then: float, now: float) -> None:
+def test_time_travel_composes_two_stamps_in_the_fixed_frame(helix: TransformTree, then: float, now: float) -> None:
     found = helix.lookup("tip", "tip", int(now * SECOND), source_at=int(then * SECOND), fixed="world")
     assert (found.parent, found.child, found.stamp, found.static) == ("tip", "tip", int(now * SECOND), False)
     assert_close(found, tip_in_world(now).inverse() @ tip_in_world(then))
 
 
-def test_each_fixed_frame_gives_its_own_answer(helix: TransformTree) -> None:
+def test_another_fixed_frame_gives_another_answer(helix: TransformTree) -> None:
     then, now = 2.5, 10.0
     question = partial(helix.lookup, "hub", "tip", int(now * SECOND), source_at=int(then * SECOND))
     # Seen from the carriage the hub only turns; seen from itself nothing has moved.
@@ -292,21 +304,12 @@ def test_each_fixed_frame_gives_its_own_answer(helix: TransformTree) -> None:
     assert_close(question(fixed="world"), turn @ Transform((2.0, 0.0, 0.0)) @ climbed)
 
 
-# No extrapolation
-
-
-@pytest.mark.parametrize("late", [0, 1, 7, 9, 10])
-def test_between_two_samples_everything_is_answered_both_ways(late: int) -> None:
-    tree = tree_of(
-        *over("a", "b", [TODAY, TODAY + 10], speed=0.0), moving("b", "c", TODAY), moving("b", "c", TODAY + 10, 5.0)
-    )
-    assert x_of(tree, "a", "c", TODAY + late) == pytest.approx(late / 2, abs=1e-12)
-    assert x_of(tree, "c", "a", TODAY + late) == pytest.approx(-late / 2, abs=1e-12)
+# Stamps that are not covered
 
 
 @pytest.mark.parametrize(("at", "kind"), [(9, PastExtrapolationError), (21, FutureExtrapolationError)])
 @pytest.mark.parametrize(("target", "source"), [("a", "b"), ("b", "a"), ("a", "c"), ("c", "a")])
-def test_one_nanosecond_outside_is_an_error_with_all_facts(
+def test_one_nanosecond_outside_the_samples_is_an_error_with_all_facts(
     at: int, kind: type[ExtrapolationError], target: str, source: str
 ) -> None:
     tree = tree_of(
@@ -318,46 +321,18 @@ def test_one_nanosecond_outside_is_an_error_with_all_facts(
     assert (error.child, error.stamp, error.oldest, error.newest, error.authority) == ("b", at, 10, 20, "odometry")
 
 
-@pytest.mark.parametrize("links", [1, 2])
-def test_one_sample_answers_only_at_its_own_stamp_until_there_is_a_second(links: int) -> None:
-    tree = tree_of(moving("a", "b", 10, 1.0), moving("b", "c", 10, 2.0))
-    source = "bc"[links - 1]
-    assert x_of(tree, "a", source, 10) == (1.0, 3.0)[links - 1]
-    with pytest.raises(PastExtrapolationError):
-        tree.lookup("a", source, 9)
-    with pytest.raises(FutureExtrapolationError):
-        tree.lookup(source, "a", 11)
-    tree.insert_many([moving("a", "b", 12, 1.0), moving("b", "c", 12, 2.0)])
-    assert x_of(tree, "a", source, 11) == (1.0, 3.0)[links - 1]
-
-
-def test_a_stamp_of_zero_and_before_is_as_good_as_any() -> None:
+def test_zero_and_negative_stamps_are_ordinary_stamps() -> None:
     tree = tree_of(*over("a", "b", [-10, 0, 10]))
     assert x_of(tree, "a", "b", 0) == 0.0
     assert x_of(tree, "a", "b", -5) == -5.0
     assert not tree.can_transform("a", "b", -11)
 
 
-def test_the_first_and_last_possible_stamps_can_be_asked() -> None:
+def test_the_first_and_last_possible_stamps_can_be_looked_up() -> None:
     tree = tree_of(moving("a", "b", STAMP_MIN, 1.0), moving("a", "b", STAMP_MAX, 2.0), keep=None)
     assert x_of(tree, "a", "b", STAMP_MIN) == 1.0
     assert x_of(tree, "a", "b") == 2.0
     assert x_of(tree, "a", "b", 0) == pytest.approx(1.5)
-
-
-def test_an_edge_that_is_over_decides_before_one_that_may_still_come() -> None:
-    tree = tree_of(*over("a", "b", [0, 10]), *over("b", "c", [20, 30]))
-    for target, source in (("a", "c"), ("c", "a")):
-        with pytest.raises(PastExtrapolationError) as caught:
-            tree.lookup(target, source, 15)
-        assert caught.value.child == "c"
-
-
-def test_of_several_edges_that_may_still_come_the_one_that_lags_most_is_named() -> None:
-    tree = tree_of(*over("a", "b", [0, 12]), *over("b", "c", [0, 10]), *over("c", "d", [0, 11]))
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.lookup("a", "d", 15)
-    assert (caught.value.child, caught.value.newest) == ("c", 10)
 
 
 def test_an_edge_above_the_common_ancestor_neither_fails_a_lookup_nor_decides_its_stamp() -> None:
@@ -373,15 +348,7 @@ def test_an_edge_above_the_common_ancestor_neither_fails_a_lookup_nor_decides_it
 # LATEST
 
 
-def test_latest_is_the_newest_stamp_that_every_moving_edge_can_answer() -> None:
-    tree = tree_of(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]), static("c", "d", 100.0, stamp=999))
-    found = tree.lookup("a", "d")
-    assert (found.stamp, found.static) == (20, False)
-    assert found.transform.translation[0] == 20.0 + 20.0 + 100.0
-    assert tree.latest_common_stamp("a", "d") == 20
-
-
-def test_latest_follows_the_lagging_edge_whatever_the_order_of_insertion() -> None:
+def test_latest_is_the_newest_stamp_of_the_lagging_edge_for_any_order_of_insertion() -> None:
     for order in permutations([*over("a", "b", [10, 20]), *over("a", "c", [12, 17])]):
         tree = tree_of(*order)
         assert tree.latest_common_stamp("b", "c") == 17
@@ -390,13 +357,13 @@ def test_latest_follows_the_lagging_edge_whatever_the_order_of_insertion() -> No
         assert tree.lookup("c", "b").stamp == 20
 
 
-def test_an_edge_whose_newest_stamp_is_zero_has_its_say_in_what_is_latest() -> None:
+def test_a_newest_stamp_of_zero_counts_for_latest() -> None:
     tree = tree_of(moving("a", "b", 0, 1.0), *over("b", "c", [-10, 10]))
     found = tree.lookup("a", "c")
     assert (found.stamp, found.transform.translation[0]) == (0, 1.0)
 
 
-def test_latest_of_an_all_static_path_is_static_and_has_no_stamp_in_common() -> None:
+def test_latest_of_an_all_static_path_is_static_without_a_common_stamp() -> None:
     tree = tree_of(static("a", "b", 1.0, stamp=5), static("b", "c", 1.0, stamp=9), static("a", "d", stamp=7))
     assert tree.latest_common_stamp("a", "c") is None
     found = tree.lookup("a", "c")
@@ -412,7 +379,7 @@ def test_a_static_sample_sent_again_renews_the_stamp_of_latest() -> None:
 
 
 @pytest.mark.parametrize(("target", "source"), [("a", "c"), ("c", "a")])
-def test_where_an_edge_does_not_reach_back_to_latest_the_lagging_edge_is_short_of_it(target: str, source: str) -> None:
+def test_latest_waits_for_the_lagging_edge_until_all_edges_cover_a_common_stamp(target: str, source: str) -> None:
     tree = tree_of(moving("a", "b", 2, authority="dead"), *over("b", "c", [20, 22]))
     with pytest.raises(FutureExtrapolationError) as caught:
         tree.lookup(target, source)
@@ -422,14 +389,14 @@ def test_where_an_edge_does_not_reach_back_to_latest_the_lagging_edge_is_short_o
     assert tree.lookup(target, source).stamp == 20
 
 
-def test_where_an_edge_does_not_reach_back_before_zero_the_lagging_edge_is_still_the_one_to_wait_for() -> None:
+def test_latest_waits_for_a_lagging_edge_with_a_negative_stamp() -> None:
     tree = tree_of(moving("a", "b", -5), *over("b", "c", [0, 10]))
     with pytest.raises(FutureExtrapolationError) as caught:
         tree.lookup("a", "c")
     assert (caught.value.child, caught.value.stamp) == ("b", 0)
 
 
-def test_latest_with_an_edge_that_has_lost_its_samples_asks_for_any_of_it() -> None:
+def test_latest_waits_for_any_sample_of_an_edge_without_samples() -> None:
     tree = tree_of(moving("a", "b", 5), static("b", "c"))
     tree.clear()
     for question in (tree.lookup, tree.latest_common_stamp):
@@ -439,7 +406,7 @@ def test_latest_with_an_edge_that_has_lost_its_samples_asks_for_any_of_it() -> N
         assert (error.child, error.stamp, error.oldest, error.newest) == ("b", LATEST, None, None)
 
 
-def test_latest_over_a_new_parent_asks_the_lagging_edge_to_come_further() -> None:
+def test_latest_before_a_change_of_parent_waits_for_the_next_stamp_of_the_lagging_edge() -> None:
     tree = tree_of(*over("map", "base", [0, 5]), *over("elsewhere", "tool", [0, 4]), *over("base", "tool", [8, 9]))
     with pytest.raises(FutureExtrapolationError) as caught:
         tree.lookup("map", "tool")
@@ -448,27 +415,25 @@ def test_latest_over_a_new_parent_asks_the_lagging_edge_to_come_further() -> Non
     assert x_of(tree, "map", "tool") == 16.0
 
 
-@pytest.mark.parametrize("not_before", [20, 19, -1])
-def test_an_answer_that_is_not_older_than_asked_for_is_given(not_before: int) -> None:
-    tree = tree_of(*over("a", "b", [0, 20]))
-    assert tree.lookup("a", "b", not_before=not_before).stamp == 20
-
-
-def test_an_older_answer_than_asked_for_counts_as_not_yet_arrived() -> None:
+@pytest.mark.parametrize(("not_before", "fresh"), [(-1, True), (19, True), (20, True), (21, False)])
+def test_latest_older_than_not_before_is_not_yet_available(not_before: int, fresh: bool) -> None:
     tree = tree_of(*over("a", "b", [0, 30]), *over("b", "c", [0, 20]))
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.lookup("a", "c", not_before=21)
-    assert (caught.value.child, caught.value.stamp, caught.value.newest) == ("c", 21, 20)
-    assert not tree.can_transform("a", "c", not_before=21)
+    assert tree.can_transform("a", "c", not_before=not_before) is fresh
+    if fresh:
+        assert tree.lookup("a", "c", not_before=not_before).stamp == 20
+    else:
+        with pytest.raises(FutureExtrapolationError) as caught:
+            tree.lookup("a", "c", not_before=not_before)
+        assert (caught.value.child, caught.value.stamp, caught.value.newest) == ("c", not_before, 20)
 
 
-def test_what_is_static_is_never_too_old() -> None:
+def test_static_answers_are_never_too_old() -> None:
     tree = tree_of(static("a", "b", stamp=1))
     assert tree.lookup("a", "b", not_before=10**18).static
     assert tree.lookup("a", "a", not_before=10**18).static
 
 
-def test_not_before_reaches_both_legs_of_a_lookup_over_a_fixed_frame() -> None:
+def test_not_before_applies_to_both_legs_of_time_travel() -> None:
     tree = tree_of(*over("map", "a", [0, 30]), *over("map", "b", [0, 20]))
     assert tree.lookup("a", "b", source_at=5, fixed="map", not_before=30).stamp == 30
     with pytest.raises(FutureExtrapolationError) as caught:
@@ -479,7 +444,7 @@ def test_not_before_reaches_both_legs_of_a_lookup_over_a_fixed_frame() -> None:
 # Parents over time
 
 
-def test_old_stamps_answer_with_the_old_parent_and_the_old_value_is_held_until_the_new_one() -> None:
+def test_old_stamps_have_the_old_parent_and_its_last_value_is_held_until_the_new_parent() -> None:
     tree = tree_of(
         *over("left", "b", [0, 10]),
         *over("right", "b", [20, 30]),
@@ -492,7 +457,7 @@ def test_old_stamps_answer_with_the_old_parent_and_the_old_value_is_held_until_t
     assert tree.chain("root", "b") == ["root", "right", "b"]
 
 
-def test_a_parent_in_another_tree_answers_only_for_its_own_time() -> None:
+def test_a_parent_in_another_tree_answers_only_at_its_own_stamps() -> None:
     tree = tree_of(*over("old", "b", [0, 10]), *over("new", "b", [20, 30]))
     assert x_of(tree, "old", "b", 5) == 5.0
     for at in (LATEST, 25):
@@ -501,14 +466,7 @@ def test_a_parent_in_another_tree_answers_only_for_its_own_time() -> None:
         assert caught.value.roots == ("old", "new")
 
 
-def test_two_parents_that_alternate_each_hold_until_the_next() -> None:
-    tree = tree_of(static("w", "p", 0.0), static("w", "q", 100.0))
-    for stamp in range(0, 50, 10):
-        tree.insert(moving("pq"[stamp // 10 % 2], "b", stamp, float(stamp)))
-    assert [x_of(tree, "w", "b", at) for at in (0, 5, 10, 15, 20, 40)] == [0.0, 0.0, 110.0, 110.0, 20.0, 40.0]
-
-
-def test_a_new_parent_makes_a_frame_leave_its_subtree_with_all_below_it() -> None:
+def test_a_new_parent_moves_a_frame_with_its_descendants_to_another_tree() -> None:
     tree = tree_of(*over("arm", "hand", [0, 10]), static("hand", "cup", 1.0), static("arm", "camera", 5.0))
     assert x_of(tree, "camera", "cup") == 10.0 + 1.0 - 5.0
     tree.insert(moving("table", "hand", 20, 3.0))
@@ -518,7 +476,7 @@ def test_a_new_parent_makes_a_frame_leave_its_subtree_with_all_below_it() -> Non
     assert x_of(tree, "camera", "cup", 10) == 6.0
 
 
-# Static
+# Static edges
 
 
 @pytest.mark.parametrize("at", [STAMP_MIN, -1, 0, 100, 1_000, STAMP_MAX])
@@ -528,7 +486,7 @@ def test_a_static_edge_answers_at_every_stamp_with_that_stamp(at: int) -> None:
     assert (found.stamp, found.static, found.transform.translation[0]) == (at, True, 3.0)
 
 
-def test_a_static_and_a_moving_edge_answer_where_the_moving_one_does() -> None:
+def test_a_path_with_static_and_moving_edges_answers_where_the_moving_ones_do() -> None:
     tree = tree_of(static("a", "b", 1.0), *over("b", "c", [10, 20]), static("c", "d", 2.0))
     assert [tree.can_transform("a", "d", at) for at in (0, 9, 10, 15, 20, 21)] == [
         False,
@@ -542,15 +500,7 @@ def test_a_static_and_a_moving_edge_answer_where_the_moving_one_does() -> None:
     assert not tree.lookup("a", "d", 15).static
 
 
-# Names
-
-
-def test_a_frame_is_where_it_is() -> None:
-    tree = tree_of(*over("a", "b", [0, 10]), static("a", "c", stamp=3))
-    for frame, newest in (("a", 0), ("b", 10), ("c", 3)):
-        found = tree.lookup(frame, frame)
-        assert (found.transform, found.static, found.stamp) == (Transform.identity(), True, newest)
-        assert tree.lookup(frame, frame, 12_345).stamp == 12_345
+# Frames
 
 
 @pytest.mark.parametrize(
@@ -565,7 +515,9 @@ def test_a_frame_is_where_it_is() -> None:
     ],
 )
 @pytest.mark.parametrize("at", [LATEST, 0])
-def test_an_unknown_frame_is_named_the_target_first(target: str, source: str, missing: str, at: int | Latest) -> None:
+def test_the_error_names_an_unknown_target_before_an_unknown_source(
+    target: str, source: str, missing: str, at: int | Latest
+) -> None:
     tree = tree_of(moving("a", "b", 0))
     for question in (tree.lookup, tree.chain):
         with pytest.raises(UnknownFrameError) as caught:
@@ -574,14 +526,14 @@ def test_an_unknown_frame_is_named_the_target_first(target: str, source: str, mi
     assert not tree.can_transform(target, source, at)
 
 
-def test_an_unknown_frame_brings_the_names_that_look_like_it() -> None:
+def test_the_error_of_an_unknown_frame_has_similar_names() -> None:
     tree = tree_of(moving("base_link", "base_laser", 0))
     with pytest.raises(UnknownFrameError, match="did you mean") as caught:
         tree.lookup("base_link", "base_lasr")
     assert caught.value.close_matches[0] == "base_laser"
 
 
-def test_two_trees_are_disconnected_even_where_their_windows_would_not_cover_the_stamp() -> None:
+def test_two_trees_are_disconnected_at_stamps_outside_their_windows_too() -> None:
     tree = tree_of(*over("a", "b", [0, 10]), *over("x", "y", [0, 10]))
     for at in (-100, 5, 100, LATEST):
         with pytest.raises(DisconnectedError) as caught:
@@ -591,13 +543,13 @@ def test_two_trees_are_disconnected_even_where_their_windows_would_not_cover_the
         assert error.stamp == (None if at is LATEST else at)
 
 
-def test_any_name_will_do_even_one_that_tf2_keeps_for_itself() -> None:
+def test_any_text_is_a_frame_name_also_one_that_tf2_reserves() -> None:
     tree = tree_of(moving("NO_PARENT", "base link", 0, 1.0), moving("base link", "küche/🦾", 0, 1.0))
     assert x_of(tree, "NO_PARENT", "küche/🦾", 0) == 2.0
 
 
 @pytest.mark.parametrize("at", [LATEST, 5])
-def test_the_chain_goes_from_target_to_source_and_back(at: int | Latest) -> None:
+def test_the_chain_lists_the_frames_from_target_to_source(at: int | Latest) -> None:
     tree = tree_of(*(moving(parent, child, 5) for child, (parent, _) in CONFIGURATIONS["v"].items()))
     assert tree.chain("c", "g", at) == ["c", "b", "a", "f", "g"]
     assert tree.chain("a", "c", at) == ["a", "b", "c"]
@@ -605,91 +557,24 @@ def test_the_chain_goes_from_target_to_source_and_back(at: int | Latest) -> None
     assert tree.chain("g", "g", at) == ["g"]
 
 
-# Two instants
-
-
-def test_the_motion_of_a_frame_between_two_instants_needs_a_fixed_frame() -> None:
-    tree = tree_of(*over("map", "cart", [0, 10]))
-    assert x_of(tree, "cart", "cart", 8, source_at=3, fixed="map") == -5.0
-    assert x_of(tree, "map", "cart", 8, source_at=3, fixed="map") == 3.0
-    assert x_of(tree, "cart", "cart", source_at=3, fixed="map") == -7.0
-    assert x_of(tree, "cart", "cart", 8, source_at=LATEST, fixed="map") == 2.0
-
-
-def test_a_fixed_frame_that_is_target_or_source_holds_at_any_stamp() -> None:
-    tree = tree_of(*over("map", "cart", [0, 10]))
-    assert x_of(tree, "map", "cart", 10**6, source_at=4, fixed="map") == 4.0
-    assert x_of(tree, "map", "cart", 4, source_at=10**6, fixed="cart") == 4.0
-
-
-def test_an_answer_between_two_instants_is_static_only_if_both_ways_are() -> None:
-    tree = tree_of(*over("map", "cart", [0, 10]), static("map", "wall", 50.0), static("map", "door", 20.0))
-    assert tree.lookup("wall", "door", 3, source_at=99, fixed="map").static
-    assert not tree.lookup("wall", "cart", 99, source_at=3, fixed="map").static
-    assert not tree.lookup("cart", "wall", 3, source_at=99, fixed="map").static
-
-
-@pytest.mark.parametrize("names", [("nobody", "b", "a"), ("a", "nobody", "b"), ("a", "b", "nobody")])
-def test_every_frame_of_a_lookup_between_two_instants_must_be_known(names: tuple[str, str, str]) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]))
-    target, source, fixed = names
-    with pytest.raises(UnknownFrameError) as caught:
-        tree.lookup(target, source, 0, source_at=10**6, fixed=fixed)
-    assert caught.value.frame == "nobody"
-
-
-@pytest.mark.parametrize(
-    ("at", "source_at", "kind"),
-    [
-        (99, 5, FutureExtrapolationError),
-        (5, 99, FutureExtrapolationError),
-        (-1, 5, PastExtrapolationError),
-        (5, -1, PastExtrapolationError),
-        (99, -1, PastExtrapolationError),
-        (-1, 99, PastExtrapolationError),
-    ],
-)
-def test_waiting_is_of_no_use_if_either_instant_is_over(
-    at: int, source_at: int, kind: type[ExtrapolationError]
-) -> None:
-    tree = tree_of(*over("map", "a", [0, 10]), *over("map", "b", [0, 10]))
-    with pytest.raises(kind):
-        tree.lookup("a", "b", at, source_at=source_at, fixed="map")
-
-
-def test_a_fixed_frame_in_another_tree_is_disconnected_whatever_the_stamps() -> None:
-    tree = tree_of(*over("map", "a", [0, 10]), *over("world", "b", [0, 10]))
-    for at, source_at in ((5, 5), (99, 99), (99, 5)):
-        with pytest.raises(DisconnectedError):
-            tree.lookup("a", "b", at, source_at=source_at, fixed="map")
-
-
-def test_time_travel_to_the_latest_of_a_still_target_carries_the_stamp_of_the_source() -> None:
-    tree = TransformTree()
-    tree.insert_many([moving("map", "cart", 4, 4.0), moving("map", "cart", 6, 6.0)])
-    found = tree.lookup("map", "cart", source_at=5, fixed="map")
-    assert (found.stamp, found.static, found.transform.translation) == (5, False, (5.0, 0.0, 0.0))
-
-
 # Arguments
 
 
-@pytest.mark.parametrize("question", [{"at": 1.5}, {"at": 5, "source_at": 1.5, "fixed": "a"}])
-def test_a_float_for_a_stamp_names_the_way_to_convert_it(question: dict[str, Any]) -> None:
+@pytest.mark.parametrize("question", [{"at": 1.5}, {"at": np.float64(1.5)}, {"at": 5, "source_at": 1.5, "fixed": "a"}])
+def test_a_float_for_a_stamp_is_a_type_error_that_names_from_seconds(question: dict[str, Any]) -> None:
     tree = tree_of(moving("a", "b", 5))
-    with pytest.raises(TypeError, match=r"from_seconds\(1\.5\)"):
-        tree.lookup("a", "b", **question)
-    with pytest.raises(TypeError, match="from_seconds"):
-        tree.can_transform("a", "b", **question)
+    for ask in (tree.lookup, tree.can_transform):
+        with pytest.raises(TypeError, match=r"from_seconds\(.*1\.5\)"):
+            ask("a", "b", **question)
 
 
 @pytest.mark.parametrize("question", [{"source_at": 5}, {"fixed": "a"}, {"source_at": LATEST}])
-def test_a_second_instant_and_a_fixed_frame_go_together(question: dict[str, Any]) -> None:
+def test_source_at_without_fixed_and_fixed_without_source_at_are_type_errors(question: dict[str, Any]) -> None:
     with pytest.raises(TypeError, match="source_at and fixed go together"):
         tree_of(moving("a", "b", 5)).lookup("a", "b", 5, **question)
 
 
-def test_not_before_goes_with_latest() -> None:
+def test_not_before_without_latest_is_a_type_error() -> None:
     tree = tree_of(moving("a", "b", 5))
     with pytest.raises(TypeError, match="LATEST"):
         tree.lookup("a", "b", 5, not_before=1)
@@ -697,16 +582,19 @@ def test_not_before_goes_with_latest() -> None:
         tree.lookup("a", "b", 5, source_at=5, fixed="a", not_before=1)
 
 
-@pytest.mark.parametrize("at", [True, None, "5", np.float64(5.0)])
-def test_what_is_no_integer_is_no_stamp(at: Any) -> None:
+@pytest.mark.parametrize("stamp", [True, None, "5"])
+@pytest.mark.parametrize("source", ["b", "c"])
+def test_a_stamp_that_is_no_integer_is_a_type_error(stamp: Any, source: str) -> None:
     tree = tree_of(moving("a", "b", 5), static("a", "c"))
-    for source in ("b", "c"):
-        for question in (tree.lookup, tree.chain):
-            with pytest.raises(TypeError, match="a stamp is an int"):
-                question("a", source, at)
+    for ask in (tree.lookup, tree.chain):
+        with pytest.raises(TypeError, match="a stamp is an int"):
+            ask("a", source, stamp)
+    if stamp is not None:
+        with pytest.raises(TypeError, match="a stamp is an int"):
+            tree.lookup("a", source, 5, source_at=stamp, fixed="a")
 
 
-def test_any_integer_is_a_stamp_and_comes_back_as_an_int() -> None:
+def test_a_numpy_integer_is_a_stamp_and_is_returned_as_an_int() -> None:
     tree = tree_of(moving("a", "b", 5))
     found = tree.lookup("a", "b", np.int64(5))  # type: ignore[arg-type]
     assert type(found.stamp) is int
@@ -721,6 +609,6 @@ def test_a_stamp_beyond_64_bits_is_a_value_error(source: str) -> None:
 
 
 @pytest.mark.parametrize("names", [("a", 5), (None, "a"), ("a", b"b")])
-def test_a_frame_that_is_no_string_is_a_type_error(names: tuple[Any, Any]) -> None:
+def test_a_frame_name_that_is_no_str_is_a_type_error(names: tuple[Any, Any]) -> None:
     with pytest.raises(TypeError, match="must be a str"):
         tree_of(moving("a", "b", 5)).lookup(*names)
