@@ -1,4 +1,4 @@
-"""How fast a link over zenoh is between two processes, how much goes through it, and what it costs."""
+"""Delay, throughput and memory of a link over zenoh between two processes."""
 
 import json
 import subprocess

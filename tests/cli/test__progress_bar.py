@@ -1,4 +1,3 @@
-import io
 import subprocess
 import sys
 from pathlib import Path
@@ -6,15 +5,9 @@ from pathlib import Path
 import pytest
 from support.programs import PATIENCE, TFBUS
 from support.recorded import SMALL
-from support.terminal import on_a_terminal
+from support.terminal import Terminal, on_a_terminal
 
-from tfbus.cli._progress_bar import progress_bar
 from tfbus.cli.output import track
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
 
 
 def test_the_bar_is_on_standard_error_and_leaves_the_output_alone(
@@ -32,12 +25,6 @@ def test_the_bar_is_on_standard_error_and_leaves_the_output_alone(
     assert shown.count("notice\n") == 3
     # At its end, the bar erases its line.
     assert shown.endswith("\x1b[2K")
-
-
-def test_the_bar_disappears_at_its_end() -> None:
-    bar = progress_bar()
-    assert bar.live.transient
-    assert bar.console.stderr
 
 
 @pytest.mark.thorough

@@ -1,7 +1,7 @@
-import io
 import sys
 
 import pytest
+from support.terminal import Terminal
 
 from tfbus import SECOND, Edge
 from tfbus.cli._tree_display import TreeDisplay, tree_lines
@@ -12,13 +12,6 @@ STATIC = Edge("base_link", "lidar", True, 1, None, None, "")
 SINGLE = Edge("base_link", "arm", False, 1, 3 * SECOND, 3 * SECOND, "driver")
 EDGES = [SINGLE, MOVING, STATIC]
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
-
-
-class Terminal(io.StringIO):
-    encoding = "utf-8"
-
-    def isatty(self) -> bool:
-        return True
 
 
 def styles(edges: list[Edge], now: int) -> dict[str, str]:

@@ -63,6 +63,7 @@ async def test_a_detection_comes_out_80_ms_later_one_fails_at_once_and_one_times
     )
 
 
+@pytest.mark.thorough
 def test_the_demo_of_future_transforms_runs_as_a_script() -> None:
     done = subprocess.run(
         [sys.executable, DEMOS / "future_transform.py"], capture_output=True, text=True, timeout=60, check=False
@@ -105,6 +106,7 @@ async def test_one_robot_sees_the_gripper_of_another_with_the_same_frames(capsys
     assert re.fullmatch(r"  robot2/base_link <- robot2/gripper +static +from 'robot2'", last)
 
 
+@pytest.mark.thorough
 def test_the_demo_of_two_robots_runs_as_a_script() -> None:
     done = subprocess.run(
         [sys.executable, DEMOS / "two_robots.py"], capture_output=True, text=True, timeout=60, check=False
@@ -113,6 +115,7 @@ def test_the_demo_of_two_robots_runs_as_a_script() -> None:
     assert len(done.stdout.splitlines()) == 8
 
 
+@pytest.mark.thorough
 def test_the_demo_of_a_watch_redraws_no_more_than_can_be_seen() -> None:
     done = subprocess.run([sys.executable, DEMOS / "watch.py"], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0
@@ -144,6 +147,7 @@ async def test_the_demo_of_a_message_filter_places_five_detections_and_tells_of_
     assert lines[-1] == "7 detections, 5 placed, dropped: {'too old': 1, 'unknown frame': 1}"
 
 
+@pytest.mark.thorough
 def test_the_demo_of_a_message_filter_runs_as_a_script() -> None:
     done = subprocess.run(
         [sys.executable, DEMOS / "message_filter.py"], capture_output=True, text=True, timeout=60, check=False
@@ -181,6 +185,7 @@ def arm_sees(seconds: float) -> tuple[float, float, float]:
     return reach * math.cos(pan), reach * math.sin(pan), height
 
 
+@pytest.mark.thorough
 def test_the_demo_of_the_arm_runs_as_a_script() -> None:
     done = subprocess.run(
         [sys.executable, DEMOS / "robot_arm.py"], capture_output=True, text=True, timeout=60, check=False
@@ -189,6 +194,7 @@ def test_the_demo_of_the_arm_runs_as_a_script() -> None:
     assert len(done.stdout.splitlines()) == 5
 
 
+@pytest.mark.thorough
 def test_the_tutorials_two_programs_find_each_other_in_either_order_and_one_goes_on_without_the_other() -> None:
     domain = new_domain()
     info = (
@@ -207,6 +213,7 @@ def test_the_tutorials_two_programs_find_each_other_in_either_order_and_one_goes
     assert (listener.errors.text, broadcaster.errors.text, broadcaster.output.text) == ("", "", "")
 
 
+@pytest.mark.thorough
 def test_the_demo_of_a_recording_finds_the_camera_where_it_was_and_keeps_the_file(tmp_path: Path) -> None:
     path = tmp_path / "kept.mcap"
     expected = []

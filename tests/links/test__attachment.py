@@ -56,7 +56,7 @@ def reason_of(data: bytes) -> str:
 
 @given(number=NUMBERS, entries=entries_of_any_kind)
 @settings(max_examples=40)
-def test_what_was_packed_comes_back(number: int, entries: list[Entry]) -> None:
+def test_unpacking_gives_back_what_was_packed(number: int, entries: list[Entry]) -> None:
     assert unpack(pack(number, entries)) == Attachment(number, tuple(entries))
 
 
@@ -182,13 +182,13 @@ GOOD = pack(
 )
 
 
-def test_what_is_cut_anywhere_or_goes_on_is_refused() -> None:
+def test_an_attachment_that_is_cut_off_or_too_long_is_refused() -> None:
     for end in range(1, len(GOOD)):
         assert reason_of(GOOD[:end]) == "attachment"
     assert reason_of(GOOD + b"\0") == "attachment"
 
 
-def test_what_has_no_meaning_is_refused() -> None:
+def test_an_attachment_without_meaning_is_refused() -> None:
     assert reason_of(header(1, 0, 1) + ONE + entry(3)) == "attachment"
     assert reason_of(header(1, 0, 1) + ONE + entry(0, origin=1)) == "attachment"
     assert reason_of(header(0, 0, 1) + entry(1)) == "attachment"
@@ -219,7 +219,7 @@ def test_counts_that_lie_cost_nothing(data: bytes) -> None:
     assert peak < 10_000 + 16 * len(data)
 
 
-def test_runs_of_billions_cost_what_their_bytes_do() -> None:
+def test_runs_of_billions_cost_memory_by_their_bytes_only() -> None:
     data = header(1, 1, 1) + ONE + b"\0\0" + entry(0, size=65_535) + run(count=2**32 - 1) * 65_535
     assert peak_of(lambda: unpack(data)) < 32 * len(data)
 
@@ -279,7 +279,7 @@ def test_many_damaged_attachments_raise_nothing_else() -> None:
 
 
 def check(data: bytes) -> None:
-    """Whatever comes out of bytes is refused, or can be packed again."""
+    """Check that bytes are refused, or that their attachment can be packed again."""
     try:
         attachment = unpack(data)
     except MalformedMessageError:

@@ -150,10 +150,11 @@ def test_no_message_is_larger_than_what_others_accept() -> None:
 def test_a_batch_too_large_for_a_message_is_counted_and_its_neighbours_go_out() -> None:
     writer = Writer()
     writer.add(moving("map", "a", 1))
-    writer.add(*[moving("map", "b", stamp) for stamp in range(MAX_BYTES // 80)])
+    long = "x" * (MAX_NAME - 10)
+    writer.add(*[moving(long, f"{long}{number}", 1) for number in range(3_000)])
     writer.add(moving("map", "c", 1))
     assert writer.sent() == [[moving("map", "a", 1)], [moving("map", "c", 1)]]
-    assert writer.report.not_sent == {"oversized": MAX_BYTES // 80}
+    assert writer.report.not_sent == {"oversized": 3_000}
     assert len(writer.refused) == 1
 
 

@@ -42,7 +42,7 @@ def losses(events: EventStream) -> list[tuple[str, tuple[str, ...]]]:
 
 
 @graphs
-def test_what_is_published_anywhere_is_heard_everywhere_once_and_as_it_was(graph: Graph) -> None:
+def test_every_bus_receives_each_batch_once_and_unchanged(graph: Graph) -> None:
     with Network(graph) as net:
         for member, bus in enumerate(net.buses):
             bus.publish(
@@ -62,7 +62,7 @@ def test_what_is_published_anywhere_is_heard_everywhere_once_and_as_it_was(graph
 
 
 @graphs
-def test_who_joins_late_has_all_that_is_static_and_nothing_else(graph: Graph) -> None:
+def test_a_late_joiner_receives_the_static_frames_and_nothing_else(graph: Graph) -> None:
     with Network(graph) as net:
         for member, bus in enumerate(net.buses):
             bus.publish([moving("map", f"a{member}", 1), static("map", f"s{member}", float(member))])
@@ -78,7 +78,7 @@ def test_who_joins_late_has_all_that_is_static_and_nothing_else(graph: Graph) ->
             assert len(latched(bus)) == len(net.buses) - len(late)
 
 
-def test_a_link_that_begins_later_brings_what_is_latched_to_another_domain() -> None:
+def test_a_second_link_of_a_bus_brings_its_static_frames_to_another_domain() -> None:
     with Network(PAIR) as net:
         net.buses[0].publish([static("map", "s"), static("map", "t")])
         net.buses[1].publish(static("map", "u"))
@@ -106,7 +106,7 @@ def test_samples_of_several_origins_in_one_batch_keep_their_origins() -> None:
 
 
 @graphs
-def test_who_passes_on_what_a_stream_gives_does_not_start_a_loop(graph: Graph) -> None:
+def test_buses_that_republish_received_batches_start_no_loop(graph: Graph) -> None:
     with Network(graph) as net:
         streams = [bus.stream(capacity=100, overflow="drop_oldest") for bus in net.buses]
         for member, bus in enumerate(net.buses):
@@ -124,7 +124,7 @@ def test_who_passes_on_what_a_stream_gives_does_not_start_a_loop(graph: Graph) -
         assert all(latched(bus) == latched(net.buses[0]) for bus in net.buses)
 
 
-def test_what_is_changed_on_its_way_is_somebody_elses() -> None:
+def test_a_changed_sample_belongs_to_the_bus_that_changed_it() -> None:
     with Network(CHAIN) as net:
         net.buses[0].publish(moving("map", "a", 1))
         net.settle()
@@ -168,7 +168,7 @@ def test_a_removed_frame_goes_everywhere_and_comes_back_with_newer_samples(graph
 
 @graphs
 @pytest.mark.parametrize("removes", [0, -1])
-def test_nobody_keeps_a_removed_static_frame_for_late_joiners(graph: Graph, removes: int) -> None:
+def test_no_link_keeps_a_removed_static_frame_for_late_joiners(graph: Graph, removes: int) -> None:
     with Network(graph) as net:
         net.buses[0].publish([static("map", "s"), static("map", "t")])
         net.settle()
@@ -184,7 +184,7 @@ def test_nobody_keeps_a_removed_static_frame_for_late_joiners(graph: Graph, remo
             assert set(latched(late)) == {"t"}
 
 
-def test_what_is_kept_for_late_joiners_is_what_was_published_last_by_whomever() -> None:
+def test_late_joiners_receive_the_last_sample_of_any_publisher() -> None:
     with Network(MESH) as net:
         for member in (2, 0, 3):
             newest = static("map", "s", float(member))
@@ -199,7 +199,7 @@ def test_what_is_kept_for_late_joiners_is_what_was_published_last_by_whomever() 
         assert [end.carrier.kept for end in net.ends] == [{}] * len(net.ends)
 
 
-def test_the_second_bridge_does_not_keep_what_the_first_one_told_it_was_removed() -> None:
+def test_the_second_bridge_does_not_keep_a_frame_whose_removal_came_by_the_first() -> None:
     with Network(TWO_BRIDGES) as net:
         source, first, second, _ = net.buses
         source.publish(static("map", "s"))
@@ -278,7 +278,7 @@ def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> No
             assert all(peer.frames == set() for peer in end.endpoint.peers.forget_all())
 
 
-def test_what_a_subscriber_removes_on_hearing_of_a_removal_is_removed_everywhere() -> None:
+def test_a_removal_by_a_subscriber_that_hears_of_another_goes_everywhere() -> None:
     with Network(MESH) as net:
         a, b, *_ = net.buses
         careful = Bus(SimulatedClock())
@@ -293,7 +293,7 @@ def test_what_a_subscriber_removes_on_hearing_of_a_removal_is_removed_everywhere
 
 
 @pytest.mark.parametrize("early", [True, False])
-def test_what_a_subscriber_publishes_on_hearing_of_a_removal_stays(early: bool) -> None:
+def test_a_frame_that_a_subscriber_republishes_on_its_removal_stays(early: bool) -> None:
     with Network(MESH) as net:
         keeper = Bus(SimulatedClock())
         net.buses.append(keeper)
@@ -377,7 +377,7 @@ def test_without_drop_the_frames_of_a_lost_peer_stay_everywhere() -> None:
         assert [frames_of(bus) for bus in net.buses] == [{"s", "a"}] * 4
 
 
-def test_the_loss_of_a_bridge_takes_nothing_from_those_who_publish_it() -> None:
+def test_the_loss_of_a_bridge_removes_no_frame_from_its_publisher() -> None:
     with Network(TWO_BRIDGES, drop_lost=True) as net:
         source, first, _, far = net.buses
         inner, outer = net.domains
@@ -429,7 +429,7 @@ def test_a_peer_that_comes_back_may_say_the_same_again(graph: Graph, drop_lost: 
         assert net.published(net.buses.index(source)) == net.heard[net.buses.index(source)]
 
 
-def test_a_bridge_that_is_started_again_brings_back_what_is_behind_it() -> None:
+def test_a_restarted_bridge_brings_back_the_frames_behind_it() -> None:
     with Network([[0, 1], [1, 2], [2, 3]], drop_lost=True) as net:
         net.buses[0].publish(static("map", "s"))
         net.settle()
@@ -444,7 +444,7 @@ def test_a_bridge_that_is_started_again_brings_back_what_is_behind_it() -> None:
         assert [set(latched(bus)) for bus in net.buses] == [{"s"}] * 5
 
 
-def test_what_is_still_on_its_way_round_does_not_bring_back_what_was_lost() -> None:
+def test_samples_on_a_slower_way_do_not_bring_back_a_lost_frame() -> None:
     with Network(RING, drop_lost=True) as net:
         a, b, c = net.buses
         a.publish([static("map", "s"), moving("map", "a", 1)])
@@ -464,7 +464,7 @@ def test_what_is_still_on_its_way_round_does_not_bring_back_what_was_lost() -> N
         assert [frames_of(bus) for bus in (b, c)] == [set(), set()]
 
 
-def test_who_removes_or_publishes_what_is_lost_on_hearing_of_it_disturbs_nobody() -> None:
+def test_a_subscriber_may_remove_and_publish_frames_of_a_lost_peer_when_it_hears_of_it() -> None:
     with Network(PAIR, drop_lost=True) as net:
         a, b = net.buses
         heard: list[str] = []
@@ -526,7 +526,7 @@ def test_the_links_of_a_bus_share_a_relay_that_forgets_everything_when_the_last_
             domain.ends = [end for end in domain.ends if end.bus is not a]
 
 
-def test_a_bus_whose_links_end_and_begin_again_is_told_nothing_of_its_own() -> None:
+def test_a_bus_that_is_linked_again_receives_none_of_its_own_samples() -> None:
     with Network(PAIR) as net:
         net.buses[0].publish(static("map", "s"))
         net.settle()

@@ -104,7 +104,7 @@ async def test_a_link_between_a_bus_and_a_foreign_world_works_both_ways() -> Non
     assert link.id == "tfbus"
 
 
-async def test_what_is_published_in_one_turn_goes_out_together_and_a_full_turn_at_once() -> None:
+async def test_samples_of_one_turn_go_out_together_and_a_full_turn_at_once() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
         async with Link(bus, "world", carrier):
@@ -262,7 +262,7 @@ async def test_messages_beyond_the_capacity_are_dropped_and_counted() -> None:
             await receive_samples(link, 10)
 
 
-async def test_what_waits_when_the_clock_jumps_back_is_dropped_unless_it_is_static() -> None:
+async def test_moving_items_that_wait_when_the_clock_jumps_back_are_dropped() -> None:
     clock, carrier = SimulatedClock(start=10), LoggedCarrier()
     with Bus(clock) as bus:
         async with Link(bus, "world", carrier) as link:
@@ -316,7 +316,7 @@ async def test_only_wanted_frames_go_out_and_come_in() -> None:
     assert world.published[-1] == ("tfbus", ForeignMessage(False, [ForeignTransform("map", "base", 1, 0.0)]))
 
 
-def test_what_comes_when_the_event_loop_has_ended_without_the_link_does_no_harm() -> None:
+def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
     carrier = LoggedCarrier()
     message = Received("driver", ForeignMessage(False, [ARM]), moving=True)
 

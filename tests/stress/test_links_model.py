@@ -13,7 +13,7 @@ pytestmark = pytest.mark.thorough
 
 @given(graph=st.sampled_from((MESH, CHAIN, RING, CIRCLE)), steps=steps_of("takeover", "banish"))
 @settings(suppress_health_check=[HealthCheck.too_slow])
-def test_without_loss_everybody_hears_every_batch_once_whole_and_in_order(graph: Graph, steps: list[Step]) -> None:
+def test_without_loss_every_bus_receives_every_batch_once_whole_and_in_order(graph: Graph, steps: list[Step]) -> None:
     with Network(graph) as net:
         model = Model(net)
         buffers = [Buffer(bus, keep=None) for bus in net.buses]
@@ -91,7 +91,7 @@ def test_when_messages_are_lost_besides_all_agree_in_the_end(graph: Graph, steps
     which=st.integers(0, 3),
 )
 @settings(suppress_health_check=[HealthCheck.too_slow])
-def test_whatever_is_on_its_way_when_a_bus_dies_its_frames_leave_everywhere(
+def test_the_frames_of_a_dead_bus_leave_everywhere_whatever_is_on_its_way(
     graph: Graph, steps: list[Step], more: list[Step], which: int
 ) -> None:
     with Network(graph, drop_lost=True) as net:

@@ -1,4 +1,4 @@
-"""A random life of a network of links: what happens by numbers, and what has to hold at its end."""
+"""A random life of a network of links: steps given by numbers, and checks for the end."""
 
 from itertools import combinations
 
@@ -9,7 +9,7 @@ from support.wires import Network, latched
 from tfbus import Bus, TransformStamped
 
 Step = tuple[str, int, int, list[int]]
-"""What happens, to which bus, where, and a few numbers to do it with."""
+"""A kind of step, the number of a bus, the number of a place, and some more numbers."""
 
 
 def frames_of(bus: Bus) -> set[str]:

@@ -1,5 +1,6 @@
-"""Commands in a pseudo-terminal."""
+"""Commands on a terminal."""
 
+import io
 import os
 import subprocess
 from contextlib import suppress
@@ -9,6 +10,15 @@ import pytest
 from support.programs import PATIENCE, TFBUS
 
 pty = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
+
+
+class Terminal(io.StringIO):
+    """A stream that takes itself for a terminal, for a command in the process of the test."""
+
+    encoding = "utf-8"
+
+    def isatty(self) -> bool:
+        return True
 
 
 def on_a_terminal(output: Path, *arguments: str) -> tuple[int, str]:

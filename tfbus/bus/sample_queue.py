@@ -1,7 +1,7 @@
 """A bounded queue of batches between a publisher that never waits and a reader that may be slow."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Literal
 
 from tfbus.geometry.stamped import Batch, TransformStamped
@@ -79,7 +79,7 @@ class SampleQueue:
         else:
             self._batches.append((published, batch))
             self._size += len(batch)
-            self._moving += sum(not sample.static for sample in batch)
+            self._moving += _count_moving(batch)
             while max(self._moving, len(self._batches)) > self.capacity and len(self._batches) > 1:
                 self._drop_batch()
 
@@ -88,7 +88,7 @@ class SampleQueue:
         if self._newest:
             batch = tuple(self._newest.values())
             self._newest.clear()
-            self._moving -= sum(not sample.static for sample in batch)
+            self._moving -= _count_moving(batch)
         elif self._kept:
             batch = tuple(sample for _, sample in self._kept.values())
             self._kept.clear()
@@ -142,15 +142,17 @@ class SampleQueue:
     def _drop_batch(self) -> None:
         before = self._moving
         published, batch = self._pop_batch()
-        self.dropped += before - self._moving
-        for sample in batch:
-            if sample.static:
-                self._keep_static(published, sample)
+        moving = before - self._moving
+        self.dropped += moving
+        if moving < len(batch):
+            for sample in batch:
+                if sample.static:
+                    self._keep_static(published, sample)
 
     def _pop_batch(self) -> TimedBatch:
         published, batch = self._batches.popleft()
         self._size -= len(batch)
-        self._moving -= sum(not sample.static for sample in batch)
+        self._moving -= _count_moving(batch)
         return published, batch
 
     def _keep_static(self, published: int, sample: TransformStamped) -> None:
@@ -163,5 +165,15 @@ class SampleQueue:
         filtered = ((published, tuple(filter(wanted, batch))) for published, batch in self._batches)
         self._batches = deque((published, batch) for published, batch in filtered if batch)
         self._size = sum(len(batch) for _, batch in self._batches)
-        self._moving = sum(not sample.static for sample in self._newest.values())
-        self._moving += sum(not sample.static for _, batch in self._batches for sample in batch)
+        self._moving = _count_moving(self._newest.values())
+        self._moving += sum(_count_moving(batch) for _, batch in self._batches)
+
+
+def _count_moving(samples: Iterable[TransformStamped]) -> int:
+    # A plain loop over the fields: streams count each batch of the bus twice.
+    count = 0
+    for sample in samples:
+        _, _, _, _, _, static = sample._fields
+        if not static:
+            count += 1
+    return count

@@ -7,7 +7,7 @@ from tfbus.links._peers import Peer
 
 
 class Provenance:
-    """Where a received batch or removal came from.
+    """The source of a received batch or removal.
 
     Attributes
     ----------

@@ -21,7 +21,7 @@ ORIGIN = b"0123456789abcdef"
 
 
 class End:
-    """A carrier, and what it has received and could not send."""
+    """A carrier, the items that it has received, and the errors of what it could not send."""
 
     def __init__(self, prefix: str, address: str, listens: bool) -> None:
         config = settings(address if listens else [], None if listens else address, None, 2.0)
@@ -34,7 +34,7 @@ class End:
         self._items.put(item)
 
     async def next(self) -> ReceivedMessage | Presence:
-        """What is received next, read."""
+        """The next item, read."""
         await until(lambda: not self._items.empty())
         content = self._items.get().content
         return content if isinstance(content, Presence) else self.carrier.read(content)
@@ -103,7 +103,7 @@ async def test_a_peer_that_joins_again_has_what_it_keeps_delivered_again() -> No
         assert {frames(await there.next())[0] for _ in range(2)} == {"lidar", "camera"}
 
 
-async def test_what_cannot_be_sent_is_reported_and_never_raised() -> None:
+async def test_failures_to_send_are_reported_and_never_raised() -> None:
     async with ends() as (here, _):
         long = OutgoingBatch(ORIGIN, 1, (moving("map", "a", 2**62),))
         here.carrier.send(Turn([long], {}))

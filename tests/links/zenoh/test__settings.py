@@ -25,7 +25,7 @@ def read(
     config: dict[str, Any] | None = None,
     lease: float = 2.0,
 ) -> Any:
-    """What one of zenoh's settings is."""
+    """The value of one of zenoh's settings."""
     return json.loads(settings(listen, connect, config, lease).get_json(path))
 
 
@@ -43,7 +43,7 @@ def test_one_address_may_be_given_as_text_or_in_a_list(addresses: Addresses) -> 
     assert read(CONNECT, connect=addresses) == ["tcp/192.168.1.5:7447"]
 
 
-def test_whoever_is_given_an_address_does_not_go_to_the_meeting_point() -> None:
+def test_a_link_with_an_address_does_not_use_the_meeting_point() -> None:
     assert read(CONNECT, listen="tcp/127.0.0.1:7000") == []
     assert read(LISTEN, connect="tcp/127.0.0.1:7000") == [LOOPBACK]
     config = {LISTEN: ["tcp/127.0.0.1:7000"]}
@@ -54,19 +54,19 @@ def test_whoever_is_given_an_address_does_not_go_to_the_meeting_point() -> None:
 
 
 @pytest.mark.parametrize("address", ["tls/192.168.1.5:7447", "quic/192.168.1.5:7447"])
-def test_whoever_connects_with_a_certificate_opens_no_port_without_one(address: str) -> None:
+def test_a_link_that_connects_with_a_certificate_opens_no_port_without_one(address: str) -> None:
     assert read(LISTEN, connect=address) == []
     assert read(LISTEN, connect=[address, "tcp/127.0.0.1:7000"]) == [LOOPBACK]
     assert read(LISTEN, connect=address, listen="tcp/127.0.0.1:7000") == ["tcp/127.0.0.1:7000"]
 
 
-def test_how_to_connect_is_no_address() -> None:
+def test_options_of_connecting_are_no_address() -> None:
     config = {"connect/retry": {"period_max_ms": 5_000}, "listen/timeout_ms": 100}
     assert read(LISTEN, config=config) == [MEETING_POINT, LOOPBACK]
     assert read(CONNECT, config=config) == [MEETING_POINT]
 
 
-def test_only_who_listens_at_an_address_of_its_own_fails_if_it_cannot() -> None:
+def test_only_a_link_with_a_listening_address_of_its_own_fails_if_it_cannot_listen() -> None:
     assert read("listen/exit_on_failure") is False
     assert read("listen/exit_on_failure", connect="tcp/127.0.0.1:7000") is False
     assert read("listen/exit_on_failure", listen="tcp/127.0.0.1:7000") is not False
@@ -106,7 +106,7 @@ def test_a_lease_is_a_time_that_passes(lease: float) -> None:
         "xyz/1.2.3.4:5",
     ],
 )
-def test_what_can_be_no_address_is_named(address: str) -> None:
+def test_an_error_names_a_malformed_address(address: str) -> None:
     for listen, connect in ((address, None), (None, address), (None, ["tcp/127.0.0.1:7000", address])):
         with pytest.raises(ValueError, match=f"not {address!r}"):
             settings(listen, connect, None, 2.0)

@@ -32,13 +32,13 @@ from tfbus.links.zenoh import ZenohLink
 pytestmark = pytest.mark.anyio
 
 ON_ONE_LOOP = pytest.mark.parametrize("anyio_backend", [("asyncio", {})], ids=["asyncio"])
-"""For what takes long and depends on zenoh only."""
+"""For tests that take long and depend on zenoh only."""
 
 Batch = tuple[TransformStamped, ...]
 
 
 class Place:
-    """Where some links meet that nobody else knows."""
+    """A domain and an address for the links of one test."""
 
     def __init__(self) -> None:
         self.domain = new_domain()
@@ -46,7 +46,7 @@ class Place:
         self._taken = False
 
     def link(self, bus: Bus, **options: Any) -> ZenohLink:
-        """A link; whoever is first listens and the others connect to it."""
+        """A link; the first one listens and the others connect to it."""
         first = not self._taken
         self._taken = True
         options["listen" if first else "connect"] = self.address
@@ -73,7 +73,7 @@ async def joined(place: Place, *buses: Bus, **options: Any) -> AsyncIterator[lis
 
 
 def is_free(place: Place) -> bool:
-    """Whether nobody listens there."""
+    """Whether no link listens there."""
     try:
         socket.create_server(("127.0.0.1", int(place.address.rpartition(":")[2]))).close()
     except OSError:
@@ -82,19 +82,19 @@ def is_free(place: Place) -> bool:
 
 
 def hear(bus: Bus) -> list[Batch]:
-    """All batches that the bus gives from now on, also as they come."""
+    """A list that receives all batches of a bus from now on."""
     heard: list[Batch] = []
     bus.subscribe(heard.append)
     return heard
 
 
 def frames(bus: Bus) -> set[str]:
-    """Whatever the bus knows to have a parent now."""
+    """The static frames of a bus."""
     return {sample.child for sample in known(bus)}
 
 
 def known(bus: Bus) -> Sequence[TransformStamped]:
-    """What whoever joins now is given at once."""
+    """The static samples that a new subscriber is given."""
     latched: list[TransformStamped] = []
     bus.subscribe(latched.extend).close()
     return latched
@@ -142,7 +142,7 @@ async def test_a_late_joiner_has_the_static_frames_and_no_moving_ones(place: Pla
                 assert late.statistics().frames == 50
 
 
-async def test_what_was_latched_before_the_link_was_there_is_sent(place: Place) -> None:
+async def test_static_frames_from_before_the_link_are_sent(place: Place) -> None:
     with Bus() as early, Bus() as late:
         early.publish(static("map", "a"))
         late.publish(static("map", "b"))
@@ -214,7 +214,7 @@ async def test_a_lookup_that_waits_is_answered_from_the_other_bus(place: Place) 
             assert (found[0].transform.translation[0], found[0].stamp) == (2.0, 15)
 
 
-async def test_what_is_published_just_before_the_end_still_arrives(place: Place) -> None:
+async def test_samples_published_just_before_the_end_still_arrive(place: Place) -> None:
     with Bus() as here, Bus() as there:
         async with place.link(there) as link:
             heard = hear(there)
@@ -506,7 +506,7 @@ async def test_peers_that_come_and_go_are_told_with_their_authorities_and_frames
         assert (lost.authorities, lost.frames) == (("urdf", "wheels"), ("base", "lidar"))
 
 
-async def test_frames_of_whoever_has_gone_stay_unless_they_are_to_be_dropped(place: Place) -> None:
+async def test_the_frames_of_a_lost_peer_stay_by_default(place: Place) -> None:
     with Bus() as here, Bus() as there:
         async with place.link(here) as link:
             async with place.link(there) as other:
@@ -537,7 +537,7 @@ async def test_both_ends_may_live_in_simulated_time(place: Place) -> None:
             assert (found.transform.translation[0], found.stamp) == (7.5, 0)
 
 
-async def test_what_waits_for_the_loop_when_the_clock_jumps_back_is_dropped(place: Place) -> None:
+async def test_messages_that_wait_when_the_clock_jumps_back_are_dropped(place: Place) -> None:
     clock = SimulatedClock()
     with Bus() as here, Bus(clock) as there, Buffer(there) as buffer:
         async with joined(place, here, there) as (_, link):
