@@ -75,6 +75,7 @@ def test_an_empty_recording_plays_nothing(tfbus: Command, tmp_path: Path) -> Non
     assert (done.returncode, done.stderr.splitlines()[-1], received) == (0, "0 samples played", [])
 
 
+@pytest.mark.thorough
 def test_without_a_peer_it_plays_after_a_second(tfbus: Command, ten_seconds: Path) -> None:
     done = tfbus.on_domain(nobody, "play", ten_seconds, "--rate", "inf", clock=SystemClock())
     assert done.stderr.splitlines()[-1] == "102 samples played"
