@@ -119,9 +119,6 @@ def test_another_program_receives_everything_from_the_first_sample_to_the_last(
     assert [sample for sample in received if sample.static] == [sample for sample in played if sample.static]
     assert [sample for sample in received if not sample.static] == [sample for sample in played if not sample.static]
     assert {sample.authority for sample in received} == {"odometry"}
-    times = [message.received for message in messages_in(copy)]
-    # At twenty times the speed, ten seconds take half of one; on a slow machine more, but never less.
-    assert times[-1] - times[0] > 0.45 * SECOND
 
 
 @pytest.mark.thorough
