@@ -26,7 +26,7 @@ class Path:
         The common ancestor.
     moving : tuple of FrameHistory
         The edges that are not static.
-    lasting : bool
+    permanent : bool
         Whether it holds at every stamp, because no frame on it changes its parent inside its window.
     """
 

@@ -2,6 +2,7 @@
 
 import re
 import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
@@ -54,6 +55,7 @@ class ZenohSession:
         self._session: zenoh.Session | None = None
         self._declared: tuple[object, ...] = ()
         self._static_subscriber: Any = None
+        self._close_at_exit: weakref.finalize[..., ZenohSession] | None = None
 
     def open(self) -> None:
         """Open the session and announce the link.
@@ -88,6 +90,8 @@ class ZenohSession:
         if abandoned:
             _close(session)
             return
+        # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
+        self._close_at_exit = weakref.finalize(self, _close, session)
         self.statics = StaticKeys(session, f"{self._prefix}/static/{self._id}")
         self._live = session.declare_publisher(
             f"{self._prefix}/live/{self._id}", congestion_control=zenoh.CongestionControl.DROP
@@ -130,6 +134,8 @@ class ZenohSession:
         with self._lock:
             self._closed = True
             session = self._session
+        if self._close_at_exit is not None:
+            self._close_at_exit.detach()
         closing = threading.Thread(target=_close, args=(session,), daemon=False)
         closing.start()
         return closing
@@ -173,6 +179,7 @@ class ZenohSession:
 
 
 def _close(session: zenoh.Session | None) -> None:
+    """Close a session, if there is one; a second call does nothing."""
     if session is not None:
         # zenoh may give up waiting for a peer; that peer notices the end by itself.
         with suppress(zenoh.ZError):
