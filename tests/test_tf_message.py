@@ -471,6 +471,7 @@ def test_a_damaged_message_does_no_harm(little_endian: bool, wanted: list[Part],
 # Memory, and what is remembered.
 
 
+@pytest.mark.thorough
 def test_no_cache_of_names_grows_without_bound() -> None:
     # Names of 80 bytes fit in a cache, those of 400 do not.
     for name in ("frame {}", "a" * 80 + "{}", "🦾" * 100 + "{}"):

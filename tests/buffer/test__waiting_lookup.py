@@ -154,6 +154,7 @@ async def test_a_wrong_policy_raises_at_once() -> None:
 
 
 @pytest.mark.parametrize("source", ["base", "arm"])
+@pytest.mark.thorough
 async def test_a_lookup_that_has_waited_leaves_no_reference_cycles(source: str) -> None:
     with Bus() as bus, Buffer(bus, keep=None) as buffer:
         bus.publish([driving("map", "base", 0.0), driving("base", "arm", 0.0), driving("base", "arm", 90.0)])

@@ -214,6 +214,7 @@ LIES = [
 
 
 @pytest.mark.parametrize("data", LIES)
+@pytest.mark.thorough
 def test_counts_that_lie_cost_nothing(data: bytes) -> None:
     peak = peak_of(lambda: reason_of(data))
     assert peak < 10_000 + 16 * len(data)

@@ -542,6 +542,7 @@ def test_messages_of_too_many_peers_are_refused_and_counted() -> None:
         assert here.reports == [(f"{MAX_PEERS}", "too many peers")]
 
 
+@pytest.mark.thorough
 def test_removals_of_unknown_frames_do_not_reach_the_bus() -> None:
     entries: list[Entry] = [RemovedFrame(ORIGIN, number, f"no {number}") for number in range(MAX_ENTRIES)]
     calls: Counter[str] = Counter()

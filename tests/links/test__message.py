@@ -106,6 +106,7 @@ def test_live_messages_are_numbered_and_a_message_to_keep_has_no_number() -> Non
     assert unpack(kept.attachment).entries == (PublishedBatch(OTHER, 2, (("calibration", True, 1),)),)
 
 
+@pytest.mark.thorough
 def test_a_full_message_is_followed_by_another_and_batches_stay_whole() -> None:
     writer = Writer()
     for _ in range(FULL_MESSAGE + 1):

@@ -173,6 +173,7 @@ def answers(tree: TransformTree, stamps: range) -> list[str]:
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(st.lists(any_samples("abcd", 5), min_size=1, max_size=4), max_size=12))
+@pytest.mark.thorough
 def test_a_loaded_recording_gives_the_answers_that_the_buffer_gave(
     run: Run, tmp_path: Path, batches: list[list[TransformStamped]]
 ) -> None:
@@ -234,6 +235,7 @@ async def test_a_few_samples_are_written_soon_without_a_flush(tmp_path: Path) ->
             await until(lambda: recorder.statistics().samples == 1)
 
 
+@pytest.mark.thorough
 async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with Bus(SimulatedClock()) as bus, bus.events() as events:

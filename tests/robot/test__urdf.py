@@ -275,6 +275,7 @@ def test_an_error_about_an_element_pickles() -> None:
     assert (str(twin), twin.element, twin.__cause__) == (str(caught.value), '<joint name="j">', None)
 
 
+@pytest.mark.thorough
 def test_without_urdf_parser_py_the_error_names_the_extra() -> None:
     hidden = (
         "import sys; sys.modules['urdf_parser_py'] = None\n"

@@ -222,6 +222,7 @@ def test_a_closed_bus_refuses_the_robot_and_its_messages() -> None:
 
 
 @pr2.needed
+@pytest.mark.thorough
 def test_the_grippers_of_a_pr2_are_where_the_recorded_transforms_of_the_real_robot_put_them() -> None:
     model = RobotModel.from_urdf(pr2.URDF)
     recorded = pr2.recorded()

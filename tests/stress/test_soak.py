@@ -181,6 +181,7 @@ async def soak(seed: int, ending: Ending) -> Crowd:
 
 
 @pytest.mark.anyio
+@pytest.mark.thorough
 async def test_a_soak_leaves_nothing_behind_and_its_books_balance() -> None:
     await soak(0, "buffers close one by one")
 

@@ -342,6 +342,7 @@ def deep() -> TransformTree:
     return tree
 
 
+@pytest.mark.thorough
 def test_a_chain_longer_than_the_recursion_limit_is_looked_up_and_drawn(deep: TransformTree) -> None:
     assert sys.getrecursionlimit() < 5_000
     for at in (LATEST, 7):
@@ -449,6 +450,7 @@ def no_growth(limit: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("insert", [TransformTree.insert_many, commit_batch])
 @pytest.mark.parametrize("order", [1, -1], ids=["in order", "backwards"])
+@pytest.mark.thorough
 def test_a_sample_takes_at_most_100_bytes(insert: Callable[[TransformTree, Any], object], order: int) -> None:
     edges = [(f"frame {depth}", f"frame {depth + 1}") for depth in range(5)]
     stamps = range(TODAY, TODAY + 5 * SECOND, SECOND // 100)[::order]

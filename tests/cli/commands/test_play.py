@@ -75,6 +75,7 @@ def test_an_empty_recording_plays_nothing(tfbus: Command, tmp_path: Path) -> Non
     assert (done.returncode, done.stderr.splitlines()[-1], received) == (0, "0 samples played", [])
 
 
+@pytest.mark.thorough
 def test_without_a_peer_it_plays_after_a_second(tfbus: Command, ten_seconds: Path) -> None:
     done = tfbus.on_domain(nobody, "play", ten_seconds, "--rate", "inf", clock=SystemClock())
     assert done.stderr.splitlines()[-1] == "102 samples played"
@@ -118,9 +119,6 @@ def test_another_program_receives_everything_from_the_first_sample_to_the_last(
     assert [sample for sample in received if sample.static] == [sample for sample in played if sample.static]
     assert [sample for sample in received if not sample.static] == [sample for sample in played if not sample.static]
     assert {sample.authority for sample in received} == {"odometry"}
-    times = [message.received for message in messages_in(copy)]
-    # At twenty times the speed, ten seconds take half of one; on a slow machine more, but never less.
-    assert times[-1] - times[0] > 0.45 * SECOND
 
 
 @pytest.mark.thorough

@@ -652,6 +652,7 @@ def run_program(program: str) -> subprocess.CompletedProcess[str]:
 
 
 @ON_ONE_LOOP
+@pytest.mark.thorough
 async def test_without_the_extra_the_error_names_it() -> None:
     done = run_program("import sys; sys.modules['zenoh'] = None; import tfbus.links.zenoh")
     assert done.returncode == 1
