@@ -614,12 +614,6 @@ async def test_every_tick_passes_a_checkpoint_even_a_late_one() -> None:
     assert scope.cancelled_caught
 
 
-async def test_what_the_body_raises_comes_out_as_it_is() -> None:
-    with pytest.raises(ZeroDivisionError):
-        async for tick in SimulatedClock().ticks(1):
-            _ = 1 / tick
-
-
 @pytest.mark.parametrize("make", [SystemClock, SimulatedClock])
 @pytest.mark.parametrize(
     ("hz", "error"),

@@ -164,25 +164,25 @@ STEPS = st.one_of(
 @given(st.lists(STEPS, max_size=30))
 def test_the_events_add_up_to_the_set_of_stale_frames(steps: list[tuple[str, str, int | None]]) -> None:
     world = World()
-    told: set[str] = set()
+    announced: set[str] = set()
     now = 0
     for kind, frame, number in steps:
         if kind == "send":
             world.send(frame, number)
         elif kind == "remove":
             world.remove(frame)
-            told.discard(frame)
+            announced.discard(frame)
         else:
             now += number or 0
             due = world.staleness.due()
             events = world.staleness.changes(now)
             for event in events:
-                assert (event.frame in told) == isinstance(event, FrameLive)
-                told ^= {event.frame}
+                assert (event.frame in announced) == isinstance(event, FrameLive)
+                announced ^= {event.frame}
             stale = {
                 name for name, known in world.edges.items() if known.newest is not None and known.newest + LIMIT < now
             }
-            assert told == stale
+            assert announced == stale
             if any(isinstance(event, FrameStale) for event in events):
                 assert due is not None
-                assert due <= now, "nobody turns stale before the announced moment"
+                assert due <= now, "no frame turns stale before the announced time"
