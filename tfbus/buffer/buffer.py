@@ -11,7 +11,7 @@ from tfbus.bus.bus import Bus
 from tfbus.data import Stamped, do_transform
 from tfbus.errors import TransformLookupError
 from tfbus.frames import as_prefix
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
 from tfbus.stamps import LATEST, Latest
 from tfbus.tree.explanation import Explanation
@@ -137,7 +137,8 @@ class Buffer:
             return answer(self._forest, target, source, at, source_at, fixed, not_before, policy)
         via = None if fixed is None else names.on_bus(fixed)
         found = answer(self._forest, names.on_bus(target), names.on_bus(source), at, source_at, via, not_before, policy)
-        return names.answer(found)
+        # Not `names.answer`, which costs a fifth of this lookup: the local names are at hand.
+        return renamed(found, target, source)
 
     async def lookup(
         self,
