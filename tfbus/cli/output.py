@@ -1,4 +1,4 @@
-"""What the subcommands print: results, notices, warnings, and values as text for people."""
+"""The output of the subcommands: results, notices, warnings, and values as text for people."""
 
 import sys
 from collections.abc import Iterable, Iterator, Mapping
