@@ -83,7 +83,7 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         with self.lock:
-            _, refused = admit(self.frames, batch)
+            _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
             outcomes = [self.insert_judged(sample) for sample in batch]
