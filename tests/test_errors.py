@@ -11,6 +11,7 @@ import pytest
 import tfbus
 from tfbus import (
     LATEST,
+    AheadError,
     BusClosedError,
     ClockResetError,
     DisconnectedError,
@@ -86,6 +87,17 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         ),
         "frame 'base_link': asked for 3.000 s within 50 ms, between samples at 2.500 s and 4.500 s, "
         "which are 2 s apart (at most 500 ms), from 'odometry'",
+    ),
+    (
+        AheadError(
+            child="base_link",
+            stamp=from_seconds(13),
+            oldest=from_seconds(2.5),
+            newest=from_seconds(16),
+            authority="odometry",
+        ),
+        "frame 'base_link': asked for the latest up to 13.000 s, newest sample is 16.000 s (3 s too new), "
+        "from 'odometry'",
     ),
     (
         LookupTimeoutError(target="map", source="base_link", timeout=0.25, missing=SHORT),

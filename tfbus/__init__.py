@@ -27,6 +27,7 @@ from tfbus.data import (
     do_transform,
 )
 from tfbus.errors import (
+    AheadError,
     BusClosedError,
     ClockResetError,
     DisconnectedError,
@@ -58,6 +59,7 @@ from tfbus.events import (
     RecordingFailed,
     Reparented,
     SampleRejected,
+    StampAhead,
     SubscriberFailed,
 )
 from tfbus.geometry.stamped import TransformStamped
@@ -87,6 +89,7 @@ from tfbus.waiting.waiting_index import PendingLookup
 __all__ = [
     "LATEST",
     "SECOND",
+    "AheadError",
     "AuthorityConflict",
     "Buffer",
     "BufferStatistics",
@@ -146,6 +149,7 @@ __all__ = [
     "RobotStatistics",
     "SampleRejected",
     "SimulatedClock",
+    "StampAhead",
     "Stamped",
     "Stream",
     "SubscriberFailed",

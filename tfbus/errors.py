@@ -10,6 +10,7 @@
                 FutureExtrapolationError                                      waiting may help
                 PastExtrapolationError                                        waiting cannot help: raised at once
                 GapError                   .before .after .max_gap            waiting cannot help: raised at once
+                AheadError                                                    waiting cannot help: raised at once
             LookupTimeoutError (TimeoutError)  __cause__ is the last lookup error
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         InvalidRobotError (ValueError)         .element
@@ -172,7 +173,13 @@ class ExtrapolationError(TransformLookupError):
         The sender of the edge's newest sample; may be empty.
     slack : int
         The greatest distance between the stamp and a sample that the policy allowed, in ns.
+    ahead : int
+        The time from the clock's now to the edge's newest stamp, in ns, if that is more than the `max_ahead` of the
+        bus: then right samples are older than it, and may have expired. Otherwise 0, as in all errors of a tree without
+        a bus.
     """
+
+    ahead: int = 0
 
     def __init__(
         self,
@@ -192,15 +199,19 @@ class ExtrapolationError(TransformLookupError):
         self.authority = authority
         self.slack = slack
 
+    def _asked(self) -> str:
+        asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
+        return f"{asked} within {format_duration(self.slack)}" if self.slack else asked
+
     def _gap(self) -> str:
         return "there is no sample in its window"
 
     def _why(self) -> str:
-        asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
-        if self.slack:
-            asked += f" within {format_duration(self.slack)}"
         sender = f", from {self.authority!r}" if self.authority else ""
-        return f"frame {self.child!r}: asked for {asked}, {self._gap()}{sender}"
+        if self.ahead:
+            ahead = format_duration(self.ahead)
+            sender += f"; its newest stamp is {ahead} ahead of the clock, and right samples expire"
+        return f"frame {self.child!r}: asked for {self._asked()}, {self._gap()}{sender}"
 
 
 class FutureExtrapolationError(ExtrapolationError):
@@ -253,6 +264,22 @@ class GapError(ExtrapolationError):
             f"between samples at {format_stamp(self.before)} and {format_stamp(self.after)}, which are "
             f"{format_duration(self.after - self.before)} apart (at most {format_duration(self.max_gap)})"
         )
+
+
+class AheadError(ExtrapolationError):
+    """The newest answer is further ahead of the clock than `max_age` allows. Waiting for samples cannot help.
+
+    `stamp` is the newest stamp that was allowed, in ns; `child` is the edge that has come no further than the answer.
+    """
+
+    def _asked(self) -> str:
+        return f"the latest up to {super()._asked()}"
+
+    def _gap(self) -> str:
+        if self.newest is None or isinstance(self.stamp, Latest):
+            return "it has no samples"
+        late = format_duration(self.newest - self.stamp)
+        return f"newest sample is {format_stamp(self.newest)} ({late} too new)"
 
 
 class LookupTimeoutError(TransformLookupError, TimeoutError):
