@@ -119,7 +119,9 @@ def test_a_prefilled_edge_that_closes_a_loop_with_the_bus_is_removed() -> None:
 
 def test_only_the_prefilled_edges_in_the_loop_are_removed() -> None:
     bus = bus_with()
-    late = Buffer(bus, prefill=tree_of(*[moving(*pair, 40) for pair in ("ab", "bc", "bd", "ra")]))
+    late = Buffer(
+        bus, prefill=tree_of(*[moving(p, c, 40) for p, c in (("a", "b"), ("b", "c"), ("b", "d"), ("r", "a"))])
+    )
     bus.publish(moving("c", "b", 60))
     assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("r", "a"), ("c", "b"), ("b", "d")]
 
