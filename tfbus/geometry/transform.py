@@ -121,6 +121,11 @@ class Transform:
             raise InvalidTransformError(f"angle {angle!r} is not finite", reason="not finite")
         return cls.from_wxyz(translation, quaternions.axangle2quat((x / length, y / length, z / length), angle, True))
 
+    @classmethod
+    def from_scipy(cls, translation: Numbers, rotation: Any) -> "Transform":
+        """From a translation in m and one ``scipy.spatial.transform.Rotation``."""
+        return cls(translation, rotation.as_quat())
+
     @property
     def translation(self) -> Vector:
         """(x, y, z) in m."""
@@ -164,6 +169,18 @@ class Transform:
             return (1.0, 0.0, 0.0), 0.0
         length = math.copysign(sine, w)
         return (x / length, y / length, z / length), 2.0 * math.atan2(sine, abs(w))
+
+    def as_scipy(self) -> Any:
+        """The rotation as a ``scipy.spatial.transform.Rotation``.
+
+        Raises
+        ------
+        ImportError
+            If scipy is not installed.
+        """
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_quat(self.rotation)
 
     def matrix(self) -> npt.NDArray[np.float64]:
         """A new homogeneous matrix of shape (4, 4)."""
