@@ -32,6 +32,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "testing": ("geometry",),
     "__init__": ("message_filter", "robot"),
     "cli": ("__init__", "links", "recording"),
+    "__main__": ("cli",),
 }
 
 SANS_IO = {*GROUND, "geometry", "data", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
