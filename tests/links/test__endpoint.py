@@ -24,13 +24,9 @@ class NotingCarrier(ForeignCarrier):
     def __init__(self) -> None:
         super().__init__(ForeignWorld())
         self.turns: list[Turn] = []
-        self.joined: list[tuple[str, bool]] = []
 
     def send(self, turn: Turn) -> None:
         self.turns.append(turn)
-
-    def peer_joined(self, peer: str, again: bool) -> None:
-        self.joined.append((peer, again))
 
 
 class Scene:
@@ -90,7 +86,6 @@ def test_a_peer_is_announced_when_it_joins_and_leaves_and_the_carrier_knows_who_
             PeerLost(7, "world", "driver", ("foreign",), ("a", "b")),
             PeerJoined(7, "world", "driver"),
         ]
-        assert here.carrier.joined == [("driver", False), ("driver", True)]
         assert here.endpoint.peers.present == ("driver",)
         assert here.bus.statistics().frames == 2
 

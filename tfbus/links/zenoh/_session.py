@@ -1,9 +1,10 @@
 """One zenoh session of a link: its keys, and what zenoh's threads receive."""
 
 import re
+import struct
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any
@@ -11,50 +12,37 @@ from typing import Any
 import zenoh
 
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._settings import without_source_location
-from tfbus.links.zenoh._statics import StaticKeys, subscribe_statics
 from tfbus.tf_message import MalformedMessageError
 
-_ID = re.compile("[0-9a-f]{32}")
 _LONGEST_SHOWN_KEY = 200
+MOST_QUESTIONS = 1_000
+_ANSWER_TIME = 2.0
+_SINCE = struct.Struct("<Q")
 
 
 class ZenohSession:
-    """A session and its keys: `open`, `resubscribe_statics` and `statics` block; `put` and `close` do not.
+    """A session and its keys: `open` and `answer` block; `put`, `ask` and `close` do not.
 
     Parameters
     ----------
     config : zenoh.Config
-    prefix : str
-        The beginning of all keys of the domain.
-    id : str
-        The link's name, a part of all its keys.
+    keys : Keys
     receive : callable
         Called in zenoh's threads with each `Received` item; a message's content is a payload and its attachment.
-
-    Attributes
-    ----------
-    statics : StaticKeys
-        Exists once the session is open.
     """
 
-    def __init__(
-        self,
-        config: zenoh.Config,
-        prefix: str,
-        id: str,  # noqa: A002 - the wire calls it so
-        receive: Callable[[Received], object],
-    ) -> None:
+    def __init__(self, config: zenoh.Config, keys: Keys, receive: Callable[[Received], object]) -> None:
         self._config = config
-        self._prefix = prefix
-        self._id = id
+        self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
         self._closed = False
         self._session: zenoh.Session | None = None
-        self._declared: tuple[object, ...] = ()
-        self._static_subscriber: Any = None
+        self._declared: list[object] = []
+        self._questions = 0
         self._close_at_exit: weakref.finalize[..., ZenohSession] | None = None
 
     def open(self) -> None:
@@ -92,36 +80,61 @@ class ZenohSession:
             return
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, _close, session)
-        self.statics = StaticKeys(session, f"{self._prefix}/static/{self._id}")
-        self._live = session.declare_publisher(
-            f"{self._prefix}/live/{self._id}", congestion_control=zenoh.CongestionControl.DROP
-        )
-        self.resubscribe_statics()
-        remote, alive = zenoh.Locality.REMOTE, session.liveliness()
-        # zenoh undeclares what nobody refers to.
-        self._declared = (
-            session.declare_subscriber(f"{self._prefix}/live/*", _directly(self._receive_live), allowed_origin=remote),
-            alive.declare_subscriber(f"{self._prefix}/@alive/*", _directly(self._receive_presence), history=True),
-            alive.declare_token(f"{self._prefix}/@alive/{self._id}"),
-        )
-
-    def resubscribe_statics(self) -> None:
-        """Have all existing static frames delivered, also those that were delivered before; for a worker thread.
-
-        Raises
-        ------
-        zenoh.ZError
-            If the session is closed.
-        """
-        assert self._session is not None
-        before, receive = self._static_subscriber, _directly(self._receive_static)
-        self._static_subscriber = subscribe_statics(self._session, f"{self._prefix}/static/*/*", receive)
-        if before is not None:
-            before.undeclare()
+        drop, remote, keys = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE, self._keys
+        self._live = session.declare_publisher(keys.own("live"), congestion_control=drop)
+        # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
+        self._declared = [
+            *(
+                session.declare_subscriber(key, _directly(self._receive_live), allowed_origin=remote)
+                for key in keys.heard("live")
+            ),
+            *(
+                session.liveliness().declare_subscriber(key, _directly(self._receive_presence), history=True)
+                for key in keys.heard("@alive")
+            ),
+            session.declare_queryable(keys.own("state"), _directly(self._receive_question)),
+            session.liveliness().declare_token(keys.own("@alive")),
+        ]
 
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested."""
         self._live.put(message.payload, attachment=message.attachment)
+
+    def ask(self, peer: str, since: int) -> None:
+        """Ask a peer for the changes of its state behind a number; the answer is received as an item."""
+        answered = False
+
+        def take(reply: zenoh.Reply) -> None:
+            nonlocal answered
+            if reply.ok is not None and not answered:
+                answered = True
+                self._receive_message(peer, reply.ok, as_answer=True)
+
+        def end() -> None:
+            if not answered:
+                self._receive(Received(peer, Answer(None)))
+
+        try:
+            assert self._session is not None
+            self._session.get(
+                self._keys.of("state", peer),
+                zenoh.handlers.Callback(take, end, indirect=False),
+                payload=_SINCE.pack(since),
+                timeout=_ANSWER_TIME,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+        except zenoh.ZError:
+            self._receive(Received(peer, Answer(None)))
+
+    def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
+        """Answer questions; for a worker thread, because zenoh waits for a peer whose queue is full."""
+        for query, message in answers:
+            # A peer that has gone needs no answer.
+            with suppress(zenoh.ZError):
+                query.reply(self._keys.own("state"), message.payload, attachment=message.attachment)
+            query.drop()
+            with self._lock:
+                self._questions -= 1
 
     def close(self) -> threading.Thread:
         """Begin to close the session, also one that is still being opened.
@@ -141,23 +154,22 @@ class ZenohSession:
         return closing
 
     def _receive_live(self, sample: zenoh.Sample) -> None:
-        self._receive_message(sample, "live", moving=True)
+        sender = self._sender(sample, "live")
+        if sender is not None and sample.kind == zenoh.SampleKind.PUT:
+            self._receive_message(sender, sample)
 
-    def _receive_static(self, sample: zenoh.Sample) -> None:
-        self._receive_message(sample, "static", moving=False)
-
-    def _receive_message(self, sample: zenoh.Sample, kind: str, moving: bool) -> None:
-        sender = self._sender(sample, kind)
-        if sender is None or sample.kind != zenoh.SampleKind.PUT:
-            return
+    def _receive_message(self, sender: str, sample: zenoh.Sample, as_answer: bool = False) -> None:
         size = len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment))
         if size > MAX_BYTES:
             self._refuse(sender, "oversized", f"{size} bytes, more than {MAX_BYTES}")
+            return
+        # Copies, for the sample would keep the whole buffer in which it came.
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        message = sample.payload.to_bytes(), attachment
+        if as_answer:
+            self._receive(Received(sender, Answer(message), size))
         else:
-            # Copies, for the sample would keep the whole buffer in which it came.
-            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            message = sample.payload.to_bytes(), attachment
-            self._receive(Received(sender, message, size, moving))
+            self._receive(Received(sender, message, size, moving=True))
 
     def _receive_presence(self, sample: zenoh.Sample) -> None:
         sender = self._sender(sample, "@alive")
@@ -165,14 +177,24 @@ class ZenohSession:
             present = sample.kind == zenoh.SampleKind.PUT
             self._receive(Received(sender, Presence.JOINED if present else Presence.LEFT))
 
+    def _receive_question(self, query: zenoh.Query) -> None:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        with self._lock:
+            admitted = len(payload) == _SINCE.size and self._questions < MOST_QUESTIONS
+            self._questions += admitted
+        if admitted:
+            self._receive(Received("", Question(_SINCE.unpack(payload)[0], query)))
+        else:
+            # Whoever means it asks again.
+            query.drop()
+
     def _sender(self, sample: zenoh.Sample, kind: str) -> str | None:
         """The peer that a sample is from; None for this link's own, and for a key without an id, which is refused."""
         key = str(sample.key_expr)
-        sender = key.removeprefix(f"{self._prefix}/{kind}/").partition("/")[0]
-        if not _ID.fullmatch(sender):
+        sender = self._keys.sender(key, kind)
+        if sender is None:
             self._refuse("", "key", f"there is no link's id in its key {key[:_LONGEST_SHOWN_KEY]!r}")
-            return None
-        return None if sender == self._id else sender
+        return None if sender == self._keys.link else sender
 
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
         self._receive(Received(sender, MalformedMessageError(reason, detail)))
@@ -186,7 +208,7 @@ def _close(session: zenoh.Session | None) -> None:
             session.close()
 
 
-def _directly(callback: Callable[[zenoh.Sample], object]) -> Any:
+def _directly(callback: Callable[[Any], object]) -> Any:
     # Otherwise each subscriber has a thread of its own, and one overtakes the other.
     return zenoh.handlers.Callback(callback, indirect=False)
 

@@ -66,8 +66,6 @@ def settings(
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
         "scouting/delay": 100,
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
-        # Caches for late joiners tell messages apart by time.
-        "timestamping/enabled": True,
         # It would leave a file open for each link that has ended.
         "transport/shared_memory/enabled": False,
         # Larger messages are not even assembled.

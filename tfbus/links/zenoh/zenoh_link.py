@@ -1,15 +1,9 @@
 """A link over zenoh: what is published on its bus reaches every other bus of the domain, and the other way round.
 
-The keys of a domain, where *link* is 32 hexadecimal digits that each link draws at random::
-
-    tfbus/domain/live/link            all that is published and removed, one message a turn of the link's event loop
-    tfbus/domain/static/link/child    the newest sample of a static frame, kept for late joiners
-    tfbus/domain/@alive/link          a liveliness token
-
-A static sample thus comes on two ways, in its batch and by itself; the relay takes the first and drops the other.
+`tfbus.links.zenoh._keys` lists the keys. Static frames, removals, and whatever else the network has lost of a link's
+state come with the answers to questions; see `tfbus.links._state`.
 """
 
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import uuid4
@@ -22,9 +16,8 @@ except ImportError:
 from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
+from tfbus.links.zenoh._keys import Keys, check_domain
 from tfbus.links.zenoh._settings import Addresses, settings
-
-_LONGEST_DOMAIN = 200
 
 
 class ZenohLink(Link):
@@ -100,19 +93,8 @@ class ZenohLink(Link):
         max_frames: int = 10_000,
         capacity: int = 10_000,
     ) -> None:
-        self.domain = _check_domain(domain)
-        carrier = ZenohCarrier(settings(listen, connect, config, lease), f"tfbus/{domain}", uuid4().hex)
+        self.domain = check_domain(domain)
+        carrier = ZenohCarrier(settings(listen, connect, config, lease), Keys(domain, uuid4().hex))
         super().__init__(
             bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
         )
-
-
-def _check_domain(domain: str) -> str:
-    if domain.endswith("/static"):
-        raise ValueError(f"the domain {domain!r} would hear the static frames of {domain.removesuffix('/static')!r}")
-    if len(domain) > _LONGEST_DOMAIN or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", domain, re.ASCII):
-        raise ValueError(
-            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
-            f"{_LONGEST_DOMAIN} at most, not {domain!r}"
-        )
-    return domain

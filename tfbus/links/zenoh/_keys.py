@@ -1,0 +1,101 @@
+"""The keys of a link on zenoh.
+
+Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digits that each link draws at random::
+
+    tfbus/domain/robot/live/link      all that is published and removed, one message a turn of the link's event loop
+    tfbus/domain/robot/state/link     a queryable: the link's state, or what has changed of it since a number
+    tfbus/domain/robot/@alive/link    a liveliness token
+"""
+
+import re
+from dataclasses import dataclass
+
+NO_ROBOT = "~"
+LONGEST_NAME = 200
+
+_ID = re.compile("[0-9a-f]{32}")
+_NAME = re.compile(r"[\w.-]+", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The keys of one link.
+
+    Parameters
+    ----------
+    domain : str
+    link : str
+    robot : str
+    robots : tuple of str
+        The robots of those that the link hears, as zenoh's key expressions of one chunk.
+    """
+
+    domain: str
+    link: str
+    robot: str = NO_ROBOT
+    robots: tuple[str, ...] = ("*",)
+
+    def own(self, kind: str) -> str:
+        """The key of this link for one of the kinds above."""
+        return f"tfbus/{self.domain}/{self.robot}/{kind}/{self.link}"
+
+    def heard(self, kind: str) -> list[str]:
+        """The key expressions of all links that this one hears."""
+        return [f"tfbus/{self.domain}/{robot}/{kind}/*" for robot in self.robots]
+
+    def of(self, kind: str, link: str) -> str:
+        """A key expression for one other link."""
+        return f"tfbus/{self.domain}/*/{kind}/{link}"
+
+    def sender(self, key: str, kind: str) -> str | None:
+        """The link that a key of one kind belongs to; None if it names none."""
+        robot, _, rest = key.removeprefix(f"tfbus/{self.domain}/").partition("/")
+        link = rest.removeprefix(f"{kind}/")
+        if not _ID.fullmatch(link) or not (robot == NO_ROBOT or _NAME.fullmatch(robot)):
+            return None
+        return link if key == f"tfbus/{self.domain}/{robot}/{kind}/{link}" else None
+
+
+def check_domain(domain: str) -> str:
+    """Return a domain.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be part of a key.
+    """
+    if len(domain) > LONGEST_NAME or not re.fullmatch(rf"{_NAME.pattern}(/{_NAME.pattern})*", domain, re.ASCII):
+        raise ValueError(
+            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
+            f"{LONGEST_NAME} at most, not {domain!r}"
+        )
+    return domain
+
+
+def check_robot(robot: str) -> str:
+    """Return the name of a robot.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be part of a key.
+    """
+    if len(robot) > LONGEST_NAME or not _NAME.fullmatch(robot):
+        raise ValueError(
+            f"a robot's name is made of letters, digits, '-', '_' and '.', {LONGEST_NAME} at most, not {robot!r}"
+        )
+    return robot
+
+
+def robots_expression(pattern: str) -> str:
+    """The key expression for the robots of a pattern, in which ``*`` stands for any letters.
+
+    Raises
+    ------
+    ValueError
+        If no name of a robot can match it.
+    """
+    if len(pattern) > LONGEST_NAME or not re.fullmatch(r"[\w.*-]+", pattern, re.ASCII):
+        raise ValueError(f"the name of a robot, or a pattern such as 'r*', is needed, not {pattern!r}")
+    collapsed = re.sub(r"\*+", "*", pattern)
+    return collapsed if collapsed == "*" else collapsed.replace("*", "$*")
