@@ -120,6 +120,7 @@ class ZenohSession:
                 self._keys.of("state", peer),
                 zenoh.handlers.Callback(take, end, indirect=False),
                 payload=_SINCE.pack(since),
+                consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
