@@ -23,7 +23,7 @@ from tfbus.links._message import Message, read_message
 from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence
-from tfbus.links._relay import LARGEST_JUMP
+from tfbus.links._relay import LARGEST_JUMP, Relay
 from tfbus.tf_message import encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
@@ -52,6 +52,7 @@ class Receiver:
         drop_lost: bool = False,
     ) -> None:
         self.bus = Bus(SimulatedClock(), on_conflict)
+        self.bus._relay = Relay(self.bus, 0)
         self.heard: list[Batch] = []
         self.bus.subscribe(self.heard.append)
         self.end = Wire(self).join(self.bus, frames, max_frames, drop_lost)

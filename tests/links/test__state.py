@@ -41,7 +41,7 @@ def test_each_change_has_a_number_and_only_the_newest_of_each_frame_is_told() ->
     assert state.number == 5
     entries, step = state.changes(0)
     assert (names(entries), step) == (["t", "s", "m"], StateStep(0, 5, state.digest))
-    assert entries[1:] == [state.static("s"), gone("m")]
+    assert entries[1:] == [state.entry("s"), gone("m")]
     assert [names(state.changes(since)[0]) for since in (3, 4, 5)] == [["s", "m"], ["m"], []]
 
 
@@ -51,8 +51,7 @@ def test_a_frame_is_brought_as_static_as_moving_or_not_at_all() -> None:
     state.change("m", MovingFrame("m"))
     state.change("x", gone("x"))
     assert [state.brings(frame) for frame in "smx?"] == [True, True, False, False]
-    assert [state.brings_moving(frame) for frame in "smx?"] == [False, True, False, False]
-    assert [state.static(frame) is not None for frame in "smx?"] == [True, False, False, False]
+    assert [type(state.entry(frame)) for frame in "smx?"] == [OutgoingBatch, MovingFrame, RemovedFrame, type(None)]
 
 
 def test_the_digest_depends_on_what_is_there_and_not_on_how_it_came_there() -> None:

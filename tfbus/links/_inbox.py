@@ -1,6 +1,6 @@
 """The inbox of a link: it publishes on the bus what peers have sent, within the limits of each peer."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from tfbus.bus.bus import Bus
@@ -152,17 +152,21 @@ class Inbox:
     def _take(self, peer: Peer, message: ReceivedMessage, live: bool) -> None:
         for error in message.errors:
             self._peers.reject(peer.id, error.reason, error)
+        together: list[ReceivedBatch] = []
         for entry in message.entries:
+            if isinstance(entry, ReceivedBatch):
+                if peer.mirror is not None:
+                    _note(peer.mirror, entry)
+                together.append(entry)
+                # The batches of an answer were never one batch, but nothing is between them.
+                if not live and entry.origin is not None:
+                    continue
+            self._publish(peer, together, live)
+            together.clear()
             if self._bus.closed:
                 # A subscriber may have closed it since the last entry.
                 return
             if isinstance(entry, ReceivedBatch):
-                if peer.mirror is not None:
-                    _note(peer.mirror, entry)
-                if self._admit_number(peer, entry.sequence, len(entry.samples)) and self._admit_authorities(
-                    peer, entry
-                ):
-                    self._publish(peer, entry, live)
                 continue
             if peer.mirror is not None:
                 peer.mirror.entry(entry)
@@ -171,18 +175,28 @@ class Inbox:
             if self._frames is None or entry.frame in self._frames:
                 provenance = Provenance(entry.origin, entry.sequence, self._outbox, peer, live, entry.lost)
                 self._relay.remove(provenance, entry.frame)
+        self._publish(peer, together, live)
 
-    def _publish(self, peer: Peer, batch: ReceivedBatch, live: bool) -> None:
-        samples: list[ReceivedTransform] = batch.samples
-        if self._frames is not None:
-            samples = [sample for sample in samples if sample.child in self._frames]
-        if batch.origin is None:
-            published, refused = self._relay.publish_foreign(self._outbox, peer, samples, self._max_frames)
-        else:
-            provenance = Provenance(batch.origin, batch.sequence, self._outbox, peer, live)
-            published, refused = self._relay.publish(provenance, samples, self._max_frames)
+    def _publish(self, peer: Peer, batches: Sequence[ReceivedBatch], live: bool) -> None:
+        received: list[tuple[Provenance, list[ReceivedTransform]]] = []
+        count = published = refused = 0
+        for batch in batches:
+            if not self._admit_number(peer, batch.sequence, len(batch.samples)):
+                continue
+            if not self._admit_authorities(peer, batch):
+                continue
+            samples = batch.samples
+            if self._frames is not None:
+                samples = [sample for sample in samples if sample.child in self._frames]
+            count += len(samples)
+            if batch.origin is None:
+                published, refused = self._relay.publish_foreign(self._outbox, peer, samples, self._max_frames)
+            else:
+                received.append((Provenance(batch.origin, batch.sequence, self._outbox, peer, live), samples))
+        if received:
+            published, refused = self._relay.publish(received, self._max_frames)
         self.samples += published
-        self.duplicates += len(samples) - published - refused
+        self.duplicates += count - published - refused
         if refused:
             error = ValueError(f"the peer has announced more than {self._max_frames} frames")
             self._peers.reject(peer.id, "too many frames", error, refused)

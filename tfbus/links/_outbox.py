@@ -7,6 +7,8 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._state import LinkState, StateStep
 
+_NO_ORIGIN = bytes(16)
+
 
 @dataclass(slots=True)
 class Turn:
@@ -59,6 +61,7 @@ class Outbox:
         self._notify = notify
         self._can_hold = can_hold
         self._entries: list[OutgoingBatch | RemovedFrame] = []
+        self._kept: set[str] = set()
         self._changes: dict[str, OutgoingBatch | RemovedFrame | None] = {}
         self._told = 0
         self._silent = False
@@ -68,8 +71,8 @@ class Outbox:
     def add_batch(self, batch: OutgoingBatch, echo: bool = False) -> None:
         """Add samples that were published.
 
-        An echo, samples that came in by this very link, does not go out; it only replaces what is kept of frames that
-        this link has sent before.
+        An echo, samples that came in by this very link, does not go out. Of frames that this link has sent before, it
+        replaces what is kept, and takes them out of the link's state, for now another link brings them.
         """
         if self._frames is not None:
             wanted = tuple(sample for sample in batch.samples if sample.child in self._frames)
@@ -91,12 +94,15 @@ class Outbox:
             self._entries.append(removal)
             self.pending += 1
         brought = self.state.brings(frame)
-        if self.state.static(frame) is not None:
+        kept = frame in self._kept
+        if kept:
+            self._kept.remove(frame)
             # A peer that is lost here may be present elsewhere, so its loss is no tombstone for others.
             self._changes[frame] = None if echo and removal.lost else removal
         # Those that hear of it by the link which brought the removal are told by that one.
         if brought or not echo:
             self._change(frame, removal, echo)
+        if kept or brought or not echo:
             self._notify()
 
     def flush(self) -> Turn:
@@ -115,30 +121,42 @@ class Outbox:
     def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
         """Note the frames of a batch; returns whether anything changes for late joiners."""
         changed = False
-        state = self.state
         for sample in batch.samples:
             _, child, _, _, _, static = sample._fields
-            if not static and state.brings_moving(child):
+            if static and (not echo or child in self._kept):
+                self._kept.add(child)
+                self._changes[child] = single = OutgoingBatch(batch.origin, batch.sequence, (sample,))
+                if echo or not self._holds(sample):
+                    self._release(child, echo)
+                else:
+                    self._change(child, single)
+                changed = True
                 continue
-            kept = state.static(child) is not None
-            if static and (not echo or kept):
-                if self._can_hold is None or self._can_hold(sample):
-                    single = OutgoingBatch(batch.origin, batch.sequence, (sample,))
-                    self._change(child, single, echo)
-                    self._changes[child] = single
-                    changed = True
-                continue
-            if kept:
+            if child in self._kept:
+                self._kept.remove(child)
                 self._changes[child] = None
                 changed = True
+            entry = self.state.entry(child)
             if not echo:
-                if self._can_hold is None or self._can_hold(sample):
-                    self._change(child, MovingFrame(child), echo)
-            elif state.brings(child):
-                self._change(child, RemovedFrame(batch.origin, batch.sequence, child, lost=True), echo)
-                changed = True
+                if not isinstance(entry, MovingFrame) and self._holds(sample):
+                    self._change(child, MovingFrame(child))
+            elif static or not isinstance(entry, MovingFrame):
+                changed = self._release(child, echo) or changed
         return changed
 
-    def _change(self, frame: str, entry: OutgoingBatch | MovingFrame | RemovedFrame, silent: bool) -> None:
+    def _holds(self, sample: TransformStamped) -> bool:
+        return self._can_hold is None or self._can_hold(sample)
+
+    def _release(self, frame: str, silent: bool) -> bool:
+        """Bring a frame no more, if it was brought, because another link does; returns whether it was."""
+        if not self.state.brings(frame):
+            return False
+        entry = self.state.entry(frame)
+        # The number of what is lost, and not that of what has come in its place.
+        origin, sequence = (entry.origin, entry.sequence) if isinstance(entry, OutgoingBatch) else (_NO_ORIGIN, 0)
+        self._change(frame, RemovedFrame(origin, sequence, frame, lost=True), silent)
+        return True
+
+    def _change(self, frame: str, entry: OutgoingBatch | MovingFrame | RemovedFrame, silent: bool = False) -> None:
         self.state.change(frame, entry)
         self._silent = self._silent or silent

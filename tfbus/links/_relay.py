@@ -8,7 +8,8 @@ world that has no origins, such as ROS, get this bus as their origin.
 A bus numbers on from the highest number that it has seen of any origin (Lamport, "Time, clocks, and the ordering of
 events in a distributed system", 1978). So of two things that are said of one frame, such as a static sample and a
 removal, the one of the higher number was said with the other in mind, or without knowing it; that one holds on every
-bus, in whatever order they come.
+bus, in whatever order they come. The first number is the machine's time in microseconds, so that what a program says
+when it is started again holds against what it has said before, although it knows nothing of that.
 
 Removals are remembered with their numbers, so that a copy on a slower way does not bring the frame back. Their memory
 is bounded: of the removals that leave it, only the highest number of each origin is remembered, and live samples of
@@ -17,6 +18,7 @@ unknown frames below that number count as outdated.
 
 from collections.abc import Container, Iterable
 from itertools import groupby
+from time import time_ns
 from typing import NamedTuple
 from uuid import uuid4
 
@@ -29,8 +31,8 @@ from tfbus.links._peers import Peer, next_age
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.registration import Registration
 
-LARGEST_JUMP = 2**48
-"""A number may be so far ahead of all that came before: at a million batches a second, nine years."""
+LARGEST_JUMP = 2**52
+"""A number may be so far ahead of all that came before: 142 years in us, for some machines begin in 1970."""
 _REMEMBERED_REMOVALS = 10_000
 _REMEMBERED_ORIGINS = 1_000
 
@@ -54,6 +56,12 @@ class Relay:
     There is one relay a bus, from `relay_of`. While no link is attached, it does nothing and remembers nothing but its
     origin and its numbers: by those the bus knows its own samples when its links have ended and others begin.
 
+    Parameters
+    ----------
+    bus : Bus
+    number : int
+        The number before the first one.
+
     Attributes
     ----------
     origin : bytes
@@ -62,9 +70,9 @@ class Relay:
 
     _registration: Registration
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, number: int) -> None:
         self.origin = uuid4().bytes
-        self._number = 0
+        self._number = number
         self._bus = bus
         self._outboxes: list[Outbox] = []
         self._newest: dict[bytes, dict[str, int]] = {}
@@ -102,13 +110,15 @@ class Relay:
         """Whether a number may be one that a bus has given by now."""
         return number - self._number <= LARGEST_JUMP
 
-    def publish(self, provenance: Provenance, samples: Iterable[ReceivedTransform], max_frames: int) -> tuple[int, int]:
-        """Publish those samples of a received batch that are news.
+    def publish(
+        self, received: Iterable[tuple[Provenance, Iterable[ReceivedTransform]]], max_frames: int
+    ) -> tuple[int, int]:
+        """Publish those samples of some received batches that are news, as one batch.
 
         Parameters
         ----------
-        provenance : Provenance
-        samples : iterable of ReceivedTransform
+        received : iterable of (Provenance, iterable of ReceivedTransform)
+            All of one peer.
         max_frames : int
             How many frames the peer may have.
 
@@ -117,11 +127,16 @@ class Relay:
         published, refused : int
             Samples that were published, and samples whose frames are too many; all others are no news.
         """
-        if provenance.origin == self.origin:
-            if provenance.sequence > self._number:
+        news: list[ReceivedTransform] = []
+        refused = 0
+        for provenance, samples in received:
+            if provenance.origin != self.origin:
+                refused += self._find_news(provenance, samples, max_frames, news)
+            elif provenance.sequence > self._number:
                 self._outnumber(provenance.sequence, {sample.child for sample in samples})
-            return 0, 0
-        return self._publish_news(provenance, samples, max_frames)
+        if news:
+            self._bus.publish(news, invalid="drop")
+        return len(news), refused
 
     def publish_foreign(
         self, outbox: Outbox, peer: Peer, samples: Iterable[ReceivedTransform], max_frames: int
@@ -132,7 +147,11 @@ class Relay:
         brought it, whose outbox is `outbox`. Parameters and results are those of `publish`.
         """
         provenance = Provenance(self.origin, self._next_number(), outbox, peer)
-        return self._publish_news(provenance, samples, max_frames)
+        news: list[ReceivedTransform] = []
+        refused = self._find_news(provenance, samples, max_frames, news)
+        if news:
+            self._bus.publish(news, invalid="drop")
+        return len(news), refused
 
     def remove(self, provenance: Provenance, frame: str) -> None:
         """Remove a frame from the bus, unless newer samples of it have come from the same origin.
@@ -198,16 +217,20 @@ class Relay:
                 lost = Provenance(self.origin, self._next_number(), outbox, peer, lost=True)
                 self._remove_from_bus(frame, lost)
 
-    def _publish_news(
-        self, provenance: Provenance, samples: Iterable[ReceivedTransform], max_frames: int
-    ) -> tuple[int, int]:
-        refused = 0
+    def _find_news(
+        self,
+        provenance: Provenance,
+        samples: Iterable[ReceivedTransform],
+        max_frames: int,
+        news: list[ReceivedTransform],
+    ) -> int:
+        """Add the samples of one batch that are news; returns how many others are of frames that are too many."""
+        refused, before = 0, len(news)
         peer = provenance.peer
         assert peer is not None
         self._number = max(self._number, provenance.sequence)
         rank = provenance.rank
         newest = self._newest.setdefault(provenance.origin, {})
-        news = []
         for sample in samples:
             fields = sample._fields
             child = fields[1]
@@ -228,13 +251,11 @@ class Relay:
             sample._provenance = provenance
             news.append(sample)
         # Only now, for a batch may have several samples of one child.
-        for sample in news:
+        for sample in news[before:] if before else news:
             newest[sample._fields[1]] = provenance.sequence
         if not newest:
             del self._newest[provenance.origin]
-        if news:
-            self._bus.publish(news, invalid="drop")
-        return len(news), refused
+        return refused
 
     def _remove_from_bus(self, frame: str, provenance: Provenance) -> None:
         if frame not in self._latest:
@@ -325,8 +346,8 @@ class Relay:
                 continue
             again = Provenance(self.origin, self._next_number(), latest.outbox, latest.peer)
             for outbox in self._outboxes:
-                held = outbox.state.static(frame)
-                if held is not None and held.origin == self.origin:
+                held = outbox.state.entry(frame)
+                if isinstance(held, OutgoingBatch) and held.origin == self.origin:
                     self._latest[frame] = again
                     self._settled[frame] = again.rank
                     outbox.add_batch(OutgoingBatch(again.origin, again.sequence, held.samples))
@@ -377,7 +398,7 @@ _LOWEST = (-1, b"")
 def relay_of(bus: Bus) -> Relay:
     """The relay of a bus, which its links share; the bus itself holds it."""
     if not isinstance(bus._relay, Relay):
-        bus._relay = Relay(bus)
+        bus._relay = Relay(bus, time_ns() // 1_000)
     return bus._relay
 
 

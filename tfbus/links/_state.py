@@ -63,19 +63,14 @@ class LinkState:
         self._gone: dict[str, None] = {}
         self._forgotten = 0
 
+    def entry(self, frame: str) -> StateEntry | None:
+        """What is said of a frame; a `RemovedFrame` if it has gone."""
+        entry = self._entries.get(frame)
+        return None if entry is None else entry[1]
+
     def brings(self, frame: str) -> bool:
         """Whether the link brings a frame."""
         return frame in self._digests
-
-    def brings_moving(self, frame: str) -> bool:
-        """Whether the link brings a frame that moves."""
-        entry = self._entries.get(frame)
-        return entry is not None and type(entry[1]) is MovingFrame
-
-    def static(self, frame: str) -> OutgoingBatch | None:
-        """The newest sample of a static frame that the link brings, as a batch of its own."""
-        entry = self._entries.get(frame)
-        return entry[1] if entry is not None and isinstance(entry[1], OutgoingBatch) else None
 
     def change(self, frame: str, entry: StateEntry) -> None:
         """Replace what is said of a frame."""

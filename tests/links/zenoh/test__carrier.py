@@ -16,7 +16,7 @@ from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links._state import StateStep
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._keys import Keys
-from tfbus.links.zenoh._settings import settings
+from tfbus.links.zenoh._settings import patch_settings, settings
 
 pytestmark = pytest.mark.anyio
 
@@ -28,7 +28,7 @@ class End:
 
     def __init__(self, domain: str, address: str, listens: bool) -> None:
         config = settings(address if listens else [], None if listens else address, None, 2.0)
-        self.carrier = ZenohCarrier(config, Keys(domain, uuid4().hex))
+        self.carrier = ZenohCarrier(config, lambda where: patch_settings(where, None, 2.0), Keys(domain, uuid4().hex))
         self.errors: list[Exception] = []
         self.report = SendReport(self.errors.append)
         self._items: Queue[Received] = Queue()

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
+from threading import Thread
 
 import anyio
 import anyio.to_thread
@@ -15,23 +16,26 @@ from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Question, Received
 from tfbus.links._state import StateEntry, StateStep
 from tfbus.links.zenoh._keys import Keys
-from tfbus.links.zenoh._session import ZenohSession
+from tfbus.links.zenoh._sessions import ZenohSessions
 
 _CLOSING_TIME = 1.0
 
 
 class ZenohCarrier:
-    """Carries the messages of one link over a zenoh session; see `tfbus.links._carrier.AskableCarrier`.
+    """Carries the messages of one link over zenoh; see `tfbus.links._carrier.AskableCarrier`.
 
     Parameters
     ----------
     config : zenoh.Config
+    patch_config : callable
+        The configuration of a session that connects to one address only.
     keys : Keys
     """
 
-    def __init__(self, config: zenoh.Config, keys: Keys) -> None:
+    def __init__(self, config: zenoh.Config, patch_config: Callable[[str], zenoh.Config], keys: Keys) -> None:
         self.id = keys.link
         self._config = config
+        self._patch_config = patch_config
         self._keys = keys
         self._answers: deque[tuple[zenoh.Query, Message]] = deque()
         self._woken = anyio.Event()
@@ -40,9 +44,9 @@ class ZenohCarrier:
         """Open the session; raises `OSError` if it cannot listen where it should, or as a client reaches nobody."""
         self._report = report
         self._writer = MessageWriter(report)
-        self._session = ZenohSession(self._config, self._keys, receive)
+        self._sessions = ZenohSessions(self._config, self._patch_config, self._keys, receive)
         # The session closes itself if it is abandoned before it is open.
-        await anyio.to_thread.run_sync(self._session.open, abandon_on_cancel=True)
+        await anyio.to_thread.run_sync(self._sessions.open, abandon_on_cancel=True)
 
     def send(self, turn: Turn) -> None:
         """Send live messages at once; while the network is congested, zenoh drops them."""
@@ -64,7 +68,7 @@ class ZenohCarrier:
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
-        self._session.ask(peer, since)
+        self._sessions.ask(peer, since)
 
     def answer(self, question: Question, entries: list[StateEntry], step: StateStep) -> None:
         """Answer a question; a worker thread sends the answers, because zenoh may wait for a peer that is frozen."""
@@ -72,25 +76,35 @@ class ZenohCarrier:
         self._woken.set()
 
     async def run(self) -> None:
-        """Send answers."""
+        """Send answers, and dial peers that were lost."""
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._sessions.keep_connected)
+            await self._send_answers()
+
+    async def _send_answers(self) -> None:
         while True:
             self._woken = anyio.Event()
             while self._answers:
                 batch = list(self._answers)
                 self._answers.clear()
-                await anyio.to_thread.run_sync(self._session.answer, batch)
+                await anyio.to_thread.run_sync(self._sessions.answer, batch)
             await self._woken.wait()
 
     async def close(self) -> None:
-        """Close the session, or give up waiting for it."""
-        closing = self._session.close()
+        """Close the sessions, or give up waiting for them."""
+        closing = self._sessions.close()
         with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
+            await anyio.to_thread.run_sync(_join, closing, abandon_on_cancel=True)
 
     def _put(self, message: Message) -> bool:
         try:
-            self._session.put(message)
+            self._sessions.put(message)
         except zenoh.ZError as error:
             self._report.failed(error)
             return False
         return True
+
+
+def _join(threads: list[Thread]) -> None:
+    for thread in threads:
+        thread.join()

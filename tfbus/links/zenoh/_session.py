@@ -32,6 +32,10 @@ class ZenohSession:
     keys : Keys
     receive : callable
         Called in zenoh's threads with each `Received` item; a message's content is a payload and its attachment.
+
+    Attributes
+    ----------
+    is_open : bool
     """
 
     def __init__(self, config: zenoh.Config, keys: Keys, receive: Callable[[Received], object]) -> None:
@@ -41,6 +45,7 @@ class ZenohSession:
         self._lock = threading.Lock()
         self._closed = False
         self._session: zenoh.Session | None = None
+        self.is_open = False
         self._declared: list[object] = []
         self._questions = 0
         self._close_at_exit: weakref.finalize[..., ZenohSession] | None = None
@@ -95,10 +100,19 @@ class ZenohSession:
             session.declare_queryable(keys.own("state"), _directly(self._receive_question)),
             session.liveliness().declare_token(keys.own("@alive")),
         ]
+        self.is_open = True
 
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested."""
         self._live.put(message.payload, attachment=message.attachment)
+
+    def addresses(self) -> dict[str, str]:
+        """The address at which each directly connected session is reached, by the id of the session; may block."""
+        try:
+            assert self._session is not None
+            return {str(link.zid): link.dst for link in self._session.info.links()}
+        except zenoh.ZError:
+            return {}
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number; the answer is received as an item."""

@@ -86,6 +86,16 @@ def settings(
     return result
 
 
+def patch_settings(address: str, config: Mapping[str, Any] | None, lease: float) -> zenoh.Config:
+    """The configuration of a session that connects to one address, and to nobody that it hears of there."""
+    own = {
+        path: value
+        for path, value in (config or {}).items()
+        if path not in ("id", "mode") and path.partition("/")[0] not in ("listen", "connect", "scouting")
+    }
+    return settings([], address, own | {"scouting/gossip/enabled": False}, lease)
+
+
 def without_source_location(error: Exception) -> str:
     """An error's text without the location in zenoh's own source."""
     return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error))

@@ -17,7 +17,7 @@ from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._keys import Keys, check_domain
-from tfbus.links.zenoh._settings import Addresses, settings
+from tfbus.links.zenoh._settings import Addresses, patch_settings, settings
 
 
 class ZenohLink(Link):
@@ -94,7 +94,14 @@ class ZenohLink(Link):
         capacity: int = 10_000,
     ) -> None:
         self.domain = check_domain(domain)
-        carrier = ZenohCarrier(settings(listen, connect, config, lease), Keys(domain, uuid4().hex))
+        # Peers tell by the id of a session at which address they have reached a link. It must not begin with 0.
+        link = f"{uuid4().int | 1 << 127:032x}"
+        own = {"id": link, **(config or {})}
+        carrier = ZenohCarrier(
+            settings(listen, connect, own, lease),
+            lambda address: patch_settings(address, config, lease),
+            Keys(domain, link),
+        )
         super().__init__(
             bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
         )

@@ -1,0 +1,187 @@
+"""All zenoh sessions of a link: the one that it was opened with, and one for each peer that only another way reaches.
+
+Peers in a mesh hear each other over direct connections only. When one of these breaks, while both ends are well with
+others, zenoh does not dial again. Then a session of its own does, the *patch*, which is connected to nobody else.
+"""
+
+import re
+import threading
+from collections.abc import Callable, Iterable
+from time import monotonic
+
+import anyio
+import anyio.to_thread
+import zenoh
+
+from tfbus.links._message import Message
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.zenoh._dialing import Dialing
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._session import ZenohSession
+
+_PROBE_TIME = 1.0
+_MEETING_TIME = 3.0
+_TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
+
+
+class ZenohSessions:
+    """The sessions of one link; peers are present while one of the sessions says so.
+
+    Parameters
+    ----------
+    config : zenoh.Config
+    patch_config : callable
+        The configuration of a session that connects to one address only.
+    keys : Keys
+    receive : callable
+        Called in any thread with each `Received` item.
+    """
+
+    def __init__(
+        self,
+        config: zenoh.Config,
+        patch_config: Callable[[str], zenoh.Config],
+        keys: Keys,
+        receive: Callable[[Received], object],
+    ) -> None:
+        self._patch_config = patch_config
+        self._keys = keys
+        self._receive = receive
+        self._lock = threading.Lock()
+        self._main = ZenohSession(config, keys, self._received_directly)
+        self._patches: dict[str, ZenohSession] = {}
+        self._present: dict[str, set[ZenohSession | None]] = {}
+        self._changes: list[tuple[str, Presence]] = []
+        self._dialing = Dialing(monotonic)
+        self._closing: list[threading.Thread] = []
+
+    def open(self) -> None:
+        """Open the session; for a worker thread.
+
+        Raises
+        ------
+        OSError
+            If it cannot listen where it should, or as a client reaches nobody.
+        """
+        self._main.open()
+
+    def put(self, message: Message) -> None:
+        """Send a live message, or drop it while the network is congested; raises `zenoh.ZError`."""
+        self._main.put(message)
+        for patch in tuple(self._patches.values()):
+            if patch.is_open:
+                patch.put(message)
+
+    def ask(self, peer: str, since: int) -> None:
+        """Ask a peer for the changes of its state behind a number."""
+        patch = self._patches.get(peer)
+        (patch if patch is not None and patch.is_open else self._main).ask(peer, since)
+
+    def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
+        """Answer questions; for a worker thread."""
+        self._main.answer(answers)
+
+    def close(self) -> list[threading.Thread]:
+        """Begin to close all sessions; returns threads that end when they are closed."""
+        sessions = [self._main, *self._patches.values()]
+        self._patches.clear()
+        return [*self._closing, *(session.close() for session in sessions)]
+
+    async def keep_connected(self, interval: float = 0.1) -> None:
+        """Dial peers that were lost, until cancelled."""
+        async with anyio.create_task_group() as tasks:
+            while True:
+                await anyio.sleep(interval)
+                with self._lock:
+                    changes, self._changes = self._changes, []
+                await self._note(changes)
+                self._closing = [closing for closing in self._closing if closing.is_alive()]
+                for peer, address in self._dialing.take_due():
+                    if peer not in self._patches:
+                        tasks.start_soon(self._patch, peer, address)
+
+    async def _note(self, changes: list[tuple[str, Presence]]) -> None:
+        for peer, presence in changes:
+            if presence is Presence.LEFT:
+                if peer not in self._present:
+                    self._dialing.left(peer)
+                    self._drop_patch(peer)
+            else:
+                self._dialing.joined(peer)
+        joined = {peer for peer, presence in changes if presence is Presence.JOINED}
+        if joined:
+            addresses = await anyio.to_thread.run_sync(self._main.addresses)
+            for peer in joined & addresses.keys():
+                self._dialing.reached(peer, addresses[peer])
+                # They are connected directly again.
+                self._drop_patch(peer)
+
+    async def _patch(self, peer: str, address: str) -> None:
+        if not await _is_reachable(address) or peer in self._patches:
+            return
+        patch = ZenohSession(self._patch_config(address), self._keys, lambda item: self._received(item, peer, patch))
+        self._patches[peer] = patch
+        try:
+            await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)
+        except OSError:
+            self._drop_patch(peer)
+            return
+        with anyio.move_on_after(_MEETING_TIME):
+            while peer not in self._present:  # noqa: ASYNC110 - zenoh's threads wake no event here
+                await anyio.sleep(0.05)
+        if peer not in self._present or None in self._present[peer]:
+            self._drop_patch(peer)
+
+    def _drop_patch(self, peer: str) -> None:
+        patch = self._patches.pop(peer, None)
+        if patch is not None:
+            self._closing.append(patch.close())
+            # It will not tell any more.
+            self._note_presence(peer, Presence.LEFT, patch)
+
+    def _received(self, item: Received, peer: str, patch: ZenohSession) -> None:
+        """Pass on an item that a patch for one peer has received."""
+        if item.sender not in ("", peer):
+            # Somebody else is at that address now.
+            return
+        if not isinstance(item.content, Presence):
+            self._receive(item)
+        elif item.content is Presence.LEFT or self._patches.get(peer) is patch:
+            self._note_presence(peer, item.content, patch)
+
+    def _received_directly(self, item: Received) -> None:
+        """Pass on an item that the first session has received."""
+        if isinstance(item.content, Presence):
+            self._note_presence(item.sender, item.content, None)
+        else:
+            self._receive(item)
+
+    def _note_presence(self, peer: str, presence: Presence, way: ZenohSession | None) -> None:
+        with self._lock:
+            ways = self._present.setdefault(peer, set())
+            was_present = bool(ways)
+            if presence is Presence.JOINED:
+                ways.add(way)
+            else:
+                ways.discard(way)
+            is_present = bool(ways)
+            if not is_present:
+                del self._present[peer]
+            if is_present is not was_present:
+                self._receive(Received(peer, presence))
+            if way is None or is_present is not was_present:
+                self._changes.append((peer, presence))
+
+
+async def _is_reachable(address: str) -> bool:
+    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try."""
+    found = _TCP.match(address)
+    if found is None:
+        return True
+    try:
+        with anyio.fail_after(_PROBE_TIME):
+            stream = await anyio.connect_tcp(found["six"] or found["four"], int(found["port"]))
+    except OSError:
+        return False
+    await stream.aclose()
+    return True
