@@ -39,7 +39,7 @@ class Stranger:
         self.origin = uuid4().bytes
         self._sequence = 0
         found: Queue[zenoh.Sample] = Queue()
-        watch = self.session.liveliness().declare_subscriber(f"{self.prefix}/*/@alive/*", found.put, history=True)
+        watch = self.session.liveliness().declare_subscriber(f"{self.prefix}/*/@alive/*/*", found.put, history=True)
         for _ in range(2):
             found.get(timeout=PATIENCE)
         watch.undeclare()
@@ -138,7 +138,7 @@ def test_values_that_are_not_numbers_are_refused_and_the_loop_has_time_for_other
 
 def test_too_many_frame_names_are_refused_and_the_first_ones_go_with_their_peer(scene: Scene) -> None:
     stranger = scene.stranger
-    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{stranger.id}")
+    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{stranger.id}/0")
     for group in range(40):
         stranger.send(*[moving("map", f"frame {group} {i}", 1) for i in range(5_000)])
     stranger.send(moving("map", "frame 0 0", 2, 7.0))
@@ -167,7 +167,7 @@ def test_forged_senders_are_limited_in_number_and_keep_no_announced_peer_out(sce
     assert link["rejected"]["too many peers"] >= MAX_PEERS
     scene.check_announced("too many peers")
     # A peer that announces itself gets in all the same.
-    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{stranger.id}")
+    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{stranger.id}/0")
     scene.victim.wait(event="PeerJoined", peer=stranger.id)
     stranger.send(moving("map", "newcomer", 1))
     scene.victim.ask("until", has=["newcomer"])
@@ -177,7 +177,7 @@ def test_forged_senders_are_limited_in_number_and_keep_no_announced_peer_out(sce
 def test_a_thousand_tokens_are_a_thousand_peers_and_go_with_their_session(scene: Scene) -> None:
     stranger = scene.stranger
     names = [uuid4().hex for _ in range(2 * MAX_PEERS)] + [f"robot{i}" for i in range(100)] + ["*", "**"]
-    tokens = [stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{name}") for name in names]
+    tokens = [stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{name}/0") for name in names]
     known = scene.friend.ask("facts")["ids"][0]
     stranger.send(moving("map", "last", 1), key=f"{stranger.prefix}/~/live/{known}")
     scene.victim.ask("until", has=["last"], peers=MAX_PEERS)

@@ -119,7 +119,8 @@ class Endpoint:
         if self._now() >= due:
             self._claimed_at = self._now()
             due += CLAIM_PERIOD
-            if self.peers.present and not self.outbox.pending:
+            # Those that this link does not hear may hear it.
+            if not self.outbox.pending:
                 self._askable.claim(self.outbox.step())
         asking = self.next_question()
         return due if asking is None else min(due, asking)

@@ -12,7 +12,7 @@ from support.processes import PATIENCE, free_ports, new_domain
 
 from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._receive_queue import Answer, Presence, Received
-from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import MOST_QUESTIONS, ZenohSession
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError
@@ -26,7 +26,11 @@ class End:
     def __init__(self, id: str, domain: str, config: zenoh.Config) -> None:  # noqa: A002
         self.id = id
         self.items: Queue[Received] = Queue()
-        self.session = ZenohSession(config, Keys(domain, id), self.items.put)
+        self.session = ZenohSession(config, Keys(domain, id), self.items.put, self._note)
+
+    def _note(self, link: str, name: str, presence: Presence) -> None:
+        assert name == FIRST_SESSION
+        self.items.put(Received(link, presence))
 
     def next(self) -> Received:
         return self.items.get(timeout=PATIENCE)
@@ -73,7 +77,7 @@ def stranger(address: str, domain: str) -> Iterator[zenoh.Session]:
     """A program that speaks zenoh and has no link; it has found a program that has one."""
     session = zenoh.open(settings([], address, None, 2.0))
     found: Queue[zenoh.Sample] = Queue()
-    watch = session.liveliness().declare_subscriber(f"tfbus/{domain}/*/@alive/*", found.put, history=True)
+    watch = session.liveliness().declare_subscriber(f"tfbus/{domain}/*/@alive/*/*", found.put, history=True)
     try:
         found.get(timeout=PATIENCE)
         watch.undeclare()
@@ -197,7 +201,15 @@ def test_other_keys_of_the_domain_are_not_received(key: str, join: Join, address
         assert first.next().content == (b"the next one", b"")
 
 
-@pytest.mark.parametrize("token", ["tfbus/{domain}/~/@alive/*", "tfbus/{domain}/~/@alive/robot", "*/*/*/@alive/{id}"])
+@pytest.mark.parametrize(
+    "token",
+    [
+        "tfbus/{domain}/~/@alive/*/0",
+        "tfbus/{domain}/~/@alive/robot/0",
+        "tfbus/{domain}/~/@alive/{id}/x",
+        "*/*/*/@alive/{id}/0",
+    ],
+)
 def test_a_token_whose_key_names_no_link_is_refused(token: str, join: Join, address: str, domain: str) -> None:
     first = join(A)
     with stranger(address, domain) as session:
@@ -241,7 +253,7 @@ def test_a_port_in_use_is_an_os_error_with_its_number(domain: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         config = settings(f"tcp/127.0.0.1:{server.getsockname()[1]}", None, None, 2.0)
         with pytest.raises(OSError, match="zenoh cannot open a session") as caught:
-            ZenohSession(config, Keys(domain, A), print).open()
+            ZenohSession(config, Keys(domain, A), print, print).open()
     assert caught.value.errno == errno.EADDRINUSE
     assert ".rs:" not in str(caught.value)
 
@@ -249,14 +261,14 @@ def test_a_port_in_use_is_an_os_error_with_its_number(domain: str) -> None:
 def test_an_os_error_that_only_zenoh_has_found_has_no_number(domain: str) -> None:
     config = settings("tls/127.0.0.1:0", None, None, 2.0)
     with pytest.raises(OSError, match="private key") as caught:
-        ZenohSession(config, Keys(domain, A), print).open()
+        ZenohSession(config, Keys(domain, A), print, print).open()
     assert caught.value.errno is None
 
 
 def test_a_client_that_reaches_nobody_raises(domain: str, address: str) -> None:
     config = settings(None, address, {"mode": "client"}, 2.0)
     with pytest.raises(OSError, match="Unable to connect"):
-        ZenohSession(config, Keys(domain, A), print).open()
+        ZenohSession(config, Keys(domain, A), print, print).open()
 
 
 def test_a_session_closed_before_it_was_open_does_not_stay_open(join: Join, domain: str, address: str) -> None:

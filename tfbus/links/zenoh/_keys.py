@@ -4,16 +4,19 @@ Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digi
 
     tfbus/domain/robot/live/link      all that is published and removed, one message a turn of the link's event loop
     tfbus/domain/robot/state/link     a queryable: the link's state, or what has changed of it since a number
-    tfbus/domain/robot/@alive/link    a liveliness token
+    tfbus/domain/robot/@alive/link/session
+                                      a liveliness token for each session of the link; the first session is ``0``
 """
 
 import re
 from dataclasses import dataclass
 
 NO_ROBOT = "~"
+FIRST_SESSION = "0"
 LONGEST_NAME = 200
 
 _ID = re.compile("[0-9a-f]{32}")
+_SESSION = re.compile("0|[0-9a-f]{32}")
 _NAME = re.compile(r"[\w.-]+", re.ASCII)
 
 
@@ -39,13 +42,24 @@ class Keys:
         """The key of this link for one of the kinds above."""
         return f"tfbus/{self.domain}/{self.robot}/{kind}/{self.link}"
 
+    def token(self, session: str) -> str:
+        """The key of the liveliness token of one of this link's sessions."""
+        return f"{self.own('@alive')}/{session}"
+
     def heard(self, kind: str) -> list[str]:
         """The key expressions of all links that this one hears."""
-        return [f"tfbus/{self.domain}/{robot}/{kind}/*" for robot in self.robots]
+        end = "*/*" if kind == "@alive" else "*"
+        return [f"tfbus/{self.domain}/{robot}/{kind}/{end}" for robot in self.robots]
 
     def of(self, kind: str, link: str) -> str:
         """A key expression for one other link."""
         return f"tfbus/{self.domain}/*/{kind}/{link}"
+
+    def session(self, key: str) -> tuple[str, str] | None:
+        """The link and the session that a token's key belongs to; None if it names none."""
+        rest, _, session = key.rpartition("/")
+        link = self.sender(rest, "@alive")
+        return (link, session) if link is not None and _SESSION.fullmatch(session) else None
 
     def sender(self, key: str, kind: str) -> str | None:
         """The link that a key of one kind belongs to; None if it names none."""

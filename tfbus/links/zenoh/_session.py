@@ -13,7 +13,7 @@ import zenoh
 
 from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
-from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import MalformedMessageError
 
@@ -31,15 +31,29 @@ class ZenohSession:
     config : zenoh.Config
     keys : Keys
     receive : callable
-        Called in zenoh's threads with each `Received` item; a message's content is a payload and its attachment.
+        Called in zenoh's threads with each `Received` item but presence; a message's content is a payload and its
+        attachment.
+    note_presence : callable
+        Called in zenoh's threads with a link, the name of a session of it, and its `Presence`.
+    name : str
+        The name of this session among those of the link.
 
     Attributes
     ----------
     is_open : bool
     """
 
-    def __init__(self, config: zenoh.Config, keys: Keys, receive: Callable[[Received], object]) -> None:
+    def __init__(
+        self,
+        config: zenoh.Config,
+        keys: Keys,
+        receive: Callable[[Received], object],
+        note_presence: Callable[[str, str, Presence], object],
+        name: str = FIRST_SESSION,
+    ) -> None:
         self._config = config
+        self._note_presence = note_presence
+        self._name = name
         self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
@@ -76,15 +90,15 @@ class ZenohSession:
         try:
             session = zenoh.open(self._config)
         except zenoh.ZError as error:
-            raise _as_os_error(error) from error
+            raise as_os_error(error) from error
         with self._lock:
             self._session = session
             abandoned = self._closed
         if abandoned:
-            _close(session)
+            close_session(session)
             return
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
-        self._close_at_exit = weakref.finalize(self, _close, session)
+        self._close_at_exit = weakref.finalize(self, close_session, session)
         drop, remote, keys = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE, self._keys
         self._live = session.declare_publisher(keys.own("live"), congestion_control=drop)
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
@@ -98,7 +112,7 @@ class ZenohSession:
                 for key in keys.heard("@alive")
             ),
             session.declare_queryable(keys.own("state"), _directly(self._receive_question)),
-            session.liveliness().declare_token(keys.own("@alive")),
+            session.liveliness().declare_token(keys.token(self._name)),
         ]
         self.is_open = True
 
@@ -164,7 +178,7 @@ class ZenohSession:
             session = self._session
         if self._close_at_exit is not None:
             self._close_at_exit.detach()
-        closing = threading.Thread(target=_close, args=(session,), daemon=False)
+        closing = threading.Thread(target=close_session, args=(session,), daemon=False)
         closing.start()
         return closing
 
@@ -187,10 +201,12 @@ class ZenohSession:
             self._receive(Received(sender, message, size, moving=True))
 
     def _receive_presence(self, sample: zenoh.Sample) -> None:
-        sender = self._sender(sample, "@alive")
-        if sender is not None:
+        found = self._keys.session(str(sample.key_expr))
+        if found is None:
+            self._refuse_key(sample)
+        elif found[0] != self._keys.link:
             present = sample.kind == zenoh.SampleKind.PUT
-            self._receive(Received(sender, Presence.JOINED if present else Presence.LEFT))
+            self._note_presence(*found, Presence.JOINED if present else Presence.LEFT)
 
     def _receive_question(self, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
@@ -205,17 +221,20 @@ class ZenohSession:
 
     def _sender(self, sample: zenoh.Sample, kind: str) -> str | None:
         """The peer that a sample is from; None for this link's own, and for a key without an id, which is refused."""
-        key = str(sample.key_expr)
-        sender = self._keys.sender(key, kind)
+        sender = self._keys.sender(str(sample.key_expr), kind)
         if sender is None:
-            self._refuse("", "key", f"there is no link's id in its key {key[:_LONGEST_SHOWN_KEY]!r}")
+            self._refuse_key(sample)
         return None if sender == self._keys.link else sender
+
+    def _refuse_key(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        self._refuse("", "key", f"there is no link's id in its key {key[:_LONGEST_SHOWN_KEY]!r}")
 
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
         self._receive(Received(sender, MalformedMessageError(reason, detail)))
 
 
-def _close(session: zenoh.Session | None) -> None:
+def close_session(session: zenoh.Session | None) -> None:
     """Close a session, if there is one; a second call does nothing."""
     if session is not None:
         # zenoh may give up waiting for a peer; that peer notices the end by itself.
@@ -228,7 +247,8 @@ def _directly(callback: Callable[[Any], object]) -> Any:
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
-def _as_os_error(error: zenoh.ZError) -> OSError:
+def as_os_error(error: zenoh.ZError) -> OSError:
+    """The error of a session that cannot be opened, with its `errno`, if there is one."""
     text = f"zenoh cannot open a session: {without_source_location(error)}"
     number = re.search(r"\(os error (\d+)\)", text)
     return OSError(int(number[1]), text) if number else OSError(text)

@@ -8,6 +8,7 @@ import re
 import threading
 from collections.abc import Callable, Iterable
 from time import monotonic
+from uuid import uuid4
 
 import anyio
 import anyio.to_thread
@@ -16,12 +17,15 @@ import zenoh
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._dialing import Dialing
-from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
 
 _PROBE_TIME = 1.0
 _MEETING_TIME = 3.0
 _TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
+
+_Way = tuple[ZenohSession | None, str]
+"""A connection between two links: the patch here, or None for the first session, and the name of the session there."""
 
 
 class ZenohSessions:
@@ -48,9 +52,9 @@ class ZenohSessions:
         self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
-        self._main = ZenohSession(config, keys, self._received_directly)
+        self._main = ZenohSession(config, keys, receive, self._note_directly)
         self._patches: dict[str, ZenohSession] = {}
-        self._present: dict[str, set[ZenohSession | None]] = {}
+        self._present: dict[str, set[_Way]] = {}
         self._changes: list[tuple[str, Presence]] = []
         self._dialing = Dialing(monotonic)
         self._closing: list[threading.Thread] = []
@@ -119,7 +123,13 @@ class ZenohSessions:
     async def _patch(self, peer: str, address: str) -> None:
         if not await _is_reachable(address) or peer in self._patches:
             return
-        patch = ZenohSession(self._patch_config(address), self._keys, lambda item: self._received(item, peer, patch))
+        patch = ZenohSession(
+            self._patch_config(address),
+            self._keys,
+            lambda item: self._receive_by_patch(item, peer),
+            lambda link, name, presence: self._note_by_patch(link, name, presence, peer, patch),
+            uuid4().hex,
+        )
         self._patches[peer] = patch
         try:
             await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)
@@ -129,34 +139,32 @@ class ZenohSessions:
         with anyio.move_on_after(_MEETING_TIME):
             while peer not in self._present:  # noqa: ASYNC110 - zenoh's threads wake no event here
                 await anyio.sleep(0.05)
-        if peer not in self._present or None in self._present[peer]:
+        if peer not in self._present or (None, FIRST_SESSION) in self._present[peer]:
             self._drop_patch(peer)
 
     def _drop_patch(self, peer: str) -> None:
         patch = self._patches.pop(peer, None)
         if patch is not None:
             self._closing.append(patch.close())
-            # It will not tell any more.
-            self._note_presence(peer, Presence.LEFT, patch)
+            with self._lock:
+                ways = [way for way in self._present.get(peer, ()) if way[0] is patch]
+            for way in ways:
+                # It will not tell any more.
+                self._note_presence(peer, way, Presence.LEFT)
 
-    def _received(self, item: Received, peer: str, patch: ZenohSession) -> None:
-        """Pass on an item that a patch for one peer has received."""
-        if item.sender not in ("", peer):
-            # Somebody else is at that address now.
-            return
-        if not isinstance(item.content, Presence):
-            self._receive(item)
-        elif item.content is Presence.LEFT or self._patches.get(peer) is patch:
-            self._note_presence(peer, item.content, patch)
-
-    def _received_directly(self, item: Received) -> None:
-        """Pass on an item that the first session has received."""
-        if isinstance(item.content, Presence):
-            self._note_presence(item.sender, item.content, None)
-        else:
+    def _receive_by_patch(self, item: Received, peer: str) -> None:
+        # Somebody else may be at that address now.
+        if item.sender in ("", peer):
             self._receive(item)
 
-    def _note_presence(self, peer: str, presence: Presence, way: ZenohSession | None) -> None:
+    def _note_by_patch(self, link: str, name: str, presence: Presence, peer: str, patch: ZenohSession) -> None:
+        if link == peer and (presence is Presence.LEFT or self._patches.get(peer) is patch):
+            self._note_presence(peer, (patch, name), presence)
+
+    def _note_directly(self, link: str, name: str, presence: Presence) -> None:
+        self._note_presence(link, (None, name), presence)
+
+    def _note_presence(self, peer: str, way: _Way, presence: Presence) -> None:
         with self._lock:
             ways = self._present.setdefault(peer, set())
             was_present = bool(ways)
@@ -169,7 +177,7 @@ class ZenohSessions:
                 del self._present[peer]
             if is_present is not was_present:
                 self._receive(Received(peer, presence))
-            if way is None or is_present is not was_present:
+            if is_present is not was_present or way == (None, FIRST_SESSION):
                 self._changes.append((peer, presence))
 
 

@@ -16,7 +16,7 @@ except ImportError:
 from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
-from tfbus.links.zenoh._keys import Keys, check_domain
+from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
 from tfbus.links.zenoh._settings import Addresses, patch_settings, settings
 
 
@@ -40,6 +40,11 @@ class ZenohLink(Link):
         link that has an address meets them only if it connects there as well.
     config : mapping of str to any, optional
         Settings of zenoh by their path, laid over those of the link: TLS, access control, routers.
+    robot : str, optional
+        The robot whose frames this link brings: letters, digits, ``-``, ``_`` and ``.``.
+    robots : iterable of str, optional
+        Hear only the links of these robots; ``*`` in a name stands for any letters. What others send never leaves their
+        machines for this link, and they are no peers of it. By default, it hears all, with and without a robot.
     frames : iterable of str, optional
         Send and take only these children; by default all.
     drop_lost : bool
@@ -56,15 +61,17 @@ class ZenohLink(Link):
     ----------
     bus : Bus
     domain : str
+    robot : str or None
     id : str
         The name of this end for its peers.
 
     Raises
     ------
     ValueError
-        If `domain` cannot be part of a key, a number is out of range, or zenoh does not take an address or a setting.
+        If `domain` or the name of a robot cannot be part of a key, a number is out of range, or zenoh does not take an
+        address or a setting.
     TypeError
-        If `frames` is one name, or a number or an address is of another type.
+        If `frames` or `robots` is one name, or a number or an address is of another type.
     OSError
         On entering, if it cannot listen where it should, or as a client reaches nobody.
     BusClosedError, RuntimeError
@@ -75,8 +82,10 @@ class ZenohLink(Link):
     Notes
     -----
     Nothing here blocks the event loop: while the network is congested, live messages are dropped, which the other end
-    counts as `lost`; static frames are recovered. Anyone who can reach the link can publish and remove any frame. The
-    removal of a moving frame is not repeated if the network loses it.
+    counts as `lost`. Static frames and removals are recovered: each link numbers what it brings and what it has
+    removed, tells the number with every message, and once a second when it has nothing else to tell; whoever has missed
+    something asks for it. A peer whose connection breaks is dialled again where it was reached before. Anyone who can
+    reach the link can publish and remove any frame.
     """
 
     def __init__(
@@ -87,20 +96,30 @@ class ZenohLink(Link):
         listen: Addresses | None = None,
         connect: Addresses | None = None,
         config: Mapping[str, Any] | None = None,
+        robot: str | None = None,
+        robots: Iterable[str] | None = None,
         frames: Iterable[str] | None = None,
         drop_lost: bool = False,
         lease: float = 2.0,
         max_frames: int = 10_000,
         capacity: int = 10_000,
     ) -> None:
+        if isinstance(robots, str):
+            raise TypeError(f"robots must be several names, not {robots!r}")
         self.domain = check_domain(domain)
+        self.robot = robot
         # Peers tell by the id of a session at which address they have reached a link. It must not begin with 0.
         link = f"{uuid4().int | 1 << 127:032x}"
         own = {"id": link, **(config or {})}
         carrier = ZenohCarrier(
             settings(listen, connect, own, lease),
             lambda address: patch_settings(address, config, lease),
-            Keys(domain, link),
+            Keys(
+                domain,
+                link,
+                NO_ROBOT if robot is None else check_robot(robot),
+                ("*",) if robots is None else tuple(dict.fromkeys(map(robots_expression, robots))),
+            ),
         )
         super().__init__(
             bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
