@@ -1,3 +1,4 @@
+import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
@@ -84,6 +85,35 @@ async def test_links_of_some_robots_know_and_hear_only_those(address: str, domai
             bus.close()
 
 
+async def test_of_robots_with_a_rate_come_the_newest_samples_now_and_then_and_all_static_frames(
+    address: str, domain: str
+) -> None:
+    with Bus() as dashboard, Bus() as quick, Bus() as slow:
+        heard: list[int] = []
+        dashboard.subscribe(lambda batch: heard.extend(s.stamp for s in batch if s.child == "slow/base"))
+        async with (
+            ZenohRouter(address),
+            client(quick, domain, address, robot="quick") as first,
+            client(slow, domain, address, robot="slow", slow_rate=20.0) as second,
+        ):
+            slow.publish([static("map", "slow/lidar"), static("map", "slow/camera")])
+            robots = {"quick": math.inf, "s*": 20.0}
+            async with client(dashboard, domain, address, robots=robots) as link:
+                await until(lambda: link.peers == tuple(sorted((first.id, second.id))))
+                await until(lambda: set(latched(dashboard)) == {"slow/lidar", "slow/camera"})
+                for stamp in range(100):
+                    slow.publish(moving("map", "slow/base", stamp))
+                    quick.publish(moving("map", "quick/base", stamp))
+                await until(lambda: heard == [99])
+                await until(lambda: link.statistics().received_samples >= 103)
+                # What is said beside the moving samples comes by questions.
+                slow.remove_frame("slow/camera")
+                await until(lambda: set(latched(dashboard)) == {"slow/lidar"})
+                slow.publish(static("map", "slow/arm"))
+                await until(lambda: set(latched(dashboard)) == {"slow/lidar", "slow/arm"})
+                assert heard == [99]
+
+
 async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(address: str) -> None:
     router = ZenohRouter(address)
     async with router:
@@ -108,3 +138,10 @@ async def test_what_makes_no_sense_is_refused_at_once() -> None:
             ZenohLink(bus, robot="a/b")
         with pytest.raises(ValueError, match="robot"):
             ZenohLink(bus, robots=["a/b"])
+        for rate in (0.0, -1.0, math.nan):
+            with pytest.raises(ValueError, match="rate"):
+                ZenohLink(bus, robots={"r1": rate})
+            with pytest.raises(ValueError, match="rate"):
+                ZenohLink(bus, slow_rate=rate)
+        with pytest.raises(ValueError, match="slow_rate"):
+            ZenohLink(bus, slow_rate=math.inf)

@@ -16,6 +16,7 @@ from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Question, Received
 from tfbus.links._state import StateEntry, StateStep
 from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._newest import NewestSamples
 from tfbus.links.zenoh._sessions import ZenohSessions
 
 _CLOSING_TIME = 1.0
@@ -30,10 +31,20 @@ class ZenohCarrier:
     patch_config : callable
         The configuration of a session that connects to one address only.
     keys : Keys
+    slow_rate : float
+        How many times a second the newest samples go out by the slow key, while somebody subscribes to it.
     """
 
-    def __init__(self, config: zenoh.Config, patch_config: Callable[[str], zenoh.Config], keys: Keys) -> None:
+    def __init__(
+        self,
+        config: zenoh.Config,
+        patch_config: Callable[[str], zenoh.Config],
+        keys: Keys,
+        slow_rate: float = 1.0,
+    ) -> None:
         self.id = keys.link
+        self._slow_period = 1 / slow_rate
+        self._newest = NewestSamples()
         self._config = config
         self._patch_config = patch_config
         self._keys = keys
@@ -50,6 +61,7 @@ class ZenohCarrier:
 
     def send(self, turn: Turn) -> None:
         """Send live messages at once; while the network is congested, zenoh drops them."""
+        self._newest.note(turn)
         for message in self._writer.write(turn.entries, turn.step):
             if self._put(message) and message.number:
                 self._report.sent(message.samples)
@@ -64,6 +76,7 @@ class ZenohCarrier:
 
     def claim(self, step: StateStep) -> None:
         """Tell all peers the state of this link."""
+        self._newest.step = step
         self._put(self._writer.claim(step))
 
     def ask(self, peer: str, since: int) -> None:
@@ -79,6 +92,7 @@ class ZenohCarrier:
         """Send answers, and dial peers that were lost."""
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(self._sessions.keep_connected)
+            tasks.start_soon(self._send_slowly)
             await self._send_answers()
 
     async def _send_answers(self) -> None:
@@ -89,6 +103,15 @@ class ZenohCarrier:
                 self._answers.clear()
                 await anyio.to_thread.run_sync(self._sessions.answer, batch)
             await self._woken.wait()
+
+    async def _send_slowly(self) -> None:
+        while True:
+            await anyio.sleep(self._slow_period)
+            if self._sessions.is_heard_slowly():
+                try:
+                    self._sessions.put_slowly(self._newest.take())
+                except zenoh.ZError as error:
+                    self._report.failed(error)
 
     async def close(self) -> None:
         """Close the sessions, or give up waiting for them."""

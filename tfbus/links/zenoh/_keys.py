@@ -3,6 +3,7 @@
 Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digits that each link draws at random::
 
     tfbus/domain/robot/live/link      all that is published and removed, one message a turn of the link's event loop
+    tfbus/domain/robot/slow/link      the newest sample of each moving frame, now and then, while somebody subscribes
     tfbus/domain/robot/state/link     a queryable: the link's state, or what has changed of it since a number
     tfbus/domain/robot/@alive/link/session
                                       a liveliness token for each session of the link; the first session is ``0``
@@ -31,12 +32,15 @@ class Keys:
     robot : str
     robots : tuple of str
         The robots of those that the link hears, as zenoh's key expressions of one chunk.
+    slow_robots : tuple of (str, float)
+        The same for those of which it hears the slow key, at most so many times a second.
     """
 
     domain: str
     link: str
     robot: str = NO_ROBOT
     robots: tuple[str, ...] = ("*",)
+    slow_robots: tuple[tuple[str, float], ...] = ()
 
     def own(self, kind: str) -> str:
         """The key of this link for one of the kinds above."""
@@ -47,9 +51,14 @@ class Keys:
         return f"{self.own('@alive')}/{session}"
 
     def heard(self, kind: str) -> list[str]:
-        """The key expressions of all links that this one hears."""
+        """The key expressions of a kind of all links that this one hears."""
         end = "*/*" if kind == "@alive" else "*"
-        return [f"tfbus/{self.domain}/{robot}/{kind}/{end}" for robot in self.robots]
+        slow = [robot for robot, _ in self.slow_robots] if kind == "@alive" else []
+        return [f"tfbus/{self.domain}/{robot}/{kind}/{end}" for robot in dict.fromkeys([*self.robots, *slow])]
+
+    def slow(self) -> list[tuple[str, float]]:
+        """The key expressions of the slow keys that this link hears, each with its rate in Hz."""
+        return [(f"tfbus/{self.domain}/{robot}/slow/*", rate) for robot, rate in self.slow_robots]
 
     def of(self, kind: str, link: str) -> str:
         """A key expression for one other link."""

@@ -1,5 +1,6 @@
 """One zenoh session of a link: its keys, and what zenoh's threads receive."""
 
+import math
 import re
 import struct
 import threading
@@ -7,11 +8,13 @@ import weakref
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import suppress
+from time import monotonic
 from typing import Any
 
 import zenoh
 
 from tfbus.links._message import MAX_BYTES, Message
+from tfbus.links._peers import MAX_PEERS
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._settings import without_source_location
@@ -20,6 +23,9 @@ from tfbus.tf_message import MalformedMessageError
 _LONGEST_SHOWN_KEY = 200
 MOST_QUESTIONS = 1_000
 _ANSWER_TIME = 2.0
+_TOGETHER = 0.02
+_EARLY = 0.9
+"""s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
 _SINCE = struct.Struct("<Q")
 
 
@@ -101,11 +107,16 @@ class ZenohSession:
         self._close_at_exit = weakref.finalize(self, close_session, session)
         drop, remote, keys = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE, self._keys
         self._live = session.declare_publisher(keys.own("live"), congestion_control=drop)
+        self._slow = session.declare_publisher(keys.own("slow"), congestion_control=drop)
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
         self._declared = [
             *(
                 session.declare_subscriber(key, _directly(self._receive_live), allowed_origin=remote)
                 for key in keys.heard("live")
+            ),
+            *(
+                session.declare_subscriber(key, _directly(self._receive_slow(rate)), allowed_origin=remote)
+                for key, rate in keys.slow()
             ),
             *(
                 session.liveliness().declare_subscriber(key, _directly(self._receive_presence), history=True)
@@ -119,6 +130,14 @@ class ZenohSession:
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested."""
         self._live.put(message.payload, attachment=message.attachment)
+
+    def put_slowly(self, message: Message) -> None:
+        """Send a message by the slow key, or drop it while the network is congested."""
+        self._slow.put(message.payload, attachment=message.attachment)
+
+    def is_heard_slowly(self) -> bool:
+        """Whether anybody subscribes to the slow key."""
+        return bool(self._slow.matching_status.matching)  # type: ignore[attr-defined]
 
     def addresses(self) -> dict[str, str]:
         """The address at which each directly connected session is reached, by the id of the session; may block."""
@@ -186,6 +205,27 @@ class ZenohSession:
         sender = self._sender(sample, "live")
         if sender is not None and sample.kind == zenoh.SampleKind.PUT:
             self._receive_message(sender, sample)
+
+    def _receive_slow(self, rate: float) -> Callable[[zenoh.Sample], None]:
+        period = 1 / rate
+        taken: dict[str, float] = {}
+
+        def receive(sample: zenoh.Sample) -> None:
+            sender = self._sender(sample, "slow")
+            if sender is None or sample.kind != zenoh.SampleKind.PUT:
+                return
+            now = monotonic()
+            # What belongs together comes in several messages at once.
+            since = now - taken.get(sender, -math.inf)
+            if _TOGETHER < since < _EARLY * period:
+                return
+            if since > _TOGETHER:
+                if len(taken) >= MAX_PEERS:
+                    taken.clear()
+                taken[sender] = now
+            self._receive_message(sender, sample)
+
+        return receive
 
     def _receive_message(self, sender: str, sample: zenoh.Sample, as_answer: bool = False) -> None:
         size = len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment))

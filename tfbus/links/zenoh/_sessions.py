@@ -71,10 +71,19 @@ class ZenohSessions:
 
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested; raises `zenoh.ZError`."""
-        self._main.put(message)
-        for patch in tuple(self._patches.values()):
-            if patch.is_open:
-                patch.put(message)
+        for session in self._open():
+            session.put(message)
+
+    def put_slowly(self, messages: Iterable[Message]) -> None:
+        """Send messages by the slow key of each session that somebody hears there; raises `zenoh.ZError`."""
+        hearing = [session for session in self._open() if session.is_heard_slowly()]
+        for message in messages:
+            for session in hearing:
+                session.put_slowly(message)
+
+    def is_heard_slowly(self) -> bool:
+        """Whether anybody subscribes to the slow key."""
+        return any(session.is_heard_slowly() for session in self._open())
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
@@ -84,6 +93,9 @@ class ZenohSessions:
     def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
         """Answer questions; for a worker thread."""
         self._main.answer(answers)
+
+    def _open(self) -> list[ZenohSession]:
+        return [self._main, *(patch for patch in tuple(self._patches.values()) if patch.is_open)]
 
     def close(self) -> list[threading.Thread]:
         """Begin to close all sessions; returns threads that end when they are closed."""

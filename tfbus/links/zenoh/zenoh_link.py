@@ -4,6 +4,7 @@
 state come with the answers to questions; see `tfbus.links._state`.
 """
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import uuid4
@@ -42,9 +43,14 @@ class ZenohLink(Link):
         Settings of zenoh by their path, laid over those of the link: TLS, access control, routers.
     robot : str, optional
         The robot whose frames this link brings: letters, digits, ``-``, ``_`` and ``.``.
-    robots : iterable of str, optional
+    robots : iterable of str, or mapping of str to float, optional
         Hear only the links of these robots; ``*`` in a name stands for any letters. What others send never leaves their
-        machines for this link, and they are no peers of it. By default, it hears all, with and without a robot.
+        machines for this link, and they are no peers of it. By default, it hears all, with and without a robot. A
+        mapping gives a rate in Hz for each: of a robot with a finite rate come the static frames and the newest sample
+        of each moving one, at most so often, and no more often than its links send that, by their `slow_rate`;
+        `math.inf` is for everything.
+    slow_rate : float
+        How often this link sends the newest sample of each moving frame to those that asked for less than all, in Hz.
     frames : iterable of str, optional
         Send and take only these children; by default all.
     drop_lost : bool
@@ -97,7 +103,8 @@ class ZenohLink(Link):
         connect: Addresses | None = None,
         config: Mapping[str, Any] | None = None,
         robot: str | None = None,
-        robots: Iterable[str] | None = None,
+        robots: Iterable[str] | Mapping[str, float] | None = None,
+        slow_rate: float = 1.0,
         frames: Iterable[str] | None = None,
         drop_lost: bool = False,
         lease: float = 2.0,
@@ -106,6 +113,14 @@ class ZenohLink(Link):
     ) -> None:
         if isinstance(robots, str):
             raise TypeError(f"robots must be several names, not {robots!r}")
+        rates = robots if isinstance(robots, Mapping) else dict.fromkeys(("*",) if robots is None else robots, math.inf)
+        for rate in (*rates.values(), slow_rate):
+            # Not a number is not greater either.
+            if not rate > 0:
+                raise ValueError(f"a rate must be greater than zero, got {rate!r} Hz")
+        if slow_rate == math.inf:
+            raise ValueError("slow_rate must be finite")
+        heard = {robots_expression(robot): rate for robot, rate in rates.items()}
         self.domain = check_domain(domain)
         self.robot = robot
         # Peers tell by the id of a session at which address they have reached a link. It must not begin with 0.
@@ -118,8 +133,10 @@ class ZenohLink(Link):
                 domain,
                 link,
                 NO_ROBOT if robot is None else check_robot(robot),
-                ("*",) if robots is None else tuple(dict.fromkeys(map(robots_expression, robots))),
+                tuple(robot for robot, rate in heard.items() if rate == math.inf),
+                tuple((robot, rate) for robot, rate in heard.items() if rate < math.inf),
             ),
+            slow_rate,
         )
         super().__init__(
             bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
