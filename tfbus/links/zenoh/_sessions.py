@@ -39,6 +39,8 @@ class ZenohSessions:
     keys : Keys
     receive : callable
         Called in any thread with each `Received` item.
+    dialing : Dialing, optional
+        Decides whom to dial when.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class ZenohSessions:
         patch_config: Callable[[str], zenoh.Config],
         keys: Keys,
         receive: Callable[[Received], object],
+        dialing: Dialing | None = None,
     ) -> None:
         self._patch_config = patch_config
         self._keys = keys
@@ -56,7 +59,7 @@ class ZenohSessions:
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
         self._changes: list[tuple[str, Presence]] = []
-        self._dialing = Dialing(monotonic)
+        self._dialing = Dialing(monotonic) if dialing is None else dialing
         self._closing: list[threading.Thread] = []
 
     def open(self) -> None:
