@@ -107,11 +107,11 @@ class ZenohCarrier:
     async def _send_slowly(self) -> None:
         while True:
             await anyio.sleep(self._slow_period)
-            if self._sessions.is_heard_slowly():
-                try:
+            try:
+                if self._sessions.is_heard_slowly():
                     self._sessions.put_slowly(self._newest.take())
-                except zenoh.ZError as error:
-                    self._report.failed(error)
+            except zenoh.ZError as error:
+                self._report.failed(error)
 
     async def close(self) -> None:
         """Close the sessions, or give up waiting for them."""

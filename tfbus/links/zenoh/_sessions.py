@@ -148,7 +148,8 @@ class ZenohSessions:
         self._patches[peer] = patch
         try:
             await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)
-        except OSError:
+        except (OSError, zenoh.ZError):
+            # It may also have been lost while it began.
             self._drop_patch(peer)
             return
         with anyio.move_on_after(_MEETING_TIME):
