@@ -24,7 +24,7 @@ SEED = int(os.environ.get("FAULT_SEED", "1"))
 HOSTS = 4
 WHOLE_AGAIN = 10.0
 """s; so long after a fault all buses are equal."""
-LEASE = 1.0
+LEASE = 2.0
 
 
 class Host:
@@ -140,7 +140,7 @@ class World:
                 process.ask("remove", frame=frame)
             else:
                 process.ask("statics", names=[frame], x=float(next(self._numbers)))
-        time.sleep(self._rng.choice((0.1, 0.5, 2.0, 4.0)))
+        time.sleep(self._rng.choice((0.1, 0.5, 2.0, 5.0)))
 
     def mend(self) -> None:
         """Repair everything."""

@@ -7,7 +7,7 @@ from typing import Any
 
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import SendReport
-from tfbus.links._endpoint import CLAIM_PERIOD, Endpoint
+from tfbus.links._endpoint import LONGEST_CLAIM_PERIOD, Endpoint
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
 from tfbus.links._outbox import Turn
@@ -184,7 +184,7 @@ class Domain:
 
     def claim(self) -> None:
         """Have all ends claim their states."""
-        self.time += CLAIM_PERIOD
+        self.time += LONGEST_CLAIM_PERIOD
         for end in self.ends:
             end.endpoint.send()
             end.endpoint.reconcile()

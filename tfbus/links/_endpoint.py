@@ -21,7 +21,8 @@ from tfbus.links._state import CHUNK
 from tfbus.tf_message import MalformedMessageError
 
 CLAIM_PERIOD = 1.0
-"""s; a link that has nothing to send claims its state so often."""
+LONGEST_CLAIM_PERIOD = 10.0
+"""s; a link claims its state so long after it has sent something, and then after twice that time, up to the longest."""
 
 
 class Endpoint:
@@ -75,6 +76,7 @@ class Endpoint:
         self._askable = carrier if isinstance(carrier, AskableCarrier) else None
         self._now = now
         self._claimed_at = -CLAIM_PERIOD
+        self._claim_period = CLAIM_PERIOD
         self.peers = Peers(self._report)
         self.outbox = Outbox(frames, notify, None if self._askable is None else self._askable.can_hold)
         self.inbox = Inbox(bus, self._relay, self.outbox, frames, max_frames, self.peers)
@@ -105,6 +107,7 @@ class Endpoint:
         if turn.entries or turn.statics:
             self._carrier.send(turn)
             self._claimed_at = self._now()
+            self._claim_period = CLAIM_PERIOD
 
     def next_question(self) -> float | None:
         """When the next peer is to be asked; None while nothing is missing."""
@@ -115,10 +118,11 @@ class Endpoint:
         if self._reconciler is None or self._askable is None:
             return inf
         self._reconciler.run()
-        due = self._claimed_at + CLAIM_PERIOD
+        due = self._claimed_at + self._claim_period
         if self._now() >= due:
             self._claimed_at = self._now()
-            due += CLAIM_PERIOD
+            self._claim_period = min(2 * self._claim_period, LONGEST_CLAIM_PERIOD)
+            due = self._claimed_at + self._claim_period
             # Those that this link does not hear may hear it.
             if not self.outbox.pending:
                 self._askable.claim(self.outbox.step())

@@ -106,7 +106,7 @@ class ZenohSessions:
         self._patches.clear()
         return [*self._closing, *(session.close() for session in sessions)]
 
-    async def keep_connected(self, interval: float = 0.1) -> None:
+    async def keep_connected(self, interval: float = 0.5) -> None:
         """Dial peers that were lost, until cancelled."""
         async with anyio.create_task_group() as tasks:
             while True:

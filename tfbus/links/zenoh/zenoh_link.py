@@ -89,7 +89,7 @@ class ZenohLink(Link):
     -----
     Nothing here blocks the event loop: while the network is congested, live messages are dropped, which the other end
     counts as `lost`. Static frames and removals are recovered: each link numbers what it brings and what it has
-    removed, tells the number with every message, and once a second when it has nothing else to tell; whoever has missed
+    removed, tells the number with every message, and now and then when it has nothing else to tell; whoever has missed
     something asks for it. A peer whose connection breaks is dialled again where it was reached before. Anyone who can
     reach the link can publish and remove any frame.
     """
