@@ -28,7 +28,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "message_filter": ("buffer",),
     "robot": ("bus",),
     "links": ("bus", "tf_message"),
-    "recording": ("bus", "tf_message"),
+    "recording": ("robot", "tf_message"),
     "testing": ("geometry",),
     "__init__": ("message_filter", "robot"),
     "cli": ("__init__", "links", "recording"),
@@ -42,9 +42,13 @@ CORE = {"anyio", "numpy", "transforms3d"}
 # The module, or the room, that each extra is for.
 EXTRAS = {
     "cyclopts": ("cli",),
+    "lz4": ("recording.formats",),
     "mcap": ("recording.formats",),
+    "mcap_protobuf": ("recording.formats",),
+    "pyarrow": ("cli",),
     "rich": ("cli",),
     "rosbags": ("recording.formats",),
+    "ruamel": ("recording.formats",),
     "urdf_parser_py": ("robot",),
     "zenoh": ("links.zenoh",),
     "zstandard": ("recording.formats",),

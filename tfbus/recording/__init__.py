@@ -7,15 +7,17 @@ A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Play
 
 from tfbus.errors import RecordingError
 from tfbus.recording.load import load
+from tfbus.recording.message import RecordedMessage
 from tfbus.recording.player import Player
 from tfbus.recording.recorder import Recorder
-from tfbus.recording.recording import RecordedMessage, Recording, open_recording
+from tfbus.recording.recording import RecordedTopic, Recording, open_recording
 from tfbus.recording.summary import FrameSummary, RecordingSummary, summarise
 
 __all__ = [
     "FrameSummary",
     "Player",
     "RecordedMessage",
+    "RecordedTopic",
     "Recorder",
     "Recording",
     "RecordingError",

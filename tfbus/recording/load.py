@@ -3,12 +3,42 @@
 import logging
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping
 
+from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import Batch
-from tfbus.recording.recording import RecordedMessage, open_recording
+from tfbus.recording._blocks import Block, DecodedBlock
+from tfbus.recording._selection import Topics
+from tfbus.recording.formats._columns import Columns
+from tfbus.recording.recording import Recording, open_recording
+from tfbus.recording.speed_limit import SpeedLimit
+from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.cycles import NewestEdge, admit
+from tfbus.tree.forest import Forest
 from tfbus.tree.tree import TransformTree, forest_of
+
+MAX_DETAILS = 20
+
+
+class Problems(Counter[str]):
+    """The number of transforms and messages that were left out, by reason.
+
+    Attributes
+    ----------
+    details : list of str
+        What was lost at the first damaged places; at most `MAX_DETAILS`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.details: list[str] = []
+
+    def note(self, errors: tuple[InvalidTransformError | MalformedMessageError, ...]) -> None:
+        """Count the errors of a message."""
+        for error in errors:
+            self[error.reason] += 1
+            if isinstance(error, MalformedMessageError) and len(self.details) < MAX_DETAILS:
+                self.details.append(error.detail)
 
 
 def load(
@@ -16,6 +46,10 @@ def load(
     since: int | None = None,
     until: int | None = None,
     *,
+    topics: Topics = None,
+    prefix: str = "",
+    namespaces: bool = False,
+    max_speed: float | None = None,
     problems: Counter[str] | None = None,
 ) -> TransformTree:
     """Read all transforms of a recording, or of a part of it, into a tree that keeps them all.
@@ -29,9 +63,15 @@ def load(
         As `open_recording`.
     since, until : int, optional
         The first and the last log time, in ns. Static transforms from before `since` are in the tree as well.
+    topics, prefix, namespaces
+        As `open_recording`.
+    max_speed : float, optional
+        In m/s. A moving sample that is further from the last one of its frame that was kept, by stamp, than this speed
+        allows, is left out and counted as ``"speed"``. If the first samples of a frame contradict each other, the first
+        one that a later one agrees with is kept.
     problems : Counter, optional
         Gets the number of transforms and messages that were left out, by reason. Without it, they are logged as a
-        warning.
+        warning, as is what was not read although it may hold transforms.
 
     Returns
     -------
@@ -41,26 +81,80 @@ def load(
     Raises
     ------
     RecordingError
-        If the recording cannot be read at all.
+        If the recording cannot be read at all, or as `open_recording`.
+    ValueError, TypeError
+        If `max_speed` is not greater than zero, or as `open_recording`.
     """
-    counted: Counter[str] = Counter() if problems is None else problems
+    limit = None if max_speed is None else SpeedLimit(max_speed)
+    found = Problems()
     tree = TransformTree(keep=None)
-    with open_recording(path) as recording:
-        fill(tree, recording.messages(since, until), counted)
-    if problems is None and counted:
-        reasons = ", ".join(f"{count} x {reason}" for reason, count in counted.most_common())
-        logging.getLogger("tfbus").warning("left out of %s: %s", os.fspath(path), reasons)
+    with open_recording(path, topics=topics, prefix=prefix, namespaces=namespaces) as recording:
+        fill(tree, recording, found, since, until, limit=limit)
+        remarks = recording.remarks
+    if problems is not None:
+        problems.update(found)
+        return tree
+    logger = logging.getLogger("tfbus")
+    if found:
+        reasons = ", ".join(f"{count} x {reason}" for reason, count in found.most_common())
+        logger.warning("left out of %s: %s", os.fspath(path), "; ".join([reasons, *found.details]))
+    for remark in remarks:
+        logger.warning("%s: %s", os.fspath(path), remark)
     return tree
 
 
-def fill(tree: TransformTree, messages: Iterable[RecordedMessage], problems: Counter[str]) -> None:
-    """Insert the samples of some messages into a tree, and count by reason those that are left out."""
+def fill(
+    tree: TransformTree,
+    recording: Recording,
+    problems: Problems,
+    since: int | None = None,
+    until: int | None = None,
+    *,
+    limit: SpeedLimit | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> None:
+    """Insert the samples of a recording into a tree, and count by reason those that are left out.
+
+    Parameters
+    ----------
+    tree : TransformTree
+    recording : Recording
+    problems : Problems
+    since, until : int, optional
+        As `load`.
+    limit : SpeedLimit, optional
+    progress : callable, optional
+        Called with the number of messages in each block that has been inserted.
+    """
     forest = forest_of(tree)
-    for _, batch, errors in messages:
-        if errors:
-            problems.update(error.reason for error in errors)
-        forest.commit(without_loops(forest.frames, batch, problems))
+    for block in recording.blocks(since, until):
+        columns = block.columns() if limit is None else None
+        if columns is None or not _append(forest, columns):
+            _commit(forest, block, problems, limit)
+        if progress is not None:
+            progress(len(block))
+    if limit is not None:
+        forest.commit(without_loops(forest.frames, limit.undecided(), problems))
+        problems.update(limit.dropped)
     forest.forget_changes()
+
+
+def _append(forest: Forest, columns: list[Columns]) -> bool:
+    """Append the samples of a block, if none of them has to be judged; returns whether that was so."""
+    if not all(
+        not each.static and forest.can_append(each.parent, each.child, each.authority, each.stamps) for each in columns
+    ):
+        return False
+    for each in columns:
+        forest.append(each.child, each.stamps, each.rows)
+    return True
+
+
+def _commit(forest: Forest, block: Block | DecodedBlock, problems: Problems, limit: SpeedLimit | None) -> None:
+    for _, batch, errors in block.messages():
+        if errors:
+            problems.note(errors)
+        forest.commit(without_loops(forest.frames, batch if limit is None else limit.admit(batch), problems))
 
 
 def without_loops(edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str]) -> Batch:

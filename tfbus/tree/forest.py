@@ -6,6 +6,9 @@ held for one lookup or one batch, so worker threads may read while the loop inse
 
 import threading
 
+import numpy as np
+import numpy.typing as npt
+
 from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import Latest, as_stamp
@@ -110,6 +113,28 @@ class Forest:
                     plain = False
                     self.insert_judged(sample)
         return plain
+
+    def can_append(self, parent: str, child: str, authority: str, stamps: npt.NDArray[np.int64]) -> bool:
+        """Whether moving samples of a frame are its next ones, so that inserting them changes nothing but stamps.
+
+        Parameters
+        ----------
+        parent, child, authority : str
+        stamps : int64 array of shape (n,)
+            ns; n is at least one.
+        """
+        history = self.frames.get(child)
+        return (
+            history is not None
+            and history.can_append(parent, authority, int(stamps[0]))
+            and bool((stamps[1:] > stamps[:-1]).all())
+        )
+
+    def append(self, child: str, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
+        """Store the samples that `can_append` has approved; the rows have shape (n, 7)."""
+        with self.lock:
+            self.frames[child].append_many(stamps, rows)
+            self.inserted += len(stamps)
 
     def insert_judged(self, sample: TransformStamped) -> Outcome:
         """Store one sample that closes no loop."""

@@ -102,7 +102,9 @@ def test_a_message_whose_log_time_is_no_stamp_is_reported_and_the_others_are_rea
         (message.received, len(message.batch), [str(each) for each in message.errors]) for message in messages_in(path)
     ]
     reasons = [f"no message of transforms (damaged): a message has the log time {time} ns" for time, _, _ in late]
-    assert found == [(5, 1, []), *((5, 0, [reason]) for reason in reasons)]
+    assert found[:3] == [(5, 1, []), *((5, 0, [reason]) for reason in reasons)]
+    # A finished file also promises three.
+    assert len(found) == 3 + finish
 
 
 def test_a_finished_file_without_messages_is_an_empty_recording(write: Write) -> None:
@@ -161,14 +163,18 @@ def test_a_damaged_chunk_is_reported_and_the_others_are_read(write: Write, finis
     path = write(LINES, finish=finish)
     damage(path, encode(EXPECTED[15][1]))
     messages = messages_in(path)
-    (lost,) = [message for message in messages if message.errors]
+    lost, *promised = [message for message in messages if message.errors]
     assert [error.reason for error in lost.errors] == ["damaged"]
+    assert "its checksum does not match" in str(lost.errors[0])
     assert lost.batch == ()
     read = [(message.received, message.batch) for message in messages if message.batch]
     missing = [place for place, line in enumerate(EXPECTED) if line not in read]
     assert 15 in missing
     assert missing == list(range(missing[0], missing[-1] + 1))
     assert len(missing) < 12
+    # A finished file promises how many messages there are.
+    expected = f"the file promises {COUNT} messages on '/tf', and {COUNT - len(missing)} were found"
+    assert [error.detail for message in promised for error in message.errors] == [expected] * finish  # type: ignore[union-attr]
     # It comes in the place of what is lost.
     assert messages.index(lost) == missing[0]
 
@@ -228,18 +234,22 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(write: Write) -> Non
     path.write_bytes(data)
     lost, *read = messages_in(path)
     assert [error.reason for error in lost.errors] == ["damaged"]
+    promised = [read.pop() for _ in range(2)]
+    assert ["promises" in str(message.errors) for message in promised] == [True, True]
     assert 0 < len(read) < len(EXPECTED)
     assert [(message.received, message.batch) for message in read] == EXPECTED[-len(read) :]
 
 
-def test_unreadable_records_end_the_reading_and_are_reported(write: Write) -> None:
+def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Write) -> None:
     path = write(LINES, finish=False)
     data = path.read_bytes()
     nonsense = b"\x04" + (100).to_bytes(8, "little") + b"\xff" * 100
     path.write_bytes(data + nonsense + data[8:])
-    *read, lost = messages_in(path)
-    assert [(message.received, message.batch) for message in read] == EXPECTED
+    messages = messages_in(path)
+    lost = messages.pop(len(EXPECTED))
+    assert [(message.received, message.batch) for message in messages] == EXPECTED * 2
     assert [error.reason for error in lost.errors] == ["damaged"]
+    assert f"the channel at byte {len(data)}" in str(lost.errors[0])
 
 
 @pytest.mark.parametrize(
@@ -323,7 +333,8 @@ THREE = [moving("a", name, 1) for name in "bcd"]
         ("3", [""] * 3),
         ('[["odometry", "x"]]', [""] * 3),
         ('[["odometry", 3], ["slam", -1]]', [""] * 3),
-        ('[["odometry", 1000000000000]]', [""] * 3),
+        ('[["odometry", 1000000000000]]', ["odometry"] * 3),
+        ('[["odometry", 1000000000000], ["slam", 1]]', [""] * 3),
     ],
 )
 def test_authorities_are_in_the_metadata_of_the_channel(write: Write, metadata: str, authorities: list[str]) -> None:

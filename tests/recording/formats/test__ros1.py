@@ -57,33 +57,6 @@ def test_a_range_includes_both_ends() -> None:
     assert statics == {"laser", "camera", "arm", "table"}
 
 
-def test_a_bag_that_was_never_finished_says_what_helps(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag.active"
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    writer = Writer(path)
-    writer.open()
-    connection = writer.add_connection("/tf", "tf2_msgs/msg/TFMessage", typestore=types)
-    payload = types.cdr_to_ros1(encode([moving("a", "b", 1)]), "tf2_msgs/msg/TFMessage")
-    writer.write(connection, 1, payload)
-    torn = path.read_bytes()
-    writer.close()
-    path.write_bytes(torn)
-    with pytest.raises(RecordingError, match="reindex") as raised:
-        open_recording(path)
-    assert raised.value.reason == "damaged"
-
-
-def test_a_bag_that_is_cut_is_refused_or_says_what_is_lost(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag"
-    data = SMALL.read_bytes()
-    for size in range(20, len(data), 997):
-        path.write_bytes(data[:size])
-        with pytest.raises(RecordingError) as raised:
-            open_recording(path)
-        assert raised.value.reason == "damaged"
-        assert "\n" not in str(raised.value)
-
-
 def test_damage_inside_of_a_bag_is_counted(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     data = bytearray(SMALL.read_bytes())
