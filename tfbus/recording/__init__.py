@@ -11,7 +11,8 @@ from tfbus.recording.message import RecordedMessage
 from tfbus.recording.player import Player
 from tfbus.recording.recorder import Recorder
 from tfbus.recording.recording import RecordedTopic, Recording, open_recording
-from tfbus.recording.summary import FrameSummary, RecordingSummary, summarise
+from tfbus.recording.spread import Spread
+from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
 
 __all__ = [
     "FrameSummary",
@@ -22,6 +23,8 @@ __all__ = [
     "Recording",
     "RecordingError",
     "RecordingSummary",
+    "SenderSummary",
+    "Spread",
     "load",
     "open_recording",
     "summarise",

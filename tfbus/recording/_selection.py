@@ -76,8 +76,8 @@ class Selection:
             return Choice(static, self._prefix + self._prefixes[name]) if name in self._prefixes else None
         if self._namespaces:
             inner = f"{namespace}/" if namespace else ""
-            return Choice(static, self._prefix + inner) if own else None
-        if (own and not namespace) or (channel.type in FOXGLOVE_TYPES and not own):
+            return Choice(static, self._prefix + inner) if own and not inner.startswith("/") else None
+        if name in (MOVING_TOPIC, STATIC_TOPIC) or (channel.type in FOXGLOVE_TYPES and not own):
             return Choice(static, self._prefix)
         return None
 

@@ -181,9 +181,10 @@ class Recording:
 
     def _check_topics(self, storage: Storage) -> None:
         """Raise `RecordingError` if a topic that was asked for is not there, as far as the file tells."""
-        names = {channel.topic.removeprefix("/") for channel in storage.channels}
         for topic in self._selection.topics if storage.complete else ():
-            read = any(self._is_wanted(channel) for channel in storage.channels if channel.topic.removeprefix("/") == topic)
+            read = any(
+                self._is_wanted(channel) for channel in storage.channels if channel.topic.removeprefix("/") == topic
+            )
             if not read:
                 kinds = {channel.type for channel in storage.channels if channel.topic.removeprefix("/") == topic}
                 with_transforms = sorted({each.topic for each in storage.channels if looks_like_transforms(each)})

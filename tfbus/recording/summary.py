@@ -1,7 +1,6 @@
 """`summarise`, which lists topics, frames and senders of a recording, with rates, gaps and delays, and its problems.
 
-The recording is read once and not kept: only the stamp, 8 bytes, and the delay, 4 bytes, of each moving transform stay
-in memory.
+The recording is read once and not kept: only one stamp, 8 bytes, of each moving transform stays in memory.
 """
 
 import math
@@ -9,29 +8,21 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.geometry.stamped import Batch
 from tfbus.recording._blocks import Block, DecodedBlock
+from tfbus.recording._delays import Delays
 from tfbus.recording.formats._columns import Columns
 from tfbus.recording.load import Problems, without_loops
 from tfbus.recording.message import RecordedMessage
 from tfbus.recording.recording import RecordedTopic, Recording
+from tfbus.recording.spread import Spread
 from tfbus.stamps import SECOND, to_seconds
 
 _BLOCK = 1_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """The mean of some durations, the one that 99 % of them do not exceed, and the greatest; in s."""
-
-    mean: float
-    p99: float
-    max: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +241,7 @@ class _Sent:
         self.static = 0
         self.moving = 0
         self.stamps = array("q")
-        self.delays = array("f")
+        self.delays = Delays()
 
 
 class _Frame:
@@ -274,7 +265,7 @@ class _Frame:
         else:
             sent.moving += 1
             sent.stamps.append(stamp)
-            sent.delays.append((received - stamp) / SECOND)
+            sent.delays.add(np.array([received - stamp]))
         if static or self.newest is None or stamp >= self.newest:
             self.parent, self.authority, self.static = parent, authority, static
             self.newest = None if static else stamp
@@ -287,31 +278,29 @@ class _Frame:
         stamps = columns.stamps
         sent.moving += len(stamps)
         sent.stamps.frombytes(stamps.tobytes())
-        sent.delays.frombytes(((columns.received - stamps) / SECOND).astype(np.float32).tobytes())
+        sent.delays.add(columns.received - stamps)
         newest = int(stamps.max())
         if self.newest is None or newest >= self.newest:
             self.newest, self.authority = newest, columns.authority
 
     def summary(self) -> FrameSummary:
         """The summary of all samples so far."""
-        stamps = np.unique(_joined([sent.stamps for sent in self.sent.values()], np.int64))
-        delays = _joined([sent.delays for sent in self.sent.values()], np.float32)
+        stamps = np.unique(np.concatenate([np.array(sent.stamps, np.int64) for sent in self.sent.values()]))
         several = len(stamps) > 1
         oldest, newest = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
         span = newest - oldest if several and newest is not None and oldest is not None else 0
-        periods = np.diff(stamps)
         return FrameSummary(
             self.frame,
             tuple(self.parents),
             sum(sent.static for sent in self.sent.values()),
-            len(delays),
+            sum(sent.moving for sent in self.sent.values()),
             oldest,
             newest,
             (len(stamps) - 1) * SECOND / span if several else None,
-            int(periods.max()) / SECOND if several else None,
+            int(np.diff(stamps).max()) / SECOND if several else None,
             tuple(authority for authority in self.sent if authority),
             _periods(stamps),
-            _spread(delays, float(delays.mean(dtype=np.float64))) if len(delays) else None,
+            Delays.joined(sent.delays for sent in self.sent.values()).spread(),
         )
 
     def _sent_by(self, authority: str) -> _Sent:
@@ -325,13 +314,12 @@ def _sender(frames: Mapping[str, _Frame], authority: str) -> SenderSummary:
     """The summary of an authority; its samples are taken away, so that they are not in memory twice."""
     own = {child: frame.sent[authority] for child, frame in frames.items() if authority in frame.sent}
     stamps = np.empty(sum(len(sent.stamps) for sent in own.values()), np.int64)
-    delays = np.empty(len(stamps), np.float32)
     at = 0
     for sent in own.values():
         end = at + len(sent.stamps)
-        stamps[at:end], delays[at:end] = sent.stamps, sent.delays
+        stamps[at:end] = sent.stamps
         at = end
-        sent.stamps, sent.delays = array("q"), array("f")
+        sent.stamps = array("q")
     stamps.sort()
     return SenderSummary(
         authority,
@@ -339,13 +327,7 @@ def _sender(frames: Mapping[str, _Frame], authority: str) -> SenderSummary:
         sum(sent.static for sent in own.values()),
         sum(sent.moving for sent in own.values()),
         _periods(stamps),
-        _spread(delays, float(delays.mean(dtype=np.float64))) if len(delays) else None,
-    )
-
-
-def _joined(parts: list[Any], kind: Any) -> npt.NDArray[Any]:
-    return (
-        np.frombuffer(parts[0], kind) if len(parts) == 1 else np.concatenate([np.array(part, kind) for part in parts])
+        Delays.joined(sent.delays for sent in own.values()).spread(),
     )
 
 
@@ -358,12 +340,8 @@ def _periods(stamps: npt.NDArray[np.int64]) -> Spread | None:
         periods.frombytes((differences[differences > 0] / SECOND).astype(np.float32).tobytes())
     if not periods:
         return None
-    return _spread(np.frombuffer(periods, np.float32), to_seconds(int(stamps[-1] - stamps[0])) / len(periods))
-
-
-def _spread(values: npt.NDArray[np.float32], mean: float) -> Spread:
-    """The spread of durations in s; their order is lost."""
-    values = values if values.flags.writeable and values.flags.owndata else values.copy()
+    values = np.array(periods)
     rank = math.ceil(0.99 * len(values)) - 1
     values.partition(rank)
+    mean = to_seconds(int(stamps[-1] - stamps[0])) / len(values)
     return Spread(mean, float(values[rank]), float(values[rank:].max()))

@@ -29,6 +29,10 @@ DAMAGE: Final = (struct.error, ValueError, LookupError)
 """The errors of damaged records."""
 
 
+class CutOffError(ValueError):
+    """The file ends inside of a record."""
+
+
 class Record(NamedTuple):
     """The place and the header of a record; its data are in the file from `data` on, `size` bytes."""
 
@@ -60,15 +64,19 @@ class Record(NamedTuple):
 def read_record(file: IO[bytes], offset: int) -> Record:
     """The record at an offset; raises one of `DAMAGE` if there is none."""
     file.seek(offset)
-    (length,) = _LENGTH.unpack(file.read(4))
+    (length,) = _LENGTH.unpack(_read(file, 4))
     if length > _MAX_HEADER:
         raise ValueError(f"a header claims {length:,} bytes")
-    header = file.read(length)
-    if len(header) < length:
-        raise ValueError("the file ends inside of a header")
-    fields = parse_fields(header)
-    (size,) = _LENGTH.unpack(file.read(4))
+    fields = parse_fields(_read(file, length))
+    (size,) = _LENGTH.unpack(_read(file, 4))
     return Record(offset, kind_of(fields), fields, offset + 8 + length, size)
+
+
+def _read(file: IO[bytes], size: int) -> bytes:
+    data = file.read(size)
+    if len(data) < size:
+        raise CutOffError("the file ends inside of a record")
+    return data
 
 
 def parse_fields(header: bytes) -> Fields:

@@ -35,8 +35,8 @@ def merge_chunks(
     """
     waiting: list[StoredMessage] = []
     origins: list[int] = []
-    starts = [*(place.start for place in places[1:]), _END]
-    for place, following in zip(places, starts, strict=False):
+    for number, place in enumerate(places, 1):
+        following = places[number].start if number < len(places) else _END
         found = read(place)
         if not waiting and found and _in_order(found) and found[-1][0] < following:
             # The usual case: nothing overlaps.

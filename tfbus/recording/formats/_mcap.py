@@ -13,7 +13,7 @@ from contextlib import suppress
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, NamedTuple
 
 from mcap import records
 from mcap.exceptions import EndOfFile
@@ -50,6 +50,14 @@ _KINDS: Final[dict[int, str]] = {
 _ANY: Final = Channel("", "", "")
 
 
+class _IndexedChunk(NamedTuple):
+    """An entry of the index: the place of a chunk, its length in bytes, and the numbers of the channels in it."""
+
+    place: ChunkPlace
+    length: int
+    channels: tuple[int, ...]
+
+
 class McapStorage:
     """A `Storage` of one MCAP file.
 
@@ -58,6 +66,11 @@ class McapStorage:
     path : Path
     file : file, optional
         The open file to read; by default that of the path.
+
+    Attributes
+    ----------
+    size : int
+        The length of the file in bytes.
 
     Raises
     ------
@@ -72,10 +85,10 @@ class McapStorage:
         self._path = path
         self._file = path.open("rb") if file is None else file
         try:
-            self._size = self._file.seek(0, 2)
+            self.size = self._file.seek(0, 2)
             self._schemas: dict[int, records.Schema] = {}
             self._numbered: dict[int, Channel] = {}
-            self._chunks: list[records.ChunkIndex] = []
+            self._chunks: list[_IndexedChunk] = []
             self._statistics: records.Statistics | None = None
             self._counted: Counter[int] | None = None
             self.finished = self._read_index()
@@ -135,14 +148,14 @@ class McapStorage:
 
     def _read_index(self) -> bool:
         """Read the index behind the messages, and return whether the file was finished."""
-        if self._size < len(MAGIC) + _FOOTER.size:
+        if self.size < len(MAGIC) + _FOOTER.size:
             return False
-        self._file.seek(self._size - _FOOTER.size)
+        self._file.seek(self.size - _FOOTER.size)
         footer = self._file.read()
         opcode, length, start, _, checksum, magic = _FOOTER.unpack(footer)
         if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC):
             return False
-        if start and start <= self._size and self._size - start <= MAX_INDEX:
+        if start and start <= self.size and self.size - start <= MAX_INDEX:
             self._file.seek(start)
             index = self._file.read()
             # The checksum covers the index up to the checksum itself.
@@ -156,24 +169,31 @@ class McapStorage:
         return True
 
     def _use_index(self, data: bytes) -> None:
-        index = [
-            record
-            for _, opcode, content in read_records(BytesIO(data), len(data))
-            if content is not None and (record := parse_record(opcode, content))
-        ]
-        for record in index:
-            self.register(record)
-        statistics = next((record for record in index if isinstance(record, records.Statistics)), None)
-        kinds = {record.schema_id for record in index if isinstance(record, records.Channel)} - {0}
+        chunks: list[_IndexedChunk] = []
+        statistics: records.Statistics | None = None
+        # Nearly all chunks have the same channels: one tuple for all of them saves most of the memory.
+        shared: dict[tuple[int, ...], tuple[int, ...]] = {}
+        kinds = {0}
+        for _, opcode, content in read_records(BytesIO(data), len(data)):
+            record = None if content is None else parse_record(opcode, content)
+            if isinstance(record, records.ChunkIndex):
+                numbers = tuple(record.message_index_offsets)
+                place = ChunkPlace(record.message_start_time, record.message_end_time, record.chunk_start_offset)
+                chunks.append(_IndexedChunk(place, record.chunk_length, shared.setdefault(numbers, numbers)))
+            elif isinstance(record, records.Statistics):
+                statistics = record
+            elif record is not None:
+                self.register(record)
+                if isinstance(record, records.Channel):
+                    kinds.add(record.schema_id)
         # A writer may leave schemas and channels out of its index; then the index is of no use.
         if (
             statistics is not None
             and statistics.channel_message_counts.keys() <= self._numbered.keys()
-            and kinds <= self._schemas.keys()
+            and kinds <= {0, *self._schemas}
         ):
             self._statistics = statistics
-            chunks = [record for record in index if isinstance(record, records.ChunkIndex)]
-            self._chunks = sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
+            self._chunks = sorted(chunks)
 
     def register(self, record: records.McapRecord) -> bool:
         """Note a schema or a channel; returns whether it agrees with what is known already."""
@@ -210,7 +230,7 @@ class McapStorage:
         """First and last log time of each chunk and of each message outside of chunks, as far as the file is good."""
         try:
             self._file.seek(len(MAGIC))
-            for _, opcode, content in read_records(self._file, self._size):
+            for _, opcode, content in read_records(self._file, self.size):
                 after = self._file.tell()
                 if content is not None and opcode == Opcode.MESSAGE:
                     received, _, _ = split_message(content)
@@ -235,19 +255,17 @@ class McapStorage:
         found, _ = split_chunk(content, lambda _: _ANY, lambda _: None, torn=True)
         return [received for received, _, _ in found]
 
-    def read_chunk(self, index: records.ChunkIndex) -> Chunk:
-        """The chunk at an entry of the index; raises one of `DAMAGE`."""
-        if index.chunk_start_offset + index.chunk_length > self._size:
-            raise ValueError("it is behind the end of the file")
-        self._file.seek(index.chunk_start_offset)
-        for _, opcode, content in read_records(self._file, self._size):
+    def read_chunk(self, offset: int) -> Chunk:
+        """The chunk at an offset; raises one of `DAMAGE`."""
+        self._file.seek(offset)
+        for _, opcode, content in read_records(self._file, self.size):
             if opcode == Opcode.CHUNK and content is not None:
                 return Chunk.parse(content)
             break
         raise ValueError("there is no chunk, or it is too large")
 
     @property
-    def index(self) -> list[records.ChunkIndex]:
+    def index(self) -> "list[_IndexedChunk]":
         """The entries of the index, in the order of their first log times."""
         return self._chunks
 
@@ -256,7 +274,7 @@ class McapStorage:
         while True:
             self._file.seek(at)
             try:
-                record = next(read_records(self._file, self._size))
+                record = next(read_records(self._file, self.size))
             except StopIteration:
                 return
             at = self._file.tell()
@@ -287,30 +305,36 @@ class _Reading:
 
     def by_index(self, low: int, high: int) -> Iterator[list[StoredMessage]]:
         """The messages of all chunks that overlap the range, in the order of their log times."""
-        entries = {
-            ChunkPlace(entry.message_start_time, entry.message_end_time, entry.chunk_start_offset): entry
-            for entry in self._storage.index
-            if entry.message_start_time <= high
-            and entry.message_end_time >= low
-            # Without offsets, or with unknown numbers, only reading the chunk tells what is in it.
-            and (not entry.message_index_offsets or any(map(self._may_be_wanted, entry.message_index_offsets)))
-        }
+        size = self._storage.size
+        places, too_long = [], set()
+        for place, length, numbers in self._storage.index:
+            # Without numbers, or with unknown ones, only reading the chunk tells what is in it.
+            if place.start <= high and place.end >= low and (not numbers or any(map(self._may_be_wanted, numbers))):
+                places.append(place)
+                if place.offset + length > size:
+                    too_long.add(place.offset)
 
         def read(place: ChunkPlace) -> list[StoredMessage]:
             try:
-                return self._in_chunk(self._storage.read_chunk(entries[place]))
-            except DAMAGE as error:
-                return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {error}")]
-            except EndOfFile:
-                return [lost_message(max(place.start, low), f"the chunk at byte {place.offset} is cut off")]
+                if place.offset in too_long:
+                    raise ValueError("it is behind the end of the file")
+                return self._in_chunk(self._storage.read_chunk(place.offset))
+            except (*DAMAGE, EndOfFile) as error:
+                reason = str(error) if not isinstance(error, EndOfFile) else "it is cut off"
+                return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {reason}")]
 
-        return merge_chunks(sorted(entries), read)
+        return merge_chunks(places, read)
 
     def in_sequence(self, low: int) -> Iterator[list[StoredMessage]]:
         """All messages in the order of the file, up to its end; damage before `low` is reported at `low`."""
         now = low
+        summary = False
         try:
             for offset, opcode, content in self._storage.records(len(MAGIC)):
+                # Behind the data, schemas and channels come again, and these copies may be the damaged part.
+                summary = summary or opcode == Opcode.DATA_END
+                if summary and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
+                    continue
                 try:
                     found = self._in_record(opcode, content)
                 except DAMAGE as error:

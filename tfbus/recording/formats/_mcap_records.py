@@ -39,7 +39,7 @@ _LENGTH: Final = struct.Struct("<Q")
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _SKIPPED: Final = frozenset(
     (Opcode.HEADER, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX, Opcode.METADATA)
-) | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.DATA_END}
+) | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET}
 _BOUND: Final = {Opcode.CHUNK: MAX_CHUNK, Opcode.MESSAGE: MAX_OTHER_MESSAGE}
 _PRIVATE: Final = 0x80
 
@@ -136,7 +136,7 @@ def read_records(file: IO[bytes], size: int) -> Iterator[tuple[int, int, bytes |
             raise EndOfFile(Torn(opcode, file.read(min(MAX_CHUNK, size - offset - RECORD.size))))
         if opcode == Opcode.FOOTER:
             return
-        known = opcode in _READ or opcode in _BOUND
+        known = opcode in _READ or opcode in _BOUND or opcode == Opcode.DATA_END
         if known and length <= _BOUND.get(opcode, MAX_INDEX):
             yield offset, opcode, file.read(length)
         else:

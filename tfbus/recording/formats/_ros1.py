@@ -20,6 +20,7 @@ from tfbus.recording.formats._bag_records import (
     DAMAGE,
     INDEX,
     Content,
+    CutOffError,
     Fields,
     Record,
     counts_in,
@@ -195,34 +196,39 @@ class Ros1Storage:
         try:
             header = read_record(self._file, len(_VERSION))
             at = number_in(header.fields, b"index_pos", 8)
-            connections, chunks = (number_in(header.fields, name) for name in (b"conn_count", b"chunk_count"))
-            if header.kind != BAG_HEADER or not header.end <= at <= self._size or self._size - at > MAX_INDEX:
-                return False
-            while at < self._size:
-                record = read_record(self._file, at)
-                at = record.end
-                if at > self._size:
-                    return False
-                data = record.read(self._file)
-                if record.kind == CONNECTION:
-                    self._register(record.fields, data)
-                    connections -= 1
-                elif record.kind == CHUNK_INFO:
-                    start, end = (time_in(record.fields[name]) for name in (b"start_time", b"end_time"))
-                    place = number_in(record.fields, b"chunk_pos", 8)
-                    self._chunks.append(_Chunk(start, end, place, counts_in(data)))
-                    chunks -= 1
+            missing = [number_in(header.fields, name) for name in (b"conn_count", b"chunk_count")]
+            if header.kind == BAG_HEADER and header.end <= at <= self._size and self._size - at <= MAX_INDEX:
+                while at < self._size:
+                    record = read_record(self._file, at)
+                    at = record.end
+                    if at > self._size:
+                        raise CutOffError("the index goes on behind the end of the file")
+                    self._use_index_record(record, missing)
+                if not any(missing):
+                    return True
         except DAMAGE:
-            connections = chunks = 1
-        if connections or chunks:
-            self._chunks.clear()
-            self._numbered.clear()
-            return False
-        return True
+            # Then the chunks tell all of it.
+            pass
+        self._chunks.clear()
+        self._numbered.clear()
+        return False
+
+    def _use_index_record(self, record: Record, missing: list[int]) -> None:
+        """Note a connection or a chunk, and count it down in `missing`."""
+        data = record.read(self._file)
+        if record.kind == CONNECTION:
+            self._register(record.fields, data)
+            missing[0] -= 1
+        elif record.kind == CHUNK_INFO:
+            start, end = (time_in(record.fields[name]) for name in (b"start_time", b"end_time"))
+            place = number_in(record.fields, b"chunk_pos", 8)
+            self._chunks.append(_Chunk(start, end, place, counts_in(data)))
+            missing[1] -= 1
 
     def _find_chunks(self) -> None:
         """Find the chunks of a file without an index, and the connections of their messages."""
         at = len(_VERSION)
+        cause: Exception | None = None
         while at < self._size:
             try:
                 record = read_record(self._file, at)
@@ -230,17 +236,23 @@ class Ros1Storage:
                     at = self._add_chunk(record)
                     continue
                 if record.end > self._size:
-                    raise ValueError("a record goes on behind the end of the file")
+                    raise CutOffError("a record goes on behind the end of the file")
                 at = record.end
             except DAMAGE as error:
                 following = find_chunk(self._file, at + 1)
                 if following is None:
                     # As every file that was cut, it ends inside of a record.
+                    cause = error
                     break
                 self._damage.append(f"nothing can be read from byte {at} to byte {following}: {error}")
                 at = following
-        if not self._chunks:
-            raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
+        if self._chunks:
+            return
+        if cause is not None and not isinstance(cause, CutOffError):
+            raise RecordingError(
+                f"it cannot be read as a bag of ROS 1: {cause}", path=str(self._path), reason="damaged"
+            )
+        raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
 
     def _add_chunk(self, record: Record) -> int:
         """Note a chunk, with the times and counts of the index records behind it; returns the offset of what follows.
