@@ -6,6 +6,8 @@ A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Play
 """
 
 from tfbus.errors import RecordingError
+from tfbus.recording.header_stamps import HeaderStamps, header_stamps
+from tfbus.recording.joint_states import load_joint_states
 from tfbus.recording.load import load
 from tfbus.recording.message import RecordedMessage
 from tfbus.recording.player import Player
@@ -16,6 +18,7 @@ from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummar
 
 __all__ = [
     "FrameSummary",
+    "HeaderStamps",
     "Player",
     "RecordedMessage",
     "RecordedTopic",
@@ -25,7 +28,9 @@ __all__ = [
     "RecordingSummary",
     "SenderSummary",
     "Spread",
+    "header_stamps",
     "load",
+    "load_joint_states",
     "open_recording",
     "summarise",
 ]

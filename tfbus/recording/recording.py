@@ -20,6 +20,7 @@ from tfbus.tf_message import MalformedMessageError
 
 _FIRST_BYTES: Final = 16
 _SHOWN: Final = 10
+_JOINT_TYPES: Final = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,8 @@ class Recording:
     def remarks(self) -> tuple[str, ...]:
         """What is not read although it may hold transforms: ignored topics, and ignored files of a folder."""
         ignored = [topic for topic in self.topics if topic.ignored]
-        return (*self._opened.remarks, *(_remark(topic) for topic in ignored))
+        joints = [] if any(topic.read for topic in self.topics) else [t for t in self.topics if t.type in _JOINT_TYPES]
+        return (*self._opened.remarks, *map(_remark, ignored), *map(_remark_on_joints, joints))
 
     def messages(self, since: int | None = None, until: int | None = None) -> Iterator[RecordedMessage]:
         """Iterate over the messages on the chosen topics, in the order of their log times.
@@ -216,6 +218,10 @@ class Recording:
 def _remark(topic: RecordedTopic) -> str:
     count = "" if topic.count is None else f"{topic.count:,} messages on "
     return f"not read: {count}topic {topic.name} of type {topic.type or 'unknown'}"
+
+
+def _remark_on_joints(topic: RecordedTopic) -> str:
+    return f"no transforms, but {topic.name} has the positions of joints: load_joint_states reads them with a URDF"
 
 
 def open_recording(
