@@ -26,6 +26,8 @@ from tfbus.data import (
     WrenchStamped,
     do_transform,
 )
+from tfbus.diagnosis.diagnose import diagnose
+from tfbus.diagnosis.finding import Finding
 from tfbus.errors import (
     BusClosedError,
     ClockResetError,
@@ -103,6 +105,7 @@ __all__ = [
     "ExplainedEdge",
     "Explanation",
     "ExtrapolationError",
+    "Finding",
     "FrameAdded",
     "FrameLive",
     "FrameRemoved",
@@ -164,6 +167,7 @@ __all__ = [
     "Vector3Stamped",
     "Watch",
     "WrenchStamped",
+    "diagnose",
     "do_transform",
     "from_seconds",
     "to_seconds",

@@ -6,6 +6,7 @@ A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Play
 """
 
 from tfbus.errors import RecordingError
+from tfbus.recording.examine import examine
 from tfbus.recording.header_stamps import HeaderStamps, header_stamps
 from tfbus.recording.joint_states import load_joint_states
 from tfbus.recording.load import load
@@ -28,6 +29,7 @@ __all__ = [
     "RecordingSummary",
     "SenderSummary",
     "Spread",
+    "examine",
     "header_stamps",
     "load",
     "load_joint_states",

@@ -16,6 +16,7 @@ class Block:
     Parameters
     ----------
     stored : sequence of StoredMessage
+        Also an attribute.
     columns : ColumnDecoder
     decode : callable
         Decodes one message.
@@ -27,20 +28,20 @@ class Block:
         columns: ColumnDecoder,
         decode: Callable[[StoredMessage], RecordedMessage],
     ) -> None:
-        self._stored = stored
+        self.stored = stored
         self._columns = columns
         self._decode = decode
 
     def __len__(self) -> int:
-        return len(self._stored)
+        return len(self.stored)
 
     def columns(self) -> list[Columns] | None:
         """All samples, by frame; None if the messages have to be decoded one by one."""
-        return self._columns.decode(self._stored)
+        return self._columns.decode(self.stored)
 
     def messages(self) -> Iterator[RecordedMessage]:
         """All messages, one by one."""
-        return map(self._decode, self._stored)
+        return map(self._decode, self.stored)
 
 
 class DecodedBlock:
