@@ -1,7 +1,7 @@
 import struct
 from pathlib import Path
 
-from support.recorded import write_mcap
+from support.recorded import Line, write_mcap
 from support.samples import moving
 
 from tfbus import SECOND
@@ -12,7 +12,7 @@ from tfbus.tf_message import encode
 def test_a_recording_is_examined_as_it_arrived_with_the_norms_as_they_were_sent(tmp_path: Path) -> None:
     uneven = bytearray(encode([moving("odom", "base", 3 * SECOND)]))
     uneven[-8:] = struct.pack("<d", 1.005)
-    lines = [
+    lines: list[Line] = [
         *((k * SECOND, "/tf", [moving("odom", "base", k * SECOND)]) for k in range(3)),
         (3 * SECOND, "/tf", bytes(uneven)),
         (4 * SECOND, "/tf", [moving("odom", "base", 2 * SECOND)]),

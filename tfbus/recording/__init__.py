@@ -6,6 +6,8 @@ A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Play
 """
 
 from tfbus.errors import RecordingError
+from tfbus.recording.convert import Conversion, StaticTransform, convert
+from tfbus.recording.edits import Edits
 from tfbus.recording.examine import examine
 from tfbus.recording.header_stamps import HeaderStamps, header_stamps
 from tfbus.recording.joint_states import load_joint_states
@@ -18,6 +20,8 @@ from tfbus.recording.spread import Spread
 from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
 
 __all__ = [
+    "Conversion",
+    "Edits",
     "FrameSummary",
     "HeaderStamps",
     "Player",
@@ -29,6 +33,8 @@ __all__ = [
     "RecordingSummary",
     "SenderSummary",
     "Spread",
+    "StaticTransform",
+    "convert",
     "examine",
     "header_stamps",
     "load",
