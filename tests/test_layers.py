@@ -28,14 +28,15 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "message_filter": ("buffer",),
     "robot": ("bus",),
     "links": ("bus", "tf_message"),
+    "comparison": ("tree",),
     "diagnosis": ("tree",),
     "recording": ("diagnosis", "robot", "tf_message"),
     "testing": ("geometry",),
     "__init__": ("diagnosis", "message_filter", "robot"),
-    "cli": ("__init__", "links", "recording"),
+    "cli": ("__init__", "comparison", "links", "recording"),
 }
 
-SANS_IO = {*GROUND, "geometry", "data", "diagnosis", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
+SANS_IO = {*GROUND, "geometry", "comparison", "data", "diagnosis", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
 EFFECTS = {"anyio", "asyncio", "sniffio", "socket", "threading", "time", "trio"}
 ALLOWED_EFFECTS = {"tree.forest": {"threading"}}
 

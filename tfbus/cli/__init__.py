@@ -15,6 +15,7 @@ except ImportError:
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.commands.broadcast import broadcast
 from tfbus.cli.commands.check import check
+from tfbus.cli.commands.compare import compare
 from tfbus.cli.commands.convert import convert
 from tfbus.cli.commands.demo import demo
 from tfbus.cli.commands.echo import echo
@@ -38,7 +39,7 @@ app = App(
     help="Stamped coordinate transforms for asyncio and trio.",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, check, convert):
+for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, check, convert, compare):
     app.command(command)
 
 
