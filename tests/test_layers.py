@@ -13,7 +13,7 @@ import tfbus
 
 PACKAGE = Path(tfbus.__file__).parent
 
-GROUND = ("stamps", "errors", "events", "frames", "registration", "statistics", "clock", "_log", "_aio")
+GROUND = ("stamps", "plain", "errors", "events", "frames", "registration", "statistics", "clock", "_log", "_aio")
 
 # Each room with the rooms that it may import. It may import from the ground, and from the rooms that those may import.
 ROOMS: dict[str, tuple[str, ...]] = {
@@ -34,6 +34,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "testing": ("geometry",),
     "__init__": ("diagnosis", "message_filter", "robot"),
     "cli": ("__init__", "comparison", "links", "recording"),
+    "__main__": ("cli",),
 }
 
 SANS_IO = {*GROUND, "geometry", "comparison", "data", "diagnosis", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
@@ -51,6 +52,7 @@ EXTRAS = {
     "rich": ("cli",),
     "rosbags": ("recording.formats",),
     "ruamel": ("recording.formats",),
+    "scipy": ("geometry",),
     "urdf_parser_py": ("robot",),
     "zenoh": ("links.zenoh",),
     "zstandard": ("recording.formats",),

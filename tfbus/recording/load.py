@@ -5,7 +5,10 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
 from tfbus.errors import InvalidTransformError
+from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
 from tfbus.geometry.stamped import Batch
 from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._selection import Topics
@@ -51,11 +54,12 @@ def load(
     namespaces: bool = False,
     max_speed: float | None = None,
     problems: Counter[str] | None = None,
+    max_translation: float = MAX_TRANSLATION,
 ) -> TransformTree:
     """Read all transforms of a recording, or of a part of it, into a tree that keeps them all.
 
-    Invalid transforms, and those that would close a loop of parents, are left out and counted, as are the damaged parts
-    of a file.
+    Invalid transforms, those that would close a loop of parents, and those that are further than `max_translation`, are
+    left out and counted, as are the damaged parts of a file.
 
     Parameters
     ----------
@@ -72,6 +76,8 @@ def load(
     problems : Counter, optional
         Gets the number of transforms and messages that were left out, by reason. Without it, they are logged as a
         warning, as is what was not read although it may hold transforms.
+    max_translation : float
+        The greatest magnitude of a translation, in m, at most 1e100.
 
     Returns
     -------
@@ -83,11 +89,11 @@ def load(
     RecordingError
         If the recording cannot be read at all, or as `open_recording`.
     ValueError, TypeError
-        If `max_speed` is not greater than zero, or as `open_recording`.
+        If `max_speed` or `max_translation` is not greater than zero, `max_translation` greater than 1e100, or as `open_recording`.
     """
     limit = None if max_speed is None else SpeedLimit(max_speed)
     found = Problems()
-    tree = TransformTree(keep=None)
+    tree = TransformTree(keep=None, max_translation=max_translation)
     with open_recording(path, topics=topics, prefix=prefix, namespaces=namespaces) as recording:
         fill(tree, recording, found, since, until, limit=limit)
         remarks = recording.remarks
@@ -129,36 +135,46 @@ def fill(
     forest = forest_of(tree)
     for block in recording.blocks(since, until):
         columns = block.columns() if limit is None else None
-        if columns is None or not _append(forest, columns):
-            _commit(forest, block, problems, limit)
+        if columns is None or not _append(forest, columns, tree.max_translation):
+            _commit(forest, block, problems, tree.max_translation, limit)
         if progress is not None:
             progress(len(block))
     if limit is not None:
-        forest.commit(without_loops(forest.frames, limit.undecided(), problems))
+        forest.commit(sound_samples(forest.frames, limit.undecided(), problems, tree.max_translation))
         problems.update(limit.dropped)
     forest.forget_changes()
 
 
-def _append(forest: Forest, columns: list[Columns]) -> bool:
+def _append(forest: Forest, columns: list[Columns], max_translation: float) -> bool:
     """Append the samples of a block, if none of them has to be judged; returns whether that was so."""
-    if not all(
-        not each.static and forest.can_append(each.parent, each.child, each.authority, each.stamps) for each in columns
-    ):
-        return False
+    for each in columns:
+        near = np.square(each.rows[:, :3]).sum(axis=1).max() <= max_translation**2
+        if each.static or not near or not forest.can_append(each.parent, each.child, each.authority, each.stamps):
+            return False
     for each in columns:
         forest.append(each.child, each.stamps, each.rows)
     return True
 
 
-def _commit(forest: Forest, block: Block | DecodedBlock, problems: Problems, limit: SpeedLimit | None) -> None:
+def _commit(
+    forest: Forest,
+    block: Block | DecodedBlock,
+    problems: Problems,
+    max_translation: float,
+    limit: SpeedLimit | None,
+) -> None:
     for _, batch, errors in block.messages():
         if errors:
             problems.note(errors)
-        forest.commit(without_loops(forest.frames, batch if limit is None else limit.admit(batch), problems))
+        if limit is not None:
+            batch = limit.admit(_near(batch, problems, max_translation))
+        forest.commit(sound_samples(forest.frames, batch, problems, max_translation))
 
 
-def without_loops(edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str]) -> Batch:
-    """Return the batch without the samples that would close a loop of parents, and count those.
+def sound_samples(
+    edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str], max_translation: float = MAX_TRANSLATION
+) -> Batch:
+    """Return the batch without the samples that are too far away or would close a loop of parents, and count those.
 
     Parameters
     ----------
@@ -166,13 +182,29 @@ def without_loops(edges: Mapping[str, NewestEdge], batch: Batch, problems: Count
         Every edge has a sample, because nothing is ever removed from a recording.
     batch : tuple of TransformStamped
     problems : Counter
+    max_translation : float
+        In m.
     """
+    square = max_translation**2
     for sample in batch:
-        parent, child, _, _, _, _ = sample._fields
+        parent, child, _, row, _, _ = sample._fields
         edge = edges.get(child)
-        if edge is None or edge.parent != parent:
-            accepted, refused = admit(edges, batch)
-            problems.update(error.reason for error in refused)
-            return accepted
-    # The usual case: no child has got another parent, so there is no new loop.
-    return batch
+        x, y, z, _, _, _, _ = row
+        # Not `>`, which is false for NaN.
+        if edge is None or edge.parent != parent or not x * x + y * y + z * z <= square:
+            break
+    else:
+        # The usual case: no child has got another parent, so there is no new loop.
+        return batch
+    accepted, refused = admit(edges, _near(batch, problems, max_translation))
+    problems.update(error.reason for error in refused)
+    return accepted
+
+
+def _near(batch: Batch, problems: Counter[str], max_translation: float) -> Batch:
+    """The batch without the samples that are too far away, which are counted."""
+    far = [sample for sample in batch if not is_within(sample, max_translation)]
+    if not far:
+        return batch
+    problems.update(not_physical(sample, max_translation).reason for sample in far)
+    return tuple(sample for sample in batch if is_within(sample, max_translation))

@@ -16,7 +16,7 @@ from tfbus.geometry.stamped import Batch
 from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._delays import Delays
 from tfbus.recording.formats._columns import Columns
-from tfbus.recording.load import Problems, without_loops
+from tfbus.recording.load import Problems, sound_samples
 from tfbus.recording.message import RecordedMessage
 from tfbus.recording.recording import RecordedTopic, Recording
 from tfbus.recording.spread import Spread
@@ -223,7 +223,7 @@ class _Counts:
             self.messages += 1
             if errors:
                 self.problems.note(errors)
-            self._add_batch(received, without_loops(self.frames, batch, self.problems))
+            self._add_batch(received, sound_samples(self.frames, batch, self.problems))
 
     def _add_batch(self, received: int, batch: Batch) -> None:
         for sample in batch:
