@@ -4,6 +4,8 @@ A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of 
 seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
 """
 
+from tfbus.analysis.diagnose import diagnose
+from tfbus.analysis.finding import Finding
 from tfbus.buffer.buffer import Buffer
 from tfbus.buffer.watch import Watch
 from tfbus.bus.broadcaster import TransformBroadcaster
@@ -26,8 +28,6 @@ from tfbus.data import (
     WrenchStamped,
     do_transform,
 )
-from tfbus.diagnosis.diagnose import diagnose
-from tfbus.diagnosis.finding import Finding
 from tfbus.errors import (
     AheadError,
     BusClosedError,

@@ -5,9 +5,9 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 
-from tfbus.diagnosis.examiner import Examiner
-from tfbus.diagnosis.finding import Finding
-from tfbus.diagnosis.limits import Limits
+from tfbus.analysis.examiner import Examiner
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
 from tfbus.recording._blocks import Block
 from tfbus.recording.formats._raw_transforms import RawTransform, bounded, parser_of
 from tfbus.recording.formats._storage import Channel

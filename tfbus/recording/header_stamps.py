@@ -2,7 +2,6 @@
 
 import os
 import struct
-from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,6 +12,7 @@ from tfbus.errors import RecordingError
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
 from tfbus.recording.formats._raw_transforms import COMPRESSED
 from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats._types import MessageTypes, types_with_header
 from tfbus.recording.formats._unfold import UnfoldError, unfold
 from tfbus.recording.recording import open_storage
 from tfbus.stamps import SECOND
@@ -78,7 +78,7 @@ def begins_with_header(channel: Channel) -> bool:
     """Whether the messages of a channel of ROS begin with a header, by the definition in the file or that of ROS 2."""
     if channel.encoding not in ("cdr", "ros1"):
         return False
-    if channel.schema_encoding in ("ros1msg", "ros2msg"):
+    if channel.schema and channel.schema_encoding in ("ros1msg", "ros2msg"):
         for line in channel.schema.decode(errors="replace").splitlines():
             field = line.partition("#")[0].split()
             if line.startswith("==="):
@@ -87,18 +87,7 @@ def begins_with_header(channel: Channel) -> bool:
             if field and "=" not in line.partition("#")[0]:
                 return field[0] in _HEADER_TYPES
         return False
-    package, _, kind = channel.type.partition("/")
-    return f"{package}/msg/{kind.removeprefix('msg/')}" in _types_with_header()
-
-
-@cache
-def _types_with_header() -> frozenset[str]:
-    from rosbags.typesys import Stores, get_typestore
-
-    definitions = get_typestore(Stores.ROS2_HUMBLE).fielddefs
-    return frozenset(
-        kind for kind, (_, fields) in definitions.items() if fields and "std_msgs/msg/Header" in str(fields[0])
-    )
+    return MessageTypes.name(channel.type) in types_with_header() if "/" in channel.type else False
 
 
 def _stamp(channel: Channel, payload: bytes) -> int:

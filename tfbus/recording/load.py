@@ -89,7 +89,8 @@ def load(
     RecordingError
         If the recording cannot be read at all, or as `open_recording`.
     ValueError, TypeError
-        If `max_speed` or `max_translation` is not greater than zero, `max_translation` greater than 1e100, or as `open_recording`.
+        If `max_speed` or `max_translation` is not greater than zero, or `max_translation` is greater than 1e100; or as
+        `open_recording`.
     """
     limit = None if max_speed is None else SpeedLimit(max_speed)
     found = Problems()

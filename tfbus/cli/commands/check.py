@@ -9,6 +9,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from tfbus.analysis.examiner import Examiner
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
 from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import (
     DEFAULT_TOPICS,
@@ -21,9 +24,6 @@ from tfbus.cli.arguments import (
 )
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import printable, progress, say, warn
-from tfbus.diagnosis.examiner import Examiner
-from tfbus.diagnosis.finding import Finding
-from tfbus.diagnosis.limits import Limits
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.examine import examine
 

@@ -10,11 +10,11 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from tfbus.analysis import Comparison
+from tfbus.analysis.compare import compare as compare_trees
 from tfbus.cli._table import Column, table_lines
 from tfbus.cli.arguments import DEFAULT_TOPICS, Duration, Flag, JsonFlag, TopicOptions, UsageError
 from tfbus.cli.output import format_counts, format_seconds, printable, progress, warn
-from tfbus.comparison import Comparison
-from tfbus.comparison.compare import compare as compare_trees
 from tfbus.recording.load import Problems, fill
 from tfbus.tree.tree import TransformTree
 

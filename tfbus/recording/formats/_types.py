@@ -1,5 +1,6 @@
 """Conversion of messages between CDR and the encoding of ROS 1, by the definitions of their types."""
 
+from functools import cache
 from typing import Any
 
 from tfbus.recording.formats._storage import Channel
@@ -64,3 +65,14 @@ class MessageTypes:
                 self._store.register({name: each for name, each in found.items() if name not in self._store.fielddefs})
             except Exception as error:  # noqa: BLE001
                 raise ValueError(f"the definition of {channel.type} cannot be read: {error!r}"[:200]) from None
+
+
+@cache
+def types_with_header() -> frozenset[str]:
+    """The types of ROS 2 Humble that begin with a header."""
+    from rosbags.typesys import Stores, get_typestore
+
+    definitions = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    return frozenset(
+        kind for kind, (_, fields) in definitions.items() if fields and "std_msgs/msg/Header" in str(fields[0])
+    )

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from tfbus.diagnosis import Limits
+from tfbus.analysis import Limits
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Limits)])

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.comparison.alignment import Alignment
-from tfbus.comparison.errors import PoseErrors
+from tfbus.analysis.alignment import Alignment
+from tfbus.analysis.pose_errors import PoseErrors
 from tfbus.geometry.rows import Columns, compose, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds
 from tfbus.tree.tree import TransformTree, forest_of

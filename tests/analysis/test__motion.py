@@ -1,7 +1,7 @@
 import numpy as np
 
-from tfbus.diagnosis._motion import MovingSamples
-from tfbus.diagnosis.limits import Limits
+from tfbus.analysis._motion import MovingSamples
+from tfbus.analysis.limits import Limits
 
 ROW = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 

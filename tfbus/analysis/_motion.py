@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.diagnosis.finding import Finding
-from tfbus.diagnosis.limits import Limits
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
 from tfbus.stamps import SECOND, STAMP_MAX, to_seconds
 
 _OUTLIER = 20.0

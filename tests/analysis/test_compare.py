@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from support.samples import moving, static, tree_of
 
 from tfbus import SECOND, DisconnectedError, Transform, TransformStamped, TransformTree
-from tfbus.comparison import compare
+from tfbus.analysis import compare
 
 MS = SECOND // 1_000
 

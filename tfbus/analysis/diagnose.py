@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 
-from tfbus.diagnosis.examiner import Examiner
-from tfbus.diagnosis.finding import Finding
-from tfbus.diagnosis.limits import Limits
+from tfbus.analysis.examiner import Examiner
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
 from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.tree.forest import Forest
@@ -17,7 +17,7 @@ def diagnose(tree: TransformTree, limits: Limits | None = None) -> list[Finding]
 
     A tree keeps the samples of a frame in the order of their stamps, one for each stamp, and its last static value. So
     duplicates, changes of statics and stamps that go back are found only while samples arrive: see
-    `tfbus.diagnosis.Examiner`, and ``tfbus check``.
+    `tfbus.analysis.Examiner`, and ``tfbus check``.
 
     Parameters
     ----------

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from tfbus.diagnosis._motion import MovingSamples
-from tfbus.diagnosis.finding import Finding
-from tfbus.diagnosis.limits import Limits
+from tfbus.analysis._motion import MovingSamples
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
 from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import TransformStamped
 

@@ -6,7 +6,7 @@ import pytest
 from support.samples import moving, static
 
 from tfbus import SECOND, Finding, Transform, TransformStamped
-from tfbus.diagnosis import Examiner, Limits
+from tfbus.analysis import Examiner, Limits
 
 MS = SECOND // 1_000
 

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tfbus import Transform
-from tfbus.comparison import Alignment
+from tfbus.analysis import Alignment
 
 number = st.floats(-10.0, 10.0)
 CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0]])

@@ -3,7 +3,7 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
-from tfbus.comparison import PoseErrors, Statistics
+from tfbus.analysis import PoseErrors, Statistics
 
 
 def test_statistics_are_those_of_the_values() -> None:
