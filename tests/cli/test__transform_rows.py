@@ -5,7 +5,7 @@ from tfbus.cli._transform_rows import Row, print_rows
 
 def test_without_rows_nothing_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     for kind in ("table", "csv", "json", "tum"):
-        print_rows([], kind, several=False)  # type: ignore[arg-type]  # a str and not a literal
+        print_rows([], kind, several=False)
     assert capsys.readouterr() == ("", "")
 
 

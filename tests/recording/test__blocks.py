@@ -24,5 +24,5 @@ def test_the_static_transforms_from_before_are_a_block_of_their_own(tmp_path: Pa
         latched, rest = recording.blocks(since=3)
     assert isinstance(latched, DecodedBlock)
     assert isinstance(rest, Block)
-    assert (len(latched), latched.columns()) == (1, None)
+    assert len(latched) == 1
     assert list(latched.messages()) == [RecordedMessage(3, (static("a", "b"),), ())]

@@ -87,7 +87,7 @@ def _parse_date(text: str) -> int:
     # A `datetime` has microseconds.
     head, digits, zone = _FRACTION.fullmatch(text).groups()  # type: ignore[union-attr]  # matches every text
     try:
-        date = datetime.fromisoformat(head + zone)
+        date = datetime.fromisoformat(head + (zone or ""))
         seconds = calendar.timegm((date if date.tzinfo else date.replace(tzinfo=UTC)).utctimetuple())
     except (ValueError, OverflowError):
         raise ValueError(f"expected seconds, or a date such as 2014-03-31T19:24:50, not {text!r}") from None

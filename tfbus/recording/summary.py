@@ -334,10 +334,10 @@ def _sender(frames: Mapping[str, _Frame], authority: str) -> SenderSummary:
 def _periods(stamps: npt.NDArray[np.int64]) -> Spread | None:
     """The spread of the times between different stamps, which ascend."""
     # In blocks, because the differences of millions of stamps would need as much memory once more.
-    periods = array("f")
+    periods = array("d")
     for first in range(0, len(stamps), _BLOCK):
         differences = np.diff(stamps[first : first + _BLOCK + 1])
-        periods.frombytes((differences[differences > 0] / SECOND).astype(np.float32).tobytes())
+        periods.frombytes((differences[differences > 0] / SECOND).tobytes())
     if not periods:
         return None
     values = np.array(periods)

@@ -34,8 +34,9 @@ def test_what_is_wrong_is_told_with_an_advice_and_status_1(tmp_path: Path, tfbus
 
 def test_a_domain_is_examined_for_some_time(tfbus: Command) -> None:
     async def robot(bus: Bus) -> None:
+        await bus.clock.sleep(0.5)
         bus.publish(moving("map", "base", START + SECOND))
-        bus.publish(moving("map", "base", START + SECOND // 2))
+        bus.publish(moving("map", "base", START + SECOND // 4))
         await bus.clock.sleep(100.0)
 
     done = tfbus.on_domain(robot, "check", "yard", "--duration", "3", "--json")

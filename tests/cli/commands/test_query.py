@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.recorded import SMALL, real, write_mcap
+from support.recorded import SMALL, Line, real, write_mcap
 from support.samples import moving, static
 
 from tfbus import TransformTree, from_seconds
@@ -272,7 +272,7 @@ def test_parquet_has_a_row_for_each_transform(recording: Path, tmp_path: Path, t
 
 
 def test_the_stamps_of_another_topic_are_asked_for(tmp_path: Path, tfbus: Command) -> None:
-    lines = [(k, "/tf", [moving("map", "base", k, float(k))]) for k in range(10)]
+    lines: list[Line] = [(k, "/tf", [moving("map", "base", k, float(k))]) for k in range(10)]
     lines += [(k, "/other", b"") for k in (3, 7, 20)]
     path = write_mcap(tmp_path / "run.mcap", sorted(lines, key=lambda line: line[0]))
     done = tfbus("query", path, "map", "base", "--stamps-of", "/other", "--csv")
