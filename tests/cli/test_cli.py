@@ -28,10 +28,13 @@ URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
         ("broadcast", ("--rate FLOAT", *LINK)),
         ("demo", ("--duration", "--rate", "--listen-rate", "--backend", "--simulated", "--no-broadcaster")),
         ("echo", ("TARGET", "SOURCE", "--rate FLOAT", "--max-age FLOAT", "--json", *LINK)),
-        ("info", ("FILE", "--json")),
+        ("check", ("WHAT", "--from TIME", "--max-speed FLOAT", "--json", *LINK)),
+        ("compare", ("REFERENCE", "ESTIMATE", "--pair STR...", "--scale", "--json")),
+        ("convert", ("SOURCE", "FURTHER", "--from TIME", "--rename STR...", "--drop-static", "--overwrite")),
+        ("info", ("FILE", "--json", "--wide", "--namespaces")),
         ("listen", ("--rate FLOAT", *LINK)),
-        ("play", ("FILE", "--rate FLOAT", "--loop", "--from SECONDS", "--to SECONDS", *LINK)),
-        ("query", ("FILE", "TARGET", "SOURCE", "--at SECONDS", "--every SECONDS", "--csv", "--json")),
+        ("play", ("FILE", "--rate FLOAT", "--loop", "--from TIME", "--to TIME", "--topic STR...", *LINK)),
+        ("query", ("FILE", "TARGET", "SOURCE", "--at TIME", "--every SECONDS", "--tum", "--csv", "--json")),
         ("record", ("FILE", "--duration FLOAT", "--overwrite", *LINK)),
         ("robot", ("FILE", "POSITION", "--tree", "--rate FLOAT", "--prefix STR", *LINK)),
         ("router", ("--listen STR", "--connect STR", "--backend")),
@@ -57,7 +60,7 @@ def test_the_help_of_a_command_has_an_example_and_every_option(
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = "broadcast demo echo info listen play query record robot router static tree"
+    commands = "broadcast check compare convert demo echo info listen play query record robot router static tree"
     assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands.split()
 
 

@@ -14,6 +14,9 @@ except ImportError:
 
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.commands.broadcast import broadcast
+from tfbus.cli.commands.check import check
+from tfbus.cli.commands.compare import compare
+from tfbus.cli.commands.convert import convert
 from tfbus.cli.commands.demo import demo
 from tfbus.cli.commands.echo import echo
 from tfbus.cli.commands.info import info
@@ -37,7 +40,24 @@ app = App(
     help="Stamped coordinate transforms for asyncio and trio.",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, router):
+COMMANDS = (
+    demo,
+    broadcast,
+    listen,
+    static,
+    robot,
+    echo,
+    tree,
+    record,
+    play,
+    info,
+    query,
+    check,
+    convert,
+    compare,
+    router,
+)
+for command in COMMANDS:
     app.command(command)
 
 

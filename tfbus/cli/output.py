@@ -1,7 +1,8 @@
 """The output of the subcommands: results, notices, warnings, and values as text for people."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TypeVar
 
 from tfbus.geometry.transform import Transform
@@ -27,13 +28,23 @@ def warn(message: str) -> None:
 
 def track(items: Iterable[ItemT], total: int | None, description: str) -> Iterator[ItemT]:
     """Iterate over the items with a progress bar, if standard error is a terminal."""
+    with progress(total, description) as advance:
+        for item in items:
+            yield item
+            advance(1)
+
+
+@contextmanager
+def progress(total: int | None, description: str) -> Iterator[Callable[[int], object]]:
+    """Show a progress bar for the body of a ``with``, if standard error is a terminal; gives what advances it."""
     if not sys.stderr.isatty():
-        yield from items
+        yield lambda _: None
         return
     from tfbus.cli._progress_bar import progress_bar
 
     with progress_bar() as bar:
-        yield from bar.track(items, total=total, description=description)
+        task = bar.add_task(description, total=total)
+        yield lambda count: bar.advance(task, count)
 
 
 def printable(text: str) -> str:

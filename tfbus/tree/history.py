@@ -14,6 +14,9 @@ from enum import Enum
 from struct import Struct
 from typing import NamedTuple, final
 
+import numpy as np
+import numpy.typing as npt
+
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, PastExtrapolationError
 from tfbus.geometry.rows import IDENTITY, Row
 from tfbus.stamps import SECOND, STAMP_MIN, Latest
@@ -174,6 +177,23 @@ class FrameHistory:
         if stamp > self._cut_after:
             self._cut()
         return True
+
+    def can_append(self, parent: str, authority: str, oldest: int) -> bool:
+        """Whether moving samples from a stamp on are newer, and have the parent and the authority of the others."""
+        stamps = self.stamps
+        return bool(stamps) and stamps[-1] < oldest and self._origin == (parent, authority) and self.parents is None
+
+    def append_many(self, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
+        """Store moving samples that `can_append` has approved; their stamps ascend. The rows have shape (n, 7)."""
+        records = np.empty((len(stamps), 8))
+        records[:, 0] = stamps.view(np.float64)
+        records[:, 1:] = rows
+        self.records += records.data.cast("B")
+        self.origins += [self._origin] * len(stamps)
+        self.stamps.frombytes(stamps.tobytes())
+        self.horizon = self.stamps[-1] - self._keep
+        if self.stamps[-1] > self._cut_after:
+            self._cut()
 
     def insert(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
         """Store a moving sample; the window ends at the newest. A static sample is dropped first."""
