@@ -24,6 +24,7 @@ from tfbus.cli.commands.record import record
 from tfbus.cli.commands.robot import robot
 from tfbus.cli.commands.static import static
 from tfbus.cli.commands.tree import tree
+from tfbus.cli.commands.view import view
 from tfbus.cli.output import warn
 from tfbus.errors import RecordingError, TransformLookupError
 
@@ -36,7 +37,7 @@ app = App(
     help="Stamped coordinate transforms for asyncio and trio.",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query):
+for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, view):
     app.command(command)
 
 

@@ -71,7 +71,7 @@ def query(
         raise UsageError("--csv and --json are two ways to print the same: give one of them")
     if at is not None and every is not None:
         raise UsageError("--at and --every are two questions: give one of them")
-    tree = _load(file)
+    tree = load_tree(file)
     rows = _rows_at_intervals(tree, target, source, every) if every is not None else _one_row(tree, target, source, at)
     if as_csv:
         _print_csv(rows)
@@ -81,7 +81,8 @@ def query(
         _print_table(rows)
 
 
-def _load(file: Path) -> TransformTree:
+def load_tree(file: Path) -> TransformTree:
+    """A whole recording as a tree, with warnings about what is not in it."""
     tree = TransformTree(keep=None)
     problems: Counter[str] = Counter()
     with open_recording(file) as recording:

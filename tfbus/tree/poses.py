@@ -1,0 +1,245 @@
+"""The poses of all frames in one of them: what a picture of the tree needs, and faster than a lookup for each frame.
+
+The tree is walked from the fixed frame outwards, edges above it upside down, so each edge is read once for each stamp
+at which it is needed, which is usually one. The samples are read under the lock; numpy composes them after that, one
+level of the tree at a time.
+"""
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.errors import TransformLookupError
+from tfbus.geometry.rows import IDENTITY, Row, compose, invert
+from tfbus.stamps import LATEST, STAMP_MIN, Latest
+from tfbus.tree._python_kernel import climb
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import RECORD, RECORD_SIZE, FrameHistory
+from tfbus.tree.lookup import find
+
+_pack = RECORD.pack
+_IDENTITY = _pack(0, *IDENTITY)
+_NO_ROW = _pack(0, *(np.nan,) * 7)
+
+
+class Poses(NamedTuple):
+    """The poses of the frames that are connected with a fixed frame, which comes first."""
+
+    frames: tuple[str, ...]
+    columns: npt.NDArray[np.float64]
+    """Translation (m) and quaternion (x, y, z, w) of each frame in the fixed frame, shape (7, n)."""
+    parents: npt.NDArray[np.intp]
+    """The place of each frame's parent in `frames`, shape (n,); -1 for a root."""
+    answered: npt.NDArray[np.bool_]
+    """Whether a lookup has this answer, shape (n,). Otherwise edges without a sample at the stamp keep their nearest
+    one; the columns are NaN where an edge has no sample at all."""
+    static: npt.NDArray[np.bool_]
+    """Whether the edge between each frame and its parent is static, shape (n,); False for a root."""
+    heard: npt.NDArray[np.int64]
+    """The stamp (ns) of the newest sample of each frame, not after the stamp asked for, shape (n,); `STAMP_MIN` for a
+    static frame, a root, and where there is none."""
+
+
+class _Plan(NamedTuple):
+    """The order in which the frames are reached from the fixed frame."""
+
+    topology: list[tuple[str, str]]
+    frames: list[str]
+    origins: list[int]
+    """The place of the frame from which each one is reached."""
+    edges: list[str]
+    """The child of the edge between the two."""
+    inverted: list[bool]
+    levels: list[int]
+    parents: npt.NDArray[np.intp]
+
+
+class PoseReader:
+    """Reads the poses of all frames of a forest again and again; it keeps the order of the frames while that holds.
+
+    Parameters
+    ----------
+    forest : Forest
+    """
+
+    def __init__(self, forest: Forest) -> None:
+        self._forest = forest
+        self._plans: dict[str, _Plan] = {}
+
+    def read(self, fixed: str, at: int | Latest = LATEST) -> Poses:
+        """The poses in the frame `fixed` at a stamp, or for each frame at the one that `LATEST` means.
+
+        Raises
+        ------
+        UnknownFrameError
+            If no sample names `fixed`.
+        """
+        forest = self._forest
+        with forest.lock:
+            forest.check_known(fixed)
+            plan = self._plan(fixed, at)
+            histories = [None if child == "" else forest.frames[child] for child in plan.edges]
+            gathered = _Gathered(plan, histories, at)
+            moved = _moved_to_another_parent(plan, histories) if at is LATEST else []
+            corrections = [(place, _find(forest, fixed, plan.frames[place])) for place in moved]
+            own = [forest.frames.get(frame) for frame in plan.frames]
+            static = np.array([history is not None and history.static for history in own])
+            heard = np.array([STAMP_MIN if history is None else _heard(history, at) for history in own], np.int64)
+        columns, answered = gathered.compose()
+        for place, row in corrections:
+            answered[place] = row is not None
+            if row is not None:
+                columns[:, place] = row
+        return Poses(tuple(plan.frames), columns, plan.parents, answered, static, heard)
+
+    def _plan(self, fixed: str, at: int | Latest) -> _Plan:
+        frames = self._forest.frames
+        if isinstance(at, Latest):
+            topology = [(child, history.parent) for child, history in frames.items()]
+        else:
+            topology = [(child, history.parent_at(at)) for child, history in frames.items()]
+        plan = self._plans.get(fixed)
+        if plan is None or plan.topology != topology:
+            # Only one: a picture seldom changes its fixed frame.
+            self._plans = {fixed: (plan := _make_plan(fixed, topology))}
+        return plan
+
+
+def _make_plan(fixed: str, topology: list[tuple[str, str]]) -> _Plan:
+    above = dict(topology)
+    below: dict[str, list[str]] = {}
+    for child, parent in topology:
+        below.setdefault(parent, []).append(child)
+    places = {fixed: 0}
+    plan = _Plan(topology, [fixed], [-1], [""], [False], [0], np.empty(0, np.intp))
+    for place, frame in enumerate(plan.frames):
+        reached = [(child, child, False) for child in below.get(frame, ())]
+        if frame in above:
+            reached.append((above[frame], frame, True))
+        for other, child, inverted in reached:
+            if other not in places:
+                places[other] = len(plan.frames)
+                plan.frames.append(other)
+                plan.origins.append(place)
+                plan.edges.append(child)
+                plan.inverted.append(inverted)
+                plan.levels.append(plan.levels[place] + 1)
+    parents = [places.get(above.get(frame, ""), -1) for frame in plan.frames]
+    return plan._replace(parents=np.array(parents, np.intp))
+
+
+class _Gathered:
+    """The edges of a plan, each as it is at the stamps at which the frames behind it need it.
+
+    The caller holds the lock of the forest while this is made, and may release it before `compose`.
+    """
+
+    def __init__(self, plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Latest) -> None:
+        self._plan = plan
+        self._histories = histories
+        self._records = bytearray()
+        self._origins: list[int] = []
+        self._places: list[int] = []
+        self._answered: list[bool] = []
+        # The stamp of each frame; None while the path from the fixed frame is static, and holds at every stamp.
+        self._stamps: list[int | None] = []
+        self._own: list[int] = []
+        self._others: dict[tuple[int, int], int] = {}
+        for place, history in enumerate(histories):
+            origin = plan.origins[place]
+            before = stamp = self._stamps[origin] if place else None
+            if history is not None and not history.static:
+                if isinstance(at, int):
+                    stamp = at
+                elif not history.stamps:
+                    stamp = before or 0
+                elif before is None or history.stamps[-1] < before:
+                    stamp = history.stamps[-1]
+            self._stamps.append(stamp)
+            if place == 0 or before is None or before == stamp:
+                above = self._own[origin] if place else 0
+            else:
+                assert stamp is not None
+                above = self._at_another_stamp(origin, stamp)
+            self._own.append(self._add(place, stamp, above))
+
+    def compose(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """The poses of the frames as columns of shape (7, n), and whether each is answered."""
+        places = np.array(self._places, np.intp)
+        levels = np.array(self._plan.levels, np.intp)[places]
+        order = levels.argsort(kind="stable")
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        columns = np.frombuffer(self._records, np.float64).reshape(-1, RECORD_SIZE // 8).T[1:, order]
+        origins = rank[np.array(self._origins, np.intp)[order]]
+        upside_down = np.flatnonzero(np.array(self._plan.inverted, np.bool_)[places][order])
+        columns[:, upside_down] = invert((*columns[:, upside_down],))
+        ends = levels[order].searchsorted(np.arange(1, levels.max() + 2))
+        for start, end in pairwise(ends.tolist()):
+            columns[:, start:end] = compose((*columns[:, origins[start:end]],), (*columns[:, start:end],))
+        own = rank[self._own]
+        return columns[:, own], np.array(self._answered, np.bool_)[self._own]
+
+    def _at_another_stamp(self, place: int, stamp: int) -> int:
+        """The index of a frame at a stamp that is not its own, with all before it on the path."""
+        ahead = []
+        while self._stamps[place] is not None and self._stamps[place] != stamp and (place, stamp) not in self._others:
+            ahead.append(place)
+            place = self._plan.origins[place]
+        index = self._others.get((place, stamp), self._own[place])
+        for here in reversed(ahead):
+            index = self._others[here, stamp] = self._add(here, stamp, index)
+        return index
+
+    def _add(self, place: int, stamp: int | None, above: int) -> int:
+        """Read one edge at one stamp; where it has no sample, its nearest stands in."""
+        history = self._histories[place]
+        answered = True
+        record: bytes | bytearray
+        if history is None:
+            record = _IDENTITY
+        elif history.static:
+            record = _pack(0, *history.row)
+        elif not history.stamps or stamp is None:
+            record, answered = _NO_ROW, False
+        elif stamp >= history.stamps[-1]:
+            record, answered = history.records[-RECORD_SIZE:], stamp == history.stamps[-1]
+        else:
+            oldest = history.stamps[history.start]
+            record, answered = _pack(0, *climb((history,), max(stamp, oldest))), stamp >= oldest
+        index = len(self._places)
+        self._records += record
+        self._places.append(place)
+        self._origins.append(above)
+        self._answered.append(answered and (index == 0 or self._answered[above]))
+        return index
+
+
+def _heard(history: FrameHistory, at: int | Latest) -> int:
+    stamps = history.stamps
+    if not stamps:
+        return STAMP_MIN
+    if isinstance(at, Latest) or stamps[-1] <= at:
+        return stamps[-1]
+    before = bisect_right(stamps, at, history.start) - 1
+    return stamps[before] if before >= history.start else STAMP_MIN
+
+
+def _moved_to_another_parent(plan: _Plan, histories: Sequence[FrameHistory | None]) -> list[int]:
+    """The places of the frames that had another parent on the way to them inside the window."""
+    moved = [False] * len(histories)
+    for place, history in enumerate(histories):
+        if history is not None:
+            moved[place] = history.parents is not None or moved[plan.origins[place]]
+    return [place for place, has in enumerate(moved) if has]
+
+
+def _find(forest: Forest, fixed: str, frame: str) -> Row | None:
+    try:
+        return find(forest, fixed, frame, LATEST, None)[1]
+    except TransformLookupError:
+        return None
