@@ -248,8 +248,7 @@ class Buffer:
             As `lookup`.
         """
         question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
-        moved: DataT = do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
-        return moved
+        return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
 
     def transform_nowait(
         self,
@@ -273,8 +272,7 @@ class Buffer:
             As `transform`.
         """
         question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
-        moved: DataT = do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
-        return moved
+        return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
 
     def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
         """Whether `lookup_nowait` with the same arguments has an answer now."""

@@ -11,11 +11,12 @@ from tfbus.data._arrays import CopiedByFields, as_floats
 from tfbus.data._header import check_header
 from tfbus.data.clouds import PointCloud
 from tfbus.geometry.read_only import read_only
+from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LaserScan(CopiedByFields):
+class LaserScan(CopiedByFields, PlainData):
     """One sweep of a planar laser, with the fields of sensor_msgs/LaserScan. Equal only to itself.
 
     Ray i goes in the plane z = 0 of `frame` at the angle ``angle_min + i * angle_increment``, counterclockwise from x
