@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from html import escape
 
-from tfbus.tree.edge_state import EdgeState, state_of
+from tfbus.tree.edge_state import STALE_AFTER, EdgeState, state_of
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import branches, facts
 
@@ -11,7 +11,14 @@ _PRE = "font-family: monospace; font-size: 12px; line-height: 1.35; margin: 0; w
 _MARK = "background: #f0e442; color: #000000"
 
 
-def to_html(edges: Sequence[Edge], now: int, *, marked: Collection[str] = (), with_facts: bool = True) -> str:
+def to_html(
+    edges: Sequence[Edge],
+    now: int,
+    stale_after: float = STALE_AFTER,
+    *,
+    marked: Collection[str] = (),
+    with_facts: bool = True,
+) -> str:
     """The edges as an indented tree, one frame a line, each frame in the colour of its state.
 
     Parameters
@@ -19,6 +26,8 @@ def to_html(edges: Sequence[Edge], now: int, *, marked: Collection[str] = (), wi
     edges : sequence of Edge
     now : int
         The stamp (ns) that ages are counted from.
+    stale_after : float
+        The age, in s, from which a moving frame is stale.
     marked : collection of str
         Frames to highlight.
     with_facts : bool
@@ -37,7 +46,7 @@ def to_html(edges: Sequence[Edge], now: int, *, marked: Collection[str] = (), wi
     for guides, frame, edge in drawn:
         style = "font-weight: bold"
         if edge is not None:
-            style += f"; color: {state_of(edge, now).value}"
+            style += f"; color: {state_of(edge, now, stale_after).value}"
         if frame in marked:
             style += f"; {_MARK}"
         line = f'{guides}<span style="{style}">{escape(frame)}</span>'

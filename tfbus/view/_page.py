@@ -103,6 +103,8 @@ class Page:
         self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self._live_tree = tree
         self._stale_after = stale_after
+        self._tree_key: object = None
+        self._tree_html = ""
         self._show(tree)
         if not live:
             start, end = span_of(forest_of(tree)) or (0, 0)
@@ -183,8 +185,8 @@ class Page:
             labels = scene.chain
         return Picture(scene, labels, np.concatenate([NO_SCENE.lines, *trails]))
 
-    def texts(self, now: int, drawn: int) -> Texts:
-        """The texts of the side panel, with ages from the stamp `now` (ns), and how many frames are drawn."""
+    def texts(self, now: int, scene: Scene) -> Texts:
+        """The texts of the side panel beside a scene, with ages from the stamp `now`, in ns."""
         at = self.timeline.stamp
         frames = tuple(self._tree.frames())
         then = now if at is None else at
@@ -195,15 +197,24 @@ class Page:
             facts = selection_facts(self._tree, self.fixed, self.selected, asked, then, delay)
         wanted = self.search.casefold()
         matches = [frame for frame in frames if wanted in frame.casefold()][:_MATCHES]
-        marked = () if self.selected is None else (self.selected,)
         return Texts(
-            self._status(frames, drawn),
+            self._status(frames, len(scene.frames)),
             _block(_table(facts) if facts else "Click on a frame, or search for one."),
-            _block(to_html(self._tree.edges(), then, marked=marked, with_facts=False) + legend()),
+            self._tree_text(frames, scene, then),
             _block("<br>".join(escape(str(event)) for event in reversed(self._events)) or "none so far"),
             frames,
             tuple(matches),
         )
+
+    def _tree_text(self, frames: tuple[str, ...], scene: Scene, then: int) -> str:
+        """The tree as HTML, which is long: made anew only if something in it has changed."""
+        key = (frames, scene.frames, scene.states, scene.parents.tobytes(), self.selected)
+        if key != self._tree_key:
+            self._tree_key = key
+            marked = () if self.selected is None else (self.selected,)
+            html = to_html(self._tree.edges(), then, self._stale_after, marked=marked, with_facts=False)
+            self._tree_html = _block(html + legend())
+        return self._tree_html
 
     def _status(self, frames: tuple[str, ...], drawn: int) -> str:
         line, fixed = self.timeline, self.fixed

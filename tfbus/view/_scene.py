@@ -31,6 +31,8 @@ class Scene(NamedTuple):
     """Of each frame's state, shape (n, 3)."""
     states: tuple[EdgeState, ...]
     """The state of the edge above each frame; a root is static."""
+    parents: npt.NDArray[np.intp]
+    """The place of each frame's parent, shape (n,); -1 for a root."""
     lines: Floats
     """From each frame to its parent, shape (m, 2, 3)."""
     line_colours: Colours
@@ -54,6 +56,7 @@ NO_SCENE = Scene(
     np.empty((0, 4), np.float32),
     np.empty((0, 3), np.uint8),
     (),
+    np.empty(0, np.intp),
     np.empty((0, 2, 3), np.float32),
     np.empty((0, 2, 3), np.uint8),
     (),
@@ -111,6 +114,7 @@ class SceneReader:
             wxyzs,
             colours,
             tuple(_STATES[code] for code in codes[drawn]),
+            parents,
             _lines(positions, children, parents[children]),
             np.repeat(colours[children][:, None], 2, axis=1),
             tuple(frames[place] for place in chain),

@@ -87,7 +87,7 @@ class Screen:
         self._panel.show_time()
         if texts or elapsed >= self._texts_due:
             self._texts_due = elapsed + _TEXTS_EVERY
-            self._panel.show(page.texts(now, len(picture.scene.frames)))
+            self._panel.show(page.texts(now, picture.scene))
 
     def _fit(self, scene: Scene) -> None:
         """Choose the length of the axes, and put the cameras where all frames are seen."""

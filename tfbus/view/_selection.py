@@ -7,7 +7,7 @@ from tfbus.errors import TransformLookupError
 from tfbus.stamps import SECOND, Latest, format_duration, format_stamp
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import format_rate
-from tfbus.tree.tree import TransformTree
+from tfbus.tree.tree import TransformTree, forest_of
 
 
 def selection_facts(
@@ -34,7 +34,10 @@ def selection_facts(
     dict of str to str
         By label, in the order in which people want to read them.
     """
-    edge = next((edge for edge in tree.edges() if edge.child == frame), None)
+    forest = forest_of(tree)
+    with forest.lock:
+        history = forest.frames.get(frame)
+        edge = None if history is None else history.edge()
     return {"frame": frame, **_pose_facts(tree, fixed, frame, at), **_edge_facts(edge, now, delay)}
 
 
