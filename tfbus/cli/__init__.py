@@ -19,6 +19,7 @@ from tfbus.cli.commands.echo import echo
 from tfbus.cli.commands.info import info
 from tfbus.cli.commands.listen import listen
 from tfbus.cli.commands.play import play
+from tfbus.cli.commands.plot import plot
 from tfbus.cli.commands.query import query
 from tfbus.cli.commands.record import record
 from tfbus.cli.commands.robot import robot
@@ -37,7 +38,7 @@ app = App(
     help="Stamped coordinate transforms for asyncio and trio.",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, view):
+for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, view, plot):
     app.command(command)
 
 

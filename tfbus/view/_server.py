@@ -38,13 +38,11 @@ def start_server(host: str, port: int) -> Server:
     free = _free_port(host, port)
     with _silent():
         server = Server(host, free, verbose=False)
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", control_layout="fixed")
-    server.gui.set_panel_label("tfbus")
-    # Its picture of a sky takes long to load, and to light a scene with where there is no graphics card.
-    server.scene.configure_environment_map(None)
-    server.scene.configure_default_lights(cast_shadow=False)
-    server.scene.add_light_ambient("/light", intensity=1.5)
-    server.scene.add_grid("/grid", infinite_grid=True, fade_distance=60.0, cell_size=1.0, section_size=5.0)
+    try:
+        _furnish(server)
+    except BaseException:
+        stop_server(server)
+        raise
     return server
 
 
@@ -52,6 +50,19 @@ def stop_server(server: viser.ViserServer) -> None:
     """Stop serving; in a worker thread, because it waits for viser's thread."""
     with _silent():
         server.stop()
+
+
+def _furnish(server: viser.ViserServer) -> None:
+    """Set up the empty page."""
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+    server.gui.main_panel.dock_right()
+    server.gui.set_panel_label("tfbus")
+    scene = server.scene
+    # viser's picture of a sky takes long to load, and to light a scene with where there is no graphics card.
+    scene.configure_environment_map(None)
+    scene.configure_default_lights(cast_shadow=False)
+    scene.add_light_ambient("/light", intensity=1.5)
+    scene.add_grid("/grid", infinite_grid=True, fade_distance=60.0, cell_size=1.0, section_size=5.0)
 
 
 def _free_port(host: str, port: int) -> int:
