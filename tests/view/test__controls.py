@@ -1,4 +1,5 @@
 import threading
+from functools import partial
 
 import anyio
 import pytest
@@ -16,9 +17,12 @@ async def test_functions_of_another_thread_are_called_on_the_loop_in_their_order
     controls = Controls(lambda: called.append("drawn"))
     controls.bind()
 
+    def note(number: int) -> None:
+        called.append((number, threading.get_ident()))
+
     def use() -> None:
         for number in range(3):
-            controls.put(lambda number=number: called.append((number, threading.get_ident())))
+            controls.put(partial(note, number))
         controls.put(done.set)
 
     thread = threading.Thread(target=use)
@@ -35,7 +39,7 @@ async def test_the_oldest_are_dropped_and_counted_when_there_are_too_many() -> N
     controls = Controls(lambda: None)
     controls.bind()
     for number in range(CAPACITY + 2):
-        controls.put(lambda number=number: called.append(number))
+        controls.put(partial(called.append, number))
     statistics = controls.statistics()
     assert (statistics.pending, statistics.dropped, statistics.overflow) == (CAPACITY, 2, "drop_oldest")
     await anyio.wait_all_tasks_blocked()

@@ -27,8 +27,9 @@ def solid(shape: Box | Cylinder | Sphere | Mesh, files: MeshFiles | None = None,
 
 
 def extents(found: Solid) -> list[float]:
+    """The lengths along x, y and z in m, to the micrometre."""
     vertices = found.triangles.vertices * np.array(found.scale, np.float32)
-    return [pytest.approx(length, abs=1e-6) for length in np.ptp(vertices, axis=0).tolist()]
+    return [round(float(length), 6) for length in np.ptp(vertices, axis=0)]
 
 
 @pytest.mark.parametrize("kind", ["stl", "obj", "dae"])

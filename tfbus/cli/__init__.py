@@ -16,6 +16,7 @@ from tfbus.cli.arguments import UsageError
 from tfbus.cli.commands.broadcast import broadcast
 from tfbus.cli.commands.demo import demo
 from tfbus.cli.commands.echo import echo
+from tfbus.cli.commands.foxglove import foxglove
 from tfbus.cli.commands.info import info
 from tfbus.cli.commands.listen import listen
 from tfbus.cli.commands.play import play
@@ -38,7 +39,7 @@ app = App(
     help="Stamped coordinate transforms for asyncio and trio.",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, view, plot):
+for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, view, plot, foxglove):
     app.command(command)
 
 
