@@ -127,9 +127,9 @@ def code_lines(path: Path) -> int:
     return sum(1 for number, line in lines if number not in docstrings and line.strip() and line.strip()[0] != "#")
 
 
-def test_every_module_is_in_a_room_of_the_plan_and_the_plan_has_at_most_26_rooms() -> None:
+def test_every_module_is_in_a_room_of_the_plan_and_the_plan_has_at_most_25_rooms() -> None:
     assert {room_of(module) for module in MODULES} == set(ROOMS)
-    assert len(ROOMS) <= 26
+    assert len(ROOMS.keys() - {"__init__", "__main__"}) <= 25
 
 
 def test_no_room_may_import_itself_through_another() -> None:

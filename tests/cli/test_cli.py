@@ -28,14 +28,17 @@ URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
         ("broadcast", ("--rate FLOAT", *LINK)),
         ("demo", ("--duration", "--rate", "--listen-rate", "--backend", "--simulated", "--no-broadcaster")),
         ("echo", ("TARGET", "SOURCE", "--rate FLOAT", "--max-age FLOAT", "--json", *LINK)),
+        ("foxglove", ("--port INT", *LINK)),
         ("info", ("FILE", "--json")),
         ("listen", ("--rate FLOAT", *LINK)),
         ("play", ("FILE", "--rate FLOAT", "--loop", "--from SECONDS", "--to SECONDS", *LINK)),
+        ("plot", ("FILE", "FRAMES", "--output", "--path", "--3d", "--gaps", "--text", "--compare PATH")),
         ("query", ("FILE", "TARGET", "SOURCE", "--at SECONDS", "--every SECONDS", "--csv", "--json")),
         ("record", ("FILE", "--duration FLOAT", "--overwrite", *LINK)),
         ("robot", ("FILE", "POSITION", "--tree", "--rate FLOAT", "--prefix STR", *LINK)),
         ("static", ("PARENT", "CHILD", "--xyz", "--rpy", "--quaternion", "--authority STR", *LINK)),
-        ("tree", ("--duration FLOAT", "--watch", "--rate FLOAT", "--dot PATH", "--json", *LINK)),
+        ("tree", ("--duration FLOAT", "--watch", "--rate FLOAT", "--dot PATH", "--svg PATH", "--json", *LINK)),
+        ("view", ("FILE", "--urdf PATH", "--package-path PATH", "--fixed STR", "--trail STR", "--port INT", *LINK)),
     ],
 )
 def test_the_help_of_a_command_has_an_example_and_every_option(
@@ -56,7 +59,8 @@ def test_the_help_of_a_command_has_an_example_and_every_option(
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = ["broadcast", "demo", "echo", "info", "listen", "play", "query", "record", "robot", "static", "tree"]
+    commands = ["broadcast", "demo", "echo", "foxglove", "info", "listen", "play", "plot", "query", "record", "robot"]
+    commands += ["static", "tree", "view"]
     assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands
 
 

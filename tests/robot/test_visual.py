@@ -60,7 +60,7 @@ def test_a_link_has_any_number_of_visuals_in_the_order_of_the_file() -> None:
     "shape", ['<sphere radius="nan"/>', '<box size="1 inf 1"/>', '<mesh filename="a" scale="nan 1 1"/>']
 )
 def test_a_size_that_is_not_finite_names_its_link(shape: str) -> None:
-    with pytest.raises(InvalidRobotError, match='<link name="base">.*not finite'):
+    with pytest.raises(InvalidRobotError, match=r'<link name="base">.*not finite'):
         read_visuals(shaped(shape))
 
 

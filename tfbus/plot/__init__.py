@@ -8,6 +8,7 @@ try:
     from tfbus.plot.gaps import plot_gaps
     from tfbus.plot.path import plot_path
     from tfbus.plot.transforms import plot_transforms
+    from tfbus.plot.window import show_in_window
 except ImportError as error:
     if error.name is None or error.name.startswith("tfbus"):
         raise
@@ -24,5 +25,6 @@ __all__ = [
     "plot_transforms",
     "read_reception",
     "read_series",
+    "show_in_window",
     "sparklines",
 ]

@@ -56,7 +56,7 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None) 
                 linewidth=5,
                 solid_capstyle="butt",
             )
-    strips.set_yticks(range(len(frames)), [frame.frame for frame in frames], fontsize=7)
+    strips.set_yticks(range(len(frames)), list(reception), fontsize=7)
     strips.set_ylim(len(frames) - 0.5, -0.5)
     strips.set_xlabel("time from the start [s]")
     strips.set_title("heard (static: dotted)")

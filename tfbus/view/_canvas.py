@@ -45,6 +45,7 @@ class Canvas:
         self._axes_length = 0.0
         self._labels: list[viser.LabelHandle] = []
         self._clouds: dict[str, viser.PointCloudHandle] = {}
+        self._clouds_added = 0
         scene = server.scene
         nothing = np.empty((0, 2, 3), np.float32)
         self._lines = scene.add_line_segments(
@@ -76,8 +77,12 @@ class Canvas:
         colours = np.asarray(colour)
         if colours.ndim == 2:
             colours = colours[np.isfinite(cloud.points).all(axis=1)]
+        if name not in self._clouds:
+            self._clouds_added += 1
+        # A name may have letters that viser's names give a meaning.
+        node = self._clouds[name].name if name in self._clouds else f"/points/{self._clouds_added}"
         self._clouds[name] = self._server.scene.add_point_cloud(
-            f"/points/{len(self._clouds) if name not in self._clouds else self._clouds[name].name.rsplit('/', 1)[1]}",
+            node,
             points.astype(np.float32),
             colours,
             point_size=size,

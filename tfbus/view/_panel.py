@@ -1,6 +1,6 @@
 """The side panel of the page, in viser: what people choose, and what they read."""
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
 import viser
@@ -73,9 +73,9 @@ class Panel:
         self._chosen(self.axes_length, lambda _: None)
         self._chosen(self.robot, lambda _: None)
         modes = {"Live": page.go_live, "Pause": page.freeze, "Play": page.play}
-        self._mode.on_click(lambda event: post(modes[event.target.value]))
-        self._step.on_click(lambda event: self._post_step(event.target.value == "▶"))
-        trail.on_click(lambda _: post(page.toggle_trail))
+        self._pressed(self._mode, lambda value: modes[value]())
+        self._pressed(self._step, lambda value: page.step(value == "▶"))
+        self._pressed(trail, lambda _: page.toggle_trail())
 
     def show(self, texts: Texts) -> None:
         """Bring the panel to these texts."""
@@ -100,17 +100,21 @@ class Panel:
 
     def _chosen(self, control: Any, choose: Callable[[Any], object]) -> None:
         """Call a function on the event loop with each value that somebody chooses in a browser."""
+        control.on_update(self._callback(choose))
 
-        def updated(event: Any) -> None:
+    def _pressed(self, control: Any, choose: Callable[[Any], object]) -> None:
+        """Call a function on the event loop with the name of each button that somebody presses."""
+        control.on_click(self._callback(choose))
+
+    def _callback(self, choose: Callable[[Any], object]) -> Callable[[Any], Awaitable[None]]:
+        # viser calls an async function on its own loop, in the order of the events, and others in many threads.
+        async def used(event: Any) -> None:
             # What the program itself sets has no client.
             if event.client_id is not None:
                 value = event.target.value
                 self._post(lambda: choose(value))
 
-        control.on_update(updated)
-
-    def _post_step(self, forward: bool) -> None:
-        self._post(lambda: self._page.step(forward))
+        return used
 
     def _find(self, text: str) -> None:
         page = self._page

@@ -1,6 +1,5 @@
 """``tfbus plot``."""
 
-import os
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -100,10 +99,9 @@ def _finish(draw: Callable[[Any], Any], output: Path | None, kind: str | None) -
         draw(None).savefig(picture, format=kind, dpi=150)
         write_file(output, picture.getvalue())
         return
-    import matplotlib.pyplot as plt
+    from tfbus.plot import show_in_window
 
-    if plt.get_backend().lower() == "agg":
-        display = "there is no display" if not os.environ.get("DISPLAY") else "matplotlib has no window here"
-        raise UsageError(f"{display}: write a picture with -o, or print the curves with --text")
-    draw(plt.figure(layout="constrained", figsize=(10.0, 6.5)))
-    plt.show()
+    try:
+        show_in_window(draw)
+    except RuntimeError as error:
+        raise UsageError(f"{error}: write a picture with -o, or print the curves with --text") from None
