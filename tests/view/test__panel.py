@@ -39,7 +39,8 @@ class Used:
 
     def show(self) -> None:
         self.panel.show(self.page.texts(0, self.page.picture(0).scene))
-        self.panel.show_time()
+        line = self.page.timeline
+        self.panel.show_time(None if line.stamp is None else (line.stamp, line.start, line.end))
 
 
 @pytest.fixture
@@ -54,13 +55,14 @@ def test_what_is_chosen_reaches_the_page(used: Used) -> None:
     used.choose(panel._frame, "lidar")
     used.choose(panel._labels, "all")
     used.choose(panel._speed, "× 2")
-    used.show()
-    assert (page.fixed, panel._frame.value, page.labels, page.timeline.speed) == ("base", "lidar", "all", 2.0)
+
+    def choices() -> tuple[str | None, str | None, str, float]:
+        return page.chosen_fixed, page.selected, page.labels, page.timeline.speed
+
+    assert choices() == ("base", "lidar", "all", 2.0)
     used.choose(panel._fixed, LARGEST)
     used.choose(panel._frame, NONE)
-    assert page.fixed == "map"
-    used.show()
-    assert panel._frame.value == NONE
+    assert choices() == (None, None, "all", 2.0)
 
 
 def test_what_the_program_sets_is_no_choice(used: Used) -> None:

@@ -15,19 +15,23 @@ def shown(page: Page, server: object) -> Screen:
     return Screen(server, page, (), lambda control: control())  # type: ignore[arg-type]
 
 
+def draw(screen: Screen, elapsed: int, texts: bool = False) -> None:
+    screen.show(screen.read(0, elapsed, texts))
+
+
 def test_the_texts_are_written_at_once_if_wanted_else_twice_a_second() -> None:
     tree = tree_of(static("map", "base", 1.0))
     page = Page(tree)
     with viser_page() as server:
         screen = shown(page, server)
-        screen.draw(0, 10 * SECOND, texts=False)
+        draw(screen, 10 * SECOND)
         page.select("base")
-        screen.draw(0, 10 * SECOND + SECOND // 4, texts=False)
+        draw(screen, 10 * SECOND + SECOND // 4)
         assert "Click" in screen._panel._selection.content
-        screen.draw(0, 10 * SECOND + SECOND // 2, texts=False)
+        draw(screen, 10 * SECOND + SECOND // 2)
         assert "base" in screen._panel._selection.content
         page.select(None)
-        screen.draw(0, 10 * SECOND + SECOND // 2, texts=True)
+        draw(screen, 10 * SECOND + SECOND // 2, texts=True)
         assert "Click" in screen._panel._selection.content
 
 
@@ -35,12 +39,12 @@ def test_the_first_frames_decide_the_camera_and_the_length_of_the_axes() -> None
     tree = tree_of(static("map", "a", 4.0), static("map", "b", -2.0))
     with viser_page() as server:
         screen = shown(Page(tree), server)
-        screen.draw(0, 0, texts=True)
+        draw(screen, 0, texts=True)
         # A quarter of the mean of 4 m and 2 m.
         assert screen._panel.axes_length.value == pytest.approx(0.75)
         assert server.initial_camera.look_at.tolist() == [1.0, 0.0, 0.0]
         tree.insert(static("map", "c", 100.0))
-        screen.draw(0, 0, texts=True)
+        draw(screen, 0, texts=True)
         assert server.initial_camera.look_at.tolist() == [1.0, 0.0, 0.0]
 
 
@@ -59,7 +63,7 @@ def test_points_with_a_stamp_stay_where_their_frame_was_and_others_move_with_it(
         )
 
         def places() -> dict[str, float | None]:
-            screen.draw(0, 0, texts=False)
+            draw(screen, 0)
             clouds = screen._canvas._clouds
             return {name: cloud.position[0] if cloud.visible else None for name, cloud in clouds.items()}
 

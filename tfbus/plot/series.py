@@ -71,20 +71,7 @@ def read_series(tree: TransformTree, target: str, source: str, samples: int = SA
         stamps = np.array([newest.stamp], np.int64)
         found = tree.lookup_many(target, source, stamps)
     seconds = (stamps - first).astype(np.float64) / SECOND
-    return Series(target, source, stamps, seconds, found.translations, roll_pitch_yaw(found.rotations), newest.static)
-
-
-def roll_pitch_yaw(rotations: Floats) -> Floats:
-    """Roll, pitch and yaw in degrees of quaternions (x, y, z, w), shape (n, 4); the result has shape (n, 3).
-
-    The angles are about the fixed axes x, y and z, in this order (J. Diebel, "Representing attitude", 2006, section 8).
-    """
-    x, y, z, w = rotations.T
-    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    angles: Floats = np.degrees(np.stack((roll, pitch, yaw), axis=1))
-    return angles
+    return Series(target, source, stamps, seconds, found.translations, np.degrees(found.as_rpy()), newest.static)
 
 
 def _span(tree: TransformTree) -> tuple[int, int]:

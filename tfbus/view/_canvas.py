@@ -61,15 +61,14 @@ class Canvas:
     def draw(self, picture: Picture, axes_length: float) -> None:
         """Bring the browsers to a picture, with axes of a length in m."""
         scene = picture.scene
-        with self._server.atomic():
-            self._draw_frames(scene, axes_length)
-            self._lines.points = scene.lines
-            self._lines.colors = scene.line_colours
-            self._chain.points = scene.chain_lines
-            self._trails.points = picture.trails
-            self._draw_labels(scene, picture.labels)
-            if self._solids is not None:
-                self._solids.draw(scene)
+        self._draw_frames(scene, axes_length)
+        self._lines.points = scene.lines
+        self._lines.colors = scene.line_colours
+        self._chain.points = scene.chain_lines
+        self._trails.points = picture.trails
+        self._draw_labels(scene, picture.labels)
+        if self._solids is not None:
+            self._solids.draw(scene)
 
     def add_points(self, name: str, cloud: PointCloud, size: float, colour: Any) -> None:
         """Add points, or replace those of the same name; they are hidden until they have a pose."""

@@ -51,6 +51,9 @@ class Texts(NamedTuple):
     """All frames, sorted."""
     matches: tuple[str, ...]
     """The frames that match the search, sorted."""
+    fixed: str | None
+    """The fixed frame that was chosen; None for the root of the largest tree."""
+    selected: str | None
 
 
 class Page:
@@ -118,7 +121,11 @@ class Page:
     @property
     def fixed(self) -> str | None:
         """The fixed frame; None while there are no frames."""
-        return largest_root(forest_of(self._tree)) if self.chosen_fixed is None else self.chosen_fixed
+        if self.chosen_fixed is not None:
+            return self.chosen_fixed
+        if self._root is None or self._root not in self._tree or self._tree.parent(self._root) is not None:
+            self._root = largest_root(forest_of(self._tree))
+        return self._root
 
     def freeze(self) -> None:
         """Stand still at the newest stamp, on a copy of the history: the live one would forget it after a while."""
@@ -188,6 +195,8 @@ class Page:
     def texts(self, now: int, scene: Scene) -> Texts:
         """The texts of the side panel beside a scene, with ages from the stamp `now`, in ns."""
         at = self.timeline.stamp
+        # Not for each picture, because all frames are counted.
+        self._root = None
         frames = tuple(self._tree.frames())
         then = now if at is None else at
         facts: dict[str, str] = {}
@@ -204,6 +213,8 @@ class Page:
             _block("<br>".join(escape(str(event)) for event in reversed(self._events)) or "none so far"),
             frames,
             tuple(matches),
+            self.chosen_fixed,
+            self.selected,
         )
 
     def _tree_text(self, frames: tuple[str, ...], scene: Scene, then: int) -> str:
@@ -232,6 +243,7 @@ class Page:
 
     def _show(self, tree: TransformTree) -> None:
         self._tree = tree
+        self._root: str | None = None
         self._scenes = SceneReader(forest_of(tree), self._stale_after)
 
 

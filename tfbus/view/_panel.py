@@ -83,20 +83,18 @@ class Panel:
         self._selection.content = texts.selection
         self._tree.content = texts.tree
         self._events.content = texts.events
-        page = self._page
-        chosen = page.chosen_fixed
-        _choices(self._fixed, LARGEST, texts.frames, chosen)
-        _choices(self._frame, NONE, texts.matches, page.selected)
+        _choices(self._fixed, LARGEST, texts.frames, texts.fixed)
+        _choices(self._frame, NONE, texts.matches, texts.selected)
 
-    def show_time(self) -> None:
-        """Bring the slider to the chosen stamp."""
-        line = self._page.timeline
-        self._slider.disabled = line.stamp is None
-        if line.stamp is not None:
-            length = max((line.end - line.start) / SECOND, _SLIDER_STEP)
+    def show_time(self, chosen: tuple[int, int, int] | None) -> None:
+        """Bring the slider to the chosen stamp of a span, which begins and ends at two others, in ns."""
+        self._slider.disabled = chosen is None
+        if chosen is not None:
+            stamp, start, end = chosen
+            length = max((end - start) / SECOND, _SLIDER_STEP)
             if self._slider.max != length:
                 self._slider.max = length
-            set_value(self._slider, (line.stamp - line.start) / SECOND)
+            set_value(self._slider, (stamp - start) / SECOND)
 
     def _chosen(self, control: Any, choose: Callable[[Any], object]) -> None:
         """Call a function on the event loop with each value that somebody chooses in a browser."""

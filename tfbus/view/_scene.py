@@ -106,14 +106,14 @@ class SceneReader:
         wxyzs = poses.columns[[6, 3, 4, 5]][:, drawn].T.astype(np.float32)
         colours = _PALETTE[codes[drawn]]
         children = np.flatnonzero(parents >= 0)
-        frames = tuple(poses.frames[place] for place in drawn)
+        frames = poses.frames if len(drawn) == len(poses.frames) else tuple(poses.frames[place] for place in drawn)
         chain = _chain(frames, parents, selected)
         return Scene(
             frames,
             positions,
             wxyzs,
             colours,
-            tuple(_STATES[code] for code in codes[drawn]),
+            tuple(map(_STATES.__getitem__, codes[drawn].tolist())),
             parents,
             _lines(positions, children, parents[children]),
             np.repeat(colours[children][:, None], 2, axis=1),

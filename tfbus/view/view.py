@@ -4,7 +4,7 @@ import logging
 import os
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,6 +15,7 @@ import anyio.lowlevel
 import anyio.to_thread
 import numpy as np
 
+from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
 from tfbus._log import OnceLogger
 from tfbus.buffer.buffer import Buffer
@@ -32,7 +33,7 @@ from tfbus.tree.edge_state import STALE_AFTER
 from tfbus.view._controls import Controls
 from tfbus.view._meshes import MeshFiles, Solid, solids_of
 from tfbus.view._page import Page
-from tfbus.view._screen import Points, Screen
+from tfbus.view._screen import Points, Screen, Sight
 from tfbus.view._server import Server, start_server, stop_server
 
 _AT_LEAST_EVERY = 0.5
@@ -129,6 +130,8 @@ class View:
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._controls = Controls(self._control_used)
         self._changed = anyio.Event()
+        self._drawn = anyio.Event()
+        self._drawn_waker = LoopWaker(lambda: self._drawn.set())
         self._texts_wanted = True
         self._entered = False
         self._page: Page
@@ -200,6 +203,7 @@ class View:
             raise BusClosedError
         self._entered = True
         self._controls.bind()
+        self._drawn_waker.bind()
         fixed, trails, live, stale_after = self._page_options
         self._page = Page(self._buffer.tree, fixed, trails, live, stale_after)
         # What a thread has started must not be lost to a cancellation.
@@ -262,19 +266,38 @@ class View:
                     elapsed = time.monotonic_ns()
                     self._page.timeline.advance((elapsed - before) / 1e9)
                     before = elapsed
-                    self._draw(elapsed)
+                    await self._draw(elapsed)
                     await anyio.sleep(self._period)
                     if not self._page.timeline.playing:
                         with anyio.move_on_after(_AT_LEAST_EVERY):
                             await self._changed.wait()
             tasks.cancel_scope.cancel()
 
-    def _draw(self, elapsed: int) -> None:
+    async def _draw(self, elapsed: int) -> None:
+        """Read the page here, have viser's thread show it, and wait until it has."""
         texts, self._texts_wanted = self._texts_wanted, False
+        drawn = self._drawn = anyio.Event()
         try:
-            self._screen.draw(self.bus.clock.now(), elapsed, texts)
+            assert self._server is not None
+            sight = self._screen.read(self.bus.clock.now(), elapsed, texts)
+            self._server.get_event_loop().call_soon_threadsafe(self._show_sight, sight)
         except Exception as error:  # noqa: BLE001 - a picture that fails must not end the program that it is of
-            self._log.warning((type(error), str(error)), "the page could not be drawn: %r", error)
+            self._warn(error)
+        else:
+            await drawn.wait()
+
+    def _show_sight(self, sight: Sight) -> None:
+        """Show what was read; called in viser's thread."""
+        try:
+            self._screen.show(sight)
+        except Exception as error:  # noqa: BLE001 - as above
+            self._warn(error)
+        # The event loop may have ended before the server.
+        with suppress(RuntimeError):
+            self._drawn_waker.wake()
+
+    def _warn(self, error: Exception) -> None:
+        self._log.warning((type(error), str(error)), "the page could not be drawn: %r", error)
 
     @contextmanager
     def _listening(self) -> Iterator[None]:
