@@ -12,6 +12,7 @@ import pytest
 import tfbus
 from tfbus import (
     LATEST,
+    AheadError,
     BusClosedError,
     ClockResetError,
     DisconnectedError,
@@ -87,6 +88,17 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         ),
         "frame 'base_link': asked for 3.000 s within 50 ms, between samples at 2.500 s and 4.500 s, "
         "which are 2 s apart (at most 500 ms), from 'odometry'",
+    ),
+    (
+        AheadError(
+            child="base_link",
+            stamp=from_seconds(13),
+            oldest=from_seconds(2.5),
+            newest=from_seconds(16),
+            authority="odometry",
+        ),
+        "frame 'base_link': asked for the latest up to 13.000 s, newest sample is 16.000 s (3 s too new), "
+        "from 'odometry'",
     ),
     (
         LookupTimeoutError(target="map", source="base_link", timeout=0.25, missing=SHORT),
@@ -420,6 +432,18 @@ def test_the_message_of_an_error_of_many_lookups_has_the_index(error: TransformL
     for twin in (pickle.loads(pickle.dumps(one_of_many)), copy.deepcopy(one_of_many)):
         assert_same_error(twin, one_of_many)
         assert twin.index == 17
+
+
+def test_similar_names_are_looked_for_only_when_a_timeout_is_shown() -> None:
+    missing = UnknownFrameError(frame="bse", known=_Unread(["base"]))
+    late = LookupTimeoutError(target="map", source="bse", timeout=1.0, missing=missing)
+    with pytest.raises(AssertionError):
+        str(late)
+
+
+class _Unread(list[str]):
+    def __iter__(self) -> Iterator[str]:
+        raise AssertionError
 
 
 class Foreign(Exception):

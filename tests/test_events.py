@@ -15,6 +15,7 @@ from tfbus import (
     FrameStale,
     InvalidTransformError,
     KindChanged,
+    PastLoop,
     PeerJoined,
     PeerLost,
     PeerRejected,
@@ -22,6 +23,7 @@ from tfbus import (
     RecordingFailed,
     Reparented,
     SampleRejected,
+    StampAhead,
     SubscriberFailed,
 )
 
@@ -38,6 +40,10 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
         "frame 'odom' comes from two authorities, 'slam' and 'odometry'",
     ),
     (
+        PastLoop(AT, "cup", "hand", "cell", 10 * SECOND, ("cup", "hand", "cup")),
+        "the frames cup -> hand -> cup form a loop at 10.000 s, with late data of 'cell'",
+    ),
+    (
         SampleRejected(AT, "cycle", "a", "b", "rogue", InvalidTransformError("no\nloops", reason="cycle")),
         "a sample from 'rogue' was rejected: no loops",
     ),
@@ -50,6 +56,10 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
         "frame 'base' is stale, its newest sample from 'odometry' is 500 ms old",
     ),
     (FrameLive(AT, "base", AT, "odometry"), "frame 'base' is live again, from 'odometry'"),
+    (
+        StampAhead(AT, "base", AT + 3600 * SECOND, "peer"),
+        "frame 'base' has a sample 3600 s ahead of the clock, from 'peer'",
+    ),
     (ClockReset(AT, 90 * SECOND), "the clock jumped back from 90.000 s"),
     (SubscriberFailed(AT, "print", OSError("full")), "the subscriber print raised OSError('full')"),
     (PeerJoined(AT, "tf", "5eed"), "peer 5eed has joined tf"),

@@ -27,6 +27,7 @@ from tfbus.data import (
     do_transform,
 )
 from tfbus.errors import (
+    AheadError,
     BusClosedError,
     ClockResetError,
     DisconnectedError,
@@ -51,6 +52,7 @@ from tfbus.events import (
     FrameRemoved,
     FrameStale,
     KindChanged,
+    PastLoop,
     PeerJoined,
     PeerLost,
     PeerRejected,
@@ -58,6 +60,7 @@ from tfbus.events import (
     RecordingFailed,
     Reparented,
     SampleRejected,
+    StampAhead,
     SubscriberFailed,
 )
 from tfbus.geometry.stamped import TransformStamped
@@ -87,6 +90,7 @@ from tfbus.waiting.waiting_index import PendingLookup
 __all__ = [
     "LATEST",
     "SECOND",
+    "AheadError",
     "AuthorityConflict",
     "Buffer",
     "BufferStatistics",
@@ -123,6 +127,7 @@ __all__ = [
     "Mimic",
     "Outcome",
     "PastExtrapolationError",
+    "PastLoop",
     "PeerJoined",
     "PeerLost",
     "PeerRejected",
@@ -146,6 +151,7 @@ __all__ = [
     "RobotStatistics",
     "SampleRejected",
     "SimulatedClock",
+    "StampAhead",
     "Stamped",
     "Stream",
     "SubscriberFailed",

@@ -10,6 +10,7 @@
                 FutureExtrapolationError                                      waiting may help
                 PastExtrapolationError                                        waiting cannot help: raised at once
                 GapError                   .before .after .max_gap            waiting cannot help: raised at once
+                AheadError                                                    waiting cannot help: raised at once
             LookupTimeoutError (TimeoutError)  __cause__ is the last lookup error
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         InvalidRobotError (ValueError)         .element
@@ -183,7 +184,7 @@ class DisconnectedError(TransformLookupError):
         The stamp at which they are not connected, in ns; None for a lookup of the newest samples.
     loop : tuple of str
         Frames that form a loop of parents at that stamp, the first one repeated at the end; empty if there is none.
-        Only out-of-order samples can form one.
+        Only samples that came late or out of order can form one.
     """
 
     target: str
@@ -229,6 +230,10 @@ class ExtrapolationError(TransformLookupError):
         The sender of the edge's newest sample; may be empty.
     slack : int
         The greatest distance between the stamp and a sample that the policy allowed, in ns.
+    ahead : int
+        The time from the clock's now to the edge's newest stamp, in ns, if that is more than the `max_ahead` of the
+        bus: then right samples are older than it, and may have expired. Otherwise 0, as in all errors of a tree without
+        a bus.
     """
 
     child: str
@@ -237,6 +242,7 @@ class ExtrapolationError(TransformLookupError):
     newest: int | None
     authority: str
     slack: int
+    ahead: int = 0
 
     def __init__(
         self,
@@ -256,15 +262,19 @@ class ExtrapolationError(TransformLookupError):
         self.authority = authority
         self.slack = slack
 
+    def _asked(self) -> str:
+        asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
+        return f"{asked} within {format_duration(self.slack)}" if self.slack else asked
+
     def _gap(self) -> str:
         return "there is no sample in its window"
 
     def _why(self) -> str:
-        asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
-        if self.slack:
-            asked += f" within {format_duration(self.slack)}"
         sender = f", from {self.authority!r}" if self.authority else ""
-        return f"frame {self.child!r}: asked for {asked}, {self._gap()}{sender}"
+        if self.ahead:
+            ahead = format_duration(self.ahead)
+            sender += f"; its newest stamp is {ahead} ahead of the clock, and right samples expire"
+        return f"frame {self.child!r}: asked for {self._asked()}, {self._gap()}{sender}"
 
 
 class FutureExtrapolationError(ExtrapolationError):
@@ -273,7 +283,8 @@ class FutureExtrapolationError(ExtrapolationError):
     Attributes
     ----------
     others : tuple of str
-        Other child frames whose next sample may also give an answer; empty unless a policy is used with `LATEST`.
+        Other child frames whose next sample may also give an answer; empty unless a policy is used with `LATEST`, or
+        two ways lead round a loop of parents at the stamp.
     """
 
     others: tuple[str, ...] = ()
@@ -323,6 +334,22 @@ class GapError(ExtrapolationError):
         )
 
 
+class AheadError(ExtrapolationError):
+    """The newest answer is further ahead of the clock than `max_age` allows. Waiting for samples cannot help.
+
+    `stamp` is the newest stamp that was allowed, in ns; `child` is the edge that has come no further than the answer.
+    """
+
+    def _asked(self) -> str:
+        return f"the latest up to {super()._asked()}"
+
+    def _gap(self) -> str:
+        if self.newest is None or isinstance(self.stamp, Latest):
+            return "it has no samples"
+        late = format_duration(self.newest - self.stamp)
+        return f"newest sample is {format_stamp(self.newest)} ({late} too new)"
+
+
 class LookupTimeoutError(TransformLookupError, TimeoutError):
     """The timeout of an awaited lookup expired; ``__cause__`` is the lookup error at that moment.
 
@@ -340,12 +367,20 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
     target: str
     source: str
     timeout: float
+    _missing: BaseException | None = None
 
     def __init__(self, *, target: str, source: str, timeout: float, missing: TransformLookupError) -> None:
-        super().__init__(f"no transform from {source!r} to {target!r} within {timeout:g} s: {missing}")
+        super().__init__()
         self.target = target
         self.source = source
         self.timeout = timeout
+        self._missing = missing
+
+    def _why(self) -> str:
+        # Not earlier, because a thousand timeouts at once would look for the similar names of a thousand frames.
+        # One that comes back from JSON has only its cause.
+        missing = self.__cause__ if self._missing is None else self._missing
+        return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {missing}"
 
 
 class InvalidTransformError(TransformError, ValueError):

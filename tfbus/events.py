@@ -111,6 +111,40 @@ class SampleRejected:
 
 
 @dataclass(frozen=True, slots=True)
+class PastLoop:
+    """Late samples form a loop of parents at a past stamp; the newest parents form none.
+
+    An event stream gives it once for each frame, parent and authority, as it does `SampleRejected`; the ``looped`` of
+    each buffer in ``statistics().buffers`` counts every sample.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the event, in ns.
+    frame, parent, authority : str
+        Of the sample that closes the loop. It is stored.
+    at : int
+        The first stamp of the loop from that of the sample on, in ns.
+    loop : tuple of str
+        The frames of the loop from child to parent, the first one repeated at the end.
+    """
+
+    stamp: int
+    frame: str
+    parent: str
+    authority: str
+    at: int
+    loop: tuple[str, ...]
+
+    def __str__(self) -> str:
+        frames = " -> ".join(self.loop)
+        return _line(
+            self.stamp,
+            f"the frames {frames} form a loop at {format_stamp(self.at)}, with late data of {self.authority!r}",
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class FrameStale:
     """The newest sample of a moving frame is older than the event stream's `stale_after`.
 
@@ -157,6 +191,36 @@ class FrameLive:
 
     def __str__(self) -> str:
         return _line(self.stamp, f"frame {self.frame!r} is live again, from {self.authority!r}")
+
+
+@dataclass(frozen=True, slots=True)
+class StampAhead:
+    """The newest sample of a frame is ahead of the clock by more than the `max_ahead` of the bus.
+
+    Until the clock has reached it, samples with right stamps are older than the newest one, and they expire once they
+    are older than the window. An event stream gives it once for each frame and authority, until the frame is removed or
+    added or the clock jumps back. With ``reject_ahead=True`` the sample was refused, and nothing expires.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the event, in ns.
+    frame, authority : str
+        The frame, and the sender of the sample.
+    newest : int
+        The stamp of the sample, in ns.
+    """
+
+    stamp: int
+    frame: str
+    newest: int
+    authority: str
+
+    def __str__(self) -> str:
+        ahead = format_duration(self.newest - self.stamp)
+        return _line(
+            self.stamp, f"frame {self.frame!r} has a sample {ahead} ahead of the clock, from {self.authority!r}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,8 +377,10 @@ Event = (
     | KindChanged
     | AuthorityConflict
     | SampleRejected
+    | PastLoop
     | FrameStale
     | FrameLive
+    | StampAhead
     | ClockReset
     | SubscriberFailed
     | PeerJoined

@@ -242,3 +242,10 @@ def format_duration(nanoseconds: int) -> str:
             digits = f"{nanoseconds / unit:.0f}" if size >= 100 * unit else f"{nanoseconds / unit:.3g}"
             return f"{digits} {name}"
     return f"{nanoseconds} ns"
+
+
+def format_age(nanoseconds: int) -> str:
+    """The text of an age: ``age 410 ms``; or ``2.5 s ahead``, if it is negative."""
+    if nanoseconds < 0:
+        return f"{format_duration(-nanoseconds)} ahead"
+    return f"age {format_duration(nanoseconds)}"

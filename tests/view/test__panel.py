@@ -73,7 +73,8 @@ def test_what_the_program_sets_is_no_choice(used: Used) -> None:
 
 def test_a_search_with_one_match_selects_it(used: Used) -> None:
     used.choose(used.panel._search, "a")
-    assert used.page.selected is None
+    used.show()
+    assert used.panel._frame.value == NONE
     used.choose(used.panel._search, "LID")
     assert (used.page.selected, used.page.search) == ("lidar", "LID")
     used.show()

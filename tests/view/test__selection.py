@@ -51,6 +51,11 @@ def test_a_frame_without_a_pose_says_why_and_keeps_the_other_facts() -> None:
     assert selection_facts(tree, None, "a", LATEST, 0)["pose"] == "there is no fixed frame"
 
 
+def test_a_stamp_ahead_of_the_clock_is_told() -> None:
+    facts = selection_facts(tree_of(moving("map", "a", 3 * SECOND)), "map", "a", LATEST, SECOND)
+    assert facts["age"] == "2 s ahead"
+
+
 def test_a_root_has_no_parent() -> None:
     facts = selection_facts(tree_of(static("map", "a", 2.0)), "a", "map", LATEST, 0)
     assert facts["parent"] == "none, it is a root"

@@ -1,33 +1,31 @@
 """Lookups that wait: parked under the frames that they lack, woken by new samples, and tried again."""
 
-import logging
 import math
 from collections.abc import Callable
+from contextlib import nullcontext, suppress
 
 import anyio
 import anyio.lowlevel
 
-from tfbus._log import OnceLogger
+from tfbus.buffer._hanging_report import REPORT_AFTER, HangingReport
 from tfbus.buffer._local_names import LocalNames
 from tfbus.clock import Clock
 from tfbus.errors import (
     MAY_COME,
     BusClosedError,
     ClockResetError,
+    ExtrapolationError,
     LookupTimeoutError,
     TransformLookupError,
     UnknownFrameError,
 )
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import LATEST, Latest, as_duration, from_seconds
-from tfbus.tree.lookup import answer
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from_seconds
+from tfbus.tree.lookup import Bounds, answer
 from tfbus.tree.question import Question
 from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.waiting_index import Waiter, blocking_frames, without_traceback
-
-REPORT_AFTER = 5.0
-"""A lookup that has waited for longer than this, in s, is logged."""
+from tfbus.waiting.waiting_index import Waiter, without_traceback
 
 
 class Lookups:
@@ -40,6 +38,8 @@ class Lookups:
         The clock of timeouts and ages.
     check_thread : callable
         Raises unless the calling thread may wait here.
+    newest_plausible : callable
+        Gives the greatest stamp, in ns, that is not ahead of the clock now.
     local_names : LocalNames, optional
         Translates the answers. Questions, errors and log lines have the names of the bus.
     """
@@ -49,41 +49,58 @@ class Lookups:
         live: LiveTree,
         clock: Clock,
         check_thread: Callable[[], object],
+        newest_plausible: Callable[[], int],
         local_names: LocalNames | None = None,
     ) -> None:
         self._live = live
         self._clock = clock
         self._check_thread = check_thread
+        self._newest_plausible = newest_plausible
         self._local_names = local_names
-        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._report = HangingReport(live.waiting, clock)
 
-    def not_before(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> int | None:
-        """The oldest stamp that counts as `LATEST` now, in ns; None for any."""
+    def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
+        """The stamps that count as `LATEST` now; None for any."""
         if at is not LATEST and source_at is not LATEST:
             raise TypeError("max_age goes with LATEST: an answer at a given stamp never gets newer")
         if as_duration(max_age, "max_age") == math.inf:
             return None
-        return self._clock.now() - from_seconds(max_age)
+        now, age = self._clock.now(), from_seconds(max_age)
+        return Bounds(max(now - age, STAMP_MIN), min(now + age, STAMP_MAX))
+
+    def note_ahead(self, error: ExtrapolationError) -> None:
+        """Write into an error by how much the newest stamp of its edge is ahead of the clock."""
+        if error.newest is not None and error.newest > self._newest_plausible():
+            error.ahead = error.newest - self._clock.now()
 
     def lookup_nowait(self, question: Question) -> TransformStamped:
         """The answer, or an error at once."""
-        not_before = None
+        bounds = None
         if question.max_age is not None:
-            not_before = self.not_before(question.max_age, question.at, question.source_at)
-        found = answer(
-            self._live.forest,
-            question.target,
-            question.source,
-            question.at,
-            question.source_at,
-            question.fixed,
-            not_before,
-            question.policy,
-        )
+            bounds = self.bounds(question.max_age, question.at, question.source_at)
+        try:
+            found = answer(
+                self._live.forest,
+                question.target,
+                question.source,
+                question.at,
+                question.source_at,
+                question.fixed,
+                bounds,
+                question.policy,
+            )
+        except ExtrapolationError as error:
+            self.note_ahead(error)
+            raise
         return found if self._local_names is None else self._local_names.answer(found)
 
-    async def lookup(self, question: Question, timeout: float | None) -> TransformStamped:
-        """The answer as soon as there is one, after a checkpoint; the errors are those of `Buffer.lookup`."""
+    async def lookup(
+        self, question: Question, timeout: float | None, others: tuple[Question, ...] = ()
+    ) -> TransformStamped:
+        """The answer as soon as there is one, after a checkpoint; the errors are those of `Buffer.lookup`.
+
+        `others` are questions whose answers are needed as well: an error of one that waiting cannot help is raised.
+        """
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
         last_reset = self._live.last_reset
         await anyio.lowlevel.checkpoint()
@@ -95,16 +112,18 @@ class Lookups:
         self._check_thread()
         since = self._clock.now()
         silent = min(limit, REPORT_AFTER)
-        found = await self._lookup_within(silent, question, since, last_reset, blocker, report=False)
+        found = await self._lookup_within(silent, question, since, last_reset, blocker, others, report=False)
         if isinstance(found, TransformLookupError) and silent < limit:
-            found = await self._lookup_within(limit - silent, question, since, last_reset, found, report=True)
+            found = await self._lookup_within(limit - silent, question, since, last_reset, found, others, report=True)
         if isinstance(found, TransformLookupError):
             raise LookupTimeoutError(
                 target=question.target, source=question.source, timeout=limit, missing=found
             ) from found
         return found
 
-    async def park(self, question: Question, since: int, blocker: TransformLookupError) -> None:
+    async def park(
+        self, question: Question, since: int, blocker: TransformLookupError, others: tuple[Question, ...] = ()
+    ) -> None:
         """Wait for a sample that may have removed the cause of `blocker`.
 
         Raises
@@ -115,8 +134,8 @@ class Lookups:
         if self._live.end_reason is not None:
             raise BusClosedError(self._live.end_reason) from blocker
         woken = anyio.Event()
-        waiter = Waiter(question, since, woken.set)
-        self._live.waiting.park(waiter, blocker)
+        waiter = Waiter(question, since, woken.set, others)
+        self._live.park(waiter, blocker)
         try:
             await woken.wait()
         except BaseException:
@@ -124,16 +143,9 @@ class Lookups:
             self._live.waiting.remove(waiter)
             raise
 
-    def report(self, question: Question, blocker: TransformLookupError) -> None:
-        """Log the error of a lookup that has waited for long."""
-        self._log.warning(
-            (type(blocker), blocking_frames(blocker)),
-            "a lookup of %r in %r has waited for more than %g s: %s",
-            question.source,
-            question.target,
-            REPORT_AFTER,
-            blocker,
-        )
+    def report(self, question: Question, since: int, blocker: TransformLookupError) -> float:
+        """Log a lookup that has waited for long; return the time, in s, after which to call this again."""
+        return self._report.tell(question, since, blocker)
 
     async def _lookup_within(
         self,
@@ -142,19 +154,25 @@ class Lookups:
         since: int,
         last_reset: ClockResetError | None,
         blocker: TransformLookupError,
+        others: tuple[Question, ...],
         *,
         report: bool,
     ) -> TransformStamped | TransformLookupError:
         """Wait for the answer for some time; return it, or the error that still blocks it."""
+        pause = math.inf
         with self._clock.move_on_after(seconds):
             while True:
                 if report:
-                    self.report(question, blocker)
-                await self.park(question, since, blocker)
+                    pause = self.report(question, since, blocker)
+                with nullcontext() if pause == math.inf else self._clock.move_on_after(pause):
+                    await self.park(question, since, blocker, others)
                 try:
                     return self._lookup_since(last_reset, question)
                 except MAY_COME as error:
                     blocker = without_traceback(error)
+                for other in others:
+                    with suppress(*MAY_COME):
+                        self.lookup_nowait(other)
         try:
             # The data may have come in the same turn of the loop in which the time was up.
             return self._lookup_since(last_reset, question)

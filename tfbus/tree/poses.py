@@ -133,7 +133,7 @@ def _make_plan(fixed: str, topology: list[tuple[str, str]]) -> _Plan:
 
 
 class _Gathered(NamedTuple):
-    """The edges of a plan, each as it is at the stamps at which the frames behind it need it; m of them for n frames."""
+    """The edges of a plan, each as it is at the stamps at which the frames behind it need it."""
 
     plan: _Plan
     records: bytearray

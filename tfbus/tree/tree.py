@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from tfbus.data import PointCloud, TwistStamped
 from tfbus.errors import TransformLookupError
+from tfbus.geometry.bounds import MAX_TRANSLATION, as_max_translation, check_translations
 from tfbus.geometry.stamped import TransformStamped, as_batch
 from tfbus.geometry.transform_array import TransformArray
 from tfbus.stamps import LATEST, Latest, Stamps, as_duration, as_stamp, as_stamps, from_seconds
@@ -19,9 +20,9 @@ from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import Edge, Outcome
+from tfbus.tree.history import Edge, FrameHistory, Outcome
 from tfbus.tree.html import legend, to_html
-from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer
+from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer, bounds_of
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.rendering import describe, to_dot, to_yaml
 
@@ -29,21 +30,28 @@ from tfbus.tree.rendering import describe, to_dot, to_yaml
 class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
-    Any thread may read it while another one inserts.
+    Any thread may read it while another one inserts. A copy, and what `edges` and the texts show, is the tree at one
+    moment; an explanation reads its edges one after the other.
 
     Parameters
     ----------
     keep : float or None
-        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything.
+        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything. A late
+        sample then costs more the longer the history is, because all samples after it are moved: in the middle of a
+        million samples some ms.
+    max_translation : float
+        The greatest magnitude of a translation, in m, at most 1e100; a longer one is refused as not physical, so that
+        every answer is finite.
 
     Raises
     ------
-    ValueError
-        If `keep` is negative or NaN.
+    TypeError, ValueError
+        If `keep` is negative or NaN, or `max_translation` is not greater than zero and at most 1e100.
 
     Attributes
     ----------
     keep : float or None
+    max_translation : float
 
     Examples
     --------
@@ -54,8 +62,9 @@ class TransformTree:
     (0.1, 0.0, 0.2)
     """
 
-    def __init__(self, keep: float | None = 10.0) -> None:
+    def __init__(self, keep: float | None = 10.0, *, max_translation: float = MAX_TRANSLATION) -> None:
         self.keep = keep
+        self.max_translation = as_max_translation(max_translation)
         self._forest = Forest(window_of(keep))
         self._filled_by_bus = False
 
@@ -67,7 +76,8 @@ class TransformTree:
         Raises
         ------
         InvalidTransformError
-            If it would close a loop of parents. Nothing is stored.
+            If it would close a loop of parents, or its translation is not finite or longer than `max_translation`.
+            Nothing is stored.
         TypeError
             If it is not a `TransformStamped`.
         """
@@ -79,12 +89,14 @@ class TransformTree:
         Raises
         ------
         InvalidTransformError
-            If a sample would close a loop of parents.
+            If a sample would close a loop of parents, or a translation is not finite or longer than `max_translation`.
         TypeError
             If something in it is not a `TransformStamped`.
         """
         self._check_writable("use bus.publish, or a copy() of the tree")
-        return self._forest.insert(as_batch(samples))
+        batch = as_batch(samples)
+        check_translations(batch, self.max_translation)
+        return self._forest.insert(batch)
 
     @property
     def inserted(self) -> int:
@@ -101,6 +113,11 @@ class TransformTree:
         """Number of samples that were older than the window of their frame."""
         return self._forest.expired
 
+    @property
+    def looped(self) -> int:
+        """Number of samples that formed a loop of parents at a past stamp when they came; see `lookup`."""
+        return self._forest.looped
+
     # Questions about transforms
 
     def lookup(
@@ -112,6 +129,7 @@ class TransformTree:
         source_at: At | None = None,
         fixed: str | None = None,
         not_before: int | None = None,
+        not_after: int | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -130,6 +148,8 @@ class TransformTree:
             The frame that stands still between the two stamps.
         not_before : int, optional
             Count a `LATEST` answer older than this (ns) as not yet arrived.
+        not_after : int, optional
+            Refuse a `LATEST` answer newer than this (ns), such as one from a clock that is ahead.
         tolerance : float
             In s. If an edge does not cover the stamp, or only by a gap that is too long, its nearest sample within this
             distance stands in.
@@ -155,12 +175,22 @@ class TransformTree:
             If the stamp is older than an edge's window.
         GapError
             If the stamp lies in a gap that is too long.
+        AheadError
+            If the `LATEST` answer is newer than `not_after`.
         TypeError
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
-            `not_before` comes without a `LATEST`.
+            `not_before` or `not_after` comes without a `LATEST`.
+
+        Notes
+        -----
+        The newest parents never form a loop. Those at an older stamp may, if samples came late, and then two ways lead
+        from source to target. If the way of the newest parents has samples for the stamp, it is the answer; otherwise
+        the way that has them. If both others have them, the frames count as not connected at that stamp. `looped`
+        counts the samples that form such loops. The answer depends on the samples only, never on earlier questions.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
-        return answer(self._forest, target, source, at, source_at, fixed, not_before, policy)
+        bounds = bounds_of(not_before, not_after)
+        return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
     def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
@@ -177,6 +207,7 @@ class TransformTree:
         at: At = LATEST,
         *,
         not_before: int | None = None,
+        not_after: int | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -186,7 +217,7 @@ class TransformTree:
 
         Parameters
         ----------
-        target, source, at, not_before, tolerance, max_gap, extrapolate
+        target, source, at, not_before, not_after, tolerance, max_gap, extrapolate
             As `lookup`. Time travel has two halves; explain each of them.
         now : int, optional
             The stamp that ages are counted from, in ns; by default the newest in the tree.
@@ -197,12 +228,12 @@ class TransformTree:
             As `lookup`. A lookup without an answer is no error here.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
-        if not_before is not None and at is not LATEST:
+        bounds = bounds_of(not_before, not_after)
+        if bounds is not None and at is not LATEST:
             raise TypeError(AT_LATEST_ONLY)
         if at is not LATEST:
             at = as_stamp(at)
-        with self._forest.lock:
-            return explain(self._forest, target, source, at, not_before, policy, now)
+        return explain(self._forest, target, source, at, bounds, policy, now)
 
     def lookup_many(
         self,
@@ -384,8 +415,8 @@ class TransformTree:
 
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
-        with self._forest.lock:
-            return [self._forest.frames[child].edge() for child in sorted(self._forest.frames)]
+        edges = self._forest.read_all(FrameHistory.edge)
+        return [edges[child] for child in sorted(edges)]
 
     def __contains__(self, frame: object) -> bool:
         with self._forest.lock:
@@ -410,7 +441,7 @@ class TransformTree:
 
     def copy(self) -> "TransformTree":
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
-        twin = TransformTree(self.keep)
+        twin = TransformTree(self.keep, max_translation=self.max_translation)
         twin._forest = self._forest.copy()
         return twin
 
@@ -450,9 +481,9 @@ class TransformTree:
             raise RuntimeError(f"a bus feeds this tree: {instead}")
 
 
-def tree_of(forest: Forest, keep: float | None) -> TransformTree:
+def tree_of(forest: Forest, keep: float | None, max_translation: float = MAX_TRANSLATION) -> TransformTree:
     """The tree over a forest that a bus fills. It cannot be changed, because a change would wake no waiting lookup."""
-    tree = TransformTree(keep)
+    tree = TransformTree(keep, max_translation=max_translation)
     tree._forest = forest
     tree._filled_by_bus = True
     return tree

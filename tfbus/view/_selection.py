@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable
 
 from tfbus.errors import TransformLookupError
-from tfbus.stamps import SECOND, Latest, format_duration, format_stamp
+from tfbus.stamps import SECOND, Latest, format_age, format_duration, format_stamp
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import format_rate
 from tfbus.tree.tree import TransformTree, forest_of
@@ -64,7 +64,7 @@ def _edge_facts(edge: Edge | None, now: int, delay: float | None) -> dict[str, s
         return {"parent": "none, it is a root"}
     known = {"parent": edge.parent, "rate": format_rate(edge.static, edge.newest, edge.rate)}
     if edge.newest is not None:
-        known["age"] = format_duration(now - edge.newest)
+        known["age"] = format_age(now - edge.newest).removeprefix("age ")
     if delay is not None:
         known["delay"] = format_duration(round(delay * SECOND))
     return {**known, "authority": edge.authority or "not known"}
