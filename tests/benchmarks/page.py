@@ -113,7 +113,7 @@ async def load(name: str, batches: Batches, rate: float, urdf: Path | None) -> N
 async def latency(count: int) -> None:
     """Print the time from a publish to the arrival of the change, of one frame among so many."""
     bus = Bus()
-    batches = crowd(count, depth=count)
+    batches = crowd(count)
     delays: list[float] = []
     with Buffer(bus) as buffer:
         bus.publish(batches(bus.clock.now()))

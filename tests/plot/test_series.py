@@ -25,7 +25,7 @@ def test_a_series_covers_what_all_edges_cover_at_equal_intervals() -> None:
 
 def test_seconds_count_from_the_oldest_sample_of_any_frame() -> None:
     start = 1_700_000_000 * SECOND
-    tree = tree_of(moving("map", "other", start), *over("map", "base", (start + SECOND, start + 3 * SECOND)))
+    tree = tree_of(moving("map", "other", start), *over("map", "base", (start + SECOND, start + 3 * SECOND), speed=0.0))
     assert read_series(tree, "map", "base", samples=3).seconds.tolist() == [1.0, 2.0, 3.0]
 
 
