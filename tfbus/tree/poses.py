@@ -47,7 +47,8 @@ class Poses(NamedTuple):
 class _Plan(NamedTuple):
     """The order in which the frames are reached from the fixed frame."""
 
-    topology: list[tuple[str, str]]
+    topology: tuple[list[str], list[str]]
+    """All children, and the parent of each."""
     frames: list[str]
     origins: list[int]
     """The place of the frame from which each one is reached."""
@@ -88,7 +89,13 @@ class PoseReader:
             corrections = [(place, _find(forest, fixed, plan.frames[place])) for place in moved]
             own = [forest.frames.get(frame) for frame in plan.frames]
             static = np.array([history is not None and history.static for history in own])
-            heard = np.array([STAMP_MIN if history is None else _heard(history, at) for history in own], np.int64)
+            if isinstance(at, Latest):
+                newest = [
+                    history.stamps[-1] if history is not None and history.stamps else STAMP_MIN for history in own
+                ]
+            else:
+                newest = [STAMP_MIN if history is None else _heard(history, at) for history in own]
+            heard = np.array(newest, np.int64)
         columns, answered = gathered.compose()
         for place, row in corrections:
             answered[place] = row is not None
@@ -99,9 +106,11 @@ class PoseReader:
     def _plan(self, fixed: str, at: int | Latest) -> _Plan:
         frames = self._forest.frames
         if isinstance(at, Latest):
-            topology = [(child, history.parent) for child, history in frames.items()]
+            parents = [history.parent for history in frames.values()]
         else:
-            topology = [(child, history.parent_at(at)) for child, history in frames.items()]
+            parents = [history.parent_at(at) for history in frames.values()]
+        # Not pairs: a thousand new tuples for each picture keep the garbage collector busy.
+        topology = list(frames), parents
         plan = self._plans.get(fixed)
         if plan is None or plan.topology != topology:
             # Only one: a picture seldom changes its fixed frame.
@@ -109,10 +118,10 @@ class PoseReader:
         return plan
 
 
-def _make_plan(fixed: str, topology: list[tuple[str, str]]) -> _Plan:
-    above = dict(topology)
+def _make_plan(fixed: str, topology: tuple[list[str], list[str]]) -> _Plan:
+    above = dict(zip(*topology, strict=True))
     below: dict[str, list[str]] = {}
-    for child, parent in topology:
+    for child, parent in above.items():
         below.setdefault(parent, []).append(child)
     places = {fixed: 0}
     plan = _Plan(topology, [fixed], [-1], [""], [False], [0], np.empty(0, np.intp))
@@ -231,11 +240,12 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     return gathered
 
 
-def _heard(history: FrameHistory, at: int | Latest) -> int:
+def _heard(history: FrameHistory, at: int) -> int:
+    """The stamp of the newest sample not after `at`; `STAMP_MIN` if there is none."""
     stamps = history.stamps
     if not stamps:
         return STAMP_MIN
-    if isinstance(at, Latest) or stamps[-1] <= at:
+    if stamps[-1] <= at:
         return stamps[-1]
     before = bisect_right(stamps, at, history.start) - 1
     return stamps[before] if before >= history.start else STAMP_MIN
