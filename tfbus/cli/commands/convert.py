@@ -7,8 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from tfbus.cli._graphviz import write_file
 from tfbus.cli.arguments import Flag, Instant, UsageError
-from tfbus.cli.commands.tree import write_file
 from tfbus.cli.output import format_counts, progress, say, warn
 from tfbus.recording.convert import StaticTransform
 from tfbus.recording.convert import convert as convert_recordings
@@ -93,7 +93,7 @@ def convert(
     except OSError as error:
         raise UsageError(f"cannot write {output}: {error.strerror or error}") from None
     if static_to_yaml is not None:
-        write_file(static_to_yaml, to_yaml(done.statics.values()))
+        write_file(static_to_yaml, to_yaml(done.statics.values()).encode())
     say(f"{done.messages:,} messages with {done.transforms:,} transforms in {output}")
     if done.problems:
         warn(f"left out: {format_counts(done.problems)}")

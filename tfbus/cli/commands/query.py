@@ -11,11 +11,10 @@ from cyclopts import Parameter
 
 from tfbus.cli._transform_rows import Format, Row, print_rows, write_parquet
 from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, Instant, JsonFlag, Positive, Step, TopicOptions, UsageError
-from tfbus.cli.output import format_counts, format_seconds, progress, track, warn
+from tfbus.cli.output import format_seconds, track, warn
+from tfbus.cli.recorded_tree import load_tree
 from tfbus.errors import DisconnectedError
 from tfbus.recording.header_stamps import header_stamps
-from tfbus.recording.load import Problems, fill
-from tfbus.recording.speed_limit import SpeedLimit
 from tfbus.stamps import LATEST, to_seconds
 from tfbus.tree.tree import TransformTree
 
@@ -84,7 +83,7 @@ def query(
         raise UsageError("--at, --every and --stamps-of are different questions: give one of them")
     if tum and len(pairs) > 1:
         raise UsageError("--tum has no names of frames: ask for one pair")
-    tree, start = _load(file, topics, max_speed)
+    tree, start = load_tree(file, topics, max_speed)
     stamps = None if stamps_of is None else _stamps_of(file, stamps_of)
 
     def rows() -> Iterator[Row]:
@@ -106,23 +105,6 @@ def _pairs(target: str, source: str, further: Sequence[str]) -> list[tuple[str, 
     if len(further) % 2:
         raise UsageError(f"frames come in pairs of TARGET and SOURCE, and {further[-1]!r} has no SOURCE")
     return [(target, source), *zip(further[::2], further[1::2], strict=True)]
-
-
-def _load(file: Path, topics: TopicOptions, max_speed: float | None) -> tuple[TransformTree, int | None]:
-    """The tree of a recording, and the log time of its first message."""
-    tree = TransformTree(keep=None)
-    problems = Problems()
-    limit = None if max_speed is None else SpeedLimit(max_speed)
-    with topics.open(file) as recording, progress(recording.count, "reading") as advance:
-        if not recording.finished:
-            warn(f"{file} was not finished by its writer: this is what can be read")
-        fill(tree, recording, problems, limit=limit, progress=advance)
-        remarks, start = recording.remarks, recording.start
-    if problems:
-        warn(f"left out of {file}: {format_counts(problems)}")
-    for line in (*problems.details, *remarks):
-        warn(line)
-    return tree, start
 
 
 def _stamps_of(file: Path, topic: str) -> npt.NDArray[np.int64]:
