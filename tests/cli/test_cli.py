@@ -36,6 +36,7 @@ URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
         ("query", ("FILE", "TARGET", "SOURCE", "--at SECONDS", "--every SECONDS", "--csv", "--json")),
         ("record", ("FILE", "--duration FLOAT", "--overwrite", *LINK)),
         ("robot", ("FILE", "POSITION", "--tree", "--rate FLOAT", "--prefix STR", *LINK)),
+        ("router", ("--listen STR", "--connect STR", "--backend")),
         ("static", ("PARENT", "CHILD", "--xyz", "--rpy", "--quaternion", "--authority STR", *LINK)),
         ("tree", ("--duration FLOAT", "--watch", "--rate FLOAT", "--dot PATH", "--svg PATH", "--json", *LINK)),
         ("view", ("FILE", "--urdf PATH", "--package-path PATH", "--fixed STR", "--trail STR", "--port INT", *LINK)),
@@ -59,9 +60,8 @@ def test_the_help_of_a_command_has_an_example_and_every_option(
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = ["broadcast", "demo", "echo", "foxglove", "info", "listen", "play", "plot", "query", "record", "robot"]
-    commands += ["static", "tree", "view"]
-    assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands
+    commands = "broadcast demo echo foxglove info listen play plot query record robot router static tree view"
+    assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands.split()
 
 
 @pytest.mark.parametrize(

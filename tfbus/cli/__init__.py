@@ -24,6 +24,7 @@ from tfbus.cli.commands.plot import plot
 from tfbus.cli.commands.query import query
 from tfbus.cli.commands.record import record
 from tfbus.cli.commands.robot import robot
+from tfbus.cli.commands.router import router
 from tfbus.cli.commands.static import static
 from tfbus.cli.commands.tree import tree
 from tfbus.cli.commands.view import view
@@ -39,7 +40,8 @@ app = App(
     help="Stamped coordinate transforms for asyncio and trio.",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, view, plot, foxglove):
+commands = (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, router, view, plot, foxglove)
+for command in commands:
     app.command(command)
 
 
