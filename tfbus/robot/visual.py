@@ -13,7 +13,7 @@ from tfbus.robot._urdf import read_elements, transform_of
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box about its origin; `size` is its length along x, y and z, in m."""
+    """A box about its origin, with its length along x, y and z in m."""
 
     size: Vector
 
@@ -35,7 +35,7 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A mesh in a file, as the URDF names it (``package://...``, ``file://...`` or a path); `scale` along x, y, z."""
+    """A mesh in a file, as the URDF names it (``package://...``, ``file://...`` or a path), scaled along x, y and z."""
 
     filename: str
     scale: Vector = (1.0, 1.0, 1.0)
