@@ -301,13 +301,13 @@ class Game:
         for held, counted in zip(on_the_bus, statistics.buffers, strict=True):
             kinds = ("inserted", "replaced", "expired", "superseded")
             assert [getattr(counted, kind) for kind in kinds] == [held.counted[kind] for kind in kinds]
-            assert counted.offered == held.counted.total()
+            assert counted.offered == counted.inserted + counted.replaced + counted.expired
 
     def check_everything(self) -> None:
-        """Ask every buffer for every two frames that it knows, at some stamps."""
+        """Ask every buffer for a third of all pairs of frames that it knows, at some stamps."""
         for real, held in zip(self.reals, self.held.values(), strict=True):
             frames = [frame for frame in sorted(held.tree.names()) if real.has_name(frame)]
-            for target, source in product(frames, frames):
+            for target, source in list(product(frames, frames))[self.published % 3 :: 3]:
                 latest = partial(real.buffer.lookup_nowait, real.name(target), real.name(source))
                 compare(latest, partial(held.tree.lookup, target, source, LATEST))
                 for stamp in range(START + OFFSETS[0] + self.published % 5, self.middle + OFFSETS[-1], 5):

@@ -75,7 +75,7 @@ class Held:
         unseen = self.unseen.get(sample.child)
         late = unseen is not None and unseen.stamp is not None and not sample.static and sample.stamp < unseen.stamp
         if unseen is not None and late and sample.parent != unseen.parent:
-            self.counted["superseded"] += 1
+            self.counted.update(("superseded", "expired"))
             return
         if not late:
             self.unseen.pop(sample.child, None)

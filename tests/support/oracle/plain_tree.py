@@ -229,13 +229,13 @@ class PlainTree:
 
     def way(self, target: str, source: str, at: At) -> Way:
         """The way that counts: if there are two round a loop, the newest one if it holds, else the one with samples."""
-        ways = list(self.ways(target, source, at))
-        if not ways:
+        found = self.ways(target, source, at)
+        if not found:
             raise Blocked((DisconnectedError,))
         if isinstance(at, Latest):
-            return ways[0]
-        covered = [way for way in ways if all(self.children[name].covers(at) for name, _ in way)]
-        newest = list(self.ways(target, source, LATEST))
+            return found[0]
+        covered = [way for way in found if all(self.children[name].covers(at) for name, _ in way)]
+        newest = self.ways(target, source, LATEST)
         for way in covered:
             if way in newest:
                 return way
@@ -243,7 +243,7 @@ class PlainTree:
             raise Blocked((DisconnectedError,))
         if covered:
             return covered[0]
-        errors = [facts for way in ways for facts in self.deciding_facts(way, at)]
+        errors = [facts for way in found for facts in self.deciding_facts(way, at)]
         raise Blocked(*([facts for facts in errors if facts[0] is FutureExtrapolationError] or errors))
 
     def deciding_facts(self, way: Way, at: int) -> list[Facts]:
@@ -253,17 +253,10 @@ class PlainTree:
         reached = [facts[3] if isinstance(facts[3], int) else float("-inf") for facts in errors]
         return past or [facts for facts, reach in zip(errors, reached, strict=True) if reach == min(reached)]
 
-    def ways(self, target: str, source: str, at: At, seen: frozenset[str] = frozenset()) -> Iterator[Way]:
-        """Every way from source to target along edges that hold at `at`, none of which passes a frame twice."""
-        if source == target:
-            yield []
-            return
-        for name, child in self.children.items():
-            parent = child.parent_at(at)
-            for here, there, up in ((name, parent, True), (parent, name, False)):
-                if here == source and there not in seen:
-                    for rest in self.ways(target, there, at, seen | {source}):
-                        yield [(name, up), *rest]
+    def ways(self, target: str, source: str, at: At) -> list[Way]:
+        """Every way from source to target along the edges that hold at `at`."""
+        held = [(name, child.parent_at(at)) for name, child in self.children.items()]
+        return list(ways(held, target, source, frozenset()))
 
     def along(self, way: Way, at: int) -> Pose:
         pose = Pose(0.0, 0j, 0.0)
@@ -271,6 +264,18 @@ class PlainTree:
             edge = self.children[name].pose_at(at)
             pose = (edge if up else edge.inverse()) @ pose
         return pose
+
+
+def ways(held: list[tuple[str, str]], target: str, here: str, seen: frozenset[str]) -> Iterator[Way]:
+    """Every way along edges, each a child and its parent, that passes no frame twice."""
+    if here == target:
+        yield []
+        return
+    for child, parent in held:
+        for end, there, up in ((child, parent, True), (parent, child, False)):
+            if end == here and there not in seen:
+                for rest in ways(held, target, there, seen | {here}):
+                    yield [(child, up), *rest]
 
 
 def climb(parents: dict[str, str], name: str) -> list[str]:
