@@ -13,7 +13,7 @@ import tfbus
 
 PACKAGE = Path(tfbus.__file__).parent
 
-GROUND = ("stamps", "errors", "events", "frames", "registration", "statistics", "clock", "_log", "_aio")
+GROUND = ("stamps", "plain", "errors", "events", "frames", "registration", "statistics", "clock", "_log", "_aio")
 
 # Each room with the rooms that it may import. It may import from the ground, and from the rooms that those may import.
 ROOMS: dict[str, tuple[str, ...]] = {
@@ -32,6 +32,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "testing": ("geometry",),
     "__init__": ("message_filter", "robot"),
     "cli": ("__init__", "links", "recording"),
+    "__main__": ("cli",),
 }
 
 SANS_IO = {*GROUND, "geometry", "data", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
@@ -45,6 +46,7 @@ EXTRAS = {
     "mcap": ("recording.formats",),
     "rich": ("cli",),
     "rosbags": ("recording.formats",),
+    "scipy": ("geometry",),
     "urdf_parser_py": ("robot",),
     "zenoh": ("links.zenoh",),
     "zstandard": ("recording.formats",),

@@ -1,15 +1,18 @@
 """`TransformStamped`, a transform between two frames at an instant, and batches of such samples."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
 from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
+from tfbus.plain import from_fields
 from tfbus.stamps import as_stamp, format_duration, format_stamp
 
 Fields = tuple[str, str, int, Row, str, bool]
+
+_KINDS = {"parent": str, "child": str, "stamp": int, "transform": Transform, "authority": str, "static": bool}
 
 
 class TransformStamped:
@@ -123,6 +126,36 @@ class TransformStamped:
         }
         return TransformStamped(**{**fields, **changes})
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns."""
+        parent, child, stamp, row, authority, static = self._fields
+        return {
+            "type": "TransformStamped",
+            "parent": parent,
+            "child": child,
+            "stamp": stamp,
+            "transform": from_row(row).to_dict(),
+            "authority": authority,
+            "static": static,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "TransformStamped":
+        """The sample or answer that `to_dict` made `data` of.
+
+        Raises
+        ------
+        ValueError
+            If the data are not those of a `TransformStamped`. The message names the field.
+        """
+        if "gap" not in data:
+            return TransformStamped(**from_fields(TransformStamped, data, _KINDS))
+        fields = from_fields(TransformStamped, data, {**_KINDS, "extrapolated_by": int, "gap": int})
+        policy_use = fields.pop("extrapolated_by"), fields.pop("gap")
+        answer = TransformStamped(**fields)
+        target, source, stamp, row, _, static = answer._fields
+        return qualified_answer(target, source, stamp, row, static, *policy_use)
+
     def __eq__(self, other: object) -> bool:
         return self._fields == other._fields if isinstance(other, TransformStamped) else NotImplemented
 
@@ -154,6 +187,10 @@ class QualifiedTransform(TransformStamped):
     def gap(self) -> int:
         """The time in ns between two samples that were interpolated, on the edge where it is longest."""
         return self._policy_use[1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As that of a `TransformStamped`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
+        return {**super().to_dict(), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
 
     def __str__(self) -> str:
         held = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""

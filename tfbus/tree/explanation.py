@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
-from tfbus.stamps import LATEST, Latest, format_duration, format_stamp, to_seconds
+from tfbus.stamps import LATEST, Latest, format_age, format_duration, format_stamp, to_seconds
 from tfbus.tree._extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
-from tfbus.tree.lookup import At, find
+from tfbus.tree.lookup import At, Bounds, find
 from tfbus.tree.path import Path
 from tfbus.tree.policy import Policy
 from tfbus.tree.rendering import format_rate
@@ -37,7 +37,7 @@ class ExplainedEdge:
     newest : int or None
         The stamp of the newest sample, in ns; None if the edge is static or has none.
     age : float or None
-        How old the newest sample was at the `now` of the explanation, in s.
+        How old the newest sample was at the `now` of the explanation, in s; negative if it is ahead of it.
     rate : float or None
         Mean samples a second over the window; None for fewer than two.
     authority : str
@@ -126,7 +126,7 @@ def _cells(edge: ExplainedEdge, whole: Explanation) -> list[str]:
     below = not whole.half_chains and whole.chain.index(edge.parent) < whole.chain.index(edge.child)
     age = ""
     if edge.newest is not None and whole.now is not None:
-        age = f"age {format_duration(whole.now - edge.newest)}"
+        age = format_age(whole.now - edge.newest)
     return [
         "!" if edge.error is not None else " ",
         f"{edge.parent} <- {edge.child}" if below else f"{edge.child} -> {edge.parent}",
@@ -156,14 +156,14 @@ def _aligned(rows: list[list[str]]) -> list[str]:
 
 
 def explain(
-    forest: Forest, target: str, source: str, at: At, not_before: int | None, policy: Policy | None, now: int | None
+    forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, policy: Policy | None, now: int | None
 ) -> Explanation:
     """The explanation of a lookup; the parameters are those of `TransformTree.explain`."""
     extrapolation = None if policy is None else Extrapolation(policy)
     stamp: int | None = None
     raised: TransformLookupError | None = None
     try:
-        stamp, _, _ = find(forest, target, source, at, not_before, extrapolation)
+        stamp, _, _ = find(forest, target, source, at, bounds, extrapolation)
     except TransformLookupError as error:
         raised = error
     if isinstance(raised, UnknownFrameError):

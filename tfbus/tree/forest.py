@@ -43,6 +43,8 @@ class Forest:
         them may have another answer.
     new_parents : set of str
         Frames that have become a parent since `forget_changes`, so that they may have become known.
+    expired_frames : list of str
+        The frame of each sample that expired since `forget_changes`.
     inserted, replaced, expired : int
         Number of samples that had each `Outcome`.
     """
@@ -50,6 +52,7 @@ class Forest:
     __slots__ = (
         "changed",
         "expired",
+        "expired_frames",
         "frames",
         "inserted",
         "lock",
@@ -68,6 +71,7 @@ class Forest:
         self.paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
+        self.expired_frames: list[str] = []
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
@@ -132,6 +136,7 @@ class Forest:
             self.replaced += 1
         else:
             self.expired += 1
+            self.expired_frames.append(child)
         return outcome
 
     def remove(self, frame: str) -> None:
@@ -156,9 +161,10 @@ class Forest:
             self.paths.clear()
 
     def forget_changes(self) -> None:
-        """Empty `changed` and `new_parents`."""
+        """Empty `changed`, `new_parents` and `expired_frames`."""
         self.changed.clear()
         self.new_parents.clear()
+        self.expired_frames.clear()
 
     # Questions
 

@@ -1,8 +1,10 @@
 """Lookups at one stamp: the stamp that `LATEST` means, the transform along the path, and the error if there is none."""
 
 from contextlib import suppress
+from typing import NamedTuple
 
 from tfbus.errors import (
+    AheadError,
     DisconnectedError,
     ExtrapolationError,
     FutureExtrapolationError,
@@ -11,7 +13,7 @@ from tfbus.errors import (
 )
 from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
-from tfbus.stamps import LATEST, Latest, as_stamp
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_stamp
 from tfbus.tree._extrapolation import Extrapolation
 from tfbus.tree._python_kernel import climb
 from tfbus.tree.forest import Forest
@@ -24,7 +26,30 @@ Found = tuple[int, Row, bool]
 """Stamp in ns, row, and whether the whole path is static."""
 
 GO_TOGETHER = "source_at and fixed go together: source at its stamp, carried through the fixed frame"
-AT_LATEST_ONLY = "not_before goes with LATEST: an answer at a given stamp never gets newer"
+AT_LATEST_ONLY = "not_before and not_after go with LATEST: an answer at a given stamp never gets newer"
+
+
+class Bounds(NamedTuple):
+    """The oldest and the newest stamp that count as `LATEST`, in ns."""
+
+    not_before: int
+    not_after: int
+
+
+def bounds_of(not_before: int | None, not_after: int | None) -> Bounds | None:
+    """The bounds that two arguments make; None if they allow every stamp.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one is not a stamp.
+    """
+    if not_before is None and not_after is None:
+        return None
+    return Bounds(
+        STAMP_MIN if not_before is None else as_stamp(not_before),
+        STAMP_MAX if not_after is None else as_stamp(not_after),
+    )
 
 
 def answer(
@@ -34,21 +59,21 @@ def answer(
     at: At,
     source_at: At | None,
     fixed: str | None,
-    not_before: int | None,
+    bounds: Bounds | None,
     policy: Policy | None,
 ) -> TransformStamped:
     """The answer of `TransformTree.lookup`, without keywords: each of them costs a twentieth of a lookup."""
-    if not_before is not None and at is not LATEST and source_at is not LATEST:
+    if bounds is not None and at is not LATEST and source_at is not LATEST:
         raise TypeError(AT_LATEST_ONLY)
     if type(at) is not int and at is not LATEST:
         at = as_stamp(at)
     extrapolation = None if policy is None else Extrapolation(policy)
     with forest.lock:
         if source_at is None and fixed is None:
-            stamp, row, static = find(forest, target, source, at, not_before, extrapolation)
+            stamp, row, static = find(forest, target, source, at, bounds, extrapolation)
         else:
             stamp, row, static = find_in_time_travel(
-                forest, target, source, at, source_at, fixed, not_before, extrapolation
+                forest, target, source, at, source_at, fixed, bounds, extrapolation
             )
     if extrapolation is None:
         return answer_of(target, source, stamp, row, static)
@@ -56,7 +81,7 @@ def answer(
 
 
 def find(
-    forest: Forest, target: str, source: str, at: At, not_before: int | None, extrapolation: Extrapolation | None = None
+    forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, extrapolation: Extrapolation | None = None
 ) -> Found:
     """Source in target at one stamp. The caller holds the lock; the errors are those of `TransformTree.lookup`."""
     path = forest.paths.get((target, source))
@@ -67,7 +92,7 @@ def find(
             at = path.static_stamp if len(path.frames) > 1 else _newest_stamp(forest, target)
         return as_stamp(at), path.row(0), True
     if at is LATEST:
-        return _find_latest(forest, path, not_before, extrapolation)
+        return _find_latest(forest, path, bounds, extrapolation)
     if extrapolation is not None:
         return at, extrapolation.row(path, as_stamp(at)), False
     try:
@@ -78,7 +103,7 @@ def find(
     raise path.deciding_error(as_stamp(at))
 
 
-def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolation: Extrapolation | None) -> Found:
+def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolation: Extrapolation | None) -> Found:
     """Source in target at the newest stamp that every moving edge has reached.
 
     Under a policy it is the newest stamp of any edge, as far as the lagging edge may be held.
@@ -86,8 +111,13 @@ def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolati
     common, lagging = path.newest_common()
     if extrapolation is not None:
         common = min(common + extrapolation.policy.hold, max(edge.stamps[-1] for edge in path.moving))
-    if not_before is not None and common < not_before:
-        raise _latest_error(path, lagging, not_before, extrapolation, 0)
+    if bounds is not None and common < bounds.not_before:
+        raise _latest_error(path, lagging, bounds.not_before, extrapolation, 0)
+    if bounds is not None and common > bounds.not_after:
+        edge = lagging if extrapolation is None else max(path.moving, key=lambda edge: edge.stamps[-1])
+        raise AheadError(
+            child=edge.child, stamp=bounds.not_after, oldest=edge.oldest, newest=edge.newest, authority=edge.authority
+        )
     try:
         path_then = path
         if not path.permanent:
@@ -127,7 +157,7 @@ def find_in_time_travel(
     at: At,
     source_at: At | None,
     fixed: str | None,
-    not_before: int | None,
+    bounds: Bounds | None,
     extrapolation: Extrapolation | None = None,
 ) -> Found:
     """Source at its own stamp, carried through the fixed frame into target at another. The caller holds the lock."""
@@ -138,16 +168,16 @@ def find_in_time_travel(
     for name in (target, source, fixed):
         forest.check_known(name)
     try:
-        stamp, target_from_fixed, target_static = find(forest, target, fixed, at, not_before, extrapolation)
+        stamp, target_from_fixed, target_static = find(forest, target, fixed, at, bounds, extrapolation)
     except FutureExtrapolationError:
         # Waiting for this half is useless if waiting cannot help the other one: then that error is raised.
-        find(forest, fixed, source, source_at, not_before, extrapolation)
+        find(forest, fixed, source, source_at, bounds, extrapolation)
         raise
     except DisconnectedError:
         with suppress(DisconnectedError, FutureExtrapolationError):
-            find(forest, fixed, source, source_at, not_before, extrapolation)
+            find(forest, fixed, source, source_at, bounds, extrapolation)
         raise
-    source_stamp, fixed_from_source, source_static = find(forest, fixed, source, source_at, not_before, extrapolation)
+    source_stamp, fixed_from_source, source_static = find(forest, fixed, source, source_at, bounds, extrapolation)
     if at is LATEST and target_static and not source_static:
         stamp = source_stamp
     return stamp, compose(target_from_fixed, fixed_from_source), target_static and source_static

@@ -13,6 +13,7 @@ from itertools import count
 
 from tfbus.errors import (
     MAY_COME,
+    AheadError,
     DisconnectedError,
     FutureExtrapolationError,
     GapError,
@@ -70,6 +71,8 @@ def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
     """
     if isinstance(error, FutureExtrapolationError):
         return (error.child, *error.others)
+    if isinstance(error, AheadError):
+        return (error.child,)
     if isinstance(error, UnknownFrameError):
         return (error.frame,)
     if isinstance(error, DisconnectedError):
