@@ -172,13 +172,12 @@ class Game:
         self.clock.set(self.clock.now() + by * SECOND)
         if by < 0 and not self.bus.closed:
             self.plain.record.append(Reset())
-            held = self.plain.buffers()
+            on_the_bus = self.plain.on_the_bus()
             for waiting in self.waiting:
-                waiting.reset |= not waiting.fresh and held[waiting.place].on_the_bus
+                waiting.reset |= not waiting.fresh and waiting.place in on_the_bus
 
     def join(self, joining: Join) -> None:
-        held = self.plain.buffers()
-        on_the_bus = [place for place, buffer in held.items() if buffer.on_the_bus]
+        on_the_bus = self.plain.on_the_bus()
         prefill = None
         if joining.prefill is not None and on_the_bus:
             prefill = on_the_bus[joining.prefill % len(on_the_bus)]
@@ -191,7 +190,7 @@ class Game:
         self.reals.append(Real(buffer, joining.prefix, keep))
 
     def leave(self, place: int) -> None:
-        on_the_bus = [other for other, buffer in self.plain.buffers().items() if buffer.on_the_bus]
+        on_the_bus = self.plain.on_the_bus()
         if on_the_bus:
             chosen = on_the_bus[place % len(on_the_bus)]
             self.reals[chosen].buffer.close()

@@ -124,6 +124,12 @@ class PlainBus:
             frame in buffer.tree.names() for buffer in held
         )
 
+    def on_the_bus(self) -> list[int]:
+        """The buffers that have joined and not left."""
+        left = [entry.buffer for entry in self.record if isinstance(entry, Left)]
+        joined = [entry.buffer for entry in self.record if isinstance(entry, Joined)]
+        return [buffer for buffer in joined if buffer not in left]
+
     def buffers(self) -> dict[int, Held]:
         """Every buffer that has ever joined, as it has to be now."""
         held: dict[int, Held] = {}

@@ -24,8 +24,8 @@ from tfbus import (
 
 At = int | Latest
 Facts = tuple[object, ...]
-Way = list[tuple[str, bool]]
-"""The edges from source to target, by child; True for each that is climbed."""
+Way = list[tuple[str, str, bool]]
+"""The edges from source to target, each a child and its parent; True for those that are climbed."""
 Within = tuple[int, int] | None
 """The oldest and the newest stamp that count as the latest, in ns."""
 
@@ -175,12 +175,12 @@ class PlainTree:
         if isinstance(at, Latest):
             return self.at_latest(target, source, within)
         way = self.way(target, source, at)
-        return Answer(at, all(self.children[name].static for name, _ in way), self.along(way, at))
+        return Answer(at, all(self.children[name].static for name, _, _ in way), self.along(way, at))
 
     def at_latest(self, target: str, source: str, within: Within) -> Answer:
         """Source in target at the newest stamp that all moving edges of the newest way have reached."""
         way = self.way(target, source, LATEST)
-        edges = {name: self.children[name] for name, _ in way}
+        edges = {name: self.children[name] for name, _, _ in way}
         moving = {name: edge for name, edge in edges.items() if not edge.static}
         if not moving:
             if target == source and target in self.children:
@@ -234,7 +234,7 @@ class PlainTree:
             raise Blocked((DisconnectedError,))
         if isinstance(at, Latest):
             return found[0]
-        covered = [way for way in found if all(self.children[name].covers(at) for name, _ in way)]
+        covered = [way for way in found if all(self.children[name].covers(at) for name, _, _ in way)]
         newest = self.ways(target, source, LATEST)
         for way in covered:
             if way in newest:
@@ -248,7 +248,7 @@ class PlainTree:
 
     def deciding_facts(self, way: Way, at: int) -> list[Facts]:
         """The facts of an edge that has lost the stamp; else of one that has come least far."""
-        errors = [self.children[name].facts(name, at) for name, _ in way if not self.children[name].covers(at)]
+        errors = [self.children[name].facts(name, at) for name, _, _ in way if not self.children[name].covers(at)]
         past = [facts for facts in errors if facts[0] is PastExtrapolationError]
         reached = [facts[3] if isinstance(facts[3], int) else float("-inf") for facts in errors]
         return past or [facts for facts, reach in zip(errors, reached, strict=True) if reach == min(reached)]
@@ -260,7 +260,7 @@ class PlainTree:
 
     def along(self, way: Way, at: int) -> Pose:
         pose = Pose(0.0, 0j, 0.0)
-        for name, up in way:
+        for name, _, up in way:
             edge = self.children[name].pose_at(at)
             pose = (edge if up else edge.inverse()) @ pose
         return pose
@@ -275,7 +275,7 @@ def ways(held: list[tuple[str, str]], target: str, here: str, seen: frozenset[st
         for end, there, up in ((child, parent, True), (parent, child, False)):
             if end == here and there not in seen:
                 for rest in ways(held, target, there, seen | {here}):
-                    yield [(child, up), *rest]
+                    yield [(child, parent, up), *rest]
 
 
 def climb(parents: dict[str, str], name: str) -> list[str]:
