@@ -45,6 +45,7 @@ def test_the_json_of_a_bus_has_its_buffers_and_queues_by_name() -> None:
             "waiting": 5,
             "expired_ahead": 2,
             "superseded": 1,
+            "looped": 0,
         }
     ]
     assert described["queues"] == [

@@ -23,6 +23,8 @@ class BufferStatistics:
     superseded : int
         Those of the expired samples that came late, and name another parent than a newer sample that was published
         before the buffer joined.
+    looped : int
+        Samples that formed a loop of parents at a past stamp, as late data can; they are among the samples above.
     """
 
     offered: int
@@ -32,6 +34,7 @@ class BufferStatistics:
     waiting: int
     expired_ahead: int = 0
     superseded: int = 0
+    looped: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from tfbus.events import (
     FrameRemoved,
     FrameStale,
     KindChanged,
+    PastLoop,
     Reparented,
     SampleRejected,
     StampAhead,
@@ -29,8 +30,8 @@ class EventQueue:
 
     A conflict of authorities is given once for each frame and pair of them. From then on a new parent or kind of that
     frame is given once for each authority that claims it. A rejected sample is given once for each frame, authority and
-    reason, and a stamp ahead of the clock once for each frame and authority. All of this begins anew when the frame is
-    removed or added, and when the clock jumps back.
+    reason; a stamp ahead of the clock, for each frame and authority; and a loop of parents in the past, for each frame,
+    authority and parent. All of this begins anew when the frame is removed or added, and when the clock jumps back.
 
     If one authority moves a frame to and fro, every move is an event, because that may be intended. If the queue is
     full, such a frame pushes out its own events and no others.
@@ -104,9 +105,9 @@ class EventQueue:
         if isinstance(event, AuthorityConflict):
             seen = self._conflicts.setdefault(event.frame, SeenKeys(_CLAIMS))
             key = frozenset((event.authority, event.other))
-        elif isinstance(event, (SampleRejected, StampAhead)):
+        elif isinstance(event, (SampleRejected, StampAhead, PastLoop)):
             seen = self._refusals.setdefault(event.frame, SeenKeys(_CLAIMS))
-            key = (event.authority, event.reason if isinstance(event, SampleRejected) else StampAhead)
+            key = (type(event), event.authority, _what(event))
             if len(self._refusals) > _REFUSED_FRAMES:
                 del self._refusals[next(iter(self._refusals))]
         elif isinstance(event, Reparented) and event.frame in self._conflicts:
@@ -118,3 +119,10 @@ class EventQueue:
         else:
             return False
         return not seen.add(key)
+
+
+def _what(event: SampleRejected | StampAhead | PastLoop) -> str | None:
+    """That of which an event tells once, beside its frame and authority."""
+    if isinstance(event, SampleRejected):
+        return event.reason
+    return event.parent if isinstance(event, PastLoop) else None

@@ -29,6 +29,8 @@ from tfbus.registration import Registration
 from tfbus.stamps import STAMP_MIN, format_duration
 from tfbus.tree.cycles import NewestEdge, admit
 
+_FORMER_PARENTS = 1_000
+
 Invalid = Literal["raise", "drop"]
 
 
@@ -108,6 +110,8 @@ class Topology:
         self._parents = 0
         self._turn = 0
         self._newest: dict[str, _Edge] = {}
+        # Every parent of a newest edge, and some that were one.
+        self._named: set[str] = set()
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
         self.reparented = 0
@@ -257,7 +261,9 @@ class Topology:
         if self._ownership.restricts:
             batch, unowned = self._ownership.split(batch, self._newest)
             refused += unowned
-        accepted, looped = admit(self._newest, batch)
+        if len(self._named) > 2 * len(self._newest) + _FORMER_PARENTS:
+            self._named = {known.parent for known in self._newest.values()}
+        accepted, looped = admit(self._newest, batch, self._named)
         if looped and self._ownership.reserves and not (refused and invalid == "raise"):
             accepted, looped = self._defend(batch, refused, invalid)
         refused += looped
@@ -272,6 +278,7 @@ class Topology:
         for error in refused:
             self._log.warning((error.reason, error.child, error.authority), "dropped a sample: %s", error)
         for sample in accepted:
+            self._named.add(sample.parent)
             self._record(sample)
         if ahead and not rejects_ahead:
             stored = set(map(id, accepted))
@@ -298,7 +305,7 @@ class Topology:
         """
         edges = dict(self._newest)
         removed: list[InvalidTransformError] = []
-        _, looped = admit(edges, batch)
+        _, looped = admit(edges, batch, self._named)
         while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
             rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
             if len(rest) < len(batch):
@@ -307,14 +314,14 @@ class Topology:
             else:
                 del edges[_child(intruder)]
                 removed.append(intruder)
-            _, looped = admit(edges, batch)
+            _, looped = admit(edges, batch, self._named)
         if invalid == "drop" or not (looped or refused):
             for error in removed:
                 self.reject(error.reason, error)
                 self._log.warning(("intruder", error.child, error.authority), "removed a frame: %s", error)
                 self._evict(_child(error))
         # Whoever was told of a removal may have published.
-        return admit(self._newest, batch)
+        return admit(self._newest, batch, self._named)
 
     def _record(self, sample: TransformStamped) -> None:
         parent, child, stamp, _, authority, static = sample._fields

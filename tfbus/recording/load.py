@@ -3,7 +3,7 @@
 import logging
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 
 from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
 from tfbus.geometry.stamped import Batch
@@ -65,12 +65,16 @@ def fill(tree: TransformTree, messages: Iterable[RecordedMessage], problems: Cou
     for _, batch, errors in messages:
         if errors:
             problems.update(error.reason for error in errors)
-        forest.commit(sound_samples(forest.frames, batch, problems, tree.max_translation))
+        forest.commit(sound_samples(forest.frames, batch, forest.names.parents, problems, tree.max_translation))
     forest.forget_changes()
 
 
 def sound_samples(
-    edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str], max_translation: float = MAX_TRANSLATION
+    edges: Mapping[str, NewestEdge],
+    batch: Batch,
+    parents: Container[str],
+    problems: Counter[str],
+    max_translation: float = MAX_TRANSLATION,
 ) -> Batch:
     """Return the batch without the samples that are too far away or would close a loop of parents, and count those.
 
@@ -79,6 +83,8 @@ def sound_samples(
     edges : mapping of child to its newest edge
         Every edge has a sample, because nothing is ever removed from a recording.
     batch : tuple of TransformStamped
+    parents : container of str
+        The frames that are a parent of one of the edges.
     problems : Counter
     max_translation : float
         In m.
@@ -98,6 +104,6 @@ def sound_samples(
     if len(near) < len(batch):
         far = (sample for sample in batch if not is_within(sample, max_translation))
         problems.update(not_physical(sample, max_translation).reason for sample in far)
-    accepted, refused = admit(edges, near)
+    accepted, refused = admit(edges, near, parents)
     problems.update(error.reason for error in refused)
     return accepted

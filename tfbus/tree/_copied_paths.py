@@ -1,9 +1,12 @@
 """Copies of the samples that a lookup at many stamps needs.
 
 While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies the
-samples on them as blocks of memory. All work in numpy comes after that, on the copies.
+samples on them: as blocks of memory, or only those next to a stamp where there are many more samples than stamps. All
+other work in numpy comes after that, on the copies.
 """
 
+from array import array
+from bisect import bisect_left, bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +17,26 @@ from tfbus.geometry.rows import Row
 from tfbus.stamps import Stamps
 from tfbus.tree._python_kernel import Step
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import FrameHistory, Samples
+from tfbus.tree.history import RECORD_SIZE, FrameHistory, Samples
 from tfbus.tree.path import Path
 
 Places = slice | npt.NDArray[np.intp]
 """Indices into the stamps that were asked for."""
+
+_BLOCK = 64
+"""Up to this many samples for each stamp, all samples are copied at once, which is faster than to pick some."""
+
+
+class Query(NamedTuple):
+    """The question where `source` is, seen from `target`, at many stamps."""
+
+    target: str
+    source: str
+    stamps: Stamps
+
+    def span(self) -> tuple[int, int] | None:
+        """The first and the last stamp, in ns; None if there are none."""
+        return (int(self.stamps.min()), int(self.stamps.max())) if len(self.stamps) else None
 
 
 class CopiedPath(NamedTuple):
@@ -72,37 +90,49 @@ class PathsOverTime(NamedTuple):
         return [(np.flatnonzero(numbers == i), path) for i, path in enumerate(different)]
 
 
-def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] | None) -> PathsOverTime:
-    """Copy the paths from source to target that hold from a first stamp to a last. The caller holds the lock.
+def copy_paths(forest: Forest, query: Query, span: tuple[int, int] | None) -> PathsOverTime:
+    """Copy the paths from source to target that hold at the stamps of a query. The caller holds the lock.
 
     Parameters
     ----------
     forest : Forest
-    target, source : str
+    query : Query
     span : (int, int) or None
-        The first and the last stamp, in ns; None if there are no stamps.
+        The first and the last of its stamps, in ns; None if there are none.
 
     Raises
     ------
     UnknownFrameError
     """
+    target, source = query.target, query.source
     forest.check_known(target)
     forest.check_known(source)
     if span is None:
         return PathsOverTime([], [None])
     low, high = span
     paths: list[Path | None] = [_path_at(forest, target, source, low)]
-    changes: list[int] = []
-    if paths[0] is None or not paths[0].permanent:
-        changes = [stamp for stamp in forest.parent_changes() if low < stamp <= high]
-        paths += [_path_at(forest, target, source, stamp) for stamp in changes]
+    changes = _changes(forest, target, source, paths[0], low, high)
+    paths += [_path_at(forest, target, source, stamp) for stamp in changes]
     copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
     for path in paths:
         if path is not None and (path.up, path.down) not in copies:
-            up = tuple(_copy(step, low, high) for step in path.up)
-            down = tuple(_copy(step, low, high) for step in path.down)
+            up = tuple(_copy(step, query, low, high) for step in path.up)
+            down = tuple(_copy(step, query, low, high) for step in path.down)
             copies[path.up, path.down] = CopiedPath(up, down)
     return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
+
+
+def _changes(forest: Forest, target: str, source: str, path: Path | None, low: int, high: int) -> list[int]:
+    """The stamps after `low`, up to `high`, at which the path may change."""
+    if path is not None and path.permanent and path.root not in forest.frames:
+        return []
+    edges = forest.edges_above(target, source)
+    if all(edge.parents is None for edge in edges):
+        return []
+    # Of two ways round a loop of parents, the one whose samples cover the stamp counts.
+    changes = {stamp for edge in edges for stamp in edge.beginnings()}
+    changes.update(edge.stamps[-1] + 1 for edge in edges if edge.stamps)
+    return sorted(stamp for stamp in changes if low < stamp <= high)
 
 
 def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
@@ -112,5 +142,25 @@ def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
         return None
 
 
-def _copy(step: Step, low: int, high: int) -> Samples | Row:
-    return step.samples_between(low, high) if isinstance(step, FrameHistory) else step
+def _copy(step: Step, query: Query, low: int, high: int) -> Samples | Row:
+    if not isinstance(step, FrameHistory):
+        return step
+    between = bisect_right(step.stamps, high) - bisect_left(step.stamps, low)
+    return (
+        step.samples_between(low, high) if between <= _BLOCK * len(query.stamps) else samples_around(step, query.stamps)
+    )
+
+
+def samples_around(edge: FrameHistory, stamps: Stamps) -> Samples:
+    """Copies of the samples next to each of some stamps (ns), on both sides; one that has the stamp counts as before.
+
+    The edge must have samples.
+    """
+    start = edge.start
+    # The views on the history end with each line, because a history that is being viewed cannot grow.
+    after = np.frombuffer(edge.stamps, np.int64)[start:].searchsorted(stamps, "right")
+    places = start + np.unique(np.concatenate((after - 1, after)).clip(0, len(edge.stamps) - start - 1))
+    own = np.frombuffer(edge.stamps, np.int64)[places]
+    records = np.frombuffer(edge.records, np.uint8).reshape(-1, RECORD_SIZE)[places]
+    parents = None if edge.parents is None else [edge.origins[place][0] for place in places.tolist()]
+    return Samples(array("q", own.tobytes()), bytearray(records), parents)

@@ -20,7 +20,7 @@ from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import Edge, Outcome
+from tfbus.tree.history import Edge, FrameHistory, Outcome
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer, bounds_of
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.rendering import describe, to_dot, to_yaml
@@ -29,12 +29,15 @@ from tfbus.tree.rendering import describe, to_dot, to_yaml
 class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
-    Any thread may read it while another one inserts.
+    Any thread may read it while another one inserts. A copy, and what `edges` and the texts show, is the tree at one
+    moment; an explanation reads its edges one after the other.
 
     Parameters
     ----------
     keep : float or None
-        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything.
+        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything. A late
+        sample then costs more the longer the history is, because all samples after it are moved: in the middle of a
+        million samples some ms.
     max_translation : float
         The greatest magnitude of a translation, in m, at most 1e100; a longer one is refused as not physical, so that
         every answer is finite.
@@ -109,6 +112,11 @@ class TransformTree:
         """Number of samples that were older than the window of their frame."""
         return self._forest.expired
 
+    @property
+    def looped(self) -> int:
+        """Number of samples that formed a loop of parents at a past stamp when they came; see `lookup`."""
+        return self._forest.looped
+
     # Questions about transforms
 
     def lookup(
@@ -171,6 +179,13 @@ class TransformTree:
         TypeError
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
             `not_before` or `not_after` comes without a `LATEST`.
+
+        Notes
+        -----
+        The newest parents never form a loop. Those at an older stamp may, if samples came late, and then two ways lead
+        from source to target. If the way of the newest parents has samples for the stamp, it is the answer; otherwise
+        the way that has them. If both others have them, the frames count as not connected at that stamp. `looped`
+        counts the samples that form such loops. The answer depends on the samples only, never on earlier questions.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)
@@ -217,8 +232,7 @@ class TransformTree:
             raise TypeError(AT_LATEST_ONLY)
         if at is not LATEST:
             at = as_stamp(at)
-        with self._forest.lock:
-            return explain(self._forest, target, source, at, bounds, policy, now)
+        return explain(self._forest, target, source, at, bounds, policy, now)
 
     def lookup_many(
         self,
@@ -400,8 +414,8 @@ class TransformTree:
 
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
-        with self._forest.lock:
-            return [self._forest.frames[child].edge() for child in sorted(self._forest.frames)]
+        edges = self._forest.read_all(FrameHistory.edge)
+        return [edges[child] for child in sorted(edges)]
 
     def __contains__(self, frame: object) -> bool:
         with self._forest.lock:
