@@ -92,7 +92,10 @@ CHAIN = tuple(pairwise(FRAMES))
 # Half of the edges continue one chain, so that there often is an answer; the others reparent, or close a loop.
 ENDS = [*permutations(FRAMES, 2), *CHAIN * 5]
 EDGES = [Edge(*ends, stamp) for ends, stamp in product(ENDS, (*OFFSETS, None))]
-CHAINS = [Publish(tuple(Edge(*ends, stamp) for ends in CHAIN)) for stamp in OFFSETS]
+CHAINS = [
+    *(Publish(tuple(Edge(*ends, stamp) for ends in CHAIN)) for stamp in OFFSETS),
+    Publish(tuple(Edge(*ends, None) for ends in CHAIN[2:])),
+]
 QUESTIONS = [(target, source, at) for target, source in permutations(FRAMES, 2) for at in (*OFFSETS, *[None] * 4)]
 
 places = st.sampled_from([(), (), (), (), (), (0,), (1,), (2, 0)])
