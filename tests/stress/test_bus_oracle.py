@@ -4,7 +4,7 @@ Buffers join late, with and without prefill and prefix, and leave; samples come 
 in the past, turn static, or would close a loop; frames are removed, the clock jumps, lookups wait and are cancelled.
 """
 
-import random
+import os
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -14,8 +14,8 @@ from support.oracle.schedule import Burst, schedules
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 
-SCHEDULES = 10_000
-"""On each loop, in the thorough suite."""
+SCHEDULES = int(os.environ.get("ORACLE_SCHEDULES", "2000"))
+"""On each loop, in the thorough suite. Ten thousand take a quarter of an hour on two cores."""
 
 PARTS = 20
 """Tests that share them, so that they can run in several processes."""
@@ -37,12 +37,10 @@ def test_every_buffer_answers_as_the_model_says_whatever_happens(run: Run, burst
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("part", range(PARTS))
-def test_every_buffer_answers_as_the_model_says_in_ten_thousand_schedules(run: Run, part: int) -> None:
-    profile = settings()
-
+def test_every_buffer_answers_as_the_model_says_in_thousands_of_schedules(run: Run, part: int) -> None:
     # The parts would all have the same schedules if they were derandomised as other tests are.
-    @seed(part if profile.derandomize else random.getrandbits(64))
-    @settings(profile, max_examples=SCHEDULES // PARTS, derandomize=False)
+    @seed(part)
+    @settings(max_examples=SCHEDULES // PARTS, derandomize=False)
     @given(bursts=schedules)
     def play_part(bursts: list[Burst]) -> None:
         play(run, bursts)
