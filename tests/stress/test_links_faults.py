@@ -1,8 +1,8 @@
 """Faults at random between processes in network namespaces: some seconds after each, all buses hold the same frames.
 
 `FAULT_SECONDS` and `FAULT_SEED` in the environment make it last longer, or begin otherwise; `FAULT_KINDS` has the names
-of the faults. By default there are none that cut all connections of a host: when they come back, zenoh sometimes keeps a
-connection of which one end has never heard the other's presence, and the two stay apart.
+of the faults. By default none of them cuts all connections of a host: when they come back, zenoh sometimes keeps one of
+which one end has never heard the other's presence, and the two stay apart.
 """
 
 import os

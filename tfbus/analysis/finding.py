@@ -31,7 +31,7 @@ class Finding:
     Parameters
     ----------
     kind : str
-        One of the keys of `ADVICE`, such as ``"jump"``.
+        The kind, such as ``"jump"``.
     frame : str or None
         The child frame; None for the whole tree.
     count : int

@@ -29,7 +29,7 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None) 
     -------
     matplotlib.figure.Figure
         With three axes: the strips, the periods and the delays. A strip has a break where a frame was silent for more
-        than `GAP` times its median period.
+        than ``GAP`` times its median period.
 
     Raises
     ------
