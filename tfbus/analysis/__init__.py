@@ -1,4 +1,4 @@
-"""What is asked about trees after the fact: a doctor, and the comparison of trajectories.
+"""The analysis of trees that are complete: a doctor, and the comparison of trajectories.
 
 `diagnose` tells what in a tree cannot be right; an `Examiner` is fed with samples as they arrive, and so also sees what
 a tree does not keep, such as duplicates and stamps that go back. `compare` gives the absolute and the relative pose

@@ -1,4 +1,4 @@
-"""What is wrong with the samples of one frame, in numpy."""
+"""The faults in the samples of one frame, found in numpy."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from tfbus.analysis.limits import Limits
 from tfbus.stamps import SECOND, STAMP_MAX, to_seconds
 
 _OUTLIER = 20.0
-"""How many times as fast as its median speed a frame has to be for a jump."""
+"""The least speed of a jump, as a multiple of the median speed of its frame."""
 _MIN_MOVES = 20
 """The number of moves from which the median is taken for usual."""
 _MIN_STEP = 0.1

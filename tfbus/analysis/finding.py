@@ -21,7 +21,7 @@ ADVICE = {
     "disconnected": "nothing can be looked up between these trees: a transform is missing",
     "refused": "these are left out",
 }
-"""What to do about each kind of finding."""
+"""The advice for each kind of finding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class Finding:
 
     @property
     def advice(self) -> str:
-        """What to do about it."""
+        """The advice for this kind of finding."""
         return ADVICE[self.kind]
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""What all figures have in common: colours that people tell apart with any colour vision, and the axes of time."""
+"""The style of all figures: colours that people tell apart with any colour vision, and the axes of time."""
 
 from itertools import cycle
 from typing import Any

@@ -14,7 +14,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reception:
-    """When one frame was heard.
+    """The times at which one frame was heard.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Reception:
 
 
 def read_reception(messages: Iterable[RecordedMessage]) -> dict[str, Reception]:
-    """When each frame was heard, by frame, sorted by name.
+    """The reception of each frame, by frame, sorted by name.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ Topics: TypeAlias = str | Iterable[str] | Mapping[str, str] | None
 
 
 class Choice(NamedTuple):
-    """How a channel is read."""
+    """The way in which a channel is read."""
 
     static: bool
     prefix: str
@@ -65,7 +65,7 @@ class Selection:
         return list(self._prefixes or ())
 
     def choose(self, channel: Channel) -> Choice | None:
-        """How a channel is read; None if it is not."""
+        """The way in which a channel is read; None if it is not."""
         if not holds_transforms(channel):
             return None
         name = channel.topic.removeprefix("/")

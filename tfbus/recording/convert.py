@@ -49,7 +49,7 @@ class StaticTransform:
 
 @dataclass(slots=True)
 class Conversion:
-    """What `convert` has done.
+    """The result of `convert`.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from tfbus.recording.formats._raw_transforms import RawTransform
 
 @dataclass(frozen=True, slots=True)
 class Edits:
-    """What is changed in transforms; numbers and stamps never are.
+    """The changes that `convert` makes to transforms; numbers and stamps stay.
 
     Parameters
     ----------

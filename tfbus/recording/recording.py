@@ -103,7 +103,7 @@ class Recording:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is not read although it may hold transforms: ignored topics, and ignored files of a folder."""
+        """The ignored topics, and ignored files of a folder, that may hold transforms."""
         ignored = [topic for topic in self.topics if topic.ignored]
         joints = [] if any(topic.read for topic in self.topics) else [t for t in self.topics if t.type in _JOINT_TYPES]
         return (*self._opened.remarks, *map(_remark, ignored), *map(_remark_on_joints, joints))

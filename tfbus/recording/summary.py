@@ -237,7 +237,7 @@ class _Counts:
 
 
 class _Sent:
-    """What one authority sent of one frame."""
+    """The samples of one frame that one authority sent."""
 
     def __init__(self) -> None:
         self.static = 0

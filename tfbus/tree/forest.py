@@ -312,7 +312,7 @@ class Forest:
         return names_below(self.frames, names, above)
 
     def read_all(self, read: Callable[[FrameHistory], T]) -> dict[str, T]:
-        """What `read` gives for each frame, all of one moment.
+        """The result of `read` for each frame, all of one moment.
 
         Some frames are read at a time, so that insertions by another thread need not wait for all. Frames that have
         changed meanwhile are read again.

@@ -1,4 +1,4 @@
-"""What the page shows: the choices that people make in the browser, and the picture that follows from them.
+"""The model of the page: the choices that people make in the browser, and the picture that follows from them.
 
 It knows no browser and no event loop. `Page.picture` reads the tree at one instant; `Page.texts` gives what the side
 panel says.
@@ -31,7 +31,7 @@ _MATCHES = 200
 
 
 class Picture(NamedTuple):
-    """What the 3D part of the page shows."""
+    """The content of the 3D part of the page."""
 
     scene: Scene
     labels: tuple[str, ...]
@@ -41,7 +41,7 @@ class Picture(NamedTuple):
 
 
 class Texts(NamedTuple):
-    """What the side panel shows, as HTML; frames as plain names."""
+    """The content of the side panel, as HTML; frames as plain names."""
 
     status: str
     selection: str

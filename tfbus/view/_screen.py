@@ -33,7 +33,7 @@ class Points(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """What a page shows at a moment."""
+    """The content of a page at a moment."""
 
     picture: Picture
     texts: Texts | None
@@ -83,7 +83,7 @@ class Screen:
         self._points = points
 
     def read(self, now: int, elapsed: int, texts: bool) -> Sight:
-        """What the page shows now, for `show`.
+        """The content of the page now, for `show`.
 
         Parameters
         ----------

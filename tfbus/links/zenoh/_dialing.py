@@ -59,7 +59,7 @@ class Dialing:
             self._lost[peer] = _Lost(now, now + FIRST_PAUSE)
 
     def next_due(self) -> float | None:
-        """When to call `take_due` again; None while nobody is lost."""
+        """The time of the next call of `take_due`; None while nobody is lost."""
         return min((lost.due for lost in self._lost.values()), default=None)
 
     def take_due(self) -> list[tuple[str, str]]:

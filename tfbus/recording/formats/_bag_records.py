@@ -163,7 +163,7 @@ class Content(NamedTuple):
     connections: list[tuple[Fields, bytes]]
     """Header and data of each connection."""
     damage: str
-    """Why the rest is missing; empty if nothing is."""
+    """The reason why the rest is missing; empty if nothing is."""
 
 
 def read_chunk(file: IO[bytes], record: Record, torn: bool = False) -> bytes:

@@ -148,7 +148,7 @@ class FolderStorage:
             yield from self._shortfalls(now, wanted, read)
 
     def _shortfalls(self, now: int, wanted: Wanted, read: Counter[Channel]) -> Iterator[StoredMessage]:
-        """What the metadata promise, and the files neither promise nor have."""
+        """A report for each topic of which the metadata promise messages that the files neither promise nor have."""
         assert self._promised is not None
         known: dict[str, list[Channel]] = {}
         for channel in self.channels:

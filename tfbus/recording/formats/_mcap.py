@@ -373,7 +373,7 @@ class _Reading:
         self.unknown += sum(count for number, count in counts.items() if self._storage.channel(number) is None)
 
     def _in_torn(self, torn: Torn) -> list[StoredMessage]:
-        """What can be read of the record in which the file ends."""
+        """The readable part of the record in which the file ends."""
         with suppress(*DAMAGE):
             if torn.opcode == Opcode.CHUNK:
                 return self._in_chunk(Chunk.parse(torn.data, torn=True), torn=True)
