@@ -4,7 +4,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 import pytest
-from support.processes import free_ports, new_domain, until
+from support.processes import until
 from support.samples import moving, static
 from support.wires import latched
 
@@ -16,16 +16,6 @@ pytestmark = pytest.mark.anyio
 UNSTEADY = pytest.mark.skip(reason="now and then a link behind a router never hears of another one")
 
 CLIENT = {"mode": "client"}
-
-
-@pytest.fixture
-def address() -> str:
-    return f"tcp/127.0.0.1:{free_ports(1)[0]}"
-
-
-@pytest.fixture
-def domain() -> str:
-    return new_domain()
 
 
 @asynccontextmanager
