@@ -4,6 +4,7 @@ import subprocess
 from pathlib import Path
 
 from tfbus.cli.arguments import UsageError
+from tfbus.cli.output import write_file
 
 
 def draw(dot: str, kind: str, path: Path) -> None:
@@ -30,23 +31,3 @@ def draw(dot: str, kind: str, path: Path) -> None:
     if drawn.returncode != 0:
         raise UsageError(f"Graphviz could not draw the tree: {drawn.stderr.decode(errors='replace').strip()}")
     write_file(path, drawn.stdout)
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file, all of it or nothing; a pipe or a device is written to directly.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be written.
-    """
-    replaceable = path.is_file() or not path.exists()
-    written = path.with_name(f".{path.name}.part") if replaceable else path
-    try:
-        written.write_bytes(content)
-        if replaceable:
-            written.replace(path)
-    except OSError as error:
-        if replaceable:
-            written.unlink(missing_ok=True)
-        raise UsageError(f"cannot write {path}: {error.strerror}") from None

@@ -3,8 +3,10 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
+from tfbus.cli.arguments import UsageError
 from tfbus.geometry.transform import Transform
 from tfbus.stamps import SECOND
 
@@ -72,3 +74,23 @@ def format_transform(transform: Transform) -> str:
 def format_counts(counts: Mapping[str, int]) -> str:
     """Counts by reason in one line: ``3 x not finite, 1 x cycle``."""
     return ", ".join(f"{count:,} x {reason}" for reason, count in counts.items())
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file, all of it or nothing; a pipe or a device is written to directly.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be written.
+    """
+    replaceable = path.is_file() or not path.exists()
+    written = path.with_name(f".{path.name}.part") if replaceable else path
+    try:
+        written.write_bytes(content)
+        if replaceable:
+            written.replace(path)
+    except OSError as error:
+        if replaceable:
+            written.unlink(missing_ok=True)
+        raise UsageError(f"cannot write {path}: {error.strerror}") from None

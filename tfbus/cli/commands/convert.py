@@ -7,9 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tfbus.cli._graphviz import write_file
 from tfbus.cli.arguments import Flag, Instant, UsageError
-from tfbus.cli.output import format_counts, progress, say, warn
+from tfbus.cli.output import format_counts, progress, say, warn, write_file
 from tfbus.recording.convert import StaticTransform
 from tfbus.recording.convert import convert as convert_recordings
 from tfbus.recording.edits import Edits

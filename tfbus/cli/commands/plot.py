@@ -7,9 +7,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from tfbus.cli._graphviz import write_file
 from tfbus.cli.arguments import Flag, UsageError
-from tfbus.cli.output import track
+from tfbus.cli.output import track, write_file
 from tfbus.cli.recorded_tree import load_tree
 from tfbus.errors import UnknownFrameError
 from tfbus.recording.recording import open_recording

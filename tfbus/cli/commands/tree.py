@@ -10,10 +10,10 @@ import anyio.to_thread
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.bus.delays import Delays
-from tfbus.cli._graphviz import draw, write_file
+from tfbus.cli._graphviz import draw
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import print_now
+from tfbus.cli.output import print_now, write_file
 from tfbus.stamps import to_seconds
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import to_dot
