@@ -14,9 +14,12 @@ async def close_task_group(tasks: anyio.abc.TaskGroup) -> None:
     try:
         await tasks.__aexit__(None, None, None)
     except BaseExceptionGroup as group:
-        if len(group.exceptions) > 1:
-            raise
-        error = group.exceptions[0]
+        error: BaseException = group
+        # A task may have had a group of its own.
+        while isinstance(error, BaseExceptionGroup):
+            if len(error.exceptions) > 1:
+                raise
+            error = error.exceptions[0]
     else:
         return
     raise_unchanged(error)

@@ -7,7 +7,11 @@ from typing import Any, Self
 
 import anyio
 import anyio.to_thread
-import zenoh
+
+try:
+    import zenoh
+except ImportError:
+    raise ImportError('a router of zenoh needs a package more: pip install "tfbus[zenoh]"') from None
 
 from tfbus.links.zenoh._session import as_os_error, close_session
 from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, settings
