@@ -96,6 +96,7 @@ async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
         assert here.items.empty()
 
 
+@pytest.mark.thorough
 async def test_nobody_at_the_address_is_tried_again() -> None:
     async with ends() as (here, there):
         here.dialing.reached(there.id, f"tcp/127.0.0.1:{free_ports(1)[0]}")
