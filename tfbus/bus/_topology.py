@@ -309,8 +309,9 @@ class Topology:
         while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
             rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
             if len(rest) < len(batch):
+                # An error for each sample, so that all are counted.
+                refused += [intruder] * (len(batch) - len(rest))
                 batch = rest
-                refused.append(intruder)
             else:
                 del edges[_child(intruder)]
                 removed.append(intruder)
