@@ -13,7 +13,18 @@ import tfbus
 
 PACKAGE = Path(tfbus.__file__).parent
 
-GROUND = ("stamps", "errors", "events", "frames", "registration", "statistics", "clock", "_log", "_aio")
+GROUND = (
+    "stamps",
+    "errors",
+    "events",
+    "frames",
+    "registration",
+    "statistics",
+    "clock",
+    "_log",
+    "_aio",
+    "_which_kernel",
+)
 
 # Each room with the rooms that it may import. It may import from the ground, and from the rooms that those may import.
 ROOMS: dict[str, tuple[str, ...]] = {
@@ -57,7 +68,8 @@ def module_name(path: Path) -> str:
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
 
 
-SOURCES = {module_name(path): path for path in PACKAGE.rglob("*.py")}
+# The build hook is no module of the package: nothing imports it, and no wheel has it.
+SOURCES = {module_name(path): path for path in PACKAGE.rglob("*.py") if path.name != "_build.py"}
 MODULES = sorted(SOURCES)
 DOORS = {module for module in MODULES if SOURCES[module].name == "__init__.py"}
 
@@ -93,7 +105,8 @@ def own_imports(module: str) -> set[str]:
     found = set()
     for name in imports(module):
         top, _, rest = name.partition(".")
-        if top == "tfbus":
+        # The compiled kernel belongs to the ground, and imports nothing of tfbus.
+        if top == "tfbus" and rest.partition(".")[0] != "_kernel":
             owners = [known for known in SOURCES if f"{rest}.".startswith(f"{known}.")]
             found.add(max(owners, key=len, default="__init__"))
     return found

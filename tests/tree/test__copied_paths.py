@@ -1,5 +1,3 @@
-from array import array
-
 import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of
@@ -7,7 +5,7 @@ from support.samples import moving, over, static, tree_of
 from tfbus import TransformStamped, TransformTree, UnknownFrameError
 from tfbus.geometry.rows import Row
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, copy_paths
-from tfbus.tree.history import RECORD, Samples
+from tfbus.tree.history import Samples
 from tfbus.tree.tree import forest_of
 
 
@@ -19,7 +17,7 @@ def copies(tree: TransformTree, target: str, source: str, span: tuple[int, int] 
 
 def xs(samples: Samples) -> list[tuple[int, float]]:
     """The stamp and x of each copied sample."""
-    return [(record[0], record[1]) for record in RECORD.iter_unpack(samples.records)]
+    return list(zip(samples.stamps.tolist(), samples.rows[:, 0].tolist(), strict=True))
 
 
 @pytest.mark.parametrize("span", [None, (0, 5)])
@@ -126,7 +124,7 @@ def test_changes_of_parents_elsewhere_split_no_permanent_path() -> None:
 
 
 def samples(*stamps: int) -> Samples:
-    return Samples(array("q", stamps), bytearray(), None)
+    return Samples((np.array(stamps, np.int64), 0, np.zeros((len(stamps), 7)), 0, 7, len(stamps)), [])
 
 
 STAMPS = np.array([15, 4, 10, 9, 20])

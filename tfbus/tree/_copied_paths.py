@@ -12,10 +12,9 @@ import numpy.typing as npt
 from tfbus.errors import DisconnectedError
 from tfbus.geometry.rows import Row
 from tfbus.stamps import Stamps
-from tfbus.tree._python_kernel import Step
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory, Samples
-from tfbus.tree.path import Path
+from tfbus.tree.path import Path, Step
 
 Places = slice | npt.NDArray[np.intp]
 """Indices into the stamps that were asked for."""
@@ -35,13 +34,13 @@ class CopiedPath(NamedTuple):
     def covers_all(self, stamps: Stamps) -> bool:
         """Whether each edge covers every one of the stamps."""
         low, high = stamps.min(), stamps.max()
-        return all(edge.stamps and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
+        return all(len(edge.stamps) and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
 
     def covered(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
         """A mask of the stamps that all edges cover, shape (n,)."""
         covered = np.ones(len(stamps), np.bool_)
         for samples in self.moving:
-            if not samples.stamps:
+            if not len(samples.stamps):
                 covered[:] = False
             else:
                 covered &= (samples.stamps[0] <= stamps) & (stamps <= samples.stamps[-1])

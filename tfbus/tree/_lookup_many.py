@@ -99,9 +99,9 @@ def _rows_one_by_one(
     forest: Forest, target: str, source: str, stamps: Stamps, source_stamps: Stamps | None, fixed: str | None
 ) -> list[Row]:
     """The rows at a few stamps; errors as for the lookup at one stamp. The caller holds the lock."""
-    path = forest.paths.get((target, source))
+    path = forest.paths.find(target, source)
     if path is not None and source_stamps is None:
-        return path.rows(stamps.tolist())
+        return [path.row_at(at) for at in stamps.tolist()]
     for name in (target, source) if fixed is None else (target, source, fixed):
         forest.check_known(name)
     if source_stamps is None:

@@ -13,7 +13,6 @@ from tfbus.tree._extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, find
-from tfbus.tree.path import Path
 from tfbus.tree.policy import Policy
 from tfbus.tree.rendering import format_rate
 
@@ -181,7 +180,7 @@ def explain(
     links = [*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:]))]
     instant = stamp
     if isinstance(raised, ExtrapolationError):
-        instant = _reached(path) if isinstance(at, Latest) else at
+        instant = path.latest() if isinstance(at, Latest) else at
     found = []
     for child, parent in links:
         edge = forest.frames[child]
@@ -211,11 +210,6 @@ def _up_to_root(forest: Forest, frame: str, instant: int | None) -> tuple[str, .
             return (*walk, here)
         walk[here] = None
     return tuple(walk)
-
-
-def _reached(path: Path) -> int | None:
-    """The newest common stamp of all moving edges; None if one has no samples."""
-    return path.newest_common()[0] if all(edge.stamps for edge in path.moving) else None
 
 
 def _explained(
@@ -266,7 +260,7 @@ def _block(edge: FrameHistory, at: At, raised: ExtrapolationError, policy: Polic
         return None
     # `LATEST` waits until the lagging edges reach what the others still hold.
     if isinstance(raised.stamp, Latest):
-        return None if edge.stamps else edge.extrapolation_error(LATEST)
-    if edge.stamps and edge.stamps[-1] >= raised.stamp - raised.slack:
+        return None if len(edge) else edge.extrapolation_error(LATEST)
+    if edge.newest is not None and edge.newest >= raised.stamp - raised.slack:
         return None
     return edge.extrapolation_error(raised.stamp, raised.slack)

@@ -9,12 +9,12 @@ import threading
 from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import Latest, as_stamp
+from tfbus.tree._kernel import commit
 from tfbus.tree._known_frames import KnownFrames
+from tfbus.tree._path_cache import PathCache
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
 from tfbus.tree.path import Path, find_path
-
-_PATHS_KEPT = 10_000
 
 
 class Forest:
@@ -36,7 +36,7 @@ class Forest:
     frames : dict of str to FrameHistory
         By child.
     names : KnownFrames
-    paths : dict of (target, source) to Path
+    paths : PathCache
         The permanent paths that have been found. A change that could make one wrong empties it.
     changed : set of str
         Frames with another parent or kind, or a longer past, since `forget_changes`: a lookup from a frame below one of
@@ -65,7 +65,7 @@ class Forest:
         self.window = window
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
-        self.paths: dict[tuple[str, str], Path] = {}
+        self.paths = PathCache(self.lock)
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
         self.inserted = 0
@@ -98,18 +98,18 @@ class Forest:
         bool
             Whether every sample was the next one of its frame, so that nothing but stamps has changed.
         """
-        frames = self.frames
-        plain = True
+        count = len(batch)
         with self.lock:
-            for sample in batch:
-                parent, child, stamp, row, authority, static = sample._fields
-                history = frames.get(child)
-                if history is not None and not static and history.append(parent, stamp, row, authority):
-                    self.inserted += 1
-                else:
-                    plain = False
-                    self.insert_judged(sample)
-        return plain
+            stored = commit(self.frames, batch, 0)
+            self.inserted += stored
+            if stored == count:
+                return True
+            while stored < count:
+                self.insert_judged(batch[stored])
+                end = commit(self.frames, batch, stored + 1)
+                self.inserted += end - stored - 1
+                stored = end
+        return False
 
     def insert_judged(self, sample: TransformStamped) -> Outcome:
         """Store one sample that closes no loop."""
@@ -118,7 +118,7 @@ class Forest:
         if history is None:
             history = self._add_frame(child, parent, static)
         if static:
-            if row != history.row:
+            if row != history.static_row:
                 # The paths hold the rows of static edges.
                 self.paths.clear()
             outcome = history.insert_static(parent, stamp, row, authority)
@@ -171,7 +171,7 @@ class Forest:
         ValueError
             If the stamp does not fit 64 bits.
         """
-        path = self.paths.get((target, source))
+        path = self.paths.find(target, source)
         if path is not None:
             return path
         instant = None if isinstance(at, Latest) else as_stamp(at)
@@ -179,9 +179,7 @@ class Forest:
         self.check_known(source)
         path = find_path(self.frames, target, source, instant)
         if path.permanent:
-            if len(self.paths) >= _PATHS_KEPT:
-                self.paths.clear()
-            self.paths[target, source] = path
+            self.paths.keep(target, source, path)
         return path
 
     def parent_changes(self) -> list[int]:

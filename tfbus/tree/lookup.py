@@ -13,7 +13,6 @@ from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
 from tfbus.stamps import LATEST, Latest, as_stamp
 from tfbus.tree._extrapolation import Extrapolation
-from tfbus.tree._python_kernel import climb
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.path import Path, find_path
@@ -38,6 +37,10 @@ def answer(
     policy: Policy | None,
 ) -> TransformStamped:
     """The answer of `TransformTree.lookup`, without keywords: each of them costs a twentieth of a lookup."""
+    if policy is None and not_before is None and source_at is None and fixed is None:
+        found = forest.paths.answer(target, source, at)
+        if found is not None:
+            return found
     if not_before is not None and at is not LATEST and source_at is not LATEST:
         raise TypeError(AT_LATEST_ONLY)
     if type(at) is not int and at is not LATEST:
@@ -59,19 +62,19 @@ def find(
     forest: Forest, target: str, source: str, at: At, not_before: int | None, extrapolation: Extrapolation | None = None
 ) -> Found:
     """Source in target at one stamp. The caller holds the lock; the errors are those of `TransformTree.lookup`."""
-    path = forest.paths.get((target, source))
+    path = forest.paths.find(target, source)
     if path is None:
         path = forest.find_path(target, source, at)
     if not path.moving:
         if isinstance(at, Latest):
             at = path.static_stamp if len(path.frames) > 1 else _newest_stamp(forest, target)
-        return as_stamp(at), path.row(0), True
+        return as_stamp(at), path.row_at(0), True
     if at is LATEST:
         return _find_latest(forest, path, not_before, extrapolation)
     if extrapolation is not None:
         return at, extrapolation.row(path, as_stamp(at)), False
     try:
-        return at, climb(path.up, at) if not path.down else path.row(at), False
+        return at, path.row_at(as_stamp(at)), False
     except ExtrapolationError:
         # Another edge may decide. The error is raised outside, so that it keeps no traceback of this one alive.
         pass
@@ -85,14 +88,15 @@ def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolati
     """
     common, lagging = path.newest_common()
     if extrapolation is not None:
-        common = min(common + extrapolation.policy.hold, max(edge.stamps[-1] for edge in path.moving))
+        newest = max(edge.newest for edge in path.moving if edge.newest is not None)
+        common = min(common + extrapolation.policy.hold, newest)
     if not_before is not None and common < not_before:
         raise _latest_error(path, lagging, not_before, extrapolation, 0)
     try:
         path_then = path
         if not path.permanent:
             path_then = find_path(forest.frames, path.frames[0], path.frames[-1], common)
-        return common, path_then.row(common) if extrapolation is None else extrapolation.row(path_then, common), False
+        row = path_then.row_at(common) if extrapolation is None else extrapolation.row(path_then, common)
     except TransformLookupError as error:
         # The lagging edge has to reach what the others still hold, or the far end of their gap. Where a parent has
         # changed, any later stamp of it may be enough.
@@ -103,6 +107,7 @@ def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolati
             needed = max(common if edge.oldest is None else edge.oldest for edge in path.moving)
         tolerance = 0 if extrapolation is None else extrapolation.policy.tolerance
         raise _latest_error(path, lagging, needed, extrapolation, tolerance) from error
+    return common, row, False
 
 
 def _latest_error(

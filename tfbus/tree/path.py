@@ -7,13 +7,16 @@ can fail or slow a lookup. Runs of static edges are folded into one row.
 from collections.abc import Mapping
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, PastExtrapolationError
-from tfbus.geometry.rows import Row, compose, invert
-from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN
-from tfbus.tree._python_kernel import Step, climb
+from tfbus.geometry.rows import IDENTITY, Row, compose, invert
+from tfbus.stamps import LATEST, STAMP_MIN
+from tfbus.tree._kernel import Chain
 from tfbus.tree.history import FrameHistory
 
+Step = FrameHistory | Row
+"""A moving edge, or the row of a run of static edges."""
 
-class Path:
+
+class Path(Chain):
     """The edges from `source` to `target`, by the parents that hold at one stamp.
 
     Attributes
@@ -30,16 +33,17 @@ class Path:
         Whether it holds at every stamp, because no frame on it changes its parent inside its window.
     """
 
-    __slots__ = ("_static", "down", "frames", "moving", "permanent", "root", "up")
+    __slots__ = ("_static", "frames", "moving", "permanent", "root")
+    up: tuple[Step, ...]
+    down: tuple[Step, ...]
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
+        super().__init__(_fold(ups), _fold(downs))
         edges = ups + downs
-        self.up = _fold(ups)
-        self.down = _fold(downs)
         self.root = root
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
-        self.permanent = all(edge.parents is None for edge in edges)
+        self.permanent = not any(edge.mixed for edge in edges)
         self._static = tuple(edge for edge in edges if edge.static)
 
     @property
@@ -47,23 +51,20 @@ class Path:
         """The newest stamp among the static samples, in ns; sending one again changes it, but not the path."""
         return max((edge.static_stamp or 0 for edge in self._static), default=0)
 
-    def row(self, at: int) -> Row:
-        """The row of source in target at a stamp.
+    def row_at(self, at: int) -> Row:
+        """The row of source in target at a stamp: that of the kernel or, if it is not plain, the same step by step.
 
         Raises
         ------
         ExtrapolationError
             If an edge does not cover it.
         """
-        if not self.down:
-            return climb(self.up, at)
-        return compose(invert(climb(self.down, at)), climb(self.up, at))
-
-    def rows(self, stamps: list[int]) -> list[Row]:
-        """The rows at some stamps."""
-        if not self.down:
-            return [climb(self.up, at) for at in stamps]
-        return [self.row(at) for at in stamps]
+        row = self.row(at)
+        if row is None:
+            row = _climb(self.up, at)
+            if self.down:
+                row = compose(invert(_climb(self.down, at)), row)
+        return row
 
     def newest_common(self) -> tuple[int, FrameHistory]:
         """The newest stamp that every moving edge has reached, and the edge that has come no further.
@@ -73,14 +74,10 @@ class Path:
         FutureExtrapolationError
             If an edge has no samples.
         """
-        lagging = self.moving[0]
-        common = STAMP_MAX
-        for edge in self.moving:
-            if not edge.stamps:
-                raise edge.extrapolation_error(LATEST)
-            if edge.stamps[-1] < common:
-                lagging, common = edge, edge.stamps[-1]
-        return common, lagging
+        common = self.latest()
+        if common is None:
+            raise next(edge for edge in self.moving if not len(edge)).extrapolation_error(LATEST)
+        return common, next(edge for edge in self.moving if edge.newest == common)
 
     def deciding_error(self, at: int) -> ExtrapolationError:
         """The error of a stamp that is not covered: of an edge that has lost it, else of the one that lags most."""
@@ -91,15 +88,24 @@ class Path:
         return min(missing, key=lambda error: STAMP_MIN if error.newest is None else error.newest)
 
 
+def _climb(steps: tuple[Step, ...], at: int) -> Row:
+    """The first step's child, seen from the last step's parent, at a stamp."""
+    row: Row | None = None
+    for step in steps:
+        here = step.row_at(at) if isinstance(step, FrameHistory) else step
+        row = here if row is None else compose(here, row)
+    return IDENTITY if row is None else row
+
+
 def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
     steps: list[Step] = []
     for edge in edges:
         if not edge.static:
             steps.append(edge)
         elif steps and isinstance(steps[-1], tuple):
-            steps[-1] = compose(edge.row, steps[-1])
+            steps[-1] = compose(edge.static_row, steps[-1])
         else:
-            steps.append(edge.row)
+            steps.append(edge.static_row)
     return tuple(steps)
 
 
