@@ -9,7 +9,7 @@ import pytest
 
 import tfbus
 
-MODULES = [module.name for module in pkgutil.walk_packages(tfbus.__path__, "tfbus.")]
+MODULES = [module.name for module in pkgutil.walk_packages(tfbus.__path__, "tfbus.") if module.name != "tfbus._build"]
 
 
 @pytest.mark.parametrize("name", MODULES)

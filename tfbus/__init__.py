@@ -4,6 +4,7 @@ A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of 
 seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
 """
 
+from tfbus._which_kernel import KERNEL
 from tfbus.buffer.buffer import Buffer
 from tfbus.buffer.watch import Watch
 from tfbus.bus.broadcaster import TransformBroadcaster
@@ -83,6 +84,9 @@ from tfbus.tree.policy import Hold
 from tfbus.tree.question import Question
 from tfbus.tree.tree import TransformTree
 from tfbus.waiting.waiting_index import PendingLookup
+
+kernel = KERNEL
+"""The kernel that runs: ``"compiled"``, or ``"python"`` where that was not built or ``TFBUS_KERNEL=python`` is set."""
 
 __all__ = [
     "LATEST",
@@ -166,5 +170,6 @@ __all__ = [
     "WrenchStamped",
     "do_transform",
     "from_seconds",
+    "kernel",
     "to_seconds",
 ]

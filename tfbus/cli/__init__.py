@@ -5,6 +5,7 @@ Standard output carries the result of a command; notices, warnings and errors go
 
 import os
 import sys
+from importlib.metadata import version
 from io import TextIOWrapper
 
 try:
@@ -12,6 +13,7 @@ try:
 except ImportError:
     raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
 
+from tfbus import kernel
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.commands.broadcast import broadcast
 from tfbus.cli.commands.demo import demo
@@ -34,6 +36,7 @@ INTERRUPTED = 130
 app = App(
     name="tfbus",
     help="Stamped coordinate transforms for asyncio and trio.",
+    version=lambda: f"{version('tfbus')} ({kernel} kernel)",
     suppress_keyboard_interrupt=False,
 )
 for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query):
