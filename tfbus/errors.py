@@ -132,7 +132,7 @@ class DisconnectedError(TransformLookupError):
         The stamp at which they are not connected, in ns; None for a lookup of the newest samples.
     loop : tuple of str
         Frames that form a loop of parents at that stamp, the first one repeated at the end; empty if there is none.
-        Only out-of-order samples can form one.
+        Only samples that came late or out of order can form one.
     """
 
     def __init__(
@@ -209,7 +209,8 @@ class FutureExtrapolationError(ExtrapolationError):
     Attributes
     ----------
     others : tuple of str
-        Other child frames whose next sample may also give an answer; empty unless a policy is used with `LATEST`.
+        Other child frames whose next sample may also give an answer; empty unless a policy is used with `LATEST`, or
+        two ways lead round a loop of parents at the stamp.
     """
 
     others: tuple[str, ...] = ()

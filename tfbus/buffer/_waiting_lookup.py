@@ -116,7 +116,7 @@ class Lookups:
             raise BusClosedError(self._live.end_reason) from blocker
         woken = anyio.Event()
         waiter = Waiter(question, since, woken.set)
-        self._live.waiting.park(waiter, blocker)
+        self._live.park(waiter, blocker)
         try:
             await woken.wait()
         except BaseException:

@@ -88,7 +88,7 @@ class Buffer:
             bus._check_thread()
             self._forest = forest_of(tree).copy_within(window)
         self._tree = tree_of(self._forest, keep)
-        self._live = LiveTree(self._forest)
+        self._live = LiveTree(self._forest, bus._announce_past_loop)
         self._lookups = Lookups(self._live, bus.clock, bus._check_thread, self._local_names)
         bus._attach(self._live)
 

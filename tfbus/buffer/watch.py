@@ -173,7 +173,7 @@ class Watch:
     async def _park(self, blocker: TransformLookupError, since: int) -> None:
         """Wait for a sample that may have removed the cause of `blocker`."""
         waiter = Waiter(self._question, since, self._reader.wake)
-        self._live.waiting.park(waiter, blocker)
+        self._live.park(waiter, blocker)
         try:
             silent = REPORT_AFTER - to_seconds(self._clock.now() - since)
             if silent <= 0.0 or not await self._wait(silent):

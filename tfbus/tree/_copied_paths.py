@@ -92,10 +92,8 @@ def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] |
         return PathsOverTime([], [None])
     low, high = span
     paths: list[Path | None] = [_path_at(forest, target, source, low)]
-    changes: list[int] = []
-    if paths[0] is None or not paths[0].permanent:
-        changes = [stamp for stamp in forest.parent_changes() if low < stamp <= high]
-        paths += [_path_at(forest, target, source, stamp) for stamp in changes]
+    changes = _changes(forest, target, source, paths[0], low, high)
+    paths += [_path_at(forest, target, source, stamp) for stamp in changes]
     copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
     for path in paths:
         if path is not None and (path.up, path.down) not in copies:
@@ -103,6 +101,19 @@ def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] |
             down = tuple(_copy(step, low, high) for step in path.down)
             copies[path.up, path.down] = CopiedPath(up, down)
     return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
+
+
+def _changes(forest: Forest, target: str, source: str, path: Path | None, low: int, high: int) -> list[int]:
+    """The stamps after `low`, up to `high`, at which the path may change."""
+    if path is not None and path.permanent and path.root not in forest.frames:
+        return []
+    edges = forest.edges_above(target, source)
+    if all(edge.parents is None for edge in edges):
+        return []
+    # Of two ways round a loop of parents, the one whose samples cover the stamp counts.
+    changes = {stamp for edge in edges for stamp in edge.beginnings()}
+    changes.update(edge.stamps[-1] + 1 for edge in edges if edge.stamps)
+    return sorted(stamp for stamp in changes if low < stamp <= high)
 
 
 def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:

@@ -176,7 +176,9 @@ def explain(
         links = [link for half in halves for link in pairwise(half)]
         edges = tuple(_explained(forest.frames[child], parent, raised.stamp, now, policy) for child, parent in links)
         return Explanation(target, source, at, None, now, half_chains=halves, edges=edges, errors=(raised,))
-    path = forest.find_path(target, source, at if stamp is None else stamp)
+    path = forest.find_path(target, source, at)
+    if stamp is not None and not path.permanent:
+        path = forest.find_path(target, source, stamp)
     chain, top = path.frames, path.frames.index(path.root)
     links = [*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:]))]
     instant = stamp
@@ -187,7 +189,10 @@ def explain(
         edge = forest.frames[child]
         blocked = _block(edge, at, raised, policy) if isinstance(raised, ExtrapolationError) else None
         found.append(_explained(edge, parent, instant, now, policy, blocked))
-    errors = tuple(edge.error for edge in found if edge.error is not None)
+    errors: tuple[TransformLookupError, ...] = tuple(edge.error for edge in found if edge.error is not None)
+    if raised is not None and raised not in errors:
+        # An edge of the other way round a loop of parents decides.
+        errors = (raised, *errors)
     return Explanation(target, source, at, stamp, now, chain, (), tuple(found), errors)
 
 

@@ -5,16 +5,26 @@ held for one lookup or one batch, so worker threads may read while the loop inse
 """
 
 import threading
+from collections.abc import Iterable
+from typing import NamedTuple
 
-from tfbus.errors import UnknownFrameError
+from tfbus.errors import DisconnectedError, UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.stamps import Latest, as_stamp
+from tfbus.stamps import STAMP_MIN, Latest, as_stamp
+from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
 from tfbus.tree._known_frames import KnownFrames
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
-from tfbus.tree.path import Path, find_path
+from tfbus.tree.path import Path, find_path, path_at
 
 _PATHS_KEPT = 10_000
+
+
+class LoopingSample(NamedTuple):
+    """A sample that is part of a loop of parents at a past stamp."""
+
+    sample: TransformStamped
+    loop: Loop
 
 
 class Forest:
@@ -37,22 +47,32 @@ class Forest:
         By child.
     names : KnownFrames
     paths : dict of (target, source) to Path
-        The permanent paths that have been found. A change that could make one wrong empties it.
+        The newest paths that have been found and are permanent. A change that could make one wrong empties it.
+    changing_paths : dict of (target, source) to Path
+        The same of newest paths that are not permanent.
     changed : set of str
         Frames with another parent or kind, or a longer past, since `forget_changes`: a lookup from a frame below one of
         them may have another answer.
     new_parents : set of str
         Frames that have become a parent since `forget_changes`, so that they may have become known.
+    looping : list of LoopingSample
+        Samples since `forget_changes` that are part of a loop of parents at a past stamp.
     inserted, replaced, expired : int
         Number of samples that had each `Outcome`.
+    looped : int
+        Number of samples that have been in `looping`.
     """
 
     __slots__ = (
+        "_suspects",
         "changed",
+        "changing_paths",
         "expired",
         "frames",
         "inserted",
         "lock",
+        "looped",
+        "looping",
         "names",
         "new_parents",
         "paths",
@@ -66,11 +86,15 @@ class Forest:
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
         self.paths: dict[tuple[str, str], Path] = {}
+        self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
+        self.looping: list[LoopingSample] = []
+        self._suspects: list[TransformStamped] = []
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
+        self.looped = 0
 
     # Changes
 
@@ -87,6 +111,7 @@ class Forest:
             if refused:
                 raise refused[0]
             outcomes = [self.insert_judged(sample) for sample in batch]
+            self.find_past_loops()
             self.forget_changes()
             return outcomes
 
@@ -109,6 +134,8 @@ class Forest:
                 else:
                     plain = False
                     self.insert_judged(sample)
+            if self._suspects:
+                self.find_past_loops()
         return plain
 
     def insert_judged(self, sample: TransformStamped) -> Outcome:
@@ -117,15 +144,18 @@ class Forest:
         history = self.frames.get(child)
         if history is None:
             history = self._add_frame(child, parent, static)
+            if child in self.changed:
+                self._suspects.append(sample)
         if static:
             if row != history.row:
                 # The paths hold the rows of static edges.
-                self.paths.clear()
+                self.forget_paths()
             outcome = history.insert_static(parent, stamp, row, authority)
         else:
             outcome = history.insert(parent, stamp, row, authority)
         if history.changed:
             self._restructure(history)
+            self._suspects.append(sample)
         if outcome is Outcome.INSERTED:
             self.inserted += 1
         elif outcome is Outcome.REPLACED:
@@ -153,17 +183,37 @@ class Forest:
                 history.clear()
                 history.changed = False
                 self.names.update(history.child, history.named_parents)
-            self.paths.clear()
+            self.forget_paths()
+
+    def find_past_loops(self) -> None:
+        """Note which of the samples since the last call are part of a loop of parents at a past stamp.
+
+        The samples of a whole batch are judged after the last, because one batch may turn an edge round.
+        """
+        for sample in self._suspects:
+            child = sample.child
+            if child in self.frames:
+                loop = past_loop(self.frames, child, STAMP_MIN if sample.static else sample.stamp)
+                if loop is not None:
+                    self.looping.append(LoopingSample(sample, loop))
+                    self.looped += 1
+        self._suspects.clear()
 
     def forget_changes(self) -> None:
-        """Empty `changed` and `new_parents`."""
+        """Empty `changed`, `new_parents` and `looping`."""
         self.changed.clear()
         self.new_parents.clear()
+        self.looping.clear()
+
+    def forget_paths(self) -> None:
+        """Empty `paths` and `changing_paths`."""
+        self.paths.clear()
+        self.changing_paths.clear()
 
     # Questions
 
     def find_path(self, target: str, source: str, at: int | Latest) -> Path:
-        """The path between two frames at a stamp, or by the newest parents. A permanent path is kept.
+        """The path between two frames that counts at a stamp (see `path_at`), or the one by the newest parents.
 
         Raises
         ------
@@ -171,22 +221,29 @@ class Forest:
         ValueError
             If the stamp does not fit 64 bits.
         """
-        path = self.paths.get((target, source))
+        if isinstance(at, Latest):
+            return self._newest_path(target, source)
+        instant = as_stamp(at)
+        newest: Path | None
+        try:
+            newest = self._newest_path(target, source)
+        except DisconnectedError:
+            newest = None
+        return path_at(self.frames, target, source, instant, newest)
+
+    def _newest_path(self, target: str, source: str) -> Path:
+        """The path by the newest parents; it is kept until a change may make it wrong."""
+        path = self.paths.get((target, source)) or self.changing_paths.get((target, source))
         if path is not None:
             return path
-        instant = None if isinstance(at, Latest) else as_stamp(at)
         self.check_known(target)
         self.check_known(source)
-        path = find_path(self.frames, target, source, instant)
-        if path.permanent:
-            if len(self.paths) >= _PATHS_KEPT:
-                self.paths.clear()
-            self.paths[target, source] = path
+        path = find_path(self.frames, target, source, None)
+        if len(self.paths) + len(self.changing_paths) >= _PATHS_KEPT:
+            self.forget_paths()
+        kept = self.paths if path.permanent else self.changing_paths
+        kept[target, source] = path
         return path
-
-    def parent_changes(self) -> list[int]:
-        """The stamps at which some frame changes its parent, in order. Between two of them all paths stay."""
-        return sorted({stamp for history in self.frames.values() for stamp in history.parent_changes()})
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""
@@ -200,19 +257,13 @@ class Forest:
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
             raise UnknownFrameError(frame=frame, known=self.names.sorted())
 
-    def with_descendants(self, frames: set[str]) -> set[str]:
-        """These frames and all below them, by any parent that a sample in the window names."""
-        children: dict[str, list[str]] = {}
-        for child, history in self.frames.items():
-            for parent in history.named_parents:
-                children.setdefault(parent, []).append(child)
-        found = set(frames)
-        ahead = list(frames)
-        while ahead:
-            new = [child for child in children.get(ahead.pop(), ()) if child not in found]
-            found.update(new)
-            ahead += new
-        return found
+    def edges_above(self, *names: str) -> list[FrameHistory]:
+        """The edges of some frames and of all above them, by any parent that a sample in the window names."""
+        return list(edges_above(self.frames, names).values())
+
+    def names_below(self, names: Iterable[str], above: set[str]) -> set[str]:
+        """Those of `names` that are in `above`, or below one of these by any parent in the window."""
+        return names_below(self.frames, names, above)
 
     def copy(self) -> "Forest":
         """An independent copy of the samples; its counters start at zero."""
@@ -240,7 +291,7 @@ class Forest:
         self.new_parents.add(parent)
         if has_children:
             # A root that gets a parent leaves the paths below it as they are, unless late samples formed a loop there.
-            self.paths.clear()
+            self.forget_paths()
             self.changed.add(child)
             self._drop_emptied_loop(history)
         return history
@@ -248,7 +299,7 @@ class Forest:
     def _restructure(self, history: FrameHistory) -> None:
         """Forget the paths that an insertion may have made wrong, and note the change for waiting lookups."""
         history.changed = False
-        self.paths.clear()
+        self.forget_paths()
         self.changed.add(history.child)
         self.new_parents.update(history.named_parents)
         self.names.update(history.child, history.named_parents)
@@ -270,4 +321,4 @@ class Forest:
     def _remove(self, frame: str) -> None:
         if self.frames.pop(frame, None) is not None:
             self.names.remove(frame)
-            self.paths.clear()
+            self.forget_paths()

@@ -246,6 +246,14 @@ class FrameHistory:
         stamps = self.stamps[self.start :]
         return [stamp for stamp, old, new in zip(stamps[1:], parents, parents[1:], strict=False) if new != old]
 
+    def beginnings(self) -> list[int]:
+        """The stamps inside the window at which a parent begins to hold: the oldest, and each change."""
+        return [self.stamps[self.start], *self.parent_changes()] if self.stamps else []
+
+    def begins_by(self, stamp: int) -> bool:
+        """Whether the edge is static, or has a sample in the window at `stamp` or before."""
+        return self.static or (bool(self.stamps) and self.stamps[self.start] <= stamp)
+
     def neighbours(self, stamp: int) -> tuple[int | None, int | None]:
         """The stamps of the samples before and after `stamp`, in ns; twice the same if a sample has it."""
         stamps, start = self.stamps, self.start

@@ -100,6 +100,11 @@ class TransformTree:
         """Number of samples that were older than the window of their frame."""
         return self._forest.expired
 
+    @property
+    def looped(self) -> int:
+        """Number of samples that formed a loop of parents at a past stamp when they came; see `lookup`."""
+        return self._forest.looped
+
     # Questions about transforms
 
     def lookup(
@@ -157,6 +162,13 @@ class TransformTree:
         TypeError
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
             `not_before` comes without a `LATEST`.
+
+        Notes
+        -----
+        The newest parents never form a loop. Those at an older stamp may, if samples came late, and then two ways lead
+        from source to target. If the way of the newest parents has samples for the stamp, it is the answer; otherwise
+        the way that has them. If both others have them, the frames count as not connected at that stamp. `looped`
+        counts the samples that form such loops. The answer depends on the samples only, never on earlier questions.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
         return answer(self._forest, target, source, at, source_at, fixed, not_before, policy)
