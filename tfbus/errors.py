@@ -271,10 +271,15 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
     """
 
     def __init__(self, *, target: str, source: str, timeout: float, missing: TransformLookupError) -> None:
-        super().__init__(f"no transform from {source!r} to {target!r} within {timeout:g} s: {missing}")
+        super().__init__()
         self.target = target
         self.source = source
         self.timeout = timeout
+        self._missing = missing
+
+    def _why(self) -> str:
+        # Not earlier, because a thousand timeouts at once would look for the similar names of a thousand frames.
+        return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {self._missing}"
 
 
 class InvalidTransformError(TransformError, ValueError):

@@ -12,7 +12,7 @@ the waiter is kept under the edges that have not, such as one that has stopped.
 """
 
 from bisect import bisect_left, insort
-from collections.abc import Callable, Iterable, KeysView
+from collections.abc import Callable, Iterable, Iterator, KeysView
 from dataclasses import dataclass
 from itertools import count
 
@@ -321,9 +321,11 @@ class WaitingIndex:
 
     def pending(self) -> tuple[PendingLookup, ...]:
         """All waiting lookups with the errors that block them."""
+        return tuple(self.waiting_since(_NEVER))
+
+    def waiting_since(self, stamp: int) -> Iterator[PendingLookup]:
+        """The lookups that have waited since a stamp (ns) or longer, with the errors that block them."""
         # Copied first, because another thread may call this while the loop parks and wakes.
-        return tuple(
-            PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
-            for waiter in list(self._waiters)
-            if waiter.blocked_by is not None
-        )
+        for waiter in list(self._waiters):
+            if waiter.since <= stamp and waiter.blocked_by is not None:
+                yield PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
