@@ -1,9 +1,12 @@
 """Copies of the samples that a lookup at many stamps needs.
 
 While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies the
-samples on them as blocks of memory. All work in numpy comes after that, on the copies.
+samples on them: as blocks of memory, or only those next to a stamp where there are many more samples than stamps. All
+other work in numpy comes after that, on the copies.
 """
 
+from array import array
+from bisect import bisect_left, bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +17,14 @@ from tfbus.geometry.rows import Row
 from tfbus.stamps import Stamps
 from tfbus.tree._python_kernel import Step
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import FrameHistory, Samples
+from tfbus.tree.history import RECORD_SIZE, FrameHistory, Samples
 from tfbus.tree.path import Path
 
 Places = slice | npt.NDArray[np.intp]
 """Indices into the stamps that were asked for."""
+
+_BLOCK = 64
+"""Up to this many samples for each stamp, all samples are copied at once, which is faster than to pick some."""
 
 
 class CopiedPath(NamedTuple):
@@ -72,15 +78,15 @@ class PathsOverTime(NamedTuple):
         return [(np.flatnonzero(numbers == i), path) for i, path in enumerate(different)]
 
 
-def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] | None) -> PathsOverTime:
-    """Copy the paths from source to target that hold from a first stamp to a last. The caller holds the lock.
+def copy_paths(forest: Forest, target: str, source: str, stamps: Stamps) -> PathsOverTime:
+    """Copy the paths from source to target that hold at some stamps. The caller holds the lock.
 
     Parameters
     ----------
     forest : Forest
     target, source : str
-    span : (int, int) or None
-        The first and the last stamp, in ns; None if there are no stamps.
+    stamps : integer array of shape (n,)
+        ns, sorted.
 
     Raises
     ------
@@ -88,17 +94,17 @@ def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] |
     """
     forest.check_known(target)
     forest.check_known(source)
-    if span is None:
+    if not len(stamps):
         return PathsOverTime([], [None])
-    low, high = span
+    low, high = int(stamps[0]), int(stamps[-1])
     paths: list[Path | None] = [_path_at(forest, target, source, low)]
     changes = _changes(forest, target, source, paths[0], low, high)
     paths += [_path_at(forest, target, source, stamp) for stamp in changes]
     copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
     for path in paths:
         if path is not None and (path.up, path.down) not in copies:
-            up = tuple(_copy(step, low, high) for step in path.up)
-            down = tuple(_copy(step, low, high) for step in path.down)
+            up = tuple(_copy(step, stamps) for step in path.up)
+            down = tuple(_copy(step, stamps) for step in path.down)
             copies[path.up, path.down] = CopiedPath(up, down)
     return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
 
@@ -123,5 +129,24 @@ def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
         return None
 
 
-def _copy(step: Step, low: int, high: int) -> Samples | Row:
-    return step.samples_between(low, high) if isinstance(step, FrameHistory) else step
+def _copy(step: Step, stamps: Stamps) -> Samples | Row:
+    if not isinstance(step, FrameHistory):
+        return step
+    low, high = int(stamps[0]), int(stamps[-1])
+    between = bisect_right(step.stamps, high) - bisect_left(step.stamps, low)
+    return step.samples_between(low, high) if between <= _BLOCK * len(stamps) else samples_around(step, stamps)
+
+
+def samples_around(edge: FrameHistory, stamps: Stamps) -> Samples:
+    """Copies of the samples next to each of some stamps (ns), on both sides; one that has the stamp counts as before.
+
+    The edge must have samples.
+    """
+    start = edge.start
+    # The views on the history end with each line, because a history that is being viewed cannot grow.
+    after = np.frombuffer(edge.stamps, np.int64)[start:].searchsorted(stamps, "right")
+    places = start + np.unique(np.concatenate((after - 1, after)).clip(0, len(edge.stamps) - start - 1))
+    own = np.frombuffer(edge.stamps, np.int64)[places]
+    records = np.frombuffer(edge.records, np.uint8).reshape(-1, RECORD_SIZE)[places]
+    parents = None if edge.parents is None else [edge.origins[place][0] for place in places.tolist()]
+    return Samples(array("q", own.tobytes()), bytearray(records), parents)

@@ -38,10 +38,6 @@ class Query(NamedTuple):
     source: str
     stamps: Stamps
 
-    def span(self) -> tuple[int, int] | None:
-        """The first and the last stamp, in ns; None if there are none."""
-        return (int(self.stamps.min()), int(self.stamps.max())) if len(self.stamps) else None
-
 
 def lookup_many(
     forest: Forest,
@@ -118,10 +114,10 @@ def _answers(
     out_of_range: OutOfRange,
 ) -> list["Answers"]:
     """The answers of each query; `lookup_one` raises the error of a place without an answer."""
-    spans = [query.span() for query in queries]
+    in_order = [np.sort(query.stamps) for query in queries]
     while True:
         with forest.lock:
-            copies = [copy_paths(forest, *query[:2], span) for query, span in zip(queries, spans, strict=True)]
+            copies = [copy_paths(forest, *query[:2], stamps) for query, stamps in zip(queries, in_order, strict=True)]
         answers = [Answers(paths, query.stamps, policy) for paths, query in zip(copies, queries, strict=True)]
         missing = [found.first_missing for found in answers if found.first_missing is not None]
         if not missing:

@@ -5,8 +5,8 @@ held for one lookup or one batch, so worker threads may read while the loop inse
 """
 
 import threading
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, TypeVar
 
 from tfbus.errors import DisconnectedError, UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
@@ -19,6 +19,13 @@ from tfbus.tree.path import Path, find_path, path_at
 
 _PATHS_KEPT = 10_000
 
+AT_A_TIME = 100
+"""The number of frames that are read before the lock is released, for questions about all of them."""
+
+_ROUNDS = 3
+
+T = TypeVar("T")
+
 
 class LoopingSample(NamedTuple):
     """A sample that is part of a loop of parents at a past stamp."""
@@ -30,8 +37,8 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `known_frames`, `copy` and `copy_within` take the lock themselves. The caller
-    of every other method holds it.
+    `insert`, `commit`, `remove`, `clear`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
+    themselves. The caller of every other method holds it.
 
     Parameters
     ----------
@@ -64,6 +71,7 @@ class Forest:
     """
 
     __slots__ = (
+        "_readers",
         "_suspects",
         "changed",
         "changing_paths",
@@ -91,6 +99,7 @@ class Forest:
         self.new_parents: set[str] = set()
         self.looping: list[LoopingSample] = []
         self._suspects: list[TransformStamped] = []
+        self._readers: list[set[str]] = []
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
@@ -107,12 +116,13 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         with self.lock:
-            _, refused = admit(self.frames, batch)
+            _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
             outcomes = [self.insert_judged(sample) for sample in batch]
             self.find_past_loops()
             self.forget_changes()
+            self._tell_readers([sample.child for sample in batch])
             return outcomes
 
     def commit(self, batch: Batch) -> bool:
@@ -136,6 +146,8 @@ class Forest:
                     self.insert_judged(sample)
             if self._suspects:
                 self.find_past_loops()
+            if self._readers:
+                self._tell_readers([sample.child for sample in batch])
         return plain
 
     def insert_judged(self, sample: TransformStamped) -> Outcome:
@@ -184,6 +196,7 @@ class Forest:
                 history.changed = False
                 self.names.update(history.child, history.named_parents)
             self.forget_paths()
+            self._tell_readers(self.frames)
 
     def find_past_loops(self) -> None:
         """Note which of the samples since the last call are part of a loop of parents at a past stamp.
@@ -265,21 +278,59 @@ class Forest:
         """Those of `names` that are in `above`, or below one of these by any parent in the window."""
         return names_below(self.frames, names, above)
 
+    def read_all(self, read: Callable[[FrameHistory], T]) -> dict[str, T]:
+        """What `read` gives for each frame, all of one moment.
+
+        Some frames are read at a time, so that insertions by another thread need not wait for all. Frames that have
+        changed meanwhile are read again.
+        """
+        found: dict[str, T] = {}
+        changed: set[str] = set()
+        with self.lock:
+            ahead = list(self.frames)
+            self._readers.append(changed)
+        try:
+            for _ in range(_ROUNDS):
+                for first in range(0, len(ahead), AT_A_TIME):
+                    with self.lock:
+                        self._read(ahead[first : first + AT_A_TIME], read, found, changed)
+                with self.lock:
+                    if len(changed) <= AT_A_TIME:
+                        break
+                    ahead = list(changed)
+            with self.lock:
+                self._read(list(changed), read, found, changed)
+                # From here on changes come too late.
+                self._readers.remove(changed)
+        except BaseException:
+            self._readers.remove(changed)
+            raise
+        return found
+
+    def _read(
+        self, frames: list[str], read: Callable[[FrameHistory], T], found: dict[str, T], changed: set[str]
+    ) -> None:
+        for frame in frames:
+            history = self.frames.get(frame)
+            if history is None:
+                found.pop(frame, None)
+            else:
+                found[frame] = read(history)
+            changed.discard(frame)
+
     def copy(self) -> "Forest":
         """An independent copy of the samples; its counters start at zero."""
-        twin = Forest(self.window)
-        with self.lock:
-            twin.frames = {child: history.copy() for child, history in self.frames.items()}
-            twin.names = self.names.copy()
-        return twin
+        return self._copy_of(self.window, FrameHistory.copy)
 
     def copy_within(self, window: int | None) -> "Forest":
         """An independent copy of the samples in the windows, with windows of another length (ns) from now on."""
+        return self._copy_of(window, lambda history: history.copy_within(window))
+
+    def _copy_of(self, window: int | None, copied: Callable[[FrameHistory], FrameHistory]) -> "Forest":
         twin = Forest(window)
-        with self.lock:
-            for child, history in self.frames.items():
-                short = twin.frames[child] = history.copy_within(window)
-                twin.names.update(child, short.named_parents)
+        twin.frames = self.read_all(copied)
+        for child, history in twin.frames.items():
+            twin.names.update(child, history.named_parents)
         return twin
 
     # Bookkeeping
@@ -318,7 +369,13 @@ class Forest:
                     self.changed.add(edge.child)
                     self._remove(edge.child)
 
+    def _tell_readers(self, frames: Iterable[str]) -> None:
+        """Tell the threads that read all frames which have changed."""
+        for changed in self._readers:
+            changed.update(frames)
+
     def _remove(self, frame: str) -> None:
+        self._tell_readers((frame,))
         if self.frames.pop(frame, None) is not None:
             self.names.remove(frame)
             self.forget_paths()

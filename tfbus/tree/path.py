@@ -10,7 +10,7 @@ which of them counts, by what is stored and never by what was asked before.
 
 from collections.abc import Mapping
 
-from tfbus.errors import DisconnectedError, ExtrapolationError, FutureExtrapolationError, PastExtrapolationError
+from tfbus.errors import DisconnectedError, ExtrapolationError, FutureExtrapolationError
 from tfbus.geometry.rows import Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN
 from tfbus.tree._python_kernel import Step, climb
@@ -122,11 +122,15 @@ class Path:
         return error
 
     def _own_error(self, at: int) -> ExtrapolationError:
-        missing = [edge.extrapolation_error(at) for edge in self.moving if not edge.covers(at)]
-        for error in missing:
-            if isinstance(error, PastExtrapolationError):
-                return error
-        return min(missing, key=lambda error: STAMP_MIN if error.newest is None else error.newest)
+        lagging, reached = self.moving[0], STAMP_MAX + 1
+        for edge in self.moving:
+            newest = edge.stamps[-1] if edge.stamps else STAMP_MIN
+            if edge.stamps and newest >= at:
+                if edge.stamps[edge.start] > at:
+                    return edge.extrapolation_error(at)
+            elif newest < reached:
+                lagging, reached = edge, newest
+        return lagging.extrapolation_error(at)
 
 
 def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
