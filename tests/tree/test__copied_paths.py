@@ -1,20 +1,22 @@
 from array import array
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from support.histories import at_x, moving_edge, row_of
 from support.samples import moving, over, static, tree_of
 
 from tfbus import TransformStamped, TransformTree, UnknownFrameError
 from tfbus.geometry.rows import Row
-from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, copy_paths
+from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, copy_paths, samples_around
 from tfbus.tree.history import RECORD, Samples
 from tfbus.tree.tree import forest_of
 
 
-def copies(tree: TransformTree, target: str, source: str, span: tuple[int, int] | None) -> PathsOverTime:
+def copies(tree: TransformTree, target: str, source: str, stamps: Sequence[int]) -> PathsOverTime:
     forest = forest_of(tree)
     with forest.lock:
-        return copy_paths(forest, target, source, span)
+        return copy_paths(forest, target, source, np.array(stamps, np.int64))
 
 
 def xs(samples: Samples) -> list[tuple[int, float]]:
@@ -22,18 +24,16 @@ def xs(samples: Samples) -> list[tuple[int, float]]:
     return [(record[0], record[1]) for record in RECORD.iter_unpack(samples.records)]
 
 
-@pytest.mark.parametrize("span", [None, (0, 5)])
+@pytest.mark.parametrize("span", [(), (0, 5)])
 @pytest.mark.parametrize(("target", "source"), [("nobody", "b"), ("b", "nobody")])
-def test_an_unknown_frame_is_an_error_even_without_stamps(
-    target: str, source: str, span: tuple[int, int] | None
-) -> None:
+def test_an_unknown_frame_is_an_error_even_without_stamps(target: str, source: str, span: tuple[int, ...]) -> None:
     with pytest.raises(UnknownFrameError) as caught:
         copies(tree_of(moving("a", "b", 0)), target, source, span)
     assert caught.value.frame == "nobody"
 
 
 def test_without_stamps_there_is_no_path() -> None:
-    assert copies(tree_of(moving("a", "b", 0)), "a", "b", None) == PathsOverTime([], [None])
+    assert copies(tree_of(moving("a", "b", 0)), "a", "b", ()) == PathsOverTime([], [None])
 
 
 @pytest.mark.parametrize(
@@ -118,6 +118,51 @@ def test_the_same_path_is_copied_once() -> None:
     assert first is last
     assert first is not None
     assert first.moving[0].parents == ["left", "left", "right", "right", "left", "left"]
+
+
+def test_only_the_neighbours_are_copied_where_samples_outnumber_stamps() -> None:
+    tree = tree_of(*over("a", "b", range(0, 5_000, 10)))
+    (path,) = copies(tree, "a", "b", (4_001, 15, 30, 4_005)).paths
+    assert path is not None
+    (samples,) = path.moving
+    assert list(samples.stamps) == [10, 20, 30, 40, 4_000, 4_010]
+    assert xs(samples) == [(stamp, float(stamp)) for stamp in samples.stamps]
+
+
+@pytest.mark.parametrize(
+    ("asked", "copied"),
+    [((100,), [100, 101]), ((0, 99), [100]), ((999, 500), [500, 501, 899]), ((899,), [899]), ((150,), [150, 151])],
+)
+def test_neighbours_are_copied_inside_the_window(asked: tuple[int, ...], copied: list[int]) -> None:
+    # The window's slack, a sixteenth, is fifty here: what has left the window is still in memory.
+    edge = moving_edge("a", "b", [(stamp, at_x(stamp)) for stamp in range(60, 900)], keep=799)
+    assert (edge.oldest, edge.stamps[0]) == (100, 60)
+    around = samples_around(edge, np.array(asked))
+    assert (list(around.stamps), around.parents) == (copied, None)
+
+
+def test_neighbours_have_their_parents_if_there_are_several() -> None:
+    edge = moving_edge("left", "b", [(0, at_x(0.0)), (10, at_x(1.0))])
+    edge.insert("right", 20, row_of(at_x(2.0)), "")
+    around = samples_around(edge, np.array([12]))
+    assert (list(around.stamps), around.parents) == ([10, 20], ["left", "right"])
+
+
+def test_a_history_grows_after_its_neighbours_were_copied() -> None:
+    edge = moving_edge("a", "b", [(stamp, at_x(stamp)) for stamp in range(5)])
+    around = samples_around(edge, np.array([1]))
+    edge.insert("a", 5, row_of(at_x(5.0)), "")
+    edge.clear()
+    assert xs(around) == [(1, 1.0), (2, 2.0)]
+
+
+def test_a_loop_in_the_past_splits_the_path_where_the_samples_of_a_way_begin_and_end() -> None:
+    # a was on b until 10, and from 20 on b is on a.
+    tree = tree_of(moving("b", "a", 0), moving("b", "a", 9), moving("c", "a", 10), moving("c", "a", 30))
+    tree.insert_many(over("a", "b", [20, 30]))
+    found = copies(tree, "a", "b", (0, 30))
+    assert found.changes == [10, 20]
+    assert [path is not None and len(path.up) for path in found.paths] == [0, 1, 1]
 
 
 def test_changes_of_parents_elsewhere_split_no_permanent_path() -> None:

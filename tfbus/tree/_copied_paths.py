@@ -86,7 +86,7 @@ def copy_paths(forest: Forest, target: str, source: str, stamps: Stamps) -> Path
     forest : Forest
     target, source : str
     stamps : integer array of shape (n,)
-        ns, sorted.
+        ns, in any order.
 
     Raises
     ------
@@ -96,15 +96,15 @@ def copy_paths(forest: Forest, target: str, source: str, stamps: Stamps) -> Path
     forest.check_known(source)
     if not len(stamps):
         return PathsOverTime([], [None])
-    low, high = int(stamps[0]), int(stamps[-1])
+    low, high = int(stamps.min()), int(stamps.max())
     paths: list[Path | None] = [_path_at(forest, target, source, low)]
     changes = _changes(forest, target, source, paths[0], low, high)
     paths += [_path_at(forest, target, source, stamp) for stamp in changes]
     copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
     for path in paths:
         if path is not None and (path.up, path.down) not in copies:
-            up = tuple(_copy(step, stamps) for step in path.up)
-            down = tuple(_copy(step, stamps) for step in path.down)
+            up = tuple(_copy(step, stamps, low, high) for step in path.up)
+            down = tuple(_copy(step, stamps, low, high) for step in path.down)
             copies[path.up, path.down] = CopiedPath(up, down)
     return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
 
@@ -129,10 +129,9 @@ def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
         return None
 
 
-def _copy(step: Step, stamps: Stamps) -> Samples | Row:
+def _copy(step: Step, stamps: Stamps, low: int, high: int) -> Samples | Row:
     if not isinstance(step, FrameHistory):
         return step
-    low, high = int(stamps[0]), int(stamps[-1])
     between = bisect_right(step.stamps, high) - bisect_left(step.stamps, low)
     return step.samples_between(low, high) if between <= _BLOCK * len(stamps) else samples_around(step, stamps)
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.stamps import LATEST, Latest, format_duration, format_stamp, to_seconds
-from tfbus.tree._extrapolation import Extrapolation, read_stamp
+from tfbus.tree.extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import AT_A_TIME, Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, find

@@ -99,7 +99,7 @@ class Forest:
         self.new_parents: set[str] = set()
         self.looping: list[LoopingSample] = []
         self._suspects: list[TransformStamped] = []
-        self._readers: list[set[str]] = []
+        self._readers: dict[int, set[str]] = {}
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
@@ -288,23 +288,22 @@ class Forest:
         changed: set[str] = set()
         with self.lock:
             ahead = list(self.frames)
-            self._readers.append(changed)
+            self._readers[id(changed)] = changed
         try:
             for _ in range(_ROUNDS):
                 for first in range(0, len(ahead), AT_A_TIME):
                     with self.lock:
                         self._read(ahead[first : first + AT_A_TIME], read, found, changed)
+                if len(changed) <= AT_A_TIME:
+                    break
                 with self.lock:
-                    if len(changed) <= AT_A_TIME:
-                        break
                     ahead = list(changed)
             with self.lock:
                 self._read(list(changed), read, found, changed)
-                # From here on changes come too late.
-                self._readers.remove(changed)
-        except BaseException:
-            self._readers.remove(changed)
-            raise
+                # A later change is no longer of this moment.
+                del self._readers[id(changed)]
+        finally:
+            self._readers.pop(id(changed), None)
         return found
 
     def _read(
@@ -371,7 +370,7 @@ class Forest:
 
     def _tell_readers(self, frames: Iterable[str]) -> None:
         """Tell the threads that read all frames which have changed."""
-        for changed in self._readers:
+        for changed in self._readers.values():
             changed.update(frames)
 
     def _remove(self, frame: str) -> None:

@@ -12,8 +12,8 @@ from tfbus.errors import (
 from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
 from tfbus.stamps import LATEST, Latest, as_stamp
-from tfbus.tree._extrapolation import Extrapolation
 from tfbus.tree._python_kernel import climb
+from tfbus.tree.extrapolation import Extrapolation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.path import Path

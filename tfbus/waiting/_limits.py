@@ -2,8 +2,9 @@
 
 from bisect import bisect_right
 
-from tfbus.errors import DisconnectedError, UnknownFrameError
+from tfbus.errors import DisconnectedError, ExtrapolationError, GapError, UnknownFrameError
 from tfbus.stamps import STAMP_MAX, Latest
+from tfbus.tree.extrapolation import read_stamp
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.policy import Policy
@@ -43,6 +44,7 @@ def _limits_at(
     edges = _edges(forest, target, source, at) if path is None or path.root in forest.frames else path.moving
     window = STAMP_MAX if forest.window is None else forest.window
     limits = []
+    asked = at
     if policy is not None:
         at = min(at + policy.tolerance, STAMP_MAX)
     # One loop without calls, because it runs for each wait.
@@ -57,6 +59,8 @@ def _limits_at(
         elif i < len(stamps):
             # Until the sample before the stamp leaves the window.
             limit = stamps[i - 1] + window
+            if policy is not None and policy.max_gap is not None and _is_in_gap(edge, asked, policy):
+                limit = at
         else:
             # Until a sample after the stamp comes, and the one before it has left the window or is too far away.
             near = window if policy is None or policy.max_gap is None else min(window, policy.max_gap)
@@ -64,6 +68,16 @@ def _limits_at(
         if limit < STAMP_MAX:
             limits.append((edge.child, limit))
     return limits
+
+
+def _is_in_gap(edge: FrameHistory, at: int, policy: Policy) -> bool:
+    try:
+        read_stamp(edge, at, policy)
+    except GapError:
+        return True
+    except ExtrapolationError:
+        pass
+    return False
 
 
 def _edges(forest: Forest, target: str, source: str, at: int) -> tuple[FrameHistory, ...]:
