@@ -15,6 +15,7 @@ from tfbus import (
     FrameStale,
     InvalidTransformError,
     KindChanged,
+    PastLoop,
     PeerJoined,
     PeerLost,
     PeerRejected,
@@ -36,6 +37,10 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     (
         AuthorityConflict(AT, "odom", "slam", "odometry"),
         "frame 'odom' comes from two authorities, 'slam' and 'odometry'",
+    ),
+    (
+        PastLoop(AT, "cup", "hand", "cell", 10 * SECOND, ("cup", "hand", "cup")),
+        "the frames cup -> hand -> cup form a loop at 10.000 s, with late data of 'cell'",
     ),
     (
         SampleRejected(AT, "cycle", "a", "b", "rogue", InvalidTransformError("no\nloops", reason="cycle")),

@@ -568,6 +568,16 @@ check_index(const History *self, Py_ssize_t index)
 }
 
 static PyObject *
+history_stamp(History *self, PyObject *number)
+{
+    const Py_ssize_t index = PyLong_AsSsize_t(number);
+    if ((index == -1 && PyErr_Occurred()) || check_index(self, index) < 0) {
+        return NULL;
+    }
+    return PyLong_FromLongLong(block_stamps(self->block)[self->start + index]);
+}
+
+static PyObject *
 history_sample(History *self, PyObject *number)
 {
     const Py_ssize_t index = PyLong_AsSsize_t(number);
@@ -657,13 +667,13 @@ history_take(History *self, PyObject *other)
     Py_RETURN_NONE;
 }
 
-/* columns(first, end): a view of the block, where the stamps begin (bytes), the same view, where the rows begin, the
- * number of floats a row, and the number of samples. */
+/* columns(first, end, wanted): a view of the block, where the stamps begin (bytes), the same view, where the rows begin,
+ * the number of floats a row, and the number of samples. As nothing is copied, the unwanted samples are not left out. */
 static PyObject *
 history_columns(History *self, PyObject *const *args, Py_ssize_t nargs)
 {
-    if (nargs != 2) {
-        PyErr_SetString(PyExc_TypeError, "columns takes the first index and the end");
+    if (nargs != 2 && nargs != 3) {
+        PyErr_SetString(PyExc_TypeError, "columns takes the first index, the end and the wanted stamps");
         return NULL;
     }
     Py_ssize_t first = PyLong_AsSsize_t(args[0]), end = PyLong_AsSsize_t(args[1]);
@@ -802,11 +812,12 @@ static PyMethodDef history_methods[] = {
     {"put", FAST(history_put), METH_FASTCALL,
      PyDoc_STR("put(index, stamp, row): store a sample before another, or in its place if the stamps are equal.")},
     {"find", (PyCFunction)history_find, METH_O, PyDoc_STR("find(stamp): the index of the first sample not before it.")},
+    {"stamp", (PyCFunction)history_stamp, METH_O, PyDoc_STR("stamp(index): the stamp of a sample.")},
     {"sample", (PyCFunction)history_sample, METH_O, PyDoc_STR("sample(index): the stamp and the row of a sample.")},
     {"clear", (PyCFunction)history_clear, METH_NOARGS, PyDoc_STR("Forget all samples.")},
     {"take", (PyCFunction)history_take, METH_O, PyDoc_STR("take(other): hold a copy of the samples of another.")},
     {"columns", FAST(history_columns), METH_FASTCALL,
-     PyDoc_STR("columns(first, end): the memory of some samples, which nothing changes while it is held.")},
+     PyDoc_STR("columns(first, end, wanted=None): the memory of some samples, which nothing changes while it is held.")},
     {NULL}
 };
 

@@ -21,6 +21,9 @@ class SeenKeys:
         self._capacity = capacity
         self._keys: dict[Hashable, None] = {}
 
+    def __contains__(self, key: object) -> bool:
+        return key in self._keys
+
     def add(self, key: Hashable) -> bool:
         """Add a key; return whether it is new."""
         if key in self._keys:

@@ -132,7 +132,7 @@ class DisconnectedError(TransformLookupError):
         The stamp at which they are not connected, in ns; None for a lookup of the newest samples.
     loop : tuple of str
         Frames that form a loop of parents at that stamp, the first one repeated at the end; empty if there is none.
-        Only out-of-order samples can form one.
+        Only samples that came late or out of order can form one.
     """
 
     def __init__(
@@ -209,7 +209,8 @@ class FutureExtrapolationError(ExtrapolationError):
     Attributes
     ----------
     others : tuple of str
-        Other child frames whose next sample may also give an answer; empty unless a policy is used with `LATEST`.
+        Other child frames whose next sample may also give an answer; empty unless a policy is used with `LATEST`, or
+        two ways lead round a loop of parents at the stamp.
     """
 
     others: tuple[str, ...] = ()
@@ -270,10 +271,15 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
     """
 
     def __init__(self, *, target: str, source: str, timeout: float, missing: TransformLookupError) -> None:
-        super().__init__(f"no transform from {source!r} to {target!r} within {timeout:g} s: {missing}")
+        super().__init__()
         self.target = target
         self.source = source
         self.timeout = timeout
+        self._missing = missing
+
+    def _why(self) -> str:
+        # Not earlier, because a thousand timeouts at once would look for the similar names of a thousand frames.
+        return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {self._missing}"
 
 
 class InvalidTransformError(TransformError, ValueError):

@@ -111,6 +111,40 @@ class SampleRejected:
 
 
 @dataclass(frozen=True, slots=True)
+class PastLoop:
+    """Late samples form a loop of parents at a past stamp; the newest parents form none.
+
+    An event stream gives it once for each frame, parent and authority, as it does `SampleRejected`; the ``looped`` of
+    each buffer in ``statistics().buffers`` counts every sample.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the event, in ns.
+    frame, parent, authority : str
+        Of the sample that closes the loop. It is stored.
+    at : int
+        The first stamp of the loop from that of the sample on, in ns.
+    loop : tuple of str
+        The frames of the loop from child to parent, the first one repeated at the end.
+    """
+
+    stamp: int
+    frame: str
+    parent: str
+    authority: str
+    at: int
+    loop: tuple[str, ...]
+
+    def __str__(self) -> str:
+        frames = " -> ".join(self.loop)
+        return _line(
+            self.stamp,
+            f"the frames {frames} form a loop at {format_stamp(self.at)}, with late data of {self.authority!r}",
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class FrameStale:
     """The newest sample of a moving frame is older than the event stream's `stale_after`.
 
@@ -313,6 +347,7 @@ Event = (
     | KindChanged
     | AuthorityConflict
     | SampleRejected
+    | PastLoop
     | FrameStale
     | FrameLive
     | ClockReset

@@ -18,6 +18,8 @@ class BufferStatistics:
         Samples by their `Outcome`.
     waiting : int
         Lookups that wait now.
+    looped : int
+        Samples that formed a loop of parents at a past stamp, as late data can; they are among the samples above.
     """
 
     offered: int
@@ -25,6 +27,7 @@ class BufferStatistics:
     replaced: int
     expired: int
     waiting: int
+    looped: int = 0
 
 
 @dataclass(frozen=True, slots=True)

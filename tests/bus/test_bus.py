@@ -553,7 +553,7 @@ def test_statistics_count_everything_on_the_bus() -> None:
             "clock_resets": 0,
             "callbacks_failed": 0,
             "frames": 2,
-            "buffers": ({"offered": 3, "inserted": 3, "replaced": 0, "expired": 0, "waiting": 0},),
+            "buffers": ({"offered": 3, "inserted": 3, "replaced": 0, "expired": 0, "waiting": 0, "looped": 0},),
             "queues": (
                 {"kind": "stream", "overflow": "conflate", "capacity": 7, "pending": 2, "dropped": 0, "conflated": 0},
             ),

@@ -1,18 +1,21 @@
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of
 
 from tfbus import TransformStamped, TransformTree, UnknownFrameError
+from tfbus._which_kernel import KERNEL
 from tfbus.geometry.rows import Row
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, copy_paths
 from tfbus.tree.history import Samples
 from tfbus.tree.tree import forest_of
 
 
-def copies(tree: TransformTree, target: str, source: str, span: tuple[int, int] | None) -> PathsOverTime:
+def copies(tree: TransformTree, target: str, source: str, stamps: Sequence[int]) -> PathsOverTime:
     forest = forest_of(tree)
     with forest.lock:
-        return copy_paths(forest, target, source, span)
+        return copy_paths(forest, target, source, np.array(stamps, np.int64))
 
 
 def xs(samples: Samples) -> list[tuple[int, float]]:
@@ -20,18 +23,16 @@ def xs(samples: Samples) -> list[tuple[int, float]]:
     return list(zip(samples.stamps.tolist(), samples.rows[:, 0].tolist(), strict=True))
 
 
-@pytest.mark.parametrize("span", [None, (0, 5)])
+@pytest.mark.parametrize("span", [(), (0, 5)])
 @pytest.mark.parametrize(("target", "source"), [("nobody", "b"), ("b", "nobody")])
-def test_an_unknown_frame_is_an_error_even_without_stamps(
-    target: str, source: str, span: tuple[int, int] | None
-) -> None:
+def test_an_unknown_frame_is_an_error_even_without_stamps(target: str, source: str, span: tuple[int, ...]) -> None:
     with pytest.raises(UnknownFrameError) as caught:
         copies(tree_of(moving("a", "b", 0)), target, source, span)
     assert caught.value.frame == "nobody"
 
 
 def test_without_stamps_there_is_no_path() -> None:
-    assert copies(tree_of(moving("a", "b", 0)), "a", "b", None) == PathsOverTime([], [None])
+    assert copies(tree_of(moving("a", "b", 0)), "a", "b", ()) == PathsOverTime([], [None])
 
 
 @pytest.mark.parametrize(
@@ -116,6 +117,26 @@ def test_the_same_path_is_copied_once() -> None:
     assert first is last
     assert first is not None
     assert first.moving[0].parents == ["left", "left", "right", "right", "left", "left"]
+
+
+def test_only_the_neighbours_are_copied_where_samples_outnumber_stamps() -> None:
+    tree = tree_of(*over("a", "b", range(0, 5_000, 10)))
+    (path,) = copies(tree, "a", "b", (4_001, 15, 30, 4_005)).paths
+    assert path is not None
+    (samples,) = path.moving
+    neighbours = [10, 20, 30, 40, 4_000, 4_010]
+    # The compiled kernel gives them all, as views.
+    assert list(samples.stamps) == (neighbours if KERNEL == "python" else list(range(10, 4_020, 10)))
+    assert xs(samples) == [(stamp, float(stamp)) for stamp in samples.stamps]
+
+
+def test_a_loop_in_the_past_splits_the_path_where_the_samples_of_a_way_begin_and_end() -> None:
+    # a was on b until 10, and from 20 on b is on a.
+    tree = tree_of(moving("b", "a", 0), moving("b", "a", 9), moving("c", "a", 10), moving("c", "a", 30))
+    tree.insert_many(over("a", "b", [20, 30]))
+    found = copies(tree, "a", "b", (0, 30))
+    assert found.changes == [10, 20]
+    assert [path is not None and len(path.up) for path in found.paths] == [0, 1, 1]
 
 
 def test_changes_of_parents_elsewhere_split_no_permanent_path() -> None:

@@ -21,6 +21,7 @@ from tfbus import LATEST, Transform
 from tfbus.geometry.rows import IDENTITY, Row, Vector, compose, interpolate, invert
 from tfbus.geometry.transform import from_row
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tree import _python_kernel
 
 on_both = pytest.mark.parametrize("kernel", KERNELS)
 
@@ -185,6 +186,28 @@ def test_stamps_at_the_ends_of_64_bits_leave_no_window_early(kernel: ModuleType)
     assert edge.count == 2
     edge.push(STAMP_MAX, x(3.0))
     assert contents(edge) == [(STAMP_MAX, x(3.0))]
+
+
+@pytest.mark.parametrize(
+    ("asked", "copied"),
+    [((100,), [100, 101]), ((0, 99), [100]), ((999, 500), [500, 501, 899]), ((899,), [899]), ((150,), [150, 151])],
+)
+def test_the_twin_copies_the_neighbours_in_the_window_where_samples_outnumber_stamps(
+    asked: tuple[int, ...], copied: list[int]
+) -> None:
+    # The window's slack, a sixteenth, is fifty here: what has left the window is still in memory.
+    edge = history(_python_kernel, keep=799)
+    edge.push(60, x(60.0))
+    for stamp in range(61, 900):
+        edge.append("parent", stamp, x(stamp), "")
+    assert (edge.oldest, edge.stamps[0]) == (100, 60)
+    stamps, _, records, _, width, count = edge.columns(0, edge.count, np.array(asked))
+    assert stamps.tolist() == copied
+    rows = np.frombuffer(records, np.float64, width * count).reshape(count, width)[:, -7:]
+    assert rows[:, 0].tolist() == copied
+    edge.push(1_000, x(0.0))
+    edge.clear()
+    assert stamps.tolist() == copied
 
 
 # A path

@@ -34,6 +34,10 @@ def parents_after(stored: Iterable[TransformStamped]) -> dict[str, str]:
     return {child: sample.parent for child, sample in newest_samples(stored).items()}
 
 
+def parents_of(edges: Mapping[str, KnownEdge]) -> set[str]:
+    return {edge.parent for edge in edges.values()}
+
+
 def has_loop(parent_of: Mapping[str, str]) -> bool:
     """Whether a walk from some child takes more steps than there are children."""
     for child in parent_of:
@@ -117,7 +121,7 @@ BEFORE = edges_of(moving("map", "base", 10), moving("base", "tool", 10))
 def test_admit_refuses_the_last_samples_that_close_loops_of_newest_parents(
     edges: dict[str, KnownEdge], batch: list[TransformStamped], refused: list[int]
 ) -> None:
-    accepted, errors = admit(edges, batch)
+    accepted, errors = admit(edges, batch, parents_of(edges))
     assert accepted == tuple(sample for place, sample in enumerate(batch) if place not in refused)
     assert [(error.reason, error.parent, error.child) for error in errors] == [
         ("cycle", batch[place].parent, batch[place].child) for place in refused
@@ -128,7 +132,7 @@ def test_admit_refuses_the_last_samples_that_close_loops_of_newest_parents(
 def test_the_error_names_the_whole_loop_and_its_message_at_most_ten_frames(length: int) -> None:
     names = [f"frame {number}" for number in range(length)]
     edges = edges_of(*(moving(parent, child, 0) for parent, child in pairwise(names)))
-    _, (error,) = admit(edges, [moving(names[-1], names[0], 1, authority="somebody")])
+    _, (error,) = admit(edges, [moving(names[-1], names[0], 1, authority="somebody")], names)
     assert (error.reason, error.parent, error.child, error.authority) == ("cycle", names[-1], names[0], "somebody")
     assert error.loop == (names[0], *reversed(names))
     shown = error.loop if length < 10 else (*error.loop[:8], f"({length - 8} more)", names[0])
@@ -143,7 +147,7 @@ def test_the_error_names_the_authorities_of_the_other_edges_of_the_loop_sorted()
         moving("x", "a", 0, authority="old"),
         moving("c", "y", 0, authority="elsewhere"),
     )
-    _, (error,) = admit(edges, [moving("d", "a", 1, authority="culprit")])
+    _, (error,) = admit(edges, [moving("d", "a", 1, authority="culprit")], "abcd")
     assert str(error).endswith("a -> d -> c -> b -> a, with edges from 'arm' and 'slam'")
 
 
@@ -156,7 +160,8 @@ def test_a_batch_is_admitted_whole_exactly_if_the_newest_parents_after_it_form_a
 ) -> None:
     stored: list[TransformStamped] = []
     for batch in batches:
-        accepted, errors = admit(edges_of(*stored), batch)
+        edges = edges_of(*stored)
+        accepted, errors = admit(edges, batch, parents_of(edges))
         after = parents_after([*stored, *batch])
         assert (accepted == tuple(batch)) == (not has_loop(after))
         assert len(accepted) + len(errors) == len(batch)
@@ -179,6 +184,30 @@ def test_a_batch_under_a_long_chain_is_judged_in_linear_time() -> None:
 
     links = 2_000
     edges = CountedEdges(edges_of(*(moving(f"f{i}", f"f{i + 1}", 0) for i in range(links))))
-    _, refused = admit(edges, [moving(f"f{links}", f"leaf {i}", 0) for i in range(links)])
+    leaves = [moving(f"f{links}", f"leaf {i}", 0) for i in range(links)]
+    # As if a leaf might be a parent: all walks up to the root are one.
+    _, refused = admit(edges, leaves, {*edges, *(sample.child for sample in leaves)})
     assert not refused
     assert edges.reads < 10 * links
+
+
+def test_a_chain_that_grows_at_its_end_is_not_climbed() -> None:
+    class CountedEdges(dict[str, Any]):
+        reads = 0
+
+        def get(self, key: str, default: Any = None) -> Any:
+            self.reads += 1
+            return super().get(key, default)
+
+    edges = CountedEdges(edges_of(*(moving(f"f{i}", f"f{i + 1}", 0) for i in range(2_000))))
+    parents = parents_of(edges)
+    for batch in ([moving("f2000", "a", 0)], [moving("f2000", "a", 0), moving("a", "b", 0), moving("b", "c", 0)]):
+        edges.reads = 0
+        assert admit(edges, batch, parents) == (tuple(batch), [])
+        assert edges.reads < 10
+
+
+def test_names_that_are_no_longer_parents_do_no_harm() -> None:
+    edges = edges_of(moving("a", "b", 0))
+    assert admit(edges, [moving("b", "c", 0)], {"a", "c", "former"})[1] == []
+    assert len(admit(edges, [moving("b", "a", 0)], {"a", "c", "former"})[1]) == 1

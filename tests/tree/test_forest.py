@@ -3,6 +3,7 @@ from support.samples import moving, static
 
 from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped
 from tfbus.tree.forest import Forest
+from tfbus.tree.history import FrameHistory
 
 
 def forest(*batch: TransformStamped, window: int | None = None) -> Forest:
@@ -42,6 +43,17 @@ def test_the_cache_of_paths_is_bounded() -> None:
         for source in range(110):
             known.find_path(f"frame {target}", f"frame {source}", LATEST)
             assert len(known.paths) <= 10_000
+
+
+def test_a_changing_newest_path_is_kept_until_the_topology_changes() -> None:
+    known = forest(moving("a", "b", 0), moving("z", "b", 10))
+    path = known.find_path("z", "b", LATEST)
+    assert known.find_path("z", "b", 10) is path
+    assert known.find_path("z", "b", LATEST) is path
+    known.insert_judged(moving("y", "b", 20))
+    assert known.find_path("y", "b", LATEST) is not path
+    with pytest.raises(DisconnectedError):
+        known.find_path("z", "b", LATEST)
 
 
 # Recorded changes, from which a live tree finds the lookups to wake
@@ -91,11 +103,12 @@ def test_the_first_parent_of_a_new_frame_and_of_a_root_are_recorded() -> None:
     assert (known.new_parents, known.changed) == ({"root"}, {"a"})
 
 
-def test_descendants_include_those_under_every_parent_in_the_window() -> None:
+def test_names_below_include_those_under_every_parent_in_the_window() -> None:
     known = forest(moving("a", "b", 0), moving("b", "c", 0), moving("x", "c", 5), static("c", "d"), moving("x", "y", 0))
-    assert known.with_descendants({"b"}) == {"b", "c", "d"}
-    assert known.with_descendants({"x"}) == {"x", "c", "d", "y"}
-    assert known.with_descendants({"nowhere"}) == {"nowhere"}
+    assert known.names_below("abcdxy", {"b"}) == {"b", "c", "d"}
+    assert known.names_below("abcdxy", {"x"}) == {"x", "c", "d", "y"}
+    assert known.names_below("ady", {"x"}) == {"d", "y"}
+    assert known.names_below(["d", "nowhere"], {"nowhere"}) == {"nowhere"}
 
 
 # Edges without samples
@@ -121,12 +134,10 @@ def test_edges_without_samples_stay_while_no_new_edge_contradicts_them() -> None
 # Many stamps
 
 
-def test_parent_changes_are_the_sorted_stamps_of_all_frames() -> None:
-    known = forest(*(moving(parent, "b", at) for parent, at in (("a", 0), ("z", 30), ("a", 50))), static("b", "s"))
-    assert known.parent_changes() == [30, 50]
-    for sample in (moving("a", "c", 5), moving("b", "c", 10), moving("a", "d", 20), moving("z", "d", 30)):
-        known.insert_judged(sample)
-    assert known.parent_changes() == [10, 30, 50], "a stamp at which two frames change counts once"
+def test_edges_above_are_those_by_every_parent_in_the_window() -> None:
+    known = forest(moving("a", "b", 0), moving("b", "c", 0), moving("x", "c", 5), static("y", "x"), moving("c", "d", 0))
+    assert sorted(edge.child for edge in known.edges_above("c")) == ["b", "c", "x"]
+    assert sorted(edge.child for edge in known.edges_above("y", "b")) == ["b"]
 
 
 def test_a_copy_within_a_shorter_window_has_only_the_frames_of_its_samples() -> None:
@@ -136,3 +147,90 @@ def test_a_copy_within_a_shorter_window_has_only_the_frames_of_its_samples() -> 
     assert (short.window, short.changed, short.new_parents) == (5, set(), set())
     short.insert_judged(moving("a", "b", 20))
     assert (len(short.frames["b"]), len(known.frames["b"])) == (1, 2)
+
+
+# All frames at one moment
+
+
+def test_frames_that_change_while_others_are_read_are_read_again() -> None:
+    known = forest(*(moving("root", f"f{number}", 0) for number in range(250)))
+    seen: list[str] = []
+
+    def newest(history: FrameHistory) -> int | None:
+        seen.append(history.child)
+        if len(seen) in (150, 250):
+            # Another thread cannot do this here, because the lock is held; it does so between two parts.
+            known.lock.release()
+            known.commit((moving("root", "f0", len(seen)), moving("root", "new", len(seen))))
+            if len(seen) == 250:
+                known.remove("f1")
+            known.lock.acquire()
+        return history.newest
+
+    found = known.read_all(newest)
+    assert (found["f0"], found["new"], found["f249"]) == (250, 250, 0)
+    assert found.keys() == known.frames.keys()
+    assert "f1" not in found
+    assert len(seen) <= 254
+
+
+def test_reading_ends_although_all_frames_change_all_the_time() -> None:
+    known = forest(*(moving("root", f"f{number}", 0) for number in range(250)))
+    seen: list[str] = []
+
+    def newest(history: FrameHistory) -> int | None:
+        seen.append(history.child)
+        if len(seen) <= 650 and len(seen) % 50 == 0:
+            known.lock.release()
+            known.commit(tuple(moving("root", f"f{number}", len(seen)) for number in range(250)))
+            known.lock.acquire()
+        return history.newest
+
+    found = known.read_all(newest)
+    assert (set(found.values()), len(seen)) == ({650}, 899)
+    known.commit((moving("root", "f0", 10_000),))
+    assert found["f0"] != 10_000
+
+
+def test_an_error_of_a_reader_ends_the_reading() -> None:
+    known = forest(moving("root", "a", 0))
+    with pytest.raises(ZeroDivisionError):
+        known.read_all(lambda _: 1 / 0)
+    assert not known.lock.locked()
+    assert known.read_all(len) == {"a": 1}
+
+
+# Loops of parents in the past
+
+
+def looping(*batch: TransformStamped) -> list[tuple[str, int, tuple[str, ...]]]:
+    known = forest()
+    for sample in batch:
+        known.insert_judged(sample)
+        known.find_past_loops()
+    assert known.looped == len(known.looping)
+    return [(found.sample.child, found.loop.stamp, found.loop.frames) for found in known.looping]
+
+
+def test_late_samples_that_form_a_loop_in_the_past_are_noted() -> None:
+    before = (moving("c", "a", 0), moving("c", "a", 9), moving("a", "b", 4), moving("a", "b", 9))
+    assert looping(*before) == []
+    assert looping(*before, moving("b", "a", 5)) == [("a", 5, ("a", "b", "a"))]
+    # The late sample comes before the frame of its parent does: the loop begins with that.
+    assert looping(*before, moving("b", "a", 2)) == [("a", 4, ("a", "b", "a"))]
+
+
+def test_frames_that_change_places_in_one_batch_form_no_loop() -> None:
+    known = forest(moving("c", "a", 0), moving("a", "b", 0))
+    known.commit((moving("b", "a", 10), moving("c", "b", 10)))
+    known.commit((moving("c", "a", 20), moving("a", "b", 20)))
+    assert known.looped == 0
+
+
+def test_the_notes_of_loops_are_emptied_and_their_number_stays() -> None:
+    known = forest(moving("c", "a", 0), moving("c", "a", 9), moving("a", "b", 4), moving("a", "b", 9))
+    known.forget_changes()
+    known.commit((moving("b", "a", 5),))
+    assert [found.sample for found in known.looping] == [moving("b", "a", 5)]
+    known.forget_changes()
+    assert (known.looping, known.looped) == ([], 1)

@@ -1,5 +1,6 @@
 from functools import partial
 from itertools import product
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,6 +13,7 @@ from tfbus import (
     BufferStatistics,
     ClockResetError,
     DisconnectedError,
+    ExtrapolationError,
     FutureExtrapolationError,
     InvalidTransformError,
     Latest,
@@ -22,6 +24,11 @@ from tfbus import (
     TransformTree,
     UnknownFrameError,
 )
+from tfbus.errors import MAY_COME
+from tfbus.tree.forest import LoopingSample
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.lookup import answer
+from tfbus.tree.policy import Policy
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import Waiter
 
@@ -31,7 +38,7 @@ def park(live: LiveTree, target: str, source: str, at: int, woken: list[str]) ->
     with pytest.raises(TransformLookupError) as caught:
         tree_over(live).lookup(target, source, at)
     waiter = Waiter(Question(target, source, at), 0, lambda: woken.append(source))
-    live.waiting.park(waiter, caught.value)
+    live.park(waiter, caught.value)
 
 
 def blockers(live: LiveTree) -> list[type[TransformLookupError]]:
@@ -180,8 +187,15 @@ QUESTIONS = [
 
 
 def ask(live: LiveTree, question: Question) -> None:
-    tree_over(live).lookup(
-        question.target, question.source, question.at, source_at=question.source_at, fixed=question.fixed
+    answer(
+        live.forest,
+        question.target,
+        question.source,
+        question.at,
+        question.source_at,
+        question.fixed,
+        None,
+        question.policy,
     )
 
 
@@ -192,16 +206,18 @@ def test_a_waiter_that_is_not_woken_still_has_no_answer(
     live, judge = live_tree(keep), TransformTree(keep)
     asleep: set[Question] = set()
     woken = list(QUESTIONS)
+    past: list[Question] = []
     for batch in batches:
         for question in woken:
             try:
                 ask(live, question)
             except PastExtrapolationError:
-                continue
+                past.append(question)
             except TransformLookupError as error:
-                live.waiting.park(Waiter(question, 0, partial(woken.append, question)), error)
+                live.park(Waiter(question, 0, partial(woken.append, question)), error)
                 asleep.add(question)
-        woken.clear()
+        woken[:] = past
+        past.clear()
         try:
             judge.insert_many(batch)
         except InvalidTransformError:
@@ -209,7 +225,8 @@ def test_a_waiter_that_is_not_woken_still_has_no_answer(
         live.insert(tuple(batch))
         asleep.difference_update(woken)
         for question in asleep:
-            with pytest.raises(TransformLookupError):
+            # Nor is it hopeless.
+            with pytest.raises(MAY_COME):
                 ask(live, question)
 
 
@@ -269,6 +286,133 @@ def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     live.insert((static("map", "mount", x=1.0),))
     assert woken == []
     assert len(live.waiting) == 100
+
+
+@pytest.mark.parametrize(
+    ("before", "question", "harmless", "then"),
+    [
+        pytest.param(
+            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            Question("map", "b", 5),
+            moving("a", "b", 10),
+            moving("a", "b", 11),
+            id="another edge slides past the stamp",
+        ),
+        pytest.param(
+            [moving("map", "a", 0), moving("a", "b", 3)],
+            Question("map", "b", 5),
+            moving("a", "b", 13),
+            moving("a", "b", 16),
+            id="another edge that lags jumps over the stamp",
+        ),
+        pytest.param(
+            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9), moving("map", "other", 500)],
+            Question("map", "b", 5),
+            moving("map", "other", 600),
+            moving("a", "b", 11),
+            id="other frames are far ahead",
+        ),
+        pytest.param(
+            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            Question("map", "b", 30, 5, "a"),
+            moving("map", "a", 9),
+            moving("a", "b", 11),
+            id="the other half of time travel slides past its stamp",
+        ),
+        pytest.param(
+            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            Question("map", "b", 5, policy=Policy(tolerance=4)),
+            moving("a", "b", 15),
+            moving("a", "b", 20),
+            id="with a tolerance, the nearest sample counts",
+        ),
+        pytest.param(
+            [moving("map", "a", 0), moving("a", "b", 3)],
+            Question("map", "b", 5, policy=Policy(max_gap=4)),
+            moving("a", "b", 4),
+            moving("a", "b", 9),
+            id="a gap opens round the stamp",
+        ),
+    ],
+)
+def test_a_waiter_is_woken_by_the_insertion_that_makes_it_hopeless(
+    before: list[TransformStamped], question: Question, harmless: TransformStamped, then: TransformStamped
+) -> None:
+    live = live_tree(10e-9)
+    for sample in before:
+        live.insert((sample,))
+    woken: list[str] = []
+    with pytest.raises(MAY_COME) as caught:
+        ask(live, question)
+    live.park(Waiter(question, 0, partial(woken.append, "woken")), caught.value)
+    live.insert((harmless,))
+    if woken:
+        # Woken early, it asks again, and still may have an answer.
+        with pytest.raises(MAY_COME) as caught:
+            ask(live, question)
+        live.park(Waiter(question, 0, partial(woken.append, "woken")), caught.value)
+        woken.clear()
+    assert woken == []
+    live.insert((then,))
+    assert woken == ["woken"]
+    assert live.waiting.by_frame == {}
+    with pytest.raises(ExtrapolationError) as raised:
+        ask(live, question)
+    assert not isinstance(raised.value, FutureExtrapolationError)
+
+
+def test_another_question_of_a_waiter_that_becomes_hopeless_wakes_it() -> None:
+    live = live_tree(10e-9)
+    live.insert((moving("map", "a", 0), moving("map", "b", 0), moving("map", "b", 9)))
+    woken: list[str] = []
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree_over(live).lookup("map", "a", 5)
+    others = (Question("map", "b", 5),)
+    live.park(Waiter(Question("map", "a", 5), 0, partial(woken.append, "a"), others), caught.value)
+    live.insert((moving("map", "b", 10),))
+    assert woken == []
+    live.insert((moving("map", "b", 11),))
+    assert woken == ["a"]
+
+
+class CountedFrames(dict[str, FrameHistory]):
+    """Counts how often a frame is looked up."""
+
+    reads = 0
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.reads += 1
+        return super().get(key, default)
+
+
+@pytest.mark.parametrize("event", ["another parent", "removal"])
+def test_a_change_of_parents_costs_no_walk_through_all_frames(event: str) -> None:
+    live = live_tree(None)
+    live.insert(tuple(moving("map", f"f{number}", 1) for number in range(2_000)))
+    live.insert(tuple(moving(f"f{number}", f"g{number}", 1) for number in range(2_000)))
+    woken: list[str] = []
+    for source in ("g7", "g8"):
+        park(live, "map", source, 9, woken)
+    live.forest.frames = frames = CountedFrames(live.forest.frames)
+    if event == "removal":
+        live.remove_frame("f7")
+    else:
+        live.insert((moving("elsewhere", "f7", 2),))
+    assert woken == ["g7"]
+    assert frames.reads < 50
+
+
+def test_late_samples_that_form_a_loop_are_told_once_for_each() -> None:
+    told: list[LoopingSample] = []
+    live = LiveTree(live_tree(None).forest, told.append)
+    live.insert((moving("c", "a", 0), moving("c", "a", 9), moving("a", "b", 4), moving("a", "b", 9)))
+    live.insert((moving("c", "a", 10),))
+    assert told == []
+    late = moving("b", "a", 5)
+    live.insert((late,))
+    live.insert((moving("c", "a", 11),))
+    assert told == [(late, (5, ("a", "b", "a")))]
+    assert live.statistics(7).looped == 1
 
 
 def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:

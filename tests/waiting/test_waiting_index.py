@@ -126,6 +126,80 @@ def test_removing_one_of_several_waiters_for_one_stamp_keeps_the_others() -> Non
     assert index.pop_unblocked("tool", 7) == waiters[:2] + waiters[3:]
 
 
+def test_a_waiter_is_looked_at_when_any_frame_passes_its_first_limit() -> None:
+    index = WaitingIndex()
+    early, late, without = waiter(), waiter(), waiter()
+    index.park(late, short_of("tool", 5), [("arm", 40), ("hand", 30)])
+    index.park(early, short_of("tool", 5), [("arm", 20)])
+    index.park(without, short_of("tool", 5))
+    assert index.limit == 20
+    assert index.pop_limited(20) == []
+    assert index.pop_limited(30) == [early]
+    assert (index.limit, len(index)) == (30, 3)
+    assert index.pop_limited(31) == [late]
+    assert index.limit > 2**63
+
+
+def test_under_a_limit_that_some_frame_has_passed_a_waiter_is_given_by_its_own_frame_only() -> None:
+    index = WaitingIndex()
+    index.pop_limited(100)
+    waiting = waiter()
+    index.park(waiting, short_of("tool", 5), [("arm", 40), ("hand", 30), ("base", 100)])
+    assert index.limit == 100
+    assert index.pop_unblocked("arm", 40) == []
+    assert index.pop_unblocked("base", 1_000) == []
+    assert index.pop_unblocked("hand", 31) == [waiting]
+    assert (len(index), index.by_frame) == (0, {})
+    assert index.limit > 2**63
+
+
+def test_several_waiters_under_one_frame_are_given_by_limit() -> None:
+    index = WaitingIndex()
+    index.pop_limited(100)
+    waiting = {limit: waiter() for limit in (30, 10, 20)}
+    for limit, each in waiting.items():
+        index.park(each, unknown("tool"), [("arm", limit)])
+    assert index.pop_unblocked("arm", 20) == [waiting[10]]
+    assert index.pop_unblocked("arm", 99) == [waiting[20], waiting[30]]
+    assert index.by_frame == {}
+
+
+def test_a_waiter_that_is_blocked_and_limited_by_one_frame_is_given_once() -> None:
+    index = WaitingIndex()
+    index.pop_limited(100)
+    waiting = waiter()
+    index.park(waiting, disconnected("map", "odom"), [("map", 10), ("map", 20), ("odom", 10)])
+    assert index.pop_unblocked("map", 50) == [waiting]
+    assert index.by_frame == {}
+
+
+def test_new_limits_of_a_waiter_replace_the_old_ones() -> None:
+    index = WaitingIndex()
+    waiting = waiter()
+    index.park(waiting, short_of("tool", 500), [("arm", 10), ("hand", 50)])
+    assert index.pop_limited(20) == [waiting]
+    index.set_limits(waiting, [("arm", 15), ("hand", 50)])
+    assert index.limit == 50
+    assert index.pop_limited(60) == [waiting]
+    index.set_limits(waiting, [("hand", 55)])
+    assert index.pop_unblocked("arm", 1_000) == []
+    assert index.pop_unblocked("hand", 1_000) == [waiting]
+    assert index.by_frame == {}
+
+
+def test_the_names_are_those_of_all_questions_of_parked_waiters() -> None:
+    index = WaitingIndex()
+    plain = waiter()
+    wide = Waiter(Question("map", "laser", 5, 5, "odom"), 0, list, others=(Question("base", "laser", 7),))
+    index.park(plain, unknown("tool"))
+    index.park(wide, unknown("laser"))
+    assert set(index.names) == {"map", "tool", "laser", "odom", "base"}
+    assert index.pop_asking_for({"base", "odom", "nothing"}) == [wide]
+    assert set(index.names) == {"map", "tool"}
+    index.remove(plain)
+    assert set(index.names) == set()
+
+
 def test_pop_all_gives_every_waiter_in_order_of_arrival_and_empties_the_index() -> None:
     index = WaitingIndex()
     errors = (unknown("camera"), short_of("tool", 9), disconnected("map", "odom"), short_of("tool", 1))
@@ -141,6 +215,13 @@ def test_a_given_waiter_can_be_parked_again_with_another_error() -> None:
     index.park(waiting, short_of("camera", 20))
     assert index.pop_unblocked("camera", 19) == []
     assert index.pop_unblocked("camera", 20) == [waiting]
+
+
+def test_waiting_since_leaves_out_those_that_came_later() -> None:
+    index = WaitingIndex()
+    for since in (10, 30, 20):
+        index.park(Waiter(Question("map", f"f{since}", LATEST), since, list), unknown("tool"))
+    assert [pending.since for pending in index.waiting_since(20)] == [10, 20]
 
 
 def test_pending_lists_each_question_with_its_error() -> None:

@@ -1,13 +1,13 @@
 """Lookups that wait: parked under the frames that they lack, woken by new samples, and tried again."""
 
-import logging
 import math
 from collections.abc import Callable
+from contextlib import suppress
 
 import anyio
 import anyio.lowlevel
 
-from tfbus._log import OnceLogger
+from tfbus.buffer._hanging_report import REPORT_AFTER, HangingReport
 from tfbus.buffer._local_names import LocalNames
 from tfbus.clock import Clock
 from tfbus.errors import (
@@ -24,10 +24,7 @@ from tfbus.stamps import LATEST, Latest, as_duration, from_seconds
 from tfbus.tree.lookup import answer
 from tfbus.tree.question import Question
 from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.waiting_index import Waiter, blocking_frames, without_traceback
-
-REPORT_AFTER = 5.0
-"""A lookup that has waited for longer than this, in s, is logged."""
+from tfbus.waiting.waiting_index import Waiter, without_traceback
 
 
 class Lookups:
@@ -55,7 +52,7 @@ class Lookups:
         self._clock = clock
         self._check_thread = check_thread
         self._local_names = local_names
-        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._report = HangingReport(live.waiting, clock)
 
     def not_before(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> int | None:
         """The oldest stamp that counts as `LATEST` now, in ns; None for any."""
@@ -82,8 +79,13 @@ class Lookups:
         )
         return found if self._local_names is None else self._local_names.answer(found)
 
-    async def lookup(self, question: Question, timeout: float | None) -> TransformStamped:
-        """The answer as soon as there is one, after a checkpoint; the errors are those of `Buffer.lookup`."""
+    async def lookup(
+        self, question: Question, timeout: float | None, others: tuple[Question, ...] = ()
+    ) -> TransformStamped:
+        """The answer as soon as there is one, after a checkpoint; the errors are those of `Buffer.lookup`.
+
+        `others` are questions whose answers are needed as well: an error of one that waiting cannot help is raised.
+        """
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
         last_reset = self._live.last_reset
         await anyio.lowlevel.checkpoint()
@@ -91,20 +93,25 @@ class Lookups:
             return self._lookup_since(last_reset, question)
         except MAY_COME as error:
             self._check_names(question)
-            blocker = without_traceback(error)
+            found: TransformStamped | TransformLookupError = without_traceback(error)
         self._check_thread()
         since = self._clock.now()
-        silent = min(limit, REPORT_AFTER)
-        found = await self._lookup_within(silent, question, since, last_reset, blocker, report=False)
-        if isinstance(found, TransformLookupError) and silent < limit:
-            found = await self._lookup_within(limit - silent, question, since, last_reset, found, report=True)
-        if isinstance(found, TransformLookupError):
-            raise LookupTimeoutError(
-                target=question.target, source=question.source, timeout=limit, missing=found
-            ) from found
+        left, pause, reported = limit, REPORT_AFTER, False
+        while isinstance(found, TransformLookupError):
+            if left <= 0.0:
+                raise LookupTimeoutError(
+                    target=question.target, source=question.source, timeout=limit, missing=found
+                ) from found
+            pause = min(left, pause)
+            found = await self._lookup_within(pause, question, since, last_reset, found, others, report=reported)
+            left -= pause
+            if left > 0.0 and isinstance(found, TransformLookupError):
+                pause, reported = self.report(question, since, found), True
         return found
 
-    async def park(self, question: Question, since: int, blocker: TransformLookupError) -> None:
+    async def park(
+        self, question: Question, since: int, blocker: TransformLookupError, others: tuple[Question, ...] = ()
+    ) -> None:
         """Wait for a sample that may have removed the cause of `blocker`.
 
         Raises
@@ -115,8 +122,8 @@ class Lookups:
         if self._live.end_reason is not None:
             raise BusClosedError(self._live.end_reason) from blocker
         woken = anyio.Event()
-        waiter = Waiter(question, since, woken.set)
-        self._live.waiting.park(waiter, blocker)
+        waiter = Waiter(question, since, woken.set, others)
+        self._live.park(waiter, blocker)
         try:
             await woken.wait()
         except BaseException:
@@ -124,16 +131,9 @@ class Lookups:
             self._live.waiting.remove(waiter)
             raise
 
-    def report(self, question: Question, blocker: TransformLookupError) -> None:
-        """Log the error of a lookup that has waited for long."""
-        self._log.warning(
-            (type(blocker), blocking_frames(blocker)),
-            "a lookup of %r in %r has waited for more than %g s: %s",
-            question.source,
-            question.target,
-            REPORT_AFTER,
-            blocker,
-        )
+    def report(self, question: Question, since: int, blocker: TransformLookupError) -> float:
+        """Log a lookup that has waited for long; return the time, in s, after which to call this again."""
+        return self._report.tell(question, since, blocker)
 
     async def _lookup_within(
         self,
@@ -142,19 +142,23 @@ class Lookups:
         since: int,
         last_reset: ClockResetError | None,
         blocker: TransformLookupError,
+        others: tuple[Question, ...],
         *,
         report: bool,
     ) -> TransformStamped | TransformLookupError:
         """Wait for the answer for some time; return it, or the error that still blocks it."""
         with self._clock.move_on_after(seconds):
             while True:
-                if report:
-                    self.report(question, blocker)
-                await self.park(question, since, blocker)
+                await self.park(question, since, blocker, others)
                 try:
                     return self._lookup_since(last_reset, question)
                 except MAY_COME as error:
                     blocker = without_traceback(error)
+                if report:
+                    self.report(question, since, blocker)
+                for other in others:
+                    with suppress(*MAY_COME):
+                        self.lookup_nowait(other)
         try:
             # The data may have come in the same turn of the loop in which the time was up.
             return self._lookup_since(last_reset, question)

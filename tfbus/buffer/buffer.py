@@ -1,6 +1,6 @@
 """The buffer: a tree that a bus fills, and lookups that wait for missing transforms."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, TypeVar
 
@@ -25,6 +25,9 @@ from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import PendingLookup
 
 DataT = TypeVar("DataT", bound=Stamped)
+
+_DESCRIBED = 10
+"""The number of waiting lookups that `describe` shows; each may have to search all frames for similar names."""
 
 
 class Buffer:
@@ -88,7 +91,7 @@ class Buffer:
             bus._check_thread()
             self._forest = forest_of(tree).copy_within(window)
         self._tree = tree_of(self._forest, keep)
-        self._live = LiveTree(self._forest)
+        self._live = LiveTree(self._forest, bus._announce_past_loop)
         self._lookups = Lookups(self._live, bus.clock, bus._check_thread, self._local_names)
         bus._attach(self._live)
 
@@ -207,6 +210,15 @@ class Buffer:
         policy = policy_of(tolerance, max_gap, extrapolate)
         question = Question(target, source, at, source_at, fixed, max_age, policy)
         return await self._lookups.lookup(self._on_bus(question), timeout)
+
+    async def _lookup_among(self, questions: Sequence[Question]) -> None:
+        """Wait until each question has had an answer; an error of any that waiting cannot help is raised at once.
+
+        Called by message filters.
+        """
+        asked = tuple(map(self._on_bus, questions))
+        for place, question in enumerate(asked):
+            await self._lookups.lookup(question, None, asked[place + 1 :])
 
     async def transform(
         self,
@@ -383,12 +395,15 @@ class Buffer:
         return pending if self._local_names is None else tuple(map(self._local_names.pending, pending))
 
     def describe(self) -> str:
-        """The tree as text, with each edge's rate, age, span and authority, and the lookups that wait."""
+        """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait."""
         edges = self.tree.edges()
         if self._local_names is not None:
             edges = sorted(map(self._local_names.edge, edges), key=lambda edge: edge.child)
         lines = [describe(edges, self._clock.now())]
-        lines += [f"waiting: {pending}" for pending in self.pending()]
+        pending = self.pending()
+        lines += [f"waiting: {lookup}" for lookup in pending[:_DESCRIBED]]
+        if len(pending) > _DESCRIBED:
+            lines.append(f"waiting: {len(pending) - _DESCRIBED} more lookups, see pending()")
         return "\n".join(lines)
 
     def on_close(self, callback: Callable[[], object]) -> Registration:

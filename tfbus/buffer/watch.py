@@ -7,7 +7,8 @@ from types import TracebackType
 import anyio.lowlevel
 
 from tfbus._aio.one_reader import OneReader
-from tfbus.buffer._waiting_lookup import REPORT_AFTER, Lookups
+from tfbus.buffer._hanging_report import REPORT_AFTER
+from tfbus.buffer._waiting_lookup import Lookups
 from tfbus.clock import Clock
 from tfbus.errors import MAY_COME, ClockResetError, TransformLookupError, UnknownFrameError
 from tfbus.frames import is_frame
@@ -173,12 +174,11 @@ class Watch:
     async def _park(self, blocker: TransformLookupError, since: int) -> None:
         """Wait for a sample that may have removed the cause of `blocker`."""
         waiter = Waiter(self._question, since, self._reader.wake)
-        self._live.waiting.park(waiter, blocker)
+        self._live.park(waiter, blocker)
         try:
-            silent = REPORT_AFTER - to_seconds(self._clock.now() - since)
-            if silent <= 0.0 or not await self._wait(silent):
-                self._lookups.report(self._question, blocker)
-                await self._wait()
+            pause = REPORT_AFTER - to_seconds(self._clock.now() - since)
+            while pause <= 0.0 or not await self._wait(pause):
+                pause = self._lookups.report(self._question, since, blocker)
         finally:
             self._live.waiting.remove(waiter)
 

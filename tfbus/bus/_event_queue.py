@@ -14,6 +14,7 @@ from tfbus.events import (
     FrameRemoved,
     FrameStale,
     KindChanged,
+    PastLoop,
     Reparented,
     SampleRejected,
 )
@@ -28,7 +29,8 @@ class EventQueue:
 
     A conflict of authorities is given once for each frame and pair of them. From then on a new parent or kind of that
     frame is given once for each authority that claims it. A rejected sample is given once for each frame, authority and
-    reason. All of this begins anew when the frame is removed or added, and when the clock jumps back.
+    reason, and a loop of parents in the past once for each frame, authority and parent. All of this begins anew when
+    the frame is removed or added, and when the clock jumps back.
 
     If one authority moves a frame to and fro, every move is an event, because that may be intended. If the queue is
     full, such a frame pushes out its own events and no others.
@@ -100,9 +102,10 @@ class EventQueue:
         if isinstance(event, AuthorityConflict):
             seen = self._conflicts.setdefault(event.frame, SeenKeys(_CLAIMS))
             key = frozenset((event.authority, event.other))
-        elif isinstance(event, SampleRejected):
+        elif isinstance(event, (SampleRejected, PastLoop)):
             seen = self._refusals.setdefault(event.frame, SeenKeys(_CLAIMS))
-            key = (event.authority, event.reason)
+            of_what = event.reason if isinstance(event, SampleRejected) else event.parent
+            key = (type(event), event.authority, of_what)
             if len(self._refusals) > _REFUSED_FRAMES:
                 del self._refusals[next(iter(self._refusals))]
         elif isinstance(event, Reparented) and event.frame in self._conflicts:

@@ -17,6 +17,8 @@ from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
 from tfbus.tree.cycles import NewestEdge, admit
 
+_FORMER_PARENTS = 1_000
+
 
 class _Edge:
     """The newest edge of one child.
@@ -60,6 +62,8 @@ class Topology:
         self._ownership = ownership
         self._announcer = announcer
         self._newest: dict[str, _Edge] = {}
+        # Every parent of a newest edge, and some that were one.
+        self._parents: set[str] = set()
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
         self.reparented = 0
@@ -145,7 +149,9 @@ class Topology:
         refused: list[InvalidTransformError] = []
         if self._ownership.restricts:
             batch, refused = self._ownership.split(batch, self._newest)
-        accepted, looped = admit(self._newest, batch)
+        if len(self._parents) > 2 * len(self._newest) + _FORMER_PARENTS:
+            self._parents = {known.parent for known in self._newest.values()}
+        accepted, looped = admit(self._newest, batch, self._parents)
         refused += looped
         for error in refused:
             self.reject(error.reason, error)
@@ -154,6 +160,7 @@ class Topology:
         for error in refused:
             self._log.warning((error.reason, error.child, error.authority), "dropped a sample: %s", error)
         for sample in accepted:
+            self._parents.add(sample.parent)
             self._record(sample)
         return accepted
 

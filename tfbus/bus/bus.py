@@ -23,10 +23,12 @@ from tfbus.bus.stream import Stream
 from tfbus.bus.thread_publisher import ThreadPublisher
 from tfbus.clock import Clock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError
-from tfbus.events import ClockReset, Event
+from tfbus.events import ClockReset, Event, PastLoop
 from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
 from tfbus.registration import Registration
+from tfbus.stamps import format_stamp
 from tfbus.statistics import BusStatistics
+from tfbus.tree.forest import LoopingSample
 from tfbus.waiting.live_tree import LiveTree
 
 
@@ -210,6 +212,19 @@ class Bus:
         """Announce an event that the bus cannot know. Called by links and recorders."""
         self._check_thread()
         self._announcer.announce(event)
+
+    def _announce_past_loop(self, found: LoopingSample) -> None:
+        """Log and announce a loop of parents at a past stamp. Called by buffers, which alone have the history."""
+        sample, (at, loop) = found
+        frames = " -> ".join(loop)
+        key = ("past loop", sample.child, sample.parent, sample.authority)
+        self._log.warning(
+            key, "the frames %s form a loop at %s, with late data of %r", frames, format_stamp(at), sample.authority
+        )
+        if self._announcer.has_listeners:
+            self._announcer.announce(
+                PastLoop(self._announcer.now(), sample.child, sample.parent, sample.authority, at, loop)
+            )
 
     def reserve(self, frame: str, authority: str) -> Registration:
         """Let only `authority` publish a frame, for any `on_conflict`, until the registration is closed.

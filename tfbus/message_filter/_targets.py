@@ -9,6 +9,7 @@ from tfbus.frames import is_frame
 from tfbus.geometry.rows import IDENTITY
 from tfbus.geometry.stamped import answer_of
 from tfbus.stamps import STAMP_MAX, Latest, as_duration, from_seconds
+from tfbus.tree.question import Question
 
 AnswerT = TypeVar("AnswerT")
 
@@ -77,8 +78,7 @@ class Targets(Generic[AnswerT]):
 
     async def wait(self, frame: str, stamp: int | Latest) -> None:
         """Wait until each question has had an answer; the errors are those of `Buffer.lookup`."""
-        for target, at in self.questions(frame, stamp):
-            await self._buffer.lookup(target, frame, at)
+        await self._buffer._lookup_among([Question(target, frame, at) for target, at in self.questions(frame, stamp)])
 
     def blocker(self, frame: str, stamp: int | Latest) -> TransformLookupError | None:
         """The error that an answer has now; None if there is an answer."""

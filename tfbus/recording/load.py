@@ -3,7 +3,7 @@
 import logging
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.recording import RecordedMessage, open_recording
@@ -59,11 +59,13 @@ def fill(tree: TransformTree, messages: Iterable[RecordedMessage], problems: Cou
     for _, batch, errors in messages:
         if errors:
             problems.update(error.reason for error in errors)
-        forest.commit(without_loops(forest.frames, batch, problems))
+        forest.commit(without_loops(forest.frames, batch, forest.names.parents, problems))
     forest.forget_changes()
 
 
-def without_loops(edges: Mapping[str, NewestEdge], batch: Batch, problems: Counter[str]) -> Batch:
+def without_loops(
+    edges: Mapping[str, NewestEdge], batch: Batch, parents: Container[str], problems: Counter[str]
+) -> Batch:
     """Return the batch without the samples that would close a loop of parents, and count those.
 
     Parameters
@@ -71,13 +73,15 @@ def without_loops(edges: Mapping[str, NewestEdge], batch: Batch, problems: Count
     edges : mapping of child to its newest edge
         Every edge has a sample, because nothing is ever removed from a recording.
     batch : tuple of TransformStamped
+    parents : container of str
+        The frames that are a parent of one of the edges.
     problems : Counter
     """
     for sample in batch:
         parent, child, _, _, _, _ = sample._fields
         edge = edges.get(child)
         if edge is None or edge.parent != parent:
-            accepted, refused = admit(edges, batch)
+            accepted, refused = admit(edges, batch, parents)
             problems.update(error.reason for error in refused)
             return accepted
     # The usual case: no child has got another parent, so there is no new loop.

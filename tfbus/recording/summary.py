@@ -106,14 +106,16 @@ def summarise(recording: Recording, messages: Iterable[RecordedMessage] | None =
         The messages to read, such as an iterator that shows the progress; by default, all messages of the recording.
     """
     frames: dict[str, _Frame] = {}
+    named: set[str] = set()
     problems: Counter[str] = Counter()
     count = 0
     for _, batch, errors in recording.messages() if messages is None else messages:
         count += 1
         if errors:
             problems.update(error.reason for error in errors)
-        for sample in without_loops(frames, batch, problems):
+        for sample in without_loops(frames, batch, named, problems):
             child = sample.child
+            named.add(sample.parent)
             frame = frames.get(child)
             if frame is None:
                 frame = frames[child] = _Frame(child)

@@ -1,7 +1,8 @@
 """Copies of the samples that a lookup at many stamps needs.
 
 While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies the
-samples on them as blocks of memory. All work in numpy comes after that, on the copies.
+samples on them: as blocks of memory, or only those next to a stamp where there are many more samples than stamps. All
+other work in numpy comes after that, on the copies. The compiled kernel copies nothing: its blocks can be held.
 """
 
 from typing import NamedTuple
@@ -71,15 +72,15 @@ class PathsOverTime(NamedTuple):
         return [(np.flatnonzero(numbers == i), path) for i, path in enumerate(different)]
 
 
-def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] | None) -> PathsOverTime:
-    """Copy the paths from source to target that hold from a first stamp to a last. The caller holds the lock.
+def copy_paths(forest: Forest, target: str, source: str, stamps: Stamps) -> PathsOverTime:
+    """Copy the paths from source to target that hold at some stamps. The caller holds the lock.
 
     Parameters
     ----------
     forest : Forest
     target, source : str
-    span : (int, int) or None
-        The first and the last stamp, in ns; None if there are no stamps.
+    stamps : integer array of shape (n,)
+        ns, in any order.
 
     Raises
     ------
@@ -87,21 +88,32 @@ def copy_paths(forest: Forest, target: str, source: str, span: tuple[int, int] |
     """
     forest.check_known(target)
     forest.check_known(source)
-    if span is None:
+    if not len(stamps):
         return PathsOverTime([], [None])
-    low, high = span
+    low, high = int(stamps.min()), int(stamps.max())
     paths: list[Path | None] = [_path_at(forest, target, source, low)]
-    changes: list[int] = []
-    if paths[0] is None or not paths[0].permanent:
-        changes = [stamp for stamp in forest.parent_changes() if low < stamp <= high]
-        paths += [_path_at(forest, target, source, stamp) for stamp in changes]
+    changes = _changes(forest, target, source, paths[0], low, high)
+    paths += [_path_at(forest, target, source, stamp) for stamp in changes]
     copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
     for path in paths:
         if path is not None and (path.up, path.down) not in copies:
-            up = tuple(_copy(step, low, high) for step in path.up)
-            down = tuple(_copy(step, low, high) for step in path.down)
+            up = tuple(_copy(step, stamps, low, high) for step in path.up)
+            down = tuple(_copy(step, stamps, low, high) for step in path.down)
             copies[path.up, path.down] = CopiedPath(up, down)
     return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
+
+
+def _changes(forest: Forest, target: str, source: str, path: Path | None, low: int, high: int) -> list[int]:
+    """The stamps after `low`, up to `high`, at which the path may change."""
+    if path is not None and path.permanent and path.root not in forest.frames:
+        return []
+    edges = forest.edges_above(target, source)
+    if not any(edge.mixed for edge in edges):
+        return []
+    # Of two ways round a loop of parents, the one whose samples cover the stamp counts.
+    changes = {stamp for edge in edges for stamp in edge.beginnings()}
+    changes.update(edge.newest + 1 for edge in edges if edge.newest is not None)
+    return sorted(stamp for stamp in changes if low < stamp <= high)
 
 
 def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
@@ -111,5 +123,7 @@ def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
         return None
 
 
-def _copy(step: Step, low: int, high: int) -> Samples | Row:
-    return step.samples_between(low, high) if isinstance(step, FrameHistory) else step
+def _copy(step: Step, stamps: Stamps, low: int, high: int) -> Samples | Row:
+    if not isinstance(step, FrameHistory):
+        return step
+    return step.samples_between(low, high, stamps)

@@ -1,5 +1,7 @@
 """The names of all frames that a sample in some window names."""
 
+from collections.abc import Collection
+
 
 class KnownFrames:
     """Counts the samples that name each frame, so that a frame is forgotten with the last sample that names it."""
@@ -13,6 +15,11 @@ class KnownFrames:
 
     def __contains__(self, frame: object) -> bool:
         return frame in self._parents_of or frame in self._mentions
+
+    @property
+    def parents(self) -> Collection[str]:
+        """The frames that a sample names as a parent."""
+        return self._mentions.keys()
 
     def update(self, child: str, parents: tuple[str, ...]) -> None:
         """Note that the samples of `child` name exactly these parents."""

@@ -17,8 +17,8 @@ from tfbus.geometry.rows import IDENTITY, Columns, Row, compose, invert
 from tfbus.geometry.transform_array import TransformArray, from_columns, from_rows, move
 from tfbus.stamps import LATEST, Stamps
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Places, copy_paths
-from tfbus.tree._extrapolation import read_stamps_at_many
 from tfbus.tree._segments import Floats, Segments
+from tfbus.tree.extrapolation import read_stamps_at_many
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Samples
 from tfbus.tree.lookup import answer, find, find_in_time_travel
@@ -37,10 +37,6 @@ class Query(NamedTuple):
     target: str
     source: str
     stamps: Stamps
-
-    def span(self) -> tuple[int, int] | None:
-        """The first and the last stamp, in ns; None if there are none."""
-        return (int(self.stamps.min()), int(self.stamps.max())) if len(self.stamps) else None
 
 
 def lookup_many(
@@ -118,10 +114,9 @@ def _answers(
     out_of_range: OutOfRange,
 ) -> list["Answers"]:
     """The answers of each query; `lookup_one` raises the error of a place without an answer."""
-    spans = [query.span() for query in queries]
     while True:
         with forest.lock:
-            copies = [copy_paths(forest, *query[:2], span) for query, span in zip(queries, spans, strict=True)]
+            copies = [copy_paths(forest, *query) for query in queries]
         answers = [Answers(paths, query.stamps, policy) for paths, query in zip(copies, queries, strict=True)]
         missing = [found.first_missing for found in answers if found.first_missing is not None]
         if not missing:

@@ -16,6 +16,7 @@ from contextlib import AbstractContextManager
 from math import acos, sin
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from tfbus.geometry.rows import IDENTITY, Row, compose, invert
@@ -25,6 +26,7 @@ from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
 _RECORD = struct.Struct("q7d")
 _SIZE = _RECORD.size
 _FOREVER = 2**64
+_BLOCK = 64
 _pack = _RECORD.pack
 _unpack = _RECORD.unpack_from
 _unpack_pair = struct.Struct("q7dq7d").unpack_from
@@ -139,6 +141,13 @@ class History:
         start = self._start
         return bisect_left(self.stamps, stamp, start) - start
 
+    def stamp(self, index: int) -> int:
+        """The stamp of a sample, in ns; the errors are those of `sample`."""
+        at = self._start + index
+        if index < 0 or at >= len(self.stamps):
+            raise IndexError("no sample has this index")
+        return self.stamps[at]
+
     def sample(self, index: int) -> tuple[int, Row]:
         """The stamp and the row of a sample.
 
@@ -168,11 +177,22 @@ class History:
         self.horizon = other.horizon
         self._cut_after = other._cut_after
 
-    def columns(self, first: int, end: int) -> Columns:
-        """The memory of the samples from one index to another, which nothing changes while it is held."""
+    def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
+        """The memory of the samples from one index to another, which nothing changes while it is held.
+
+        Those that are next to none of the `wanted` stamps (ns) may be left out. They are if they are many: a
+        scattered sample costs as much as 64 in a row.
+        """
         begin, end = self._start + first, self._start + min(end, self.count)
-        stamps, records = self.stamps[begin:end], self.records[begin * _SIZE : end * _SIZE]
-        return stamps, 0, records, 0, 8, len(stamps)
+        if wanted is None or end - begin <= _BLOCK * len(wanted):
+            stamps, records = self.stamps[begin:end], self.records[begin * _SIZE : end * _SIZE]
+            return stamps, 0, records, 0, 8, len(stamps)
+        # The views on the history end with each line, because a history that is being viewed cannot grow.
+        after = np.frombuffer(self.stamps, np.int64)[begin:end].searchsorted(wanted, "right")
+        places = begin + np.unique(np.concatenate((after - 1, after)).clip(0, end - begin - 1))
+        own = np.frombuffer(self.stamps, np.int64)[places]
+        rows = np.frombuffer(self.records, np.uint8).reshape(-1, _SIZE)[places]
+        return own, 0, rows, 0, 8, len(places)
 
     def _cut(self) -> None:
         """Cut off the samples that have left the window, and not again before 1/16 of it has passed."""

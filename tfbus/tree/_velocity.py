@@ -88,7 +88,7 @@ def _climb(steps: tuple[Step, ...], at: int) -> Motion:
 def _edge_motion(edge: FrameHistory, at: int) -> Motion:
     row = edge.row_at(at)
     i = edge.find(at)
-    if edge.sample(i)[0] == at and not edge.is_segment(i):
+    if edge.stamp(i) == at and not edge.is_segment(i):
         i += 1
         if i == edge.count:
             # A lone sample has a pose but no velocity.

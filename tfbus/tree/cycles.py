@@ -3,7 +3,8 @@
 The newest edges of all frames must form a forest. A batch is judged as a whole, so one batch may turn an edge round.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Container, Mapping, Sequence
 from typing import Protocol
 
 from tfbus.errors import InvalidTransformError
@@ -29,7 +30,7 @@ class NewestEdge(Protocol):
 
 
 def admit(
-    edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]
+    edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped], parents: Container[str]
 ) -> tuple[Batch, list[InvalidTransformError]]:
     """Split a batch into the samples that close no loop of parents, and the errors of those that do.
 
@@ -40,10 +41,13 @@ def admit(
     edges : mapping of child to its newest edge
         A child that is neither static nor has a newest stamp counts as having no parent.
     batch : sequence of TransformStamped
+    parents : container of str
+        The frames that are a parent of one of the edges; more names do no harm. No loop leads through a frame that is
+        not, so a chain that grows at its end needs no walk up to its root.
     """
     accepted: Sequence[TransformStamped] = batch
     refused: list[InvalidTransformError] = []
-    while loops := _find_loops(edges, changes := _changed_parents(edges, accepted)):
+    while loops := _find_loops(edges, changes := _changed_parents(edges, accepted), parents):
         loop_of = {frame: loop for loop in loops for frame in loop}
         kept: list[TransformStamped] = []
         for sample in reversed(accepted):
@@ -97,11 +101,27 @@ def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformS
     return {child: parent for child, parent in parents.items() if parent != _parent(edges.get(child))}
 
 
-def _find_loops(edges: Mapping[str, NewestEdge], changes: Mapping[str, str]) -> list[tuple[str, ...]]:
+def _possibly_looped(changes: Mapping[str, str], parents: Container[str]) -> list[str]:
+    """The changed children, without those that have no children themselves, and so on."""
+    children = Counter(changes.values())
+    childless = [child for child in changes if child not in parents and child not in children]
+    left_out = set(childless)
+    while childless:
+        parent = changes[childless.pop()]
+        children[parent] -= 1
+        if not children[parent] and parent in changes and parent not in parents:
+            childless.append(parent)
+            left_out.add(parent)
+    return [child for child in changes if child not in left_out]
+
+
+def _find_loops(
+    edges: Mapping[str, NewestEdge], changes: Mapping[str, str], parents: Container[str]
+) -> list[tuple[str, ...]]:
     """The loops through a changed child, as frames in the order of their parents. They share no frame."""
     loops: list[tuple[str, ...]] = []
     judged: set[str] = set()
-    for child in changes:
+    for child in _possibly_looped(changes, parents):
         walk: dict[str, None] = {}
         here: str | None = child
         while here is not None and here not in judged and here not in walk:

@@ -1,16 +1,18 @@
 """Explanations: how each edge on a path contributes to an answer, and which edges block it.
 
-The caller of `explain` holds the lock. Formatting an `Explanation` as text needs no lock.
+`explain` finds the path under the lock, and then reads its edges some at a time, so that a long path does not hold up
+insertions. Formatting an `Explanation` as text needs no lock.
 """
 
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.stamps import LATEST, Latest, format_duration, format_stamp, to_seconds
-from tfbus.tree._extrapolation import Extrapolation, read_stamp
-from tfbus.tree.forest import Forest
+from tfbus.tree.extrapolation import Extrapolation, read_stamp
+from tfbus.tree.forest import AT_A_TIME, Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, find
 from tfbus.tree.policy import Policy
@@ -105,7 +107,8 @@ class Explanation:
         elif isinstance(self.at, Latest) and self.stamp is not None:
             when += f": {format_stamp(self.stamp)}"
         lines = [f"{self.source!r} in {self.target!r}{when}"]
-        rows = _aligned([_cells(edge, self) for edge in self.edges])
+        top = self._top()
+        rows = _aligned([_cells(edge, self.now, place >= top) for place, edge in enumerate(self.edges)])
         if self.half_chains:
             up = len(self.half_chains[0]) - 1
             for half, of_it in zip(self.half_chains, (rows[:up], rows[up:]), strict=True):
@@ -119,13 +122,19 @@ class Explanation:
                 lines.append(f"  because {error.__cause__}")
         return "\n".join(lines)
 
+    def _top(self) -> int:
+        """The number of edges from target up to the common ancestor; those after them lead down to source."""
+        for place, edge in enumerate(self.edges):
+            if not self.half_chains and edge.parent == self.chain[place]:
+                return place
+        return len(self.edges)
 
-def _cells(edge: ExplainedEdge, whole: Explanation) -> list[str]:
+
+def _cells(edge: ExplainedEdge, now: int | None, below: bool) -> list[str]:
     """The cells of one edge's line of text."""
-    below = not whole.half_chains and whole.chain.index(edge.parent) < whole.chain.index(edge.child)
     age = ""
-    if edge.newest is not None and whole.now is not None:
-        age = f"age {format_duration(whole.now - edge.newest)}"
+    if edge.newest is not None and now is not None:
+        age = f"age {format_duration(now - edge.newest)}"
     return [
         "!" if edge.error is not None else " ",
         f"{edge.parent} <- {edge.child}" if below else f"{edge.child} -> {edge.parent}",
@@ -154,40 +163,69 @@ def _aligned(rows: list[list[str]]) -> list[str]:
     ]
 
 
+class _Finding(NamedTuple):
+    """The answer of a lookup or its error, and the edges to explain, each as child and parent."""
+
+    stamp: int | None
+    raised: TransformLookupError | None
+    instant: int | None
+    chain: tuple[str, ...] = ()
+    half_chains: tuple[tuple[str, ...], ...] = ()
+    links: tuple[tuple[str, str], ...] = ()
+
+
 def explain(
     forest: Forest, target: str, source: str, at: At, not_before: int | None, policy: Policy | None, now: int | None
 ) -> Explanation:
-    """The explanation of a lookup; the parameters are those of `TransformTree.explain`."""
+    """The explanation of a lookup; the parameters are those of `TransformTree.explain`. Takes the lock."""
+    with forest.lock:
+        found = _find(forest, target, source, at, not_before, policy)
+        if isinstance(found.raised, UnknownFrameError):
+            return Explanation(target, source, at, None, now, errors=_unknown(forest, target, source))
+        if now is None:
+            reached = (edge.newest for edge in forest.frames.values() if edge.newest is not None)
+            now = max(reached, default=None)
+    raised = found.raised
+    edges: list[ExplainedEdge] = []
+    for first in range(0, len(found.links), AT_A_TIME):
+        with forest.lock:
+            for child, parent in found.links[first : first + AT_A_TIME]:
+                edge = forest.frames.get(child)
+                if edge is None:
+                    # Another thread has removed it meanwhile.
+                    edges.append(ExplainedEdge(parent, child, False))
+                    continue
+                blocked = _block(edge, at, raised, policy) if isinstance(raised, ExtrapolationError) else None
+                edges.append(_explained(edge, parent, found.instant, now, policy, blocked))
+    errors: tuple[TransformLookupError, ...] = tuple(edge.error for edge in edges if edge.error is not None)
+    if raised is not None and raised not in errors:
+        errors = (raised, *errors)
+    return Explanation(target, source, at, found.stamp, now, found.chain, found.half_chains, tuple(edges), errors)
+
+
+def _find(forest: Forest, target: str, source: str, at: At, not_before: int | None, policy: Policy | None) -> _Finding:
     extrapolation = None if policy is None else Extrapolation(policy)
     stamp: int | None = None
     raised: TransformLookupError | None = None
     try:
         stamp, _, _ = find(forest, target, source, at, not_before, extrapolation)
+    except UnknownFrameError as error:
+        return _Finding(None, error, None)
+    except DisconnectedError as error:
+        halves = tuple(_up_to_root(forest, frame, error.stamp) for frame in (target, source))
+        links = tuple(link for half in halves for link in pairwise(half))
+        return _Finding(None, error, error.stamp, half_chains=halves, links=links)
     except TransformLookupError as error:
         raised = error
-    if isinstance(raised, UnknownFrameError):
-        return Explanation(target, source, at, None, now, errors=_unknown(forest, target, source))
-    if now is None:
-        newest = [edge.newest for edge in forest.frames.values()]
-        now = max((reached for reached in newest if reached is not None), default=None)
-    if isinstance(raised, DisconnectedError):
-        halves = tuple(_up_to_root(forest, frame, raised.stamp) for frame in (target, source))
-        links = [link for half in halves for link in pairwise(half)]
-        edges = tuple(_explained(forest.frames[child], parent, raised.stamp, now, policy) for child, parent in links)
-        return Explanation(target, source, at, None, now, half_chains=halves, edges=edges, errors=(raised,))
-    path = forest.find_path(target, source, at if stamp is None else stamp)
+    path = forest.find_path(target, source, at)
+    if stamp is not None and not path.permanent:
+        path = forest.find_path(target, source, stamp)
     chain, top = path.frames, path.frames.index(path.root)
-    links = [*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:]))]
+    links = (*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:])))
     instant = stamp
-    if isinstance(raised, ExtrapolationError):
+    if raised is not None:
         instant = path.latest() if isinstance(at, Latest) else at
-    found = []
-    for child, parent in links:
-        edge = forest.frames[child]
-        blocked = _block(edge, at, raised, policy) if isinstance(raised, ExtrapolationError) else None
-        found.append(_explained(edge, parent, instant, now, policy, blocked))
-    errors = tuple(edge.error for edge in found if edge.error is not None)
-    return Explanation(target, source, at, stamp, now, chain, (), tuple(found), errors)
+    return _Finding(stamp, raised, instant, chain, links=links)
 
 
 def _unknown(forest: Forest, *frames: str) -> tuple[UnknownFrameError, ...]:

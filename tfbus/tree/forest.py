@@ -5,23 +5,42 @@ held for one lookup or one batch, so worker threads may read while the loop inse
 """
 
 import threading
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, TypeVar
 
-from tfbus.errors import UnknownFrameError
+from tfbus.errors import DisconnectedError, UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.stamps import Latest, as_stamp
+from tfbus.stamps import STAMP_MIN, Latest, as_stamp
+from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
 from tfbus.tree._kernel import commit
 from tfbus.tree._known_frames import KnownFrames
 from tfbus.tree._path_cache import PathCache
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
-from tfbus.tree.path import Path, find_path
+from tfbus.tree.path import Path, find_path, path_at
+
+AT_A_TIME = 100
+"""The number of frames that are read before the lock is released, for questions about all of them."""
+
+_ROUNDS = 3
+
+_CHANGING_PATHS_KEPT = 5_000
+
+T = TypeVar("T")
+
+
+class LoopingSample(NamedTuple):
+    """A sample that is part of a loop of parents at a past stamp."""
+
+    sample: TransformStamped
+    loop: Loop
 
 
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `known_frames`, `copy` and `copy_within` take the lock themselves. The caller
-    of every other method holds it.
+    `insert`, `commit`, `remove`, `clear`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
+    themselves. The caller of every other method holds it.
 
     Parameters
     ----------
@@ -37,22 +56,33 @@ class Forest:
         By child.
     names : KnownFrames
     paths : PathCache
-        The permanent paths that have been found. A change that could make one wrong empties it.
+        The newest paths that have been found and are permanent. A change that could make one wrong empties it.
+    changing_paths : dict of (target, source) to Path
+        The same of newest paths that are not permanent.
     changed : set of str
         Frames with another parent or kind, or a longer past, since `forget_changes`: a lookup from a frame below one of
         them may have another answer.
     new_parents : set of str
         Frames that have become a parent since `forget_changes`, so that they may have become known.
+    looping : list of LoopingSample
+        Samples since `forget_changes` that are part of a loop of parents at a past stamp.
     inserted, replaced, expired : int
         Number of samples that had each `Outcome`.
+    looped : int
+        Number of samples that have been in `looping`.
     """
 
     __slots__ = (
+        "_readers",
+        "_suspects",
         "changed",
+        "changing_paths",
         "expired",
         "frames",
         "inserted",
         "lock",
+        "looped",
+        "looping",
         "names",
         "new_parents",
         "paths",
@@ -66,11 +96,16 @@ class Forest:
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
         self.paths = PathCache(self.lock)
+        self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
+        self.looping: list[LoopingSample] = []
+        self._suspects: list[TransformStamped] = []
+        self._readers: dict[int, set[str]] = {}
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
+        self.looped = 0
 
     # Changes
 
@@ -83,11 +118,13 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         with self.lock:
-            _, refused = admit(self.frames, batch)
+            _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
             outcomes = [self.insert_judged(sample) for sample in batch]
+            self.find_past_loops()
             self.forget_changes()
+            self._tell_readers([sample.child for sample in batch])
             return outcomes
 
     def commit(self, batch: Batch) -> bool:
@@ -102,14 +139,17 @@ class Forest:
         with self.lock:
             stored = commit(self.frames, batch, 0)
             self.inserted += stored
-            if stored == count:
-                return True
+            plain = stored == count
             while stored < count:
                 self.insert_judged(batch[stored])
                 end = commit(self.frames, batch, stored + 1)
                 self.inserted += end - stored - 1
                 stored = end
-        return False
+            if self._suspects:
+                self.find_past_loops()
+            if self._readers:
+                self._tell_readers([sample.child for sample in batch])
+        return plain
 
     def insert_judged(self, sample: TransformStamped) -> Outcome:
         """Store one sample that closes no loop."""
@@ -117,15 +157,18 @@ class Forest:
         history = self.frames.get(child)
         if history is None:
             history = self._add_frame(child, parent, static)
+            if child in self.changed:
+                self._suspects.append(sample)
         if static:
             if row != history.static_row:
                 # The paths hold the rows of static edges.
-                self.paths.clear()
+                self.forget_paths()
             outcome = history.insert_static(parent, stamp, row, authority)
         else:
             outcome = history.insert(parent, stamp, row, authority)
         if history.changed:
             self._restructure(history)
+            self._suspects.append(sample)
         if outcome is Outcome.INSERTED:
             self.inserted += 1
         elif outcome is Outcome.REPLACED:
@@ -153,17 +196,38 @@ class Forest:
                 history.clear()
                 history.changed = False
                 self.names.update(history.child, history.named_parents)
-            self.paths.clear()
+            self.forget_paths()
+            self._tell_readers(self.frames)
+
+    def find_past_loops(self) -> None:
+        """Note which of the samples since the last call are part of a loop of parents at a past stamp.
+
+        The samples of a whole batch are judged after the last, because one batch may turn an edge round.
+        """
+        for sample in self._suspects:
+            child = sample.child
+            if child in self.frames:
+                loop = past_loop(self.frames, child, STAMP_MIN if sample.static else sample.stamp)
+                if loop is not None:
+                    self.looping.append(LoopingSample(sample, loop))
+                    self.looped += 1
+        self._suspects.clear()
 
     def forget_changes(self) -> None:
-        """Empty `changed` and `new_parents`."""
+        """Empty `changed`, `new_parents` and `looping`."""
         self.changed.clear()
         self.new_parents.clear()
+        self.looping.clear()
+
+    def forget_paths(self) -> None:
+        """Empty `paths` and `changing_paths`."""
+        self.paths.clear()
+        self.changing_paths.clear()
 
     # Questions
 
     def find_path(self, target: str, source: str, at: int | Latest) -> Path:
-        """The path between two frames at a stamp, or by the newest parents. A permanent path is kept.
+        """The path between two frames that counts at a stamp (see `path_at`), or the one by the newest parents.
 
         Raises
         ------
@@ -171,20 +235,31 @@ class Forest:
         ValueError
             If the stamp does not fit 64 bits.
         """
-        path = self.paths.find(target, source)
+        if isinstance(at, Latest):
+            return self._newest_path(target, source)
+        instant = as_stamp(at)
+        newest: Path | None
+        try:
+            newest = self._newest_path(target, source)
+        except DisconnectedError:
+            newest = None
+        return path_at(self.frames, target, source, instant, newest)
+
+    def _newest_path(self, target: str, source: str) -> Path:
+        """The path by the newest parents; it is kept until a change may make it wrong."""
+        path = self.paths.find(target, source) or self.changing_paths.get((target, source))
         if path is not None:
             return path
-        instant = None if isinstance(at, Latest) else as_stamp(at)
         self.check_known(target)
         self.check_known(source)
-        path = find_path(self.frames, target, source, instant)
+        path = find_path(self.frames, target, source, None)
         if path.permanent:
             self.paths.keep(target, source, path)
+        else:
+            if len(self.changing_paths) >= _CHANGING_PATHS_KEPT:
+                self.changing_paths.clear()
+            self.changing_paths[target, source] = path
         return path
-
-    def parent_changes(self) -> list[int]:
-        """The stamps at which some frame changes its parent, in order. Between two of them all paths stay."""
-        return sorted({stamp for history in self.frames.values() for stamp in history.parent_changes()})
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""
@@ -198,35 +273,66 @@ class Forest:
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
             raise UnknownFrameError(frame=frame, known=self.names.sorted())
 
-    def with_descendants(self, frames: set[str]) -> set[str]:
-        """These frames and all below them, by any parent that a sample in the window names."""
-        children: dict[str, list[str]] = {}
-        for child, history in self.frames.items():
-            for parent in history.named_parents:
-                children.setdefault(parent, []).append(child)
-        found = set(frames)
-        ahead = list(frames)
-        while ahead:
-            new = [child for child in children.get(ahead.pop(), ()) if child not in found]
-            found.update(new)
-            ahead += new
+    def edges_above(self, *names: str) -> list[FrameHistory]:
+        """The edges of some frames and of all above them, by any parent that a sample in the window names."""
+        return list(edges_above(self.frames, names).values())
+
+    def names_below(self, names: Iterable[str], above: set[str]) -> set[str]:
+        """Those of `names` that are in `above`, or below one of these by any parent in the window."""
+        return names_below(self.frames, names, above)
+
+    def read_all(self, read: Callable[[FrameHistory], T]) -> dict[str, T]:
+        """What `read` gives for each frame, all of one moment.
+
+        Some frames are read at a time, so that insertions by another thread need not wait for all. Frames that have
+        changed meanwhile are read again.
+        """
+        found: dict[str, T] = {}
+        changed: set[str] = set()
+        with self.lock:
+            ahead = list(self.frames)
+            self._readers[id(changed)] = changed
+        try:
+            for _ in range(_ROUNDS):
+                for first in range(0, len(ahead), AT_A_TIME):
+                    with self.lock:
+                        self._read(ahead[first : first + AT_A_TIME], read, found, changed)
+                if len(changed) <= AT_A_TIME:
+                    break
+                with self.lock:
+                    ahead = list(changed)
+            with self.lock:
+                self._read(list(changed), read, found, changed)
+                # A later change is no longer of this moment.
+                del self._readers[id(changed)]
+        finally:
+            self._readers.pop(id(changed), None)
         return found
+
+    def _read(
+        self, frames: list[str], read: Callable[[FrameHistory], T], found: dict[str, T], changed: set[str]
+    ) -> None:
+        for frame in frames:
+            history = self.frames.get(frame)
+            if history is None:
+                found.pop(frame, None)
+            else:
+                found[frame] = read(history)
+            changed.discard(frame)
 
     def copy(self) -> "Forest":
         """An independent copy of the samples; its counters start at zero."""
-        twin = Forest(self.window)
-        with self.lock:
-            twin.frames = {child: history.copy() for child, history in self.frames.items()}
-            twin.names = self.names.copy()
-        return twin
+        return self._copy_of(self.window, FrameHistory.copy)
 
     def copy_within(self, window: int | None) -> "Forest":
         """An independent copy of the samples in the windows, with windows of another length (ns) from now on."""
+        return self._copy_of(window, lambda history: history.copy_within(window))
+
+    def _copy_of(self, window: int | None, copied: Callable[[FrameHistory], FrameHistory]) -> "Forest":
         twin = Forest(window)
-        with self.lock:
-            for child, history in self.frames.items():
-                short = twin.frames[child] = history.copy_within(window)
-                twin.names.update(child, short.named_parents)
+        twin.frames = self.read_all(copied)
+        for child, history in twin.frames.items():
+            twin.names.update(child, history.named_parents)
         return twin
 
     # Bookkeeping
@@ -238,7 +344,7 @@ class Forest:
         self.new_parents.add(parent)
         if has_children:
             # A root that gets a parent leaves the paths below it as they are, unless late samples formed a loop there.
-            self.paths.clear()
+            self.forget_paths()
             self.changed.add(child)
             self._drop_emptied_loop(history)
         return history
@@ -246,7 +352,7 @@ class Forest:
     def _restructure(self, history: FrameHistory) -> None:
         """Forget the paths that an insertion may have made wrong, and note the change for waiting lookups."""
         history.changed = False
-        self.paths.clear()
+        self.forget_paths()
         self.changed.add(history.child)
         self.new_parents.update(history.named_parents)
         self.names.update(history.child, history.named_parents)
@@ -265,7 +371,13 @@ class Forest:
                     self.changed.add(edge.child)
                     self._remove(edge.child)
 
+    def _tell_readers(self, frames: Iterable[str]) -> None:
+        """Tell the threads that read all frames which have changed."""
+        for changed in self._readers.values():
+            changed.update(frames)
+
     def _remove(self, frame: str) -> None:
+        self._tell_readers((frame,))
         if self.frames.pop(frame, None) is not None:
             self.names.remove(frame)
-            self.paths.clear()
+            self.forget_paths()

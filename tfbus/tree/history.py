@@ -223,7 +223,7 @@ class FrameHistory(History):
         """Whether samples i - 1 and i are both in the window and have the same parent."""
         if not 0 < i < self.count:
             return False
-        return not self.mixed or self.parent_at(self.sample(i - 1)[0]) == self.parent_at(self.sample(i)[0])
+        return not self.mixed or self.parent_at(self.stamp(i - 1)) == self.parent_at(self.stamp(i))
 
     def extrapolation_error(self, stamp: int | Latest, slack: int = 0) -> ExtrapolationError:
         """The error of a `stamp` that is not covered, and is further than `slack` ns from every sample."""
@@ -236,20 +236,40 @@ class FrameHistory(History):
         """The stamps inside the window at which the parent changes."""
         return [stamp for stamp, _ in self._runs[1:]]
 
+    def beginnings(self) -> list[int]:
+        """The stamps inside the window at which a parent begins to hold: the oldest, and each change."""
+        oldest = self.oldest
+        return [] if oldest is None else [oldest, *self.parent_changes()]
+
+    def begins_by(self, stamp: int) -> bool:
+        """Whether the edge is static, or has a sample in the window at `stamp` or before."""
+        oldest = self.oldest
+        return self.static or (oldest is not None and oldest <= stamp)
+
+    def around(self, stamp: int) -> tuple[int | None, int | None]:
+        """The stamp of the last sample not after `stamp`, and that of the next one, in ns."""
+        i, count = self.find(stamp), self.count
+        if i < count and self.stamp(i) == stamp:
+            i += 1
+        return self.stamp(i - 1) if i else None, self.stamp(i) if i < count else None
+
     def neighbours(self, stamp: int) -> tuple[int | None, int | None]:
         """The stamps of the samples before and after `stamp`, in ns; twice the same if a sample has it."""
         i = self.find(stamp)
-        after = self.sample(i)[0] if i < self.count else None
+        after = self.stamp(i) if i < self.count else None
         if after == stamp:
             return after, after
-        return self.sample(i - 1)[0] if i else None, after
+        return self.stamp(i - 1) if i else None, after
 
-    def samples_between(self, low: int, high: int) -> Samples:
-        """The samples from stamp `low` to `high`, and the next one on either side."""
+    def samples_between(self, low: int, high: int, wanted: Stamps | None = None) -> Samples:
+        """The samples from stamp `low` to `high`, and the next one on either side.
+
+        Those that are next to none of the `wanted` stamps (ns) may be left out.
+        """
         first = self.find(low)
-        if first and (first == self.count or self.sample(first)[0] != low):
+        if first and (first == self.count or self.stamp(first) != low):
             first -= 1
-        return Samples(self.columns(first, self.find(high) + 1), self._runs)
+        return Samples(self.columns(first, self.find(high) + 1, wanted), self._runs)
 
     def edge(self) -> Edge:
         """The newest edge as plain data."""
@@ -279,7 +299,7 @@ class FrameHistory(History):
         if stamp < self.horizon:
             return Outcome.EXPIRED
         at = self.find(stamp)
-        replaces = self.sample(at)[0] == stamp
+        replaces = self.stamp(at) == stamp
         if not at and not replaces:
             self.changed = True
         is_newest = replaces and at == self.count - 1
@@ -294,10 +314,10 @@ class FrameHistory(History):
 
     def _name_parent(self, parent: str, stamp: int, at: int, replaces: bool) -> None:
         """Note the parent of a late sample that will stand before the one at an index, or replace it."""
-        first, behind = self.sample(0)[0], at + replaces
+        first, behind = self.stamp(0), at + replaces
         runs = self._runs or [(first, self.parent)]
-        low = bisect_right(runs, self.sample(at - 1)[0], key=_stamp_of) if at else 0
-        after = self.sample(behind)[0] if behind < self.count else None
+        low = bisect_right(runs, self.stamp(at - 1), key=_stamp_of) if at else 0
+        after = self.stamp(behind) if behind < self.count else None
         high = len(runs) if after is None else bisect_right(runs, after, key=_stamp_of)
         fresh = [] if low and runs[low - 1][1] == parent else [(stamp, parent)]
         if after is not None and runs[high - 1][1] != parent:

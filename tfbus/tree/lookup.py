@@ -12,10 +12,10 @@ from tfbus.errors import (
 from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
 from tfbus.stamps import LATEST, Latest, as_stamp
-from tfbus.tree._extrapolation import Extrapolation
+from tfbus.tree.extrapolation import Extrapolation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
-from tfbus.tree.path import Path, find_path
+from tfbus.tree.path import Path
 from tfbus.tree.policy import Policy
 
 At = int | Latest
@@ -72,13 +72,27 @@ def find(
     if at is LATEST:
         return _find_latest(forest, path, not_before, extrapolation)
     if extrapolation is not None:
-        return at, extrapolation.row(path, as_stamp(at)), False
+        return at, _extrapolated(forest.find_path(target, source, at), at, extrapolation), False
     try:
         return at, path.row_at(as_stamp(at)), False
     except ExtrapolationError:
-        # Another edge may decide. The error is raised outside, so that it keeps no traceback of this one alive.
+        # Another edge, or another way, may decide. That is found outside, so that an error keeps no traceback of this
+        # one alive.
         pass
+    if path.root in forest.frames:
+        path = forest.find_path(target, source, at)
+        if path.covers(at):
+            return at, path.row_at(at), False
     raise path.deciding_error(as_stamp(at))
+
+
+def _extrapolated(path: Path, at: int, extrapolation: Extrapolation) -> Row:
+    """Source in target at a stamp, as far as a policy allows."""
+    try:
+        return extrapolation.row(path, at)
+    except ExtrapolationError as error:
+        decisive = path.with_rival(error, at)
+    raise decisive
 
 
 def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolation: Extrapolation | None) -> Found:
@@ -95,7 +109,7 @@ def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolati
     try:
         path_then = path
         if not path.permanent:
-            path_then = find_path(forest.frames, path.frames[0], path.frames[-1], common)
+            path_then = forest.find_path(path.frames[0], path.frames[-1], common)
         row = path_then.row_at(common) if extrapolation is None else extrapolation.row(path_then, common)
     except TransformLookupError as error:
         # The lagging edge has to reach what the others still hold, or the far end of their gap. Where a parent has

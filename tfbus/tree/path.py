@@ -2,15 +2,22 @@
 
 A path climbs from the source to the lowest common ancestor and from the target to the same frame, so no edge above that
 can fail or slow a lookup. Runs of static edges are folded into one row.
+
+The newest edges form no loop, but the edges that hold at an older stamp may: late samples can form one, and an edge is
+followed beyond its samples as well, so that an error can name it. Two ways then lead round the loop. `path_at` says
+which of them counts, by what is stored and never by what was asked before.
 """
 
 from collections.abc import Mapping
 
-from tfbus.errors import DisconnectedError, ExtrapolationError, PastExtrapolationError
+from tfbus.errors import DisconnectedError, ExtrapolationError, FutureExtrapolationError
 from tfbus.geometry.rows import IDENTITY, Row, compose, invert
-from tfbus.stamps import LATEST, STAMP_MIN
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN
 from tfbus.tree._kernel import Chain
 from tfbus.tree.history import FrameHistory
+
+Frames = Mapping[str, FrameHistory]
+"""By child."""
 
 Step = FrameHistory | Row
 """A moving edge, or the row of a run of static edges."""
@@ -31,9 +38,11 @@ class Path(Chain):
         The edges that are not static.
     permanent : bool
         Whether it holds at every stamp, because no frame on it changes its parent inside its window.
+    rival : Path or None
+        The other way round a loop, if the samples cover the stamp on neither of them.
     """
 
-    __slots__ = ("_static", "frames", "moving", "permanent", "root")
+    __slots__ = ("_changing", "_static", "frames", "moving", "permanent", "rival", "root")
     up: tuple[Step, ...]
     down: tuple[Step, ...]
 
@@ -43,13 +52,23 @@ class Path(Chain):
         self.root = root
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
-        self.permanent = not any(edge.mixed for edge in edges)
+        self._changing = tuple(edge for edge in edges if edge.mixed)
+        self.permanent = not self._changing
+        self.rival: Path | None = None
         self._static = tuple(edge for edge in edges if edge.static)
 
     @property
     def static_stamp(self) -> int:
         """The newest stamp among the static samples, in ns; sending one again changes it, but not the path."""
         return max((edge.static_stamp or 0 for edge in self._static), default=0)
+
+    def holds(self, at: int) -> bool:
+        """Whether a path by the newest parents has the parents that hold at a stamp."""
+        return all(edge.parent_at(at) == edge.parent for edge in self._changing)
+
+    def covers(self, at: int) -> bool:
+        """Whether the samples of every edge cover a stamp."""
+        return all(edge.covers(at) for edge in self.moving)
 
     def row_at(self, at: int) -> Row:
         """The row of source in target at a stamp: that of the kernel or, if it is not plain, the same step by step.
@@ -80,12 +99,35 @@ class Path(Chain):
         return common, next(edge for edge in self.moving if edge.newest == common)
 
     def deciding_error(self, at: int) -> ExtrapolationError:
-        """The error of a stamp that is not covered: of an edge that has lost it, else of the one that lags most."""
-        missing = [edge.extrapolation_error(at) for edge in self.moving if not edge.covers(at)]
-        for error in missing:
-            if isinstance(error, PastExtrapolationError):
+        """The error of a stamp that is not covered: of an edge that has lost it, else of the one that lags most.
+
+        With a `rival`, of the way that waiting may help.
+        """
+        return self.with_rival(self._own_error(at), at)
+
+    def with_rival(self, error: ExtrapolationError, at: int) -> ExtrapolationError:
+        """The error of a stamp in view of the `rival`, if there is one: waiting helps if it helps on either way."""
+        if self.rival is None:
+            return error
+        if not isinstance(error, FutureExtrapolationError):
+            other = self.rival._own_error(at)
+            if not isinstance(other, FutureExtrapolationError):
                 return error
-        return min(missing, key=lambda error: STAMP_MIN if error.newest is None else error.newest)
+            error = other
+        others = dict.fromkeys((*error.others, *(edge.child for edge in self.rival.moving)))
+        error.others = tuple(child for child in others if child != error.child)
+        return error
+
+    def _own_error(self, at: int) -> ExtrapolationError:
+        lagging, reached = self.moving[0], STAMP_MAX + 1
+        for edge in self.moving:
+            oldest, newest = edge.oldest, edge.newest
+            if oldest is not None and newest is not None and newest >= at:
+                if oldest > at:
+                    return edge.extrapolation_error(at)
+            elif (came_to := STAMP_MIN if newest is None else newest) < reached:
+                lagging, reached = edge, came_to
+        return lagging.extrapolation_error(at)
 
 
 def _climb(steps: tuple[Step, ...], at: int) -> Row:
@@ -109,8 +151,8 @@ def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
     return tuple(steps)
 
 
-def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: int | None) -> Path:
-    """The path that holds at a stamp, or by the newest parents.
+def find_path(frames: Frames, target: str, source: str, at: int | None) -> Path:
+    """A path by the parents that hold at a stamp, or the one by the newest parents.
 
     Both ends climb in turn, so the search stops at most one side's length beyond the common ancestor.
 
@@ -124,7 +166,7 @@ def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: 
     Raises
     ------
     DisconnectedError
-        If the two ends do not meet, or one runs into a loop, which out-of-order samples can form in the past.
+        If the two ends do not meet.
     """
     up, down = _Climber(frames, source, at), _Climber(frames, target, at)
     while True:
@@ -139,12 +181,83 @@ def find_path(frames: Mapping[str, FrameHistory], target: str, source: str, at: 
         down.climb()
 
 
+def path_at(frames: Frames, target: str, source: str, at: int, newest: Path | None) -> Path:
+    """The path that counts at a stamp.
+
+    That is the newest path if all its edges hold and cover the stamp. Otherwise it is the way by the parents that hold
+    at the stamp; of two ways round a loop, the one whose samples cover the stamp. If neither does, it has a `rival`.
+
+    Parameters
+    ----------
+    frames : mapping of child to its history
+    target, source : str
+    at : int
+        ns.
+    newest : Path or None
+        The path by the newest parents; None if there is none.
+
+    Raises
+    ------
+    DisconnectedError
+        If there is no way; or if the samples cover the stamp on two ways, and neither is the newest path.
+    """
+    if newest is not None and newest.holds(at):
+        if newest.root not in frames or newest.covers(at):
+            return newest
+        way = newest
+    else:
+        way = find_path(frames, target, source, at)
+    rival, loop = _other_way(frames, way, at)
+    if rival is None:
+        return way
+    if rival.covers(at):
+        if way.covers(at):
+            raise DisconnectedError(target=target, source=source, roots=(way.root, rival.root), stamp=at, loop=loop)
+        return rival
+    if way.covers(at):
+        return way
+    if way is newest:
+        # The newest path may be kept for other stamps, at which it has no rival.
+        way = Path(*_edges(frames, way), way.root)
+    elif min(rival.frames, rival.frames[::-1]) < min(way.frames, way.frames[::-1]):
+        # The same one for both directions of the question.
+        way, rival = rival, way
+    way.rival = rival
+    return way
+
+
+def _other_way(frames: Frames, way: Path, at: int) -> tuple[Path | None, tuple[str, ...]]:
+    """The other way round a loop at a stamp, if its top leads back to it, and the loop."""
+    beyond: dict[str, FrameHistory] = {}
+    here = way.root
+    while (edge := frames.get(here)) is not None and here not in beyond:
+        beyond[here] = edge
+        here = edge.parent_at(at)
+        if here == way.root or here not in way.frames:
+            continue
+        ups, downs = _edges(frames, way)
+        for side, other in ((ups, downs), (downs, ups)):
+            below = [edge.child for edge in side]
+            if here in below:
+                loop = (*below[below.index(here) :], *beyond, here)
+                del side[below.index(here) :]
+                other += beyond.values()
+                return Path(ups, downs, here), loop
+    return None, ()
+
+
+def _edges(frames: Frames, path: Path) -> tuple[list[FrameHistory], list[FrameHistory]]:
+    """The edges of a path from source up to its root, and from target."""
+    top = path.frames.index(path.root)
+    return [frames[child] for child in path.frames[:top:-1]], [frames[child] for child in path.frames[:top]]
+
+
 class _Climber:
     """One end of a path search, which climbs towards the root."""
 
     __slots__ = ("_at", "_frames", "edges", "ended", "here", "loop", "seen")
 
-    def __init__(self, frames: Mapping[str, FrameHistory], frame: str, at: int | None) -> None:
+    def __init__(self, frames: Frames, frame: str, at: int | None) -> None:
         self._frames = frames
         self._at = at
         self.here = frame

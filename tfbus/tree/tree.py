@@ -19,7 +19,7 @@ from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import Edge, Outcome
+from tfbus.tree.history import Edge, FrameHistory, Outcome
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.rendering import describe, to_dot, to_yaml
@@ -28,7 +28,8 @@ from tfbus.tree.rendering import describe, to_dot, to_yaml
 class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
-    Any thread may read it while another one inserts.
+    Any thread may read it while another one inserts. A copy, and what `edges` and the texts show, is the tree at one
+    moment; an explanation reads its edges one after the other.
 
     Parameters
     ----------
@@ -100,6 +101,11 @@ class TransformTree:
         """Number of samples that were older than the window of their frame."""
         return self._forest.expired
 
+    @property
+    def looped(self) -> int:
+        """Number of samples that formed a loop of parents at a past stamp when they came; see `lookup`."""
+        return self._forest.looped
+
     # Questions about transforms
 
     def lookup(
@@ -157,6 +163,13 @@ class TransformTree:
         TypeError
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
             `not_before` comes without a `LATEST`.
+
+        Notes
+        -----
+        The newest parents never form a loop. Those at an older stamp may, if samples came late, and then two ways lead
+        from source to target. If the way of the newest parents has samples for the stamp, it is the answer; otherwise
+        the way that has them. If both others have them, the frames count as not connected at that stamp. `looped`
+        counts the samples that form such loops. The answer depends on the samples only, never on earlier questions.
         """
         policy = None
         if tolerance == 0.0 and max_gap is None and extrapolate is None:
@@ -208,8 +221,7 @@ class TransformTree:
             raise TypeError(AT_LATEST_ONLY)
         if at is not LATEST:
             at = as_stamp(at)
-        with self._forest.lock:
-            return explain(self._forest, target, source, at, not_before, policy, now)
+        return explain(self._forest, target, source, at, not_before, policy, now)
 
     def lookup_many(
         self,
@@ -391,8 +403,8 @@ class TransformTree:
 
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
-        with self._forest.lock:
-            return [self._forest.frames[child].edge() for child in sorted(self._forest.frames)]
+        edges = self._forest.read_all(FrameHistory.edge)
+        return [edges[child] for child in sorted(edges)]
 
     def __contains__(self, frame: object) -> bool:
         with self._forest.lock:

@@ -7,11 +7,12 @@ import logging
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 
-from tfbus.errors import ClockResetError, UnknownFrameError
+from tfbus.errors import ClockResetError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.geometry.stamped import Batch
 from tfbus.registration import Registration
 from tfbus.statistics import BufferStatistics
-from tfbus.tree.forest import Forest
+from tfbus.tree.forest import Forest, LoopingSample
+from tfbus.waiting._limits import limits_of
 from tfbus.waiting.waiting_index import Waiter, WaitingIndex
 from tfbus.waiting.watch_index import WatchIndex, WatchState
 
@@ -23,6 +24,8 @@ class LiveTree:
     ----------
     forest : Forest
         Only the bus may change it from now on: another change would wake no waiting lookup.
+    on_loop : callable, optional
+        Called with each sample that forms a loop of parents at a past stamp.
 
     Attributes
     ----------
@@ -35,8 +38,9 @@ class LiveTree:
         The last jump back of the clock; a new object for each.
     """
 
-    def __init__(self, forest: Forest) -> None:
+    def __init__(self, forest: Forest, on_loop: Callable[[LoopingSample], object] | None = None) -> None:
         self.forest = forest
+        self._on_loop = on_loop
         self.waiting = WaitingIndex()
         self.watching = WatchIndex()
         self.end_reason: str | None = None
@@ -50,14 +54,30 @@ class LiveTree:
         waiters = self._waiters
         plain = self.forest.commit(batch)
         if waiters:
+            limit = self.waiting.limit
+            passed = None
             for sample in batch:
                 fields = sample._fields
                 if fields[1] in waiters:
                     _wake(self.waiting.pop_unblocked(fields[1], fields[2]))
+                if fields[2] > limit:
+                    passed = limit = fields[2]
+            if passed is not None:
+                self._wake_hopeless(passed)
         if self._watches:
             _wake(self.watching.mark([sample._fields[1] for sample in batch]))
         if not plain:
             self._wake_for_new_topology()
+
+    def park(self, waiter: Waiter, error: TransformLookupError) -> None:
+        """Let a waiter wait until a sample may have removed the cause of `error`, or has made an answer impossible.
+
+        Raises
+        ------
+        TypeError
+            If `error` is of a kind that waiting cannot help.
+        """
+        self.waiting.park(waiter, error, self._limits(waiter, error))
 
     def remove_frame(self, frame: str) -> None:
         """Forget a frame, if it is known, and wake the lookups and watches that it concerns."""
@@ -69,8 +89,7 @@ class LiveTree:
             return
         if self._waiters:
             gone = {name for name in parents if name not in forest.names}
-            concerned = forest.with_descendants({frame}) if frame in forest.names else {frame}
-            _wake(self.waiting.pop_asking_for(concerned | gone))
+            _wake(self.waiting.pop_asking_for(forest.names_below(self.waiting.names, {frame, *gone})))
         _wake(self.watching.mark((frame,)))
 
     def reset(self, before: int, after: int) -> None:
@@ -114,7 +133,29 @@ class LiveTree:
     def statistics(self, offered: int) -> BufferStatistics:
         """The counters, with the number of samples that the bus has offered."""
         forest = self.forest
-        return BufferStatistics(offered, forest.inserted, forest.replaced, forest.expired, len(self.waiting))
+        return BufferStatistics(
+            offered, forest.inserted, forest.replaced, forest.expired, len(self.waiting), forest.looped
+        )
+
+    def _limits(self, waiter: Waiter, error: TransformLookupError | None) -> list[tuple[str, int]]:
+        """The limits of a waiter, but for that of the edge that blocks it, whose next samples wake it anyway."""
+        blocking = error.child if isinstance(error, FutureExtrapolationError) else None
+        limits = limits_of(self.forest, waiter.question, blocking)
+        for other in waiter.others:
+            limits += limits_of(self.forest, other, None)
+        return limits
+
+    def _wake_hopeless(self, stamp: int) -> None:
+        """Wake the waiters that samples up to a stamp (ns) have made hopeless."""
+        for waiter in self.waiting.pop_limited(stamp):
+            limits = self._limits(waiter, waiter.blocked_by)
+            if any(
+                (newest := self.forest.frames[frame].newest) is not None and newest > limit for frame, limit in limits
+            ):
+                self.waiting.remove(waiter)
+                _wake((waiter,))
+            else:
+                self.waiting.set_limits(waiter, limits)
 
     def _wake_for_new_topology(self) -> None:
         """Wake the lookups that a new edge, another parent or kind, or a longer past may have unblocked."""
@@ -123,9 +164,13 @@ class LiveTree:
             for name in forest.new_parents:
                 _wake(self.waiting.pop_unblocked(name, None))
         if forest.changed and (self._waiters or self._watches):
-            concerned = forest.with_descendants(forest.changed)
+            asked = {*self.waiting.names, *self.watching.changing_names}
+            concerned = forest.names_below(asked, forest.changed)
             _wake(self.waiting.pop_asking_for(concerned))
             _wake(self.watching.mark_asking_for(concerned))
+        if self._on_loop is not None:
+            for found in forest.looping:
+                self._on_loop(found)
         forest.forget_changes()
 
 

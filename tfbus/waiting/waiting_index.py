@@ -4,10 +4,15 @@ A lookup that cannot be answered is parked under the frame that blocks it: an ed
 ordered by the stamp that the lookup needs; an unknown frame; or the roots of two trees. An insertion then finds the
 lookups that it may have unblocked without looking at the others. Nothing here waits or computes an answer: the
 inserting code pops the waiters that may have an answer and wakes them, and each asks the tree again.
+
+A lookup also ends when another edge of its path loses the stamp, because its window has slid on. Each of these edges
+has a limit: the newest stamp that it may reach until then. A waiter is kept by its first limit in one list for all
+frames, so an insertion costs one comparison, as long as it is in nobody's future. Once some frame has passed a limit,
+the waiter is kept under the edges that have not, such as one that has stopped.
 """
 
 from bisect import bisect_left, insort
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, KeysView
 from dataclasses import dataclass
 from itertools import count
 
@@ -23,6 +28,8 @@ from tfbus.stamps import STAMP_MIN, Latest
 from tfbus.tree.question import Question
 
 _Place = tuple[int, int, "Waiter"]
+
+_NEVER = 2**64
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,17 +54,34 @@ class Waiter:
         The stamp at which the lookup began to wait, in ns.
     wake : callable
         Called once, after the waiter was popped from the index.
+    others : tuple of Question
+        Questions whose answers are needed as well: if one of them can have no answer any more, the waiter is woken.
+
+    Attributes
+    ----------
+    asked : set of str
+        The frames that the questions name.
     """
 
-    __slots__ = ("blocked_by", "names", "place", "question", "since", "wake")
+    __slots__ = ("asked", "blocked_by", "limit", "limits", "names", "others", "place", "question", "since", "wake")
 
-    def __init__(self, question: Question, since: int, wake: Callable[[], object]) -> None:
+    def __init__(
+        self, question: Question, since: int, wake: Callable[[], object], others: tuple[Question, ...] = ()
+    ) -> None:
         self.question = question
         self.since = since
         self.wake = wake
+        self.others = others
+        self.asked = {question.target, question.source}
+        if question.fixed is not None:
+            self.asked.add(question.fixed)
+        for other in others:
+            self.asked.update((other.target, other.source))
         self.blocked_by: TransformLookupError | None = None
         self.names: tuple[str, ...] = ()
         self.place: _Place | None = None
+        self.limit: _Place | None = None
+        self.limits: list[tuple[str, _Place]] = []
 
 
 def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
@@ -91,16 +115,21 @@ def without_traceback(error: TransformLookupError) -> TransformLookupError:
 
 
 class _FrameWaiters:
-    """The waiters under one frame: by the stamp that its edge must reach, and those that need any sample of it.
+    """The waiters under one frame: by the stamp that its edge must reach, those that need any sample, and by limit.
 
     The places are sorted backwards, by negative stamp and negative order, so that the next due waiter is the last.
     """
 
-    __slots__ = ("for_any", "places")
+    __slots__ = ("for_any", "limits", "places")
 
     def __init__(self) -> None:
         self.places: list[_Place] = []
         self.for_any: dict[Waiter, None] = {}
+        self.limits: list[_Place] = []
+
+    @property
+    def empty(self) -> bool:
+        return not (self.places or self.for_any or self.limits)
 
 
 class WaitingIndex:
@@ -109,19 +138,39 @@ class WaitingIndex:
     Attributes
     ----------
     by_frame : mapping
-        The waiters under each frame that blocks a lookup.
+        The waiters under each frame that blocks a lookup, or whose next sample may make one hopeless.
     """
 
     def __init__(self) -> None:
         self.by_frame: dict[str, _FrameWaiters] = {}
         self._waiters: dict[Waiter, None] = {}
+        self._by_name: dict[str, dict[Waiter, None]] = {}
+        self._limits: list[_Place] = []
+        self._passed = STAMP_MIN
         self._order = count()
 
     def __len__(self) -> int:
         return len(self._waiters)
 
-    def park(self, waiter: Waiter, error: TransformLookupError) -> None:
+    @property
+    def names(self) -> KeysView[str]:
+        """The frames that the questions of the waiters name."""
+        return self._by_name.keys()
+
+    @property
+    def limit(self) -> int:
+        """A sample at a newer stamp (ns) may have made a waiter hopeless, whatever its frame."""
+        return -self._limits[-1][0] if self._limits else _NEVER
+
+    def park(self, waiter: Waiter, error: TransformLookupError, limits: Iterable[tuple[str, int]] = ()) -> None:
         """Put a waiter under the frames that `error` says it lacks.
+
+        Parameters
+        ----------
+        waiter : Waiter
+        error : TransformLookupError
+        limits : iterable of (str, int)
+            Other edges on its path, each with the newest stamp (ns) that it may reach before it loses the waiter's.
 
         Raises
         ------
@@ -144,29 +193,48 @@ class WaitingIndex:
                 self._under(name).for_any[waiter] = None
         waiter.blocked_by = error
         self._waiters[waiter] = None
+        for name in waiter.asked:
+            waiters = self._by_name.get(name)
+            if waiters is None:
+                waiters = self._by_name[name] = {}
+            waiters[waiter] = None
+        self.set_limits(waiter, limits)
+
+    def set_limits(self, waiter: Waiter, limits: Iterable[tuple[str, int]]) -> None:
+        """Note the limits of a parked waiter that has none."""
+        first = _NEVER
+        for frame, limit in limits:
+            if limit < self._passed:
+                place = (-limit, -next(self._order), waiter)
+                insort(self._under(frame).limits, place)
+                waiter.limits.append((frame, place))
+            elif limit < first:
+                first = limit
+        if first < _NEVER:
+            waiter.limit = (-first, -next(self._order), waiter)
+            insort(self._limits, waiter.limit)
 
     def remove(self, waiter: Waiter) -> None:
         """Remove one waiter, if it is still parked."""
         if waiter not in self._waiters:
             return
-        del self._waiters[waiter]
+        self._forget(waiter)
         for name in waiter.names:
-            blocked = self.by_frame.get(name)
-            if blocked is None:
-                continue
+            blocked = self.by_frame[name]
             if waiter.place is not None:
                 del blocked.places[bisect_left(blocked.places, waiter.place)]
             else:
-                blocked.for_any.pop(waiter, None)
-            if not blocked.places and not blocked.for_any:
+                del blocked.for_any[waiter]
+            if blocked.empty:
                 del self.by_frame[name]
         waiter.place = None
 
     def pop_unblocked(self, frame: str, stamp: int | None) -> list[Waiter]:
-        """Remove and return the waiters that a sample of `frame` at `stamp` may have unblocked.
+        """Remove and return the waiters that a sample of `frame` at `stamp` may have unblocked or made hopeless.
 
-        These are the waiters that need any sample, and those that need this stamp or an older one. No waiter needs a
-        stamp older than the newest sample, so a late sample unblocks no others.
+        These are the waiters that need any sample, those that need this stamp or an older one, and those whose limit
+        for this frame is older. No waiter needs a stamp older than the newest sample, so a late sample unblocks no
+        others.
         """
         blocked = self.by_frame.get(frame)
         if blocked is None:
@@ -174,36 +242,76 @@ class WaitingIndex:
         ready = list(blocked.for_any)
         for waiter in ready:
             self.remove(waiter)
-        places = blocked.places
-        while stamp is not None and places and -places[-1][0] <= stamp:
-            waiter = places.pop()[2]
-            # The place refers to the waiter: without this line they form a reference cycle.
-            waiter.place = None
-            del self._waiters[waiter]
-            ready.append(waiter)
-        if not places:
+        if stamp is not None:
+            limits, places = blocked.limits, blocked.places
+            while limits and -limits[-1][0] < stamp:
+                waiter = limits[-1][2]
+                self.remove(waiter)
+                ready.append(waiter)
+            while places and -places[-1][0] <= stamp:
+                waiter = places.pop()[2]
+                # The place refers to the waiter: without this line they form a reference cycle.
+                waiter.place = None
+                self._forget(waiter)
+                ready.append(waiter)
+        if blocked.empty:
             self.by_frame.pop(frame, None)
         return ready
 
-    def pop_asking_for(self, frames: set[str]) -> list[Waiter]:
+    def pop_limited(self, stamp: int) -> list[Waiter]:
+        """Take the first limit from the waiters, still parked, for which it is older than `stamp`; return them."""
+        self._passed = max(self._passed, stamp)
+        limits = self._limits
+        found = []
+        while limits and -limits[-1][0] < stamp:
+            waiter = limits.pop()[2]
+            waiter.limit = None
+            self._forget_limits(waiter)
+            found.append(waiter)
+        return found
+
+    def pop_asking_for(self, frames: Iterable[str]) -> list[Waiter]:
         """Remove and return the waiters whose question names one of the frames."""
-        ready = [
-            waiter
-            for waiter in self._waiters
-            if waiter.question.target in frames or waiter.question.source in frames or waiter.question.fixed in frames
-        ]
+        ready = dict.fromkeys(waiter for name in frames for waiter in self._by_name.get(name, ()))
         for waiter in ready:
             self.remove(waiter)
-        return ready
+        return list(ready)
 
     def pop_all(self) -> list[Waiter]:
         """Remove and return all waiters."""
         ready = list(self._waiters)
         for waiter in ready:
-            waiter.place = None
+            waiter.place = waiter.limit = None
+            waiter.limits.clear()
         self._waiters.clear()
+        self._by_name.clear()
         self.by_frame.clear()
+        self._limits.clear()
+        self._passed = STAMP_MIN
         return ready
+
+    def _forget(self, waiter: Waiter) -> None:
+        """Forget a waiter, but for the frames that block it."""
+        del self._waiters[waiter]
+        for name in waiter.asked:
+            waiters = self._by_name[name]
+            del waiters[waiter]
+            if not waiters:
+                del self._by_name[name]
+        if waiter.limit is not None:
+            del self._limits[bisect_left(self._limits, waiter.limit)]
+            waiter.limit = None
+        if waiter.limits:
+            self._forget_limits(waiter)
+
+    def _forget_limits(self, waiter: Waiter) -> None:
+        """Take a waiter from under the edges that it is kept under by limit."""
+        for frame, place in waiter.limits:
+            blocked = self.by_frame[frame]
+            del blocked.limits[bisect_left(blocked.limits, place)]
+            if blocked.empty:
+                del self.by_frame[frame]
+        waiter.limits.clear()
 
     def _under(self, frame: str) -> _FrameWaiters:
         blocked = self.by_frame.get(frame)
@@ -213,9 +321,11 @@ class WaitingIndex:
 
     def pending(self) -> tuple[PendingLookup, ...]:
         """All waiting lookups with the errors that block them."""
+        return tuple(self.waiting_since(_NEVER))
+
+    def waiting_since(self, stamp: int) -> Iterator[PendingLookup]:
+        """The lookups that have waited since a stamp (ns) or longer, with the errors that block them."""
         # Copied first, because another thread may call this while the loop parks and wakes.
-        return tuple(
-            PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
-            for waiter in list(self._waiters)
-            if waiter.blocked_by is not None
-        )
+        for waiter in list(self._waiters):
+            if waiter.since <= stamp and waiter.blocked_by is not None:
+                yield PendingLookup(waiter.question, waiter.since, waiter.blocked_by)

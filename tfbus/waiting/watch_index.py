@@ -7,8 +7,9 @@ concerns without looking at the others. It only marks them as outdated: the read
 from collections.abc import Callable, Iterable
 
 from tfbus.errors import ClockResetError
+from tfbus.stamps import LATEST
 from tfbus.tree.forest import Forest
-from tfbus.tree.path import Path, find_path
+from tfbus.tree.path import Path
 
 
 class WatchState:
@@ -96,8 +97,8 @@ class WatchIndex:
             frames = _frames_of(path)
         else:
             # The newest path gives the stamp of the answer, and the path at that stamp gives the answer.
-            frames = _frames_of(find_path(forest.frames, target, source, None))
-            frames |= _frames_of(find_path(forest.frames, target, source, stamp))
+            frames = _frames_of(forest.find_path(target, source, LATEST))
+            frames |= _frames_of(forest.find_path(target, source, stamp))
         if frames != state.frames:
             self._move(state, frames)
 
@@ -118,6 +119,12 @@ class WatchIndex:
             state.updates += 1
             state.outdated = True
         return fresh
+
+    @property
+    def changing_names(self) -> set[str]:
+        """The frames of the watches that `mark_asking_for` may mark."""
+        asking = [state for state in self._open if state.path is None]
+        return {name for state in asking for name in (state.target, state.source)}
 
     def mark_asking_for(self, frames: set[str]) -> list[WatchState]:
         """Mark the watches of some frames that have no permanent path; return those that were up to date.

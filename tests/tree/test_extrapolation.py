@@ -19,7 +19,7 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree._extrapolation import ReadStamp, read_stamp, read_stamps_at_many
+from tfbus.tree.extrapolation import ReadStamp, read_stamp, read_stamps_at_many
 from tfbus.tree.history import FrameHistory, Samples
 from tfbus.tree.policy import Policy
 
