@@ -419,3 +419,15 @@ def test_the_message_of_an_error_of_many_lookups_has_the_index(error: TransformL
     for twin in (pickle.loads(pickle.dumps(one_of_many)), copy.deepcopy(one_of_many)):
         assert_same_error(twin, one_of_many)
         assert twin.index == 17
+
+
+def test_similar_names_are_looked_for_only_when_a_timeout_is_shown() -> None:
+    missing = UnknownFrameError(frame="bse", known=_Unread(["base"]))
+    late = LookupTimeoutError(target="map", source="bse", timeout=1.0, missing=missing)
+    with pytest.raises(AssertionError):
+        str(late)
+
+
+class _Unread(list[str]):
+    def __iter__(self) -> Iterator[str]:
+        raise AssertionError

@@ -1490,7 +1490,7 @@ enum { FEW = 64 }; /* samples whose histories fit on the stack */
 static PyObject *
 commit(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
 {
-    if (nargs != 3 || !PyDict_CheckExact(args[0]) || !PyTuple_CheckExact(args[1])) {
+    if (nargs != 3 || !PyDict_Check(args[0]) || !PyTuple_CheckExact(args[1])) {
         PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a tuple of samples and an index");
         return NULL;
     }

@@ -551,7 +551,9 @@ async def test_a_long_wait_with_a_new_cause_is_logged_again(caplog: pytest.LogCa
         tasks.start_soon(buffer.lookup, "map", "a", 60 * SECOND)
         await clock.advance(6.0)
         bus.publish(driving("map", "a", 1))
-        await clock.advance(1.0)
+        await clock.advance(3.9)
+        assert len(caplog.messages) == 1
+        await clock.advance(0.1)
         first, second = caplog.messages
         tasks.cancel_scope.cancel()
     assert "not known" in first
@@ -886,3 +888,25 @@ async def test_the_error_of_an_invalid_name_has_similar_names() -> None:
         with pytest.raises(UnknownFrameError) as caught:
             await buffer.lookup("/map", "base")
         assert caught.value.close_matches == ("map",)
+
+
+# Lookups that have become hopeless
+
+
+@pytest.mark.every_loop
+async def test_a_lookup_ends_at_the_insertion_by_which_another_edge_loses_its_stamp() -> None:
+    clock, bus, buffer = make()
+    bus.publish([driving("map", "odom", 0), driving("odom", "base", 0), driving("odom", "base", 9)])
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "base", 5 * SECOND))
+        await clock.advance(8.0)
+        bus.publish(driving("odom", "base", 10))
+        await settle()
+        assert not asked.ended
+        bus.publish(driving("odom", "base", 11))
+        await settle()
+        assert asked.ended
+    with pytest.raises(PastExtrapolationError) as caught:
+        _ = asked.answer
+    assert (caught.value.child, caught.value.stamp, caught.value.oldest) == ("base", 5 * SECOND, 9 * SECOND)
+    assert buffer.pending() == ()

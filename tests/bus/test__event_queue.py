@@ -8,6 +8,7 @@ from tfbus import (
     FrameRemoved,
     FrameStale,
     KindChanged,
+    PastLoop,
     QueueStatistics,
     Reparented,
     SampleRejected,
@@ -116,6 +117,17 @@ def test_a_rejection_is_given_once_for_a_frame_authority_and_reason_until_the_fr
         for event in (end, *[rejected("a", "x"), rejected("b", "x")] * 2):
             queue.put(event)
         assert emptied(queue) == [end, *again]
+
+
+def test_a_loop_in_the_past_is_given_once_for_a_frame_authority_and_parent() -> None:
+    queue = EventQueue(100)
+    loops: list[Event] = [
+        PastLoop(1, frame, parent, authority, 0, (frame, parent, frame))
+        for frame, parent, authority in (("a", "b", "x"), ("a", "c", "x"), ("a", "b", "y"), ("d", "b", "x"))
+    ]
+    for event in (*loops, *loops, rejected("a", "x", "b")):
+        queue.put(event)
+    assert emptied(queue) == [*loops, rejected("a", "x", "b")]
 
 
 def test_a_rejection_is_no_conflict_of_authorities() -> None:

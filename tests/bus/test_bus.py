@@ -17,6 +17,7 @@ from tfbus import (
     BusClosedError,
     FutureExtrapolationError,
     InvalidTransformError,
+    PastLoop,
     PeerJoined,
     PeerLost,
     SimulatedClock,
@@ -707,3 +708,21 @@ async def test_a_buffer_that_closes_another_at_the_end_still_wakes_every_waiter(
         bus.close()
     assert isinstance(asked.error, BusClosedError)
     assert bus.closed
+
+
+@pytest.mark.anyio
+async def test_late_data_that_form_a_loop_in_the_past_are_stored_counted_logged_and_announced_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as early, Buffer(bus, keep=3e-9), bus.events() as events:
+        bus.publish([moving("c", "a", 0), moving("c", "a", 9), moving("a", "b", 4), moving("a", "b", 9)])
+        for stamp in (5, 6):
+            bus.publish(moving("b", "a", stamp, authority="late"))
+        bus.publish(moving("c", "a", 10))
+        events.close()
+        found = [event async for event in events if isinstance(event, PastLoop)]
+        assert found == [PastLoop(0, "a", "b", "late", 5, ("a", "b", "a"))]
+        assert [buffer.looped for buffer in bus.statistics().buffers] == [2, 0]
+        assert early.lookup_nowait("b", "a", 5).stamp == 5
+    (message,) = [message for message in caplog.messages if "loop" in message]
+    assert message == "the frames a -> b -> a form a loop at 0.000000005 s, with late data of 'late'"

@@ -1326,3 +1326,20 @@ def test_a_cancelled_error_of_the_source_itself_is_raised() -> None:
                 await anext(pairs)
 
     asyncio.run(main())
+
+
+@pytest.mark.every_loop
+async def test_a_message_is_dropped_when_a_target_that_it_does_not_wait_for_yet_loses_its_stamp(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    send, receive = streams
+    bus.publish([driving("map", "laser", 0), driving("laser", "arm", 0), driving("laser", "arm", 9)])
+    async with MessageFilter(receive, buffer, ["map", "arm"]) as pairs:
+        await send.send(Scan(5 * SECOND))
+        await settle()
+        bus.publish(driving("laser", "arm", 10))
+        await settle()
+        assert (pairs.pending, pairs.dropped) == (1, {})
+        bus.publish(driving("laser", "arm", 11))
+        await settle()
+        assert (pairs.pending, pairs.dropped) == (0, {"too old": 1})

@@ -17,7 +17,7 @@ from tfbus import (
 from tfbus.geometry.rows import IDENTITY
 from tfbus.geometry.transform import from_row
 from tfbus.tree.history import FrameHistory
-from tfbus.tree.path import Path, find_path
+from tfbus.tree.path import Path, find_path, path_at
 
 Frames = dict[str, FrameHistory]
 
@@ -207,3 +207,82 @@ def test_a_path_has_a_row_exactly_at_the_stamps_that_every_moving_edge_covers(
         with pytest.raises(ExtrapolationError):
             path.row_at(at)
         assert isinstance(path.deciding_error(at), PastExtrapolationError) == any(at < low for low, _ in windows)
+
+
+# The path that counts at a stamp
+
+
+def loop_of(*, a_on_b: tuple[int, ...], b_on_a: tuple[int, ...]) -> Frames:
+    """Frames a and b, each on the other at these stamps, and by the newest stamp, 100, both on c."""
+    a = moving_edge("b", "a", [(at, Transform()) for at in a_on_b])
+    b = moving_edge("a", "b", [(at, Transform()) for at in b_on_a])
+    a.insert("c", 100, IDENTITY, "")
+    b.insert("c", 100, IDENTITY, "")
+    return {"a": a, "b": b}
+
+
+def at_stamp(frames: Frames, target: str, source: str, at: int) -> Path:
+    return path_at(frames, target, source, at, find_path(frames, target, source, None))
+
+
+def test_the_newest_path_counts_at_each_stamp_at_which_it_holds_and_has_samples() -> None:
+    # Until 10, b is above c: the newest path holds then, and another way leads through it.
+    top = moving_edge("b", "c", [(0, Transform()), (10, Transform())])
+    top.insert("root", 20, IDENTITY, "")
+    frames: Frames = {"c": top} | {
+        child: moving_edge("c", child, [(0, Transform()), (30, Transform())]) for child in ("a", "b")
+    }
+    newest = find_path(frames, "a", "b", None)
+    assert newest.permanent
+    assert all(at_stamp(frames, "a", "b", at).frames == ("a", "c", "b") for at in (0, 5, 15, 30))
+    early, late = at_stamp(frames, "a", "b", -1), at_stamp(frames, "a", "b", 31)
+    assert early.rival is not None
+    assert {early.moving, early.rival.moving} == {(frames["b"], frames["a"]), (frames["a"], frames["c"])}
+    assert (late.moving, late.rival) == (newest.moving, None)
+
+
+@pytest.mark.parametrize("at", [0, 5, 10, 99])
+def test_of_two_ways_round_a_loop_the_one_with_samples_counts(at: int) -> None:
+    frames = loop_of(a_on_b=(0, 10), b_on_a=())
+    for target, source in (("a", "b"), ("b", "a")):
+        path = at_stamp(frames, target, source, at)
+        assert path.frames == (target, source)
+        assert [edge.child for edge in path.moving] == ["a"]
+
+
+def test_two_ways_with_samples_are_no_way_unless_one_is_the_newest() -> None:
+    frames = loop_of(a_on_b=(0, 10), b_on_a=(5, 20))
+    assert [edge.child for edge in at_stamp(frames, "a", "b", 4).moving] == ["a"]
+    for target, source in (("a", "b"), ("b", "a")):
+        with pytest.raises(DisconnectedError) as caught:
+            at_stamp(frames, target, source, 7)
+        assert caught.value.stamp == 7
+        assert caught.value.loop in (("a", "b", "a"), ("b", "a", "b"))
+
+
+def test_without_samples_on_either_way_both_may_still_help() -> None:
+    frames = loop_of(a_on_b=(0, 10), b_on_a=(5, 20))
+    for edge in frames.values():
+        edge.clear()
+    frames["a"].insert("b", 10, IDENTITY, "")
+    frames["b"].insert("a", 10, IDENTITY, "")
+    path = path_at(frames, "a", "b", 20, None)
+    back = path_at(frames, "b", "a", 20, None)
+    assert path.rival is not None
+    assert {path.moving, path.rival.moving} == {(frames["a"],), (frames["b"],)}
+    assert back.moving == path.moving
+    error = path.deciding_error(20)
+    assert isinstance(error, FutureExtrapolationError)
+    assert {error.child, *error.others} == {"a", "b"}
+    frames["a"].insert("b", 30, IDENTITY, "")
+    frames["a"].insert("b", 40, IDENTITY, "")
+    early = path_at(frames, "a", "b", 5, None)
+    assert isinstance(early.deciding_error(5), PastExtrapolationError)
+
+
+def test_waiting_helps_if_it_helps_on_one_of_two_ways() -> None:
+    frames: Frames = {"a": moving_edge("b", "a", [(30, Transform())]), "b": moving_edge("a", "b", [(10, Transform())])}
+    for target, source in (("a", "b"), ("b", "a")):
+        error = path_at(frames, target, source, 20, None).deciding_error(20)
+        assert type(error) is FutureExtrapolationError
+        assert (error.child, error.others) in (("b", ()), ("b", ("a",)))

@@ -3,11 +3,12 @@ import math
 import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
-from itertools import pairwise, product
+from itertools import pairwise, permutations, product
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -22,6 +23,7 @@ from tfbus import (
     Edge,
     ExtrapolationError,
     FutureExtrapolationError,
+    Hold,
     InvalidTransformError,
     Latest,
     Outcome,
@@ -539,3 +541,79 @@ def test_other_threads_can_read_the_whole_tree_while_frames_are_added_and_remove
             tree.insert_many([moving(parent, child, number) for parent, child in pairwise(["map", *frames])])
             for frame in frames:
                 tree.remove_frame(frame)
+
+
+# One tree, one answer
+
+
+def facts(question: Callable[[], TransformStamped]) -> object:
+    """An answer, or the kind and the text of its error."""
+    try:
+        return question()
+    except TransformLookupError as error:
+        return type(error), str(error)
+
+
+@given(
+    st.lists(st.lists(any_samples("abcde", 20), min_size=1, max_size=3), max_size=10),
+    st.lists(st.tuples(st.sampled_from("abcde"), st.sampled_from("abcde"), st.none() | st.integers(0, 20)), max_size=5),
+    st.sampled_from([None, 8e-9]),
+    st.sampled_from([{}, {"tolerance": 2e-9}, {"max_gap": 5e-9}, {"extrapolate": Hold(3e-9)}]),
+)
+def test_an_answer_depends_on_the_samples_and_on_no_earlier_question(
+    batches: list[list[TransformStamped]],
+    earlier: list[tuple[str, str, int | None]],
+    keep: float | None,
+    policy: dict[str, Any],
+) -> None:
+    tree = TransformTree(keep)
+    for batch in batches:
+        with suppress(InvalidTransformError):
+            tree.insert_many(batch)
+        for target, source, at in earlier:
+            tree.can_transform(target, source, LATEST if at is None else at)
+    names = [name for name in "abcde" if name in tree]
+    stamps = list(range(-1, 22)) * 2
+    for target, source in permutations(names, 2):
+        many = None
+        with suppress(TransformLookupError):
+            many = tree.copy().lookup_many(target, source, stamps, out_of_range="nan", **policy)
+        for place, at in enumerate(stamps[:23]):
+            answer = facts(lambda: tree.lookup(target, source, at, **policy))  # noqa: B023
+            assert answer == facts(lambda: tree.copy().lookup(target, source, at, **policy))  # noqa: B023
+            back = facts(lambda: tree.lookup(source, target, at, **policy))  # noqa: B023
+            assert isinstance(back, TransformStamped) == isinstance(answer, TransformStamped)
+            if isinstance(answer, TransformStamped):
+                assert many is not None
+                assert many[place].is_close(answer.transform)
+            else:
+                assert many is None or np.isnan(many.translations[place]).all()
+
+
+def test_late_data_that_form_a_loop_give_one_answer_whatever_was_asked_before() -> None:
+    # Until 20, r is on t: then r and t are each other's parents, and two ways lead from s to t.
+    samples = [
+        *(moving("r", child, at, x) for child, x in (("s", 14.0), ("t", 28.0)) for at in (0, 30)),
+        moving("q", "r", 30),
+        *(moving("t", "r", at, 77.0) for at in (0, 20)),
+    ]
+    asked, fresh = tree_of(*samples), tree_of(*samples)
+    assert asked.lookup("t", "s").stamp == 30
+    for tree in (asked, fresh):
+        assert x_of(tree, "t", "s", 15) == -14.0
+        assert x_of(tree, "s", "t", 15) == 14.0
+        assert tree.lookup_many("t", "s", [15] * 50).translations[:, 0].tolist() == [-14.0] * 50
+        assert tree.chain("t", "s", 15) == ["t", "r", "s"]
+        assert tree.explain("t", "s", 15).chain == ("t", "r", "s")
+    assert fresh.looped > 0
+
+
+def test_a_frame_that_was_the_parent_of_its_present_parent_answers_with_both_edges() -> None:
+    tree = tree_of(*over("cart", "robot", [0, 10]))
+    tree.insert_many([moving("map", "robot", 20), moving("robot", "cart", 20), moving("robot", "cart", 30)])
+    for _ in range(2):
+        assert x_of(tree, "cart", "robot", 5) == 5.0
+        assert x_of(tree, "robot", "cart", 5) == -5.0
+        assert x_of(tree, "robot", "cart", 25) == 0.0
+        tree.lookup("cart", "robot")
+    assert tree.looped == 0

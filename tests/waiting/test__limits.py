@@ -69,7 +69,7 @@ def test_with_a_greatest_gap_the_sample_after_the_stamp_decides() -> None:
     ]
     assert limits(*TWO_EDGES, question=Question("map", "tip", 50, policy=Policy(max_gap=5))) == [
         ("tip", 50),
-        ("mid", 130),
+        ("mid", 50),
     ]
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 
 import anyio
 import anyio.lowlevel
@@ -93,20 +93,17 @@ class Lookups:
             return self._lookup_since(last_reset, question)
         except MAY_COME as error:
             self._check_names(question)
-            found: TransformStamped | TransformLookupError = without_traceback(error)
+            blocker = without_traceback(error)
         self._check_thread()
         since = self._clock.now()
-        left, pause, reported = limit, REPORT_AFTER, False
-        while isinstance(found, TransformLookupError):
-            if left <= 0.0:
-                raise LookupTimeoutError(
-                    target=question.target, source=question.source, timeout=limit, missing=found
-                ) from found
-            pause = min(left, pause)
-            found = await self._lookup_within(pause, question, since, last_reset, found, others, report=reported)
-            left -= pause
-            if left > 0.0 and isinstance(found, TransformLookupError):
-                pause, reported = self.report(question, since, found), True
+        silent = min(limit, REPORT_AFTER)
+        found = await self._lookup_within(silent, question, since, last_reset, blocker, others, report=False)
+        if isinstance(found, TransformLookupError) and silent < limit:
+            found = await self._lookup_within(limit - silent, question, since, last_reset, found, others, report=True)
+        if isinstance(found, TransformLookupError):
+            raise LookupTimeoutError(
+                target=question.target, source=question.source, timeout=limit, missing=found
+            ) from found
         return found
 
     async def park(
@@ -147,15 +144,17 @@ class Lookups:
         report: bool,
     ) -> TransformStamped | TransformLookupError:
         """Wait for the answer for some time; return it, or the error that still blocks it."""
+        pause = math.inf
         with self._clock.move_on_after(seconds):
             while True:
-                await self.park(question, since, blocker, others)
+                if report:
+                    pause = self.report(question, since, blocker)
+                with nullcontext() if pause == math.inf else self._clock.move_on_after(pause):
+                    await self.park(question, since, blocker, others)
                 try:
                     return self._lookup_since(last_reset, question)
                 except MAY_COME as error:
                     blocker = without_traceback(error)
-                if report:
-                    self.report(question, since, blocker)
                 for other in others:
                     with suppress(*MAY_COME):
                         self.lookup_nowait(other)

@@ -58,6 +58,11 @@ class Path(Chain):
         self._static = tuple(edge for edge in edges if edge.static)
 
     @property
+    def children(self) -> list[str]:
+        """The children of its edges, sorted."""
+        return sorted(frame for frame in self.frames if frame != self.root)
+
+    @property
     def static_stamp(self) -> int:
         """The newest stamp among the static samples, in ns; sending one again changes it, but not the path."""
         return max((edge.static_stamp or 0 for edge in self._static), default=0)
@@ -219,7 +224,7 @@ def path_at(frames: Frames, target: str, source: str, at: int, newest: Path | No
     if way is newest:
         # The newest path may be kept for other stamps, at which it has no rival.
         way = Path(*_edges(frames, way), way.root)
-    elif min(rival.frames, rival.frames[::-1]) < min(way.frames, way.frames[::-1]):
+    elif rival.children < way.children:
         # The same one for both directions of the question.
         way, rival = rival, way
     way.rival = rival
