@@ -6,8 +6,8 @@
  * says so, and Python decides. There is no policy and no text of a transform error here.
  *
  * No function that touches a history runs Python code, allocates an object that the garbage collector tracks or lets
- * go of the interpreter's lock in between, so that other threads see each call as one step. `Chain.rows` alone works
- * without that lock, on blocks that nobody changes while it holds them.
+ * go of the interpreter's lock in between, so that other threads see each call as one step. `Held.rows` alone works
+ * without that lock, on blocks that nobody changes while it is a reader of them.
  */
 #ifndef Py_LIMITED_API
 #define Py_LIMITED_API 0x030b0000
@@ -35,7 +35,7 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 #define SAMPLE_SIZE (sizeof(int64_t) + ROW_SIZE)
 #define EXACT_GAP ((uint64_t)1 << 53) /* ns; beyond, a difference of stamps is no exact float, and Python divides */
 
-static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *PathsType;
+static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType;
 static PyObject *empty_string;
 
 /* Rows ------------------------------------------------------------------------------------------------------------ */
@@ -1142,6 +1142,18 @@ chain_latest(Chain *self, PyObject *Py_UNUSED(ignored))
     return PyLong_FromLongLong(stamp);
 }
 
+/* Held: the samples of a chain as they were at one moment, for many answers ----------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    Chain *chain;
+    Samples *samples;  /* one place a step, as in the chain */
+    Segment *segments;
+    Block **blocks;    /* those of which it is a reader, or NULL */
+    Py_ssize_t count;
+    char busy;         /* whether a thread is at work on the segments */
+} Held;
+
 /* The answers at `count` stamps as seven columns; NaN where there is none. The first such place, -1 for none, or -2 if
  * an answer is not plain. */
 static Py_ssize_t
@@ -1173,11 +1185,15 @@ fill_columns(const Chain *self, const Samples *samples, Segment *segments, const
 }
 
 static PyObject *
-chain_rows(Chain *self, PyObject *const *args, Py_ssize_t nargs)
+held_rows(Held *self, PyObject *const *args, Py_ssize_t nargs)
 {
     Py_buffer stamps, columns;
     if (nargs != 2) {
         PyErr_SetString(PyExc_TypeError, "rows takes stamps and columns");
+        return NULL;
+    }
+    if (self->busy) {
+        PyErr_SetString(PyExc_RuntimeError, "another thread reads these samples");
         return NULL;
     }
     if (PyObject_GetBuffer(args[0], &stamps, PyBUF_SIMPLE) < 0) {
@@ -1188,57 +1204,114 @@ chain_rows(Chain *self, PyObject *const *args, Py_ssize_t nargs)
         return NULL;
     }
     PyObject *result = NULL;
-    Samples *samples = NULL;
-    Segment *segments = NULL;
-    Block **blocks = NULL;
-    const Py_ssize_t count = stamps.len / (Py_ssize_t)sizeof(int64_t), steps = self->up + self->down;
-    if (columns.len != count * (Py_ssize_t)ROW_SIZE || stamps.len % (Py_ssize_t)sizeof(int64_t) != 0
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps.len / size;
+    if (columns.len != count * (Py_ssize_t)ROW_SIZE || stamps.len % size != 0
         || (uintptr_t)columns.buf % sizeof(double) != 0) {
         PyErr_SetString(PyExc_ValueError, "columns must have room for seven aligned floats a stamp");
-        goto end;
-    }
-    samples = PyMem_Malloc((size_t)(steps + 1) * sizeof(Samples));
-    segments = PyMem_Malloc((size_t)(steps + 1) * sizeof(Segment));
-    blocks = PyMem_Calloc((size_t)(steps + 1), sizeof(Block *));
-    if (samples == NULL || segments == NULL || blocks == NULL) {
-        PyErr_NoMemory();
-        goto end;
-    }
-    Py_ssize_t first_missing = -2;
-    if (chain_look(self, samples, segments)) {
-        /* What is held is not changed by others: see Block. */
-        for (Py_ssize_t i = 0; i < steps; i++) {
-            if (self->steps[i].edge != NULL && self->steps[i].edge->block != NULL) {
-                blocks[i] = self->steps[i].edge->block;
-                blocks[i]->readers++;
-                Py_INCREF(OBJECT(blocks[i]));
-            }
-        }
-        Py_INCREF(OBJECT(self));
-        Py_BEGIN_ALLOW_THREADS
-        first_missing = fill_columns(self, samples, segments, stamps.buf, count, columns.buf);
-        Py_END_ALLOW_THREADS
-        Py_DECREF(OBJECT(self));
-        for (Py_ssize_t i = 0; i < steps; i++) {
-            if (blocks[i] != NULL) {
-                blocks[i]->readers--;
-                Py_DECREF(OBJECT(blocks[i]));
-            }
-        }
-    }
-    if (first_missing == -2) {
-        Py_INCREF(Py_None);
-        result = Py_None;
     } else {
-        result = PyLong_FromSsize_t(first_missing);
+        Py_ssize_t missing;
+        self->busy = 1;
+        Py_INCREF(OBJECT(self));
+        /* Nobody changes what is held: see Block. Letting go of the interpreter costs more than a few stamps. */
+        if (count < 256) {
+            missing = fill_columns(self->chain, self->samples, self->segments, stamps.buf, count, columns.buf);
+        } else {
+            Py_BEGIN_ALLOW_THREADS
+            missing = fill_columns(self->chain, self->samples, self->segments, stamps.buf, count, columns.buf);
+            Py_END_ALLOW_THREADS
+        }
+        self->busy = 0;
+        Py_DECREF(OBJECT(self));
+        if (missing == -2) {
+            Py_INCREF(Py_None);
+            result = Py_None;
+        } else {
+            result = PyLong_FromSsize_t(missing);
+        }
     }
-end:
-    PyMem_Free(samples);
-    PyMem_Free(segments);
-    PyMem_Free(blocks);
     PyBuffer_Release(&columns);
     PyBuffer_Release(&stamps);
     return result;
+}
+
+static int
+held_traverse(Held *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->chain);
+    return 0;
+}
+
+static void
+held_dealloc(Held *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    for (Py_ssize_t i = 0; i < self->count; i++) {
+        if (self->blocks[i] != NULL) {
+            self->blocks[i]->readers--;
+            Py_DECREF(OBJECT(self->blocks[i]));
+        }
+    }
+    PyMem_Free(self->samples);
+    PyMem_Free(self->segments);
+    PyMem_Free(self->blocks);
+    Py_XDECREF(OBJECT(self->chain));
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyMethodDef held_methods[] = {
+    {"rows", FAST(held_rows), METH_FASTCALL,
+     PyDoc_STR("rows(stamps, columns): fill columns of shape (7, n), NaN without an answer; the first such place, -1 if "
+               "there is none, None if an answer is not plain.")},
+    {NULL}
+};
+
+static PyType_Slot held_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The samples of a chain as they were at one moment.")},
+    {Py_tp_dealloc, held_dealloc},
+    {Py_tp_traverse, held_traverse},
+    {Py_tp_methods, held_methods},
+    {0, NULL}
+};
+
+static PyType_Spec held_spec = {
+    "tfbus._kernel.Held", sizeof(Held), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_DISALLOW_INSTANTIATION | Py_TPFLAGS_IMMUTABLETYPE, held_slots
+};
+
+static PyObject *
+chain_hold(Chain *self, PyObject *Py_UNUSED(ignored))
+{
+    const Py_ssize_t steps = self->up + self->down;
+    Held *held = (Held *)PyType_GenericAlloc(HeldType, 0);
+    if (held == NULL) {
+        return NULL;
+    }
+    held->samples = PyMem_Calloc((size_t)steps + 1, sizeof(Samples));
+    held->segments = PyMem_Calloc((size_t)steps + 1, sizeof(Segment));
+    held->blocks = PyMem_Calloc((size_t)steps + 1, sizeof(Block *));
+    if (held->samples == NULL || held->segments == NULL || held->blocks == NULL) {
+        Py_DECREF(OBJECT(held));
+        return PyErr_NoMemory();
+    }
+    Py_INCREF(OBJECT(self));
+    held->chain = self;
+    if (!chain_look(self, held->samples, held->segments)) {
+        Py_DECREF(OBJECT(held));
+        Py_RETURN_NONE;
+    }
+    for (Py_ssize_t i = 0; i < steps; i++) {
+        Block *block = self->steps[i].edge == NULL ? NULL : self->steps[i].edge->block;
+        if (block != NULL) {
+            Py_INCREF(OBJECT(block));
+            block->readers++;
+            held->blocks[i] = block;
+        }
+    }
+    held->count = steps;
+    return OBJECT(held);
 }
 
 static int
@@ -1264,9 +1337,8 @@ static PyMethodDef chain_methods[] = {
     {"row", (PyCFunction)chain_row, METH_O, PyDoc_STR("row(at): source in target at a stamp; None if it is not plain.")},
     {"latest", (PyCFunction)chain_latest, METH_NOARGS,
      PyDoc_STR("The newest stamp that all edges have reached; None if one has no samples, or nothing moves.")},
-    {"rows", FAST(chain_rows), METH_FASTCALL,
-     PyDoc_STR("rows(stamps, columns): fill columns of shape (7, n), NaN without an answer; the first such place, -1 if "
-               "there is none, None if it is not plain.")},
+    {"hold", (PyCFunction)chain_hold, METH_NOARGS,
+     PyDoc_STR("The samples of all edges as they are now, for many answers; None if they are not plain.")},
     {NULL}
 };
 
@@ -1574,6 +1646,7 @@ module_exec(PyObject *module)
         || add_type(module, "Block", &block_spec, &BlockType) < 0
         || add_type(module, "History", &history_spec, &HistoryType) < 0
         || add_type(module, "Chain", &chain_spec, &ChainType) < 0
+        || add_type(module, "Held", &held_spec, &HeldType) < 0
         || add_type(module, "Paths", &paths_spec, &PathsType) < 0) {
         return -1;
     }

@@ -281,7 +281,7 @@ def test_many_rows_are_bit_for_bit_the_single_ones(drawn: Drawn, data: st.DataOb
     known = [stamp for step in up + down if isinstance(step, list) for stamp, _ in step]
     stamps = data.draw(st.lists(near | st.sampled_from([at, *known]), max_size=8))
     columns = np.zeros((7, len(stamps)))
-    first_missing = compiled.rows(np.array(stamps, np.int64), columns)
+    first_missing = compiled.hold().rows(np.array(stamps, np.int64), columns)
     if first_missing is None:
         assert widest_gap(up + down) > 2**53
         return
@@ -589,9 +589,11 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: kernel.Chain((), 5),
         lambda: kernel.Chain((5,), ()),
         lambda: path.row("x"),
-        lambda: path.rows(np.zeros(2, np.int64), np.zeros(13)),
-        lambda: path.rows(np.zeros(2, np.int64), bytes(112)),
-        lambda: path.rows(5, 6),
+        lambda: path.hold().rows(np.zeros(2, np.int64), np.zeros(13)),
+        lambda: path.hold().rows(np.zeros(2, np.int64), bytes(112)),
+        lambda: path.hold().rows(5, 6),
+        lambda: path.hold().rows(np.zeros(2, np.int64)),
+        lambda: kernel.Held(),
         lambda: kernel.Paths(5, LATEST, kernel.Sample),
         lambda: kernel.Paths(threading.Lock(), LATEST, int),
         lambda: paths(kernel).answer("map"),

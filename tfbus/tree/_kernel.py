@@ -1,11 +1,11 @@
 """The kernel that runs: the compiled one, or its definition in Python."""
 
 from tfbus._which_kernel import KERNEL
-from tfbus.tree._python_kernel import Columns
+from tfbus.tree._python_kernel import Columns, Held
 
 if KERNEL == "python":
     from tfbus.tree._python_kernel import Chain, History, Paths, commit
 else:
     from tfbus._kernel import Chain, History, Paths, commit  # type: ignore[assignment]
 
-__all__ = ["Chain", "Columns", "History", "Paths", "commit"]
+__all__ = ["Chain", "Columns", "Held", "History", "Paths", "commit"]

@@ -14,7 +14,7 @@ from bisect import bisect_left
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from math import acos, sin
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -276,6 +276,20 @@ def climb(steps: tuple[Step, ...], at: int) -> Row | None:
     return x, y, z, qx, qy, qz, qw
 
 
+class Held(Protocol):
+    """The samples of a chain as they were at one moment."""
+
+    def rows(self, stamps: Stamps, columns: npt.NDArray[Any]) -> int | None:
+        """Fill columns of shape (7, n) with the rows at many stamps, which are those of `Chain.row` bit for bit.
+
+        Returns
+        -------
+        int or None
+            The first place without an answer, where the columns have NaN, or -1 if there is none. None if an answer is
+            not plain; then the columns are of no use.
+        """
+
+
 class Chain:
     """The edges between two frames.
 
@@ -310,14 +324,10 @@ class Chain:
                 common = edge.stamps[-1]
         return common if self._edges else None
 
-    def rows(self, stamps: Stamps, columns: npt.NDArray[Any]) -> int | None:  # noqa: ARG002
-        """Fill columns of shape (7, n) with the rows at many stamps.
+    def hold(self) -> Held | None:
+        """The samples of all edges as they are now, for many answers; None if the kernel gives no many answers.
 
-        Returns
-        -------
-        int or None
-            The first place without an answer, where the columns have NaN, or -1 if there is none. None if an answer is
-            not plain; in Python they never are: `tfbus.tree._lookup_many` gives them with numpy.
+        The one in Python gives none: numpy does, from copies; see `tfbus.tree._lookup_many`.
         """
         return None
 

@@ -271,7 +271,7 @@ class Forest:
         if frame not in self.names:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
-            raise UnknownFrameError(frame=frame, known=self.names.sorted())
+            raise UnknownFrameError(frame=frame, known=self.names)
 
     def edges_above(self, *names: str) -> list[FrameHistory]:
         """The edges of some frames and of all above them, by any parent that a sample in the window names."""
