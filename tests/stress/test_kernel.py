@@ -38,7 +38,7 @@ def test_four_threads_read_whole_answers_while_the_loop_inserts() -> None:
         rng = random.Random()
         try:
             newest = tree.latest_common_stamp("base", "left") or 0
-            at = rng.choice([LATEST, newest, newest - rng.randrange(900)])
+            at: Any = rng.choice([LATEST, newest, newest - rng.randrange(900)])
             found = tree.lookup("lamp", "right", at).transform.translation
             many = tree.lookup_many("lamp", "right", np.arange(newest - 400, newest), out_of_range="nan")
         except TransformLookupError:
@@ -146,27 +146,30 @@ def test_no_allocation_that_fails_does_harm() -> None:
             edge.push(stamp, pose)
         return edge
 
-    calls: list[Callable[[Any, Any], object]] = [
-        lambda edge, path: edge.push(100, poses[0][1]),
-        lambda edge, path: edge.put(1, 1, poses[0][1]),
-        lambda edge, path: edge.append("parent", 100, poses[0][1], ""),
-        lambda edge, path: edge.columns(0, 4),
-        lambda edge, path: edge.sample(3),
-        lambda edge, path: kernel.History("a", None).take(edge),
-        lambda edge, path: kernel.Chain((edge,), ()),
-        lambda edge, path: path.row(3),
-        lambda edge, path: path.hold(),
-        lambda edge, path: kernel.Paths(threading.Lock(), LATEST, kernel.Sample),
-    ]
+    def calls(edge: Any, path: Any) -> list[Callable[[], object]]:
+        return [
+            lambda: edge.push(100, poses[0][1]),
+            lambda: edge.put(1, 1, poses[0][1]),
+            lambda: edge.append("parent", 100, poses[0][1], ""),
+            lambda: edge.columns(0, 4),
+            lambda: edge.sample(3),
+            lambda: kernel.History("a", None).take(edge),
+            lambda: kernel.Chain((edge,), ()),
+            lambda: path.row(3),
+            lambda: path.hold(),
+            lambda: kernel.Paths(threading.Lock(), LATEST, kernel.Sample),
+        ]
+
     failures = 0
-    for call in calls:
+    for number in range(10):
         for allowed in range(12):
             edge = edge_of()
             path = kernel.Chain((edge,) * 40, (edge,))
             before = [edge.sample(i) for i in range(edge.count)]
+            call = calls(edge, path)[number]
             memory.set_nomemory(allowed, 0)
             try:
-                call(edge, path)
+                call()
                 failed = False
             except MemoryError:
                 failed = True
@@ -189,19 +192,19 @@ def edge_path(kernel: Any, edge: Any) -> Any:
 def test_the_compiled_kernel_is_refused_in_another_interpreter() -> None:
     interpreters = pytest.importorskip("_xxsubinterpreters")
     script = """
-import importlib.util, sys
-spec = importlib.util.spec_from_file_location("tfbus._kernel", sys_argv)
+from importlib.util import module_from_spec, spec_from_file_location
 try:
-    importlib.util.module_from_spec(spec).__spec__.loader.exec_module(sys.modules.get("tfbus._kernel") or importlib.util.module_from_spec(spec))
+    spec = spec_from_file_location("tfbus._kernel", PLACE)
+    spec.loader.exec_module(module_from_spec(spec))
 except ImportError as error:
     assert "main interpreter only" in str(error) or "subinterpreters" in str(error), error
 else:
-    raise SystemExit("it was loaded")
+    raise RuntimeError("it was loaded")
 """
     assert COMPILED is not None
     number = interpreters.create()
     try:
-        interpreters.run_string(number, script.replace("sys_argv", repr(COMPILED.__file__)))
+        interpreters.run_string(number, script.replace("PLACE", repr(COMPILED.__file__)))
     finally:
         interpreters.destroy(number)
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def threads_that(read: Callable[[], None], number: int = 2) -> Iterator[None]:
-    """Some threads, two by default, call `read` over and over while the block runs, and take turns as often as they can."""
+    """Some threads call `read` over and over while the block runs, and take turns as often as they can."""
     begun, done = threading.Barrier(number + 1), threading.Event()
 
     def go_on() -> None:

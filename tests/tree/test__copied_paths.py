@@ -7,15 +7,16 @@ from support.samples import moving, over, static, tree_of
 from tfbus import TransformStamped, TransformTree, UnknownFrameError
 from tfbus._which_kernel import KERNEL
 from tfbus.geometry.rows import Row
-from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, copy_paths
+from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Query, copy_paths
 from tfbus.tree.history import Samples
 from tfbus.tree.tree import forest_of
 
 
 def copies(tree: TransformTree, target: str, source: str, stamps: Sequence[int]) -> PathsOverTime:
     forest = forest_of(tree)
+    query = Query(target, source, np.array(stamps, np.int64))
     with forest.lock:
-        return copy_paths(forest, target, source, np.array(stamps, np.int64))
+        return copy_paths(forest, query, query.span())
 
 
 def xs(samples: Samples) -> list[tuple[int, float]]:

@@ -38,7 +38,9 @@ class Buffer:
     bus : Bus
         It fills the buffer from now on, first with the latched samples, and holds it until `close`.
     keep : float or None
-        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything.
+        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything. A late
+        sample then costs more the longer the history is, because all samples after it are moved: in the middle of a
+        million samples some ms.
     prefix : str, optional
         Put before the names of this buffer's frames on the bus, such as ``"robot1/"``, so that several robots with the
         same frames can share a bus. All methods take and give names without it.

@@ -20,6 +20,21 @@ from tfbus.tree.path import Path, Step
 Places = slice | npt.NDArray[np.intp]
 """Indices into the stamps that were asked for."""
 
+_BLOCK = 64
+"""Up to this many samples for each stamp, all samples are copied at once, which is faster than to pick some."""
+
+
+class Query(NamedTuple):
+    """The question where `source` is, seen from `target`, at many stamps."""
+
+    target: str
+    source: str
+    stamps: Stamps
+
+    def span(self) -> tuple[int, int] | None:
+        """The first and the last stamp, in ns; None if there are none."""
+        return (int(self.stamps.min()), int(self.stamps.max())) if len(self.stamps) else None
+
 
 class CopiedPath(NamedTuple):
     """A path with copies of the samples on its moving edges, and one row for each run of static edges."""
@@ -72,33 +87,34 @@ class PathsOverTime(NamedTuple):
         return [(np.flatnonzero(numbers == i), path) for i, path in enumerate(different)]
 
 
-def copy_paths(forest: Forest, target: str, source: str, stamps: Stamps) -> PathsOverTime:
-    """Copy the paths from source to target that hold at some stamps. The caller holds the lock.
+def copy_paths(forest: Forest, query: Query, span: tuple[int, int] | None) -> PathsOverTime:
+    """Copy the paths from source to target that hold at the stamps of a query. The caller holds the lock.
 
     Parameters
     ----------
     forest : Forest
-    target, source : str
-    stamps : integer array of shape (n,)
-        ns, in any order.
+    query : Query
+    span : (int, int) or None
+        The first and the last of its stamps, in ns; None if there are none.
 
     Raises
     ------
     UnknownFrameError
     """
+    target, source = query.target, query.source
     forest.check_known(target)
     forest.check_known(source)
-    if not len(stamps):
+    if span is None:
         return PathsOverTime([], [None])
-    low, high = int(stamps.min()), int(stamps.max())
+    low, high = span
     paths: list[Path | None] = [_path_at(forest, target, source, low)]
     changes = _changes(forest, target, source, paths[0], low, high)
     paths += [_path_at(forest, target, source, stamp) for stamp in changes]
     copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
     for path in paths:
         if path is not None and (path.up, path.down) not in copies:
-            up = tuple(_copy(step, stamps, low, high) for step in path.up)
-            down = tuple(_copy(step, stamps, low, high) for step in path.down)
+            up = tuple(_copy(step, query, low, high) for step in path.up)
+            down = tuple(_copy(step, query, low, high) for step in path.down)
             copies[path.up, path.down] = CopiedPath(up, down)
     return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
 
@@ -123,7 +139,8 @@ def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
         return None
 
 
-def _copy(step: Step, stamps: Stamps, low: int, high: int) -> Samples | Row:
+def _copy(step: Step, query: Query, low: int, high: int) -> Samples | Row:
     if not isinstance(step, FrameHistory):
         return step
-    return step.samples_between(low, high, stamps)
+    many = step.find(high) - step.find(low) > _BLOCK * len(query.stamps)
+    return step.samples_between(low, high, query.stamps if many else None)

@@ -6,7 +6,7 @@ no answer, the lookup at one stamp is asked, so that both raise the same error.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupE
 from tfbus.geometry.rows import IDENTITY, Columns, Row, compose, invert
 from tfbus.geometry.transform_array import TransformArray, from_columns, from_rows, move
 from tfbus.stamps import LATEST, Stamps
-from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Places, copy_paths
+from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Places, Query, copy_paths
 from tfbus.tree._plain_columns import plain_columns
 from tfbus.tree._segments import Floats, Segments
 from tfbus.tree.extrapolation import read_stamps_at_many
@@ -30,14 +30,6 @@ ONE_BY_ONE = 40
 _CHUNK = 2048
 
 OutOfRange = Literal["raise", "nan"]
-
-
-class Query(NamedTuple):
-    """The question where `source` is, seen from `target`, at many stamps."""
-
-    target: str
-    source: str
-    stamps: Stamps
 
 
 def lookup_many(
@@ -143,9 +135,10 @@ def _answers(
     out_of_range: OutOfRange,
 ) -> list["Answers"]:
     """The answers of each query; `lookup_one` raises the error of a place without an answer."""
+    spans = [query.span() for query in queries]
     while True:
         with forest.lock:
-            copies = [copy_paths(forest, *query) for query in queries]
+            copies = [copy_paths(forest, query, span) for query, span in zip(queries, spans, strict=True)]
         answers = [Answers(paths, query.stamps, policy) for paths, query in zip(copies, queries, strict=True)]
         missing = [found.first_missing for found in answers if found.first_missing is not None]
         if not missing:

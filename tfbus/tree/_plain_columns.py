@@ -5,13 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from tfbus.errors import TransformLookupError
-from tfbus.stamps import LATEST, Stamps
+from tfbus.stamps import LATEST
+from tfbus.tree._copied_paths import Query
 from tfbus.tree._kernel import Held
 from tfbus.tree._segments import Floats
 from tfbus.tree.forest import Forest
-
-Query = tuple[str, str, Stamps]
-"""Target, source and the stamps, in ns, shape (n,)."""
 
 
 def plain_columns(forest: Forest, queries: Sequence[Query], with_nan: bool) -> list[Floats] | None:

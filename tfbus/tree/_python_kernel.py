@@ -26,7 +26,6 @@ from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
 _RECORD = struct.Struct("q7d")
 _SIZE = _RECORD.size
 _FOREVER = 2**64
-_BLOCK = 64
 _pack = _RECORD.pack
 _unpack = _RECORD.unpack_from
 _unpack_pair = struct.Struct("q7dq7d").unpack_from
@@ -180,11 +179,10 @@ class History:
     def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
         """The memory of the samples from one index to another, which nothing changes while it is held.
 
-        Those that are next to none of the `wanted` stamps (ns) may be left out. They are if they are many: a
-        scattered sample costs as much as 64 in a row.
+        Those that are next to none of the `wanted` stamps (ns) may be left out.
         """
         begin, end = self._start + first, self._start + min(end, self.count)
-        if wanted is None or end - begin <= _BLOCK * len(wanted):
+        if wanted is None:
             stamps, records = self.stamps[begin:end], self.records[begin * _SIZE : end * _SIZE]
             return stamps, 0, records, 0, 8, len(stamps)
         # The views on the history end with each line, because a history that is being viewed cannot grow.

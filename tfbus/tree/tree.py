@@ -34,7 +34,9 @@ class TransformTree:
     Parameters
     ----------
     keep : float or None
-        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything.
+        Length of the history of each frame, in s before that frame's newest stamp; None keeps everything. A late
+        sample then costs more the longer the history is, because all samples after it are moved: in the middle of a
+        million samples some ms.
 
     Raises
     ------
