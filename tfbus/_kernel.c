@@ -35,7 +35,7 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 #define SAMPLE_SIZE (sizeof(int64_t) + ROW_SIZE)
 #define EXACT_GAP ((uint64_t)1 << 53) /* ns; beyond, a difference of stamps is no exact float, and Python divides */
 
-static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType;
+static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
 static PyObject *empty_string;
 
 /* Rows ------------------------------------------------------------------------------------------------------------ */
@@ -370,16 +370,27 @@ static Py_ssize_t
 lower_bound(const int64_t *stamps, Py_ssize_t count, int64_t at)
 {
     Py_ssize_t low = 0;
-    while (count > 0) {
-        const Py_ssize_t half = count >> 1;
-        if (stamps[low + half] < at) {
-            low += half + 1;
-            count -= half + 1;
-        } else {
-            count = half;
+    if (count > 16 && stamps[0] < at && at < stamps[count - 1]) {
+        /* Samples mostly come at a steady rate: look where the stamp would then be. */
+        const double part = (double)((uint64_t)at - (uint64_t)stamps[0]);
+        const double whole = (double)((uint64_t)stamps[count - 1] - (uint64_t)stamps[0]);
+        const Py_ssize_t guess = (Py_ssize_t)(part / whole * (double)(count - 1));
+        const Py_ssize_t before = guess - 2, behind = guess + 3;
+        if (behind < count && stamps[behind] >= at) {
+            count = behind + 1;
+        }
+        if (before > 0 && stamps[before] < at) {
+            low = before + 1;
+            count -= low;
         }
     }
-    return low;
+    /* Without a branch that depends on the stamps, because no processor can foresee it. */
+    while (count > 1) {
+        const Py_ssize_t half = count >> 1;
+        low += stamps[low + half - 1] < at ? half : 0;
+        count -= half;
+    }
+    return low + (count == 1 && stamps[low] < at);
 }
 
 /* Put the samples in the window into a block of its own, at the front, with room for some more. */
@@ -1613,12 +1624,176 @@ commit(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
     return failed ? NULL : PyLong_FromSsize_t(first + stored);
 }
 
+/* Edge: the newest edge of a frame on a bus, and the plain judgement of a batch --------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *parent;  /* plain str */
+    PyObject *trusted; /* plain str, or NULL for nobody */
+    int64_t newest;
+    char has_newest;
+} Edge;
+
+static PyObject *
+edge_parent(Edge *self, void *Py_UNUSED(closure))
+{
+    if (self->parent == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "parent");
+        return NULL;
+    }
+    Py_INCREF(self->parent);
+    return self->parent;
+}
+
+static PyObject *
+edge_trusted(Edge *self, void *Py_UNUSED(closure))
+{
+    PyObject *trusted = self->trusted == NULL ? Py_None : self->trusted;
+    Py_INCREF(trusted);
+    return trusted;
+}
+
+static PyObject *
+edge_newest(Edge *self, void *Py_UNUSED(closure))
+{
+    if (!self->has_newest) {
+        Py_RETURN_NONE;
+    }
+    return PyLong_FromLongLong(self->newest);
+}
+
+/* `closure` is the offset of the string; None is NULL. */
+static int
+edge_set_string(PyObject *self, PyObject *value, void *closure)
+{
+    PyObject **place = (PyObject **)((char *)self + (size_t)closure);
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "an edge keeps all its fields");
+        return -1;
+    }
+    if (value == Py_None && place == &((Edge *)self)->trusted) {
+        value = NULL;
+    } else if ((value = plain_string(value)) == NULL) {
+        return -1;
+    }
+    PyObject *old = *place;
+    *place = value;
+    Py_XDECREF(old);
+    return 0;
+}
+
+static int
+edge_set_newest(Edge *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "an edge keeps all its fields");
+        return -1;
+    }
+    if (value != Py_None && read_stamp(value, &self->newest) < 0) {
+        return -1;
+    }
+    self->has_newest = value != Py_None;
+    return 0;
+}
+
+static void
+edge_dealloc(Edge *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    Py_XDECREF(self->parent);
+    Py_XDECREF(self->trusted);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyGetSetDef edge_getset[] = {
+    {"parent", (getter)edge_parent, edge_set_string, PyDoc_STR("The newest parent."), (void *)offsetof(Edge, parent)},
+    {"trusted", (getter)edge_trusted, edge_set_string,
+     PyDoc_STR("The authority whose moving samples under this parent need no judgement, or None."),
+     (void *)offsetof(Edge, trusted)},
+    {"newest", (getter)edge_newest, (setter)edge_set_newest, PyDoc_STR("The newest stamp, or None."), NULL},
+    {NULL}
+};
+
+static PyType_Slot edge_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The part of a frame's newest edge by which its samples are judged.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_dealloc, edge_dealloc},
+    {Py_tp_getset, edge_getset},
+    {0, NULL}
+};
+
+static PyType_Spec edge_spec = {
+    "tfbus._kernel.Edge", sizeof(Edge), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, edge_slots
+};
+
+/* judge(edges, batch, horizon, square): whether all samples continue known edges, none is newer than the horizon and no
+ * translation longer than the root of `square`; then their stamps are noted, else nothing. */
+static PyObject *
+judge(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    int64_t horizon;
+    if (nargs != 4 || !PyDict_Check(args[0]) || !PyTuple_CheckExact(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "judge takes a dict of edges, a tuple of samples, a stamp and a float");
+        return NULL;
+    }
+    const double square = PyFloat_AsDouble(args[3]);
+    if (read_stamp(args[2], &horizon) < 0 || (square == -1.0 && PyErr_Occurred())) {
+        return NULL;
+    }
+    const Py_ssize_t size = PyTuple_Size(args[1]);
+    Edge *few[FEW], **edges = few;
+    if (size > FEW && (edges = PyMem_Malloc((size_t)size * sizeof(Edge *))) == NULL) {
+        return PyErr_NoMemory();
+    }
+    Py_ssize_t judged = 0;
+    for (; judged < size; judged++) {
+        PyObject *item = PyTuple_GetItem(args[1], judged);
+        const Sample *sample = (const Sample *)item;
+        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static
+            || sample->stamp > horizon) {
+            break;
+        }
+        const double *row = sample->row;
+        /* Not `>`, which is false for NaN. */
+        if (!(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] <= square)) {
+            break;
+        }
+        PyObject *known = PyDict_GetItemWithError(args[0], sample->child);
+        if (known == NULL || !PyObject_TypeCheck(known, EdgeType)) {
+            break;
+        }
+        edges[judged] = (Edge *)known;
+        if (!same_string(sample->parent, edges[judged]->parent)
+            || !same_string(sample->authority, edges[judged]->trusted)) {
+            break;
+        }
+    }
+    const int plain = judged == size;
+    for (Py_ssize_t i = 0; plain && i < size; i++) {
+        const int64_t stamp = ((const Sample *)PyTuple_GetItem(args[1], i))->stamp;
+        if (!edges[i]->has_newest || stamp > edges[i]->newest) {
+            edges[i]->newest = stamp;
+            edges[i]->has_newest = 1;
+        }
+    }
+    if (edges != few) {
+        PyMem_Free(edges);
+    }
+    if (!plain && PyErr_Occurred()) {
+        return NULL;
+    }
+    return PyBool_FromLong(plain);
+}
+
 /* The module -------------------------------------------------------------------------------------------------------- */
 
 static PyMethodDef module_methods[] = {
     {"commit", FAST(commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
                "index.")},
+    {"judge", FAST(judge), METH_FASTCALL,
+     PyDoc_STR("judge(edges, batch, horizon, square): whether the whole batch is plain; then its stamps are noted.")},
     {NULL}
 };
 
@@ -1647,7 +1822,8 @@ module_exec(PyObject *module)
         || add_type(module, "History", &history_spec, &HistoryType) < 0
         || add_type(module, "Chain", &chain_spec, &ChainType) < 0
         || add_type(module, "Held", &held_spec, &HeldType) < 0
-        || add_type(module, "Paths", &paths_spec, &PathsType) < 0) {
+        || add_type(module, "Paths", &paths_spec, &PathsType) < 0
+        || add_type(module, "Edge", &edge_spec, &EdgeType) < 0) {
         return -1;
     }
     return 0;
