@@ -1,29 +1,68 @@
-"""A web service that answers where a frame is, and waits for the answer if it must.
+"""A web service that answers where a frame is, streams it, and waits for the answer if it must.
 
-The bus, the buffer and a robot that drives in a circle live in the application's lifespan. One route awaits:
+The bus, the buffer and a robot that drives in a circle live in the application's lifespan. The routes are
 
+    GET /                                           a page that shows the tree and follows the robot
+    GET /tree                                       the tree as text
     GET /transforms/map/base_link                   the newest
     GET /transforms/map/base_link?at=1250000000     at a stamp, in ns
     GET /transforms/map/base_link?timeout=0.2       waits no longer than 0.2 s (by default 1 s)
+    GET /changes/map/base_link                      Server-Sent Events: each change, at most 10 in a second
+    WebSocket /poses/map/base_link                  each change, at most 20 in a second
 
-It answers 200 with JSON, 404 with close matches for a frame that nobody has published, 504 with the reason when the
-time is up, 400 for a question that can never be answered, and 503 while the service is going down.
+A lookup answers 200 with JSON, 404 with close matches for a frame that nobody has published, 504 with the reason when
+the time is up, 400 for a question that can never be answered, and 503 while the service is going down.
 
-Run it with `pip install ".[web]"`, then `python demos/web_app.py`, and ask http://127.0.0.1:8000/transforms/map/base_link.
+Run it with `pip install ".[web]"`, then `python demos/web_app.py`, and open http://127.0.0.1:8000.
 """
 
 import contextlib
+import json
 import math
 from collections.abc import AsyncIterator
 
 import anyio
 import uvicorn
 from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import JSONResponse
-from starlette.routing import Route
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
 
 import tfbus
+
+PAGE = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<title>tfbus</title>
+<style>body { font-family: sans-serif } canvas { border: 1px solid gray }</style>
+<h1>Where is the robot?</h1>
+<canvas id="map" width="300" height="300"></canvas>
+<p>Laser in the map: <output id="laser">waiting</output></p>
+<pre id="tree"></pre>
+<script>
+const map = document.getElementById("map").getContext("2d");
+const pixel = ([x, y]) => [150 + 100 * x, 150 - 100 * y];
+const poses = new WebSocket(`ws://${location.host}/poses/map/base_link`);
+poses.onmessage = (message) => {
+  const { translation } = JSON.parse(message.data).transform;
+  const [x, y] = pixel(translation);
+  map.clearRect(0, 0, 300, 300);
+  map.fillRect(x - 5, y - 5, 10, 10);
+};
+const changes = new EventSource("/changes/map/laser");
+changes.onmessage = (message) => {
+  const { translation } = JSON.parse(message.data).transform;
+  document.getElementById("laser").value = translation.map((metres) => metres.toFixed(2)).join(", ");
+};
+const showTree = async () => {
+  document.getElementById("tree").textContent = await (await fetch("/tree")).text();
+};
+showTree();
+setInterval(showTree, 1000);
+</script>
+</html>
+"""
 
 
 async def drive(bus: tfbus.Bus) -> None:
@@ -47,13 +86,25 @@ async def lifespan(_: Starlette) -> AsyncIterator[dict[str, tfbus.Buffer]]:
             tasks.cancel_scope.cancel()
 
 
-async def transform(request: Request) -> JSONResponse:
-    buffer: tfbus.Buffer = request.state.buffer
+def buffer_of(connection: HTTPConnection) -> tfbus.Buffer:
+    buffer: tfbus.Buffer = connection.state.buffer
+    return buffer
+
+
+async def page(_: Request) -> Response:
+    return HTMLResponse(PAGE)
+
+
+async def tree(request: Request) -> Response:
+    return PlainTextResponse(buffer_of(request).describe())
+
+
+async def transform(request: Request) -> Response:
     target, source = request.path_params["target"], request.path_params["source"]
     try:
         at = int(request.query_params["at"]) if "at" in request.query_params else tfbus.LATEST
         timeout = float(request.query_params.get("timeout", 1.0))
-        found = await buffer.lookup(target, source, at, timeout=timeout)
+        found = await buffer_of(request).lookup(target, source, at, timeout=timeout)
     except tfbus.LookupTimeoutError as error:
         missing = error.__cause__
         if isinstance(missing, tfbus.UnknownFrameError):
@@ -63,18 +114,43 @@ async def transform(request: Request) -> JSONResponse:
         return JSONResponse({"error": str(error)}, 400)
     except tfbus.BusClosedError as error:
         return JSONResponse({"error": str(error)}, 503)
-    return JSONResponse(
-        {
-            "target": found.parent,
-            "source": found.child,
-            "stamp": found.stamp,
-            "translation": found.transform.translation,
-            "rotation": found.transform.rotation,
-        }
-    )
+    return JSONResponse(found.to_dict())
 
 
-app = Starlette(routes=[Route("/transforms/{target}/{source}", transform)], lifespan=lifespan)
+async def changes(request: Request) -> Response:
+    target, source = request.path_params["target"], request.path_params["source"]
+
+    async def events() -> AsyncIterator[str]:
+        with buffer_of(request).watch(target, source, max_rate=10.0) as watch:
+            async for found in watch:
+                yield f"data: {json.dumps(found.to_dict())}\n\n"
+
+    return StreamingResponse(events(), media_type="text/event-stream")
+
+
+async def poses(socket: WebSocket) -> None:
+    target, source = socket.path_params["target"], socket.path_params["source"]
+    await socket.accept()
+    # Whoever has gone is noticed at the next message.
+    with contextlib.suppress(WebSocketDisconnect):
+        with buffer_of(socket).watch(target, source, max_rate=20.0) as watch:
+            async for found in watch:
+                await socket.send_json(found.to_dict())
+        await socket.close()
+
+
+app = Starlette(
+    routes=[
+        Route("/", page),
+        Route("/tree", tree),
+        Route("/transforms/{target}/{source}", transform),
+        Route("/changes/{target}/{source}", changes),
+        WebSocketRoute("/poses/{target}/{source}", poses),
+    ],
+    lifespan=lifespan,
+)
 
 if __name__ == "__main__":
-    uvicorn.run(app, host="127.0.0.1", port=8000)
+    print("http://127.0.0.1:8000", flush=True)
+    # A stream has no end, so the server does not wait for it at its own end.
+    uvicorn.run(app, host="127.0.0.1", port=8000, log_level="warning", timeout_graceful_shutdown=1)

@@ -1,6 +1,7 @@
 import builtins
 import copy
 import inspect
+import json
 import pickle
 import re
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import pytest
 import tfbus
 from tfbus import (
     LATEST,
+    AheadError,
     BusClosedError,
     ClockResetError,
     DisconnectedError,
@@ -86,6 +88,17 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         ),
         "frame 'base_link': asked for 3.000 s within 50 ms, between samples at 2.500 s and 4.500 s, "
         "which are 2 s apart (at most 500 ms), from 'odometry'",
+    ),
+    (
+        AheadError(
+            child="base_link",
+            stamp=from_seconds(13),
+            oldest=from_seconds(2.5),
+            newest=from_seconds(16),
+            authority="odometry",
+        ),
+        "frame 'base_link': asked for the latest up to 13.000 s, newest sample is 16.000 s (3 s too new), "
+        "from 'odometry'",
     ),
     (
         LookupTimeoutError(target="map", source="base_link", timeout=0.25, missing=SHORT),
@@ -431,3 +444,59 @@ def test_similar_names_are_looked_for_only_when_a_timeout_is_shown() -> None:
 class _Unread(list[str]):
     def __iter__(self) -> Iterator[str]:
         raise AssertionError
+
+
+class Foreign(Exception):
+    """An error of another library."""
+
+
+@each_error
+@pytest.mark.parametrize("index", [None, 3])
+def test_an_error_comes_back_from_json_with_its_facts_and_its_cause(error: TransformError, index: int | None) -> None:
+    sent = copy.copy(error)
+    if isinstance(sent, TransformLookupError):
+        sent.index = index
+    sent.__cause__ = SHORT
+    data = json.loads(json.dumps(sent.to_dict(), allow_nan=False))
+    for kind in (type(sent), TransformError):
+        back = kind.from_dict(data)
+        assert type(back) is type(sent)
+        assert str(back) == str(sent) == data["message"]
+        # Facts that have a default need not be set.
+        assert {name: getattr(back, name) for name in facts(sent)} == facts(sent)
+        assert facts(sent).keys() <= data.keys()
+        assert isinstance(back.__cause__, FutureExtrapolationError)
+        assert facts(back.__cause__).items() >= facts(SHORT).items()
+
+
+def test_a_foreign_cause_comes_back_as_its_text() -> None:
+    error = BusClosedError()
+    error.__cause__ = Foreign("broken")
+    back = BusClosedError.from_dict(error.to_dict())
+    assert repr(back.__cause__) == "Exception('Foreign: broken')"
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "problem"),
+    [
+        (TransformError, {"type": "Exception"}, "not the data of a TransformError: type 'Exception'"),
+        (TransformError, {"type": None}, "not the data of a TransformError"),
+        (TransformError, {"message": 1}, "message 1"),
+        (PastExtrapolationError, {}, "not the data of a PastExtrapolationError"),
+        (TransformError, {"args": []}, "has no field 'args'"),
+        (TransformError, {"__class__": 1}, "has no field '__class__'"),
+        (TransformError, {"child": 5}, "FutureExtrapolationError.child cannot be 5"),
+        (TransformError, {"stamp": "soon"}, "FutureExtrapolationError.stamp cannot be 'soon'"),
+        (TransformError, {"cause": "none"}, "FutureExtrapolationError.cause cannot be 'none'"),
+    ],
+)
+def test_wrong_data_of_an_error_are_refused(kind: type[TransformError], changes: dict[str, Any], problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        kind.from_dict({**SHORT.to_dict(), **changes})
+
+
+def test_data_of_an_error_without_a_fact_are_refused() -> None:
+    data = SHORT.to_dict()
+    del data["newest"]
+    with pytest.raises(ValueError, match="needs the field 'newest'"):
+        TransformError.from_dict(data)

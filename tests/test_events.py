@@ -23,6 +23,7 @@ from tfbus import (
     RecordingFailed,
     Reparented,
     SampleRejected,
+    StampAhead,
     SubscriberFailed,
 )
 
@@ -55,6 +56,10 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
         "frame 'base' is stale, its newest sample from 'odometry' is 500 ms old",
     ),
     (FrameLive(AT, "base", AT, "odometry"), "frame 'base' is live again, from 'odometry'"),
+    (
+        StampAhead(AT, "base", AT + 3600 * SECOND, "peer"),
+        "frame 'base' has a sample 3600 s ahead of the clock, from 'peer'",
+    ),
     (ClockReset(AT, 90 * SECOND), "the clock jumped back from 90.000 s"),
     (SubscriberFailed(AT, "print", OSError("full")), "the subscriber print raised OSError('full')"),
     (PeerJoined(AT, "tf", "5eed"), "peer 5eed has joined tf"),

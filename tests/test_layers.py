@@ -15,6 +15,7 @@ PACKAGE = Path(tfbus.__file__).parent
 
 GROUND = (
     "stamps",
+    "plain",
     "errors",
     "events",
     "frames",
@@ -43,6 +44,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "testing": ("geometry",),
     "__init__": ("message_filter", "robot"),
     "cli": ("__init__", "links", "recording"),
+    "__main__": ("cli",),
 }
 
 SANS_IO = {*GROUND, "geometry", "data", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
@@ -56,6 +58,7 @@ EXTRAS = {
     "mcap": ("recording.formats",),
     "rich": ("cli",),
     "rosbags": ("recording.formats",),
+    "scipy": ("geometry",),
     "urdf_parser_py": ("robot",),
     "zenoh": ("links.zenoh",),
     "zstandard": ("recording.formats",),

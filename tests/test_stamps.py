@@ -2,6 +2,7 @@ import copy
 import math
 import pickle
 from array import array
+from datetime import UTC, datetime, timedelta, timezone
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any
@@ -60,6 +61,27 @@ def test_seconds_that_no_stamp_can_hold_are_a_value_error(seconds: float) -> Non
         from_seconds(seconds)
 
 
+@given(st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1))
+def test_seconds_and_nanoseconds_of_a_message_are_converted_exactly(seconds: int, nanoseconds: int) -> None:
+    assert from_seconds(seconds, nanoseconds) == seconds * SECOND + nanoseconds
+
+
+@pytest.mark.parametrize("seconds", [0.5, -0.5, 12.25])
+def test_nanoseconds_are_added_to_the_rounded_seconds(seconds: float) -> None:
+    assert from_seconds(seconds, 7) == round(seconds * SECOND) + 7
+
+
+@pytest.mark.parametrize("arguments", [("1",), (None,), (True,), (1j,), (1, 0.5), (1, "1")])
+def test_seconds_that_are_no_number_are_a_type_error(arguments: tuple[Any, ...]) -> None:
+    with pytest.raises(TypeError, match="seconds must be a"):
+        from_seconds(*arguments)
+
+
+def test_nanoseconds_may_not_leave_64_bits() -> None:
+    with pytest.raises(ValueError, match="64-bit"):
+        from_seconds(9_223_372_036, 854_775_808)
+
+
 @pytest.mark.parametrize("value", [0, -1, -(2**63), 2**63 - 1, np.int64(7), np.uint8(7), np.array(7)])
 def test_any_integer_is_a_stamp_and_becomes_a_plain_int(value: Any) -> None:
     stamp = as_stamp(value)
@@ -83,6 +105,82 @@ def test_a_value_that_is_no_integer_is_a_type_error(value: object) -> None:
 def test_a_stamp_beyond_64_bits_is_a_value_error(value: object) -> None:
     with pytest.raises(ValueError, match="64-bit"):
         as_stamp(value)
+
+
+# 2020-02-29 12:00:00 UTC is 18,321.5 days after the epoch.
+NOON = 1_582_977_600 * SECOND
+DATES = [
+    pytest.param(np.datetime64("2020-02-29T12"), NOON, id="h"),
+    pytest.param(np.datetime64("2020-02-29T12:00"), NOON, id="m"),
+    pytest.param(np.datetime64("2020-02-29T12:00:00"), NOON, id="s"),
+    pytest.param(np.datetime64("2020-02-29T12:00:00.001"), NOON + 1_000_000, id="ms"),
+    pytest.param(np.datetime64("2020-02-29T12:00:00.000001"), NOON + 1_000, id="us"),
+    pytest.param(np.datetime64("2020-02-29T12:00:00.000000001"), NOON + 1, id="ns"),
+    pytest.param(np.datetime64("2020-02-29"), NOON - SECOND * 43_200, id="D"),
+    pytest.param(np.datetime64("2020-02"), NOON - SECOND * (43_200 + 28 * 86_400), id="M"),
+    pytest.param(np.datetime64("2020"), NOON - SECOND * (43_200 + 59 * 86_400), id="Y"),
+    pytest.param(np.datetime64(2617, "W"), SECOND * 2617 * 7 * 86_400, id="W"),
+    pytest.param(np.datetime64(-1, (b"s", 25)), -25 * SECOND, id="25 s"),
+    pytest.param(np.datetime64(-1, "ps"), -1, id="ps"),
+    pytest.param(np.datetime64(1_999_999, "fs"), 1, id="fs"),
+    pytest.param(np.datetime64(2 * SECOND, "as"), 2, id="as"),
+    pytest.param(np.datetime64("2262-04"), 9_222_422_400 * SECOND, id="last month"),
+    pytest.param(datetime(2020, 2, 29, 12, microsecond=1, tzinfo=UTC), NOON + 1_000, id="datetime"),
+    pytest.param(datetime(2020, 2, 29, 13, tzinfo=timezone(timedelta(hours=1))), NOON, id="east of UTC"),
+]
+
+
+@pytest.mark.parametrize(("date", "stamp"), DATES)
+def test_a_date_is_a_stamp_and_becomes_a_plain_int(date: datetime | np.datetime64, stamp: int) -> None:
+    assert type(as_stamp(date)) is int
+    assert as_stamp(date) == stamp
+    for dates in ([date, date], np.array([date, date])):
+        stamps = as_stamps(dates)
+        assert stamps.dtype == np.int64
+        assert stamps.tolist() == [stamp, stamp]
+
+
+@pytest.mark.parametrize("unit", ["Y", "M", "W", "D", "h", "m", "s", "ms", "us", "ns"])
+def test_no_stamps_are_no_stamps_in_any_unit(unit: str) -> None:
+    assert as_stamps(np.array([], f"M8[{unit}]")).tolist() == []
+
+
+@pytest.mark.parametrize(
+    "convert", [as_stamp, lambda date: as_stamps([date]), lambda date: as_stamps(np.array([date]))]
+)
+@pytest.mark.parametrize(
+    ("date", "problem"),
+    [
+        (datetime(2020, 1, 1), r"no time zone: use .replace\(tzinfo=datetime.UTC\) .* or .astimezone\(\)"),
+        (datetime.max.replace(tzinfo=UTC), "64-bit"),
+        (np.datetime64("NaT"), "not NaT"),
+        (np.datetime64("NaT", "ns"), "not NaT"),
+        (np.datetime64("2262-05"), "64-bit"),
+        (np.datetime64("1677-09-21T00:12:43"), "64-bit"),
+        (np.datetime64("2263"), "64-bit"),
+        (np.datetime64(2**62, "Y"), "64-bit"),
+        (np.datetime64(-(2**62), "us"), "64-bit"),
+        (np.datetime64(1, (b"W", 2**31 - 1)), "64-bit"),
+    ],
+)
+def test_a_date_that_is_no_stamp_is_a_value_error(convert: Any, date: datetime | np.datetime64, problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        convert(date)
+
+
+def test_a_timestamp_of_pandas_keeps_its_nanoseconds() -> None:
+    pandas = pytest.importorskip("pandas")
+    index = pandas.DatetimeIndex(np.array([NOON, NOON + 1], "M8[ns]"))
+    for dates in (
+        index,
+        index.tz_localize("UTC"),
+        index.tz_localize("UTC").tz_convert("Asia/Tokyo"),
+        index.to_series(),
+    ):
+        assert as_stamps(dates).tolist() == [NOON, NOON + 1]
+        assert [as_stamp(date) for date in dates] == [NOON, NOON + 1]
+    with pytest.raises(ValueError, match="not NaT"):
+        as_stamp(pandas.NaT)
 
 
 @pytest.mark.parametrize("value", [0, 0.0, 1, 2.5, math.inf])
@@ -205,7 +303,7 @@ def test_one_value_that_is_no_integer_makes_a_list_a_type_error(bad: object, pla
             as_stamps(sequence)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.bool_, np.complex128, "M8[s]", "U3"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.bool_, np.complex128, "m8[s]", "U3"])
 def test_an_array_of_another_type_is_a_type_error(dtype: Any) -> None:
     with pytest.raises(TypeError, match="int of nanoseconds"):
         as_stamps(np.array([1, 0], np.int64).astype(dtype))

@@ -13,7 +13,7 @@ from tfbus.statistics import (
     RobotStatistics,
 )
 
-BUFFER = BufferStatistics(offered=6, inserted=3, replaced=2, expired=1, waiting=4)
+BUFFER = BufferStatistics(offered=9, inserted=3, replaced=2, expired=4, waiting=5, expired_ahead=2, superseded=1)
 QUEUE = QueueStatistics("stream", "conflate", capacity=5, pending=4, dropped=3)
 ONE_OF_EACH: list[Any] = [
     BUFFER,
@@ -36,7 +36,18 @@ def test_statistics_are_frozen_and_serializable_as_json(statistics: Any) -> None
 def test_the_json_of_a_bus_has_its_buffers_and_queues_by_name() -> None:
     described = json.loads(json.dumps(asdict(ONE_OF_EACH[2])))
     assert described["rejected"] == {"cycle": 2}
-    assert described["buffers"] == [{"offered": 6, "inserted": 3, "replaced": 2, "expired": 1, "waiting": 4}]
+    assert described["buffers"] == [
+        {
+            "offered": 9,
+            "inserted": 3,
+            "replaced": 2,
+            "expired": 4,
+            "waiting": 5,
+            "expired_ahead": 2,
+            "superseded": 1,
+            "looped": 0,
+        }
+    ]
     assert described["queues"] == [
         {"kind": "stream", "overflow": "conflate", "capacity": 5, "pending": 4, "dropped": 3, "conflated": 0}
     ]

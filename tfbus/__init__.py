@@ -28,6 +28,7 @@ from tfbus.data import (
     do_transform,
 )
 from tfbus.errors import (
+    AheadError,
     BusClosedError,
     ClockResetError,
     DisconnectedError,
@@ -60,6 +61,7 @@ from tfbus.events import (
     RecordingFailed,
     Reparented,
     SampleRejected,
+    StampAhead,
     SubscriberFailed,
 )
 from tfbus.geometry.stamped import TransformStamped
@@ -70,7 +72,7 @@ from tfbus.registration import Registration
 from tfbus.robot.joint import Joint, Mimic
 from tfbus.robot.model import LimitViolation, RobotModel
 from tfbus.robot.state_publisher import RobotStatePublisher
-from tfbus.stamps import LATEST, SECOND, Latest, from_seconds, to_seconds
+from tfbus.stamps import LATEST, SECOND, Latest, format_stamp, from_seconds, to_seconds
 from tfbus.statistics import (
     BufferStatistics,
     BusStatistics,
@@ -92,6 +94,7 @@ kernel = KERNEL
 __all__ = [
     "LATEST",
     "SECOND",
+    "AheadError",
     "AuthorityConflict",
     "Buffer",
     "BufferStatistics",
@@ -152,6 +155,7 @@ __all__ = [
     "RobotStatistics",
     "SampleRejected",
     "SimulatedClock",
+    "StampAhead",
     "Stamped",
     "Stream",
     "SubscriberFailed",
@@ -171,7 +175,21 @@ __all__ = [
     "Watch",
     "WrenchStamped",
     "do_transform",
+    "format_stamp",
     "from_seconds",
     "kernel",
     "to_seconds",
 ]
+
+
+def __getattr__(name: str) -> str:
+    if name != "__version__":
+        raise AttributeError(f"module 'tfbus' has no attribute {name!r}")
+    # Reading it takes as long as a quarter of the import.
+    from importlib.metadata import version
+
+    return version("tfbus")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

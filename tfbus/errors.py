@@ -10,6 +10,7 @@
                 FutureExtrapolationError                                      waiting may help
                 PastExtrapolationError                                        waiting cannot help: raised at once
                 GapError                   .before .after .max_gap            waiting cannot help: raised at once
+                AheadError                                                    waiting cannot help: raised at once
             LookupTimeoutError (TimeoutError)  __cause__ is the last lookup error
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         InvalidRobotError (ValueError)         .element
@@ -22,23 +23,27 @@ can be pickled and copied, with their cause. Arguments of the wrong type raise `
 """
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property, lru_cache
 from heapq import nlargest
-from typing import Any
+from typing import Any, Self, TypeVar, get_type_hints
 
+from tfbus.plain import from_fields, from_plain, to_plain
 from tfbus.stamps import Latest, format_duration, format_stamp
 
 LOOKED_AT = 30
 """The number of known names that are compared in full with an unknown one; a comparison takes tens of microseconds."""
 
 
+AnyError = TypeVar("AnyError", bound="TransformError")
+
+
 def _restore(
-    cls: type["TransformError"], args: tuple[Any, ...], facts: dict[str, Any], cause: BaseException | None
-) -> "TransformError":
+    cls: type[AnyError], args: tuple[Any, ...], facts: dict[str, Any], cause: BaseException | None
+) -> AnyError:
     # LookupTimeoutError inherits `__new__` from LookupError, which refuses subclasses of OSError.
-    make = OSError.__new__ if issubclass(cls, OSError) else cls.__new__
-    error: TransformError = make(cls, *args)
+    make: Any = OSError.__new__ if issubclass(cls, OSError) else cls.__new__
+    error: AnyError = make(cls, *args)
     error.args = args
     error.__dict__.update(facts)
     if cause is not None:
@@ -55,6 +60,49 @@ class TransformError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         return _restore, (type(self), self.args, self.__dict__, self.__cause__)
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: the class as ``"type"``, the ``"message"``, the facts, and the cause or None."""
+        facts = {name: to_plain(getattr(self, name)) for name in self._facts()}
+        return {"type": type(self).__name__, "message": str(self), **facts, "cause": to_plain(self.__cause__)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The error that `to_dict` made `data` of, of this class or of one below it.
+
+        A cause that is not an error of tfbus comes back as an `Exception` with its type and message.
+
+        Raises
+        ------
+        ValueError
+            If the data are not those of such an error. The message names the fact.
+        """
+        given = dict(data)
+        name, message, cause = (given.pop(key, None) for key in ("type", "message", "cause"))
+        kind: type[Self] | None = next((kind for kind in _with_subclasses(cls) if kind.__name__ == name), None)
+        if kind is None or not isinstance(message, str):
+            raise ValueError(f"these are not the data of a {cls.__name__}: type {name!r}, message {message!r}")
+        hints = kind._facts()
+        facts = from_fields(kind, given, hints)
+        index = "" if facts.get("index") is None else f"stamps[{facts['index']}]: "
+        args = () if kind._why is not TransformError._why else (message.removeprefix(index),)
+        reason = from_plain(TransformError | Exception | None, cause, f"{name}.cause")
+        return _restore(kind, args, facts, reason)
+
+    @classmethod
+    def _facts(cls) -> dict[str, Any]:
+        """The names and types of the facts: the public annotations of the class."""
+        return {name: hint for name, hint in get_type_hints(cls).items() if not name.startswith("_")}
+
+    def _why(self) -> str:
+        """The message; a class that makes it of its facts has its own."""
+        return super().__str__()
+
+
+def _with_subclasses(cls: type[AnyError]) -> Iterable[type[AnyError]]:
+    yield cls
+    for below in cls.__subclasses__():
+        yield from _with_subclasses(below)
+
 
 class TransformLookupError(TransformError, LookupError):
     """A lookup has no answer, at least not now.
@@ -66,9 +114,6 @@ class TransformLookupError(TransformError, LookupError):
     """
 
     index: int | None = None
-
-    def _why(self) -> str:
-        return super().__str__()
 
     def __str__(self) -> str:
         return self._why() if self.index is None else f"stamps[{self.index}]: {self._why()}"
@@ -86,6 +131,9 @@ class UnknownFrameError(TransformLookupError):
         known then.
     """
 
+    frame: str
+    _known: Iterable[str] = ()
+
     def __init__(self, *, frame: str, known: Iterable[str] = ()) -> None:
         super().__init__()
         self.frame = frame
@@ -100,6 +148,10 @@ class UnknownFrameError(TransformLookupError):
         hint = " or ".join(repr(name) for name in self.close_matches)
         slash = ", a frame name has no leading slash" if self.frame.startswith("/") else ""
         return f"frame {self.frame!r} is not known{slash}" + (f", did you mean {hint}?" if hint else "")
+
+    @classmethod
+    def _facts(cls) -> dict[str, Any]:
+        return {**super()._facts(), "close_matches": tuple[str, ...]}
 
     def __reduce__(self) -> tuple[Any, ...]:
         facts = {**self.__dict__, "_known": (), "close_matches": self.close_matches}
@@ -135,6 +187,12 @@ class DisconnectedError(TransformLookupError):
         Frames that form a loop of parents at that stamp, the first one repeated at the end; empty if there is none.
         Only samples that came late or out of order can form one.
     """
+
+    target: str
+    source: str
+    roots: tuple[str, str]
+    stamp: int | None
+    loop: tuple[str, ...]
 
     def __init__(
         self,
@@ -173,7 +231,19 @@ class ExtrapolationError(TransformLookupError):
         The sender of the edge's newest sample; may be empty.
     slack : int
         The greatest distance between the stamp and a sample that the policy allowed, in ns.
+    ahead : int
+        The time from the clock's now to the edge's newest stamp, in ns, if that is more than the `max_ahead` of the
+        bus: then right samples are older than it, and may have expired. Otherwise 0, as in all errors of a tree without
+        a bus.
     """
+
+    child: str
+    stamp: int | Latest
+    oldest: int | None
+    newest: int | None
+    authority: str
+    slack: int
+    ahead: int = 0
 
     def __init__(
         self,
@@ -193,15 +263,19 @@ class ExtrapolationError(TransformLookupError):
         self.authority = authority
         self.slack = slack
 
+    def _asked(self) -> str:
+        asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
+        return f"{asked} within {format_duration(self.slack)}" if self.slack else asked
+
     def _gap(self) -> str:
         return "there is no sample in its window"
 
     def _why(self) -> str:
-        asked = "the latest" if isinstance(self.stamp, Latest) else format_stamp(self.stamp)
-        if self.slack:
-            asked += f" within {format_duration(self.slack)}"
         sender = f", from {self.authority!r}" if self.authority else ""
-        return f"frame {self.child!r}: asked for {asked}, {self._gap()}{sender}"
+        if self.ahead:
+            ahead = format_duration(self.ahead)
+            sender += f"; its newest stamp is {ahead} ahead of the clock, and right samples expire"
+        return f"frame {self.child!r}: asked for {self._asked()}, {self._gap()}{sender}"
 
 
 class FutureExtrapolationError(ExtrapolationError):
@@ -244,6 +318,10 @@ class GapError(ExtrapolationError):
         The greatest gap that the lookup allowed, in ns.
     """
 
+    before: int
+    after: int
+    max_gap: int
+
     def __init__(self, *, before: int, after: int, max_gap: int, **facts: Any) -> None:
         super().__init__(**facts)
         self.before = before
@@ -255,6 +333,22 @@ class GapError(ExtrapolationError):
             f"between samples at {format_stamp(self.before)} and {format_stamp(self.after)}, which are "
             f"{format_duration(self.after - self.before)} apart (at most {format_duration(self.max_gap)})"
         )
+
+
+class AheadError(ExtrapolationError):
+    """The newest answer is further ahead of the clock than `max_age` allows. Waiting for samples cannot help.
+
+    `stamp` is the newest stamp that was allowed, in ns; `child` is the edge that has come no further than the answer.
+    """
+
+    def _asked(self) -> str:
+        return f"the latest up to {super()._asked()}"
+
+    def _gap(self) -> str:
+        if self.newest is None or isinstance(self.stamp, Latest):
+            return "it has no samples"
+        late = format_duration(self.newest - self.stamp)
+        return f"newest sample is {format_stamp(self.newest)} ({late} too new)"
 
 
 class LookupTimeoutError(TransformLookupError, TimeoutError):
@@ -271,6 +365,11 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
         The timeout, in s on the bus's clock.
     """
 
+    target: str
+    source: str
+    timeout: float
+    _missing: BaseException | None = None
+
     def __init__(self, *, target: str, source: str, timeout: float, missing: TransformLookupError) -> None:
         super().__init__()
         self.target = target
@@ -280,7 +379,9 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
 
     def _why(self) -> str:
         # Not earlier, because a thousand timeouts at once would look for the similar names of a thousand frames.
-        return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {self._missing}"
+        # One that comes back from JSON has only its cause.
+        missing = self.__cause__ if self._missing is None else self._missing
+        return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {missing}"
 
 
 class InvalidTransformError(TransformError, ValueError):
@@ -298,6 +399,13 @@ class InvalidTransformError(TransformError, ValueError):
     owner : str or None
         For ``"authority"`` and ``"reserved"``, the only authority that may publish the child.
     """
+
+    reason: str
+    parent: str | None
+    child: str | None
+    authority: str | None
+    loop: tuple[str, ...]
+    owner: str | None
 
     def __init__(
         self,
@@ -328,6 +436,8 @@ class InvalidRobotError(TransformError, ValueError):
         The invalid element, such as ``<joint name="elbow">``; empty if the error is about the whole description.
     """
 
+    element: str
+
     def __init__(self, problem: str, *, element: str = "") -> None:
         super().__init__(f"in {element}: {problem}" if element else problem)
         self.element = element
@@ -345,6 +455,9 @@ class RecordingError(TransformError, ValueError):
         ``"damaged"``, ``"unreadable"`` or ``"missing extra"``.
     """
 
+    path: str
+    reason: str
+
     def __init__(self, problem: str, *, path: str, reason: str) -> None:
         # Messages of other packages may have several lines.
         super().__init__(f"recording {path!r}: {' '.join(problem.split()).rstrip('.')}")
@@ -360,6 +473,9 @@ class ClockResetError(TransformError):
     before, after : int
         The clock's stamps just before and just after the jump, in ns.
     """
+
+    before: int
+    after: int
 
     def __init__(self, *, before: int, after: int) -> None:
         super().__init__(f"the clock jumped back from {format_stamp(before)} to {format_stamp(after)}")

@@ -194,6 +194,36 @@ class FrameLive:
 
 
 @dataclass(frozen=True, slots=True)
+class StampAhead:
+    """The newest sample of a frame is ahead of the clock by more than the `max_ahead` of the bus.
+
+    Until the clock has reached it, samples with right stamps are older than the newest one, and they expire once they
+    are older than the window. An event stream gives it once for each frame and authority, until the frame is removed or
+    added or the clock jumps back. With ``reject_ahead=True`` the sample was refused, and nothing expires.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the event, in ns.
+    frame, authority : str
+        The frame, and the sender of the sample.
+    newest : int
+        The stamp of the sample, in ns.
+    """
+
+    stamp: int
+    frame: str
+    newest: int
+    authority: str
+
+    def __str__(self) -> str:
+        ahead = format_duration(self.newest - self.stamp)
+        return _line(
+            self.stamp, f"frame {self.frame!r} has a sample {ahead} ahead of the clock, from {self.authority!r}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class ClockReset:
     """The clock jumped back from `before` to `stamp` (ns), and the bus forgot every moving frame.
 
@@ -350,6 +380,7 @@ Event = (
     | PastLoop
     | FrameStale
     | FrameLive
+    | StampAhead
     | ClockReset
     | SubscriberFailed
     | PeerJoined

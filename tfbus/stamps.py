@@ -6,9 +6,11 @@ float. A duration is a ``float`` of seconds, because it is easier to write and r
 
 import math
 import operator
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
 from enum import Enum
 from numbers import Real
-from typing import Final
+from typing import Any, Final, SupportsIndex, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +21,31 @@ SECOND: Final = 1_000_000_000
 STAMP_MIN: Final = -(2**63)
 STAMP_MAX: Final = 2**63 - 1
 
+StampLike: TypeAlias = SupportsIndex | np.datetime64 | datetime
+"""What `as_stamp` accepts; a ``pandas.Timestamp`` is a ``datetime``."""
+
+StampsLike: TypeAlias = npt.ArrayLike | Sequence[StampLike]
+"""What `as_stamps` accepts."""
+
 Stamps = npt.NDArray[np.int64]
 """An array of stamps in ns, shape (n,)."""
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_DAY = 86_400 * SECOND
+_UNITS = {
+    "Y": 365 * _DAY,
+    "M": 28 * _DAY,
+    "W": 7 * _DAY,
+    "D": _DAY,
+    "h": 3_600 * SECOND,
+    "m": 60 * SECOND,
+    "s": SECOND,
+    "ms": 1_000_000,
+    "us": 1_000,
+}
+"""The units of datetime64 of more than a nanosecond, in ns; years and months at their shortest."""
+_PARTS = {"ps": 1_000, "fs": 1_000_000, "as": SECOND}
+"""How many of the finer units are a nanosecond."""
 
 
 class Latest(Enum):
@@ -36,23 +61,40 @@ LATEST: Final = Latest.LATEST
 """In place of a stamp: the newest stamp that every moving edge on the path can answer."""
 
 
-def from_seconds(seconds: float) -> int:
+def from_seconds(seconds: float, nanoseconds: SupportsIndex = 0) -> int:
     """Nanoseconds in a number of seconds, rounded to the nearest.
 
     Parameters
     ----------
     seconds : float
         An ``int`` is converted exactly, a ``float`` to the nanosecond nearest to its exact value.
+    nanoseconds : int
+        Added to them, so that ``from_seconds(stamp.sec, stamp.nanosec)`` is exactly the stamp of a ROS message.
 
     Raises
     ------
+    TypeError
+        If `seconds` is not a number, or `nanoseconds` not an integer.
     ValueError
         If `seconds` is not finite, or the result does not fit a signed 64-bit integer.
+
+    Examples
+    --------
+    >>> from_seconds(1.5)
+    1500000000
+    >>> from_seconds(1396293888, 53123456)
+    1396293888053123456
     """
+    if not is_real(seconds):
+        raise TypeError(f"seconds must be a number, not {seconds!r}")
     if not -math.inf < seconds < math.inf:
         raise ValueError(f"seconds must be finite, not {seconds!r}")
+    try:
+        rest = operator.index(nanoseconds)
+    except TypeError:
+        raise TypeError(f"nanoseconds must be an int, not {nanoseconds!r}") from None
     whole = math.floor(seconds)
-    stamp = whole * SECOND + round((seconds - whole) * SECOND)
+    stamp = whole * SECOND + round((seconds - whole) * SECOND) + rest
     if not STAMP_MIN <= stamp <= STAMP_MAX:
         raise ValueError(f"{seconds!r} s does not fit a stamp of 64-bit nanoseconds")
     return stamp
@@ -64,17 +106,24 @@ def to_seconds(stamp: int) -> float:
 
 
 def as_stamp(value: object) -> int:
-    """Check that `value` is a stamp, and return it as a plain ``int``.
+    """Convert `value` to a stamp, a plain ``int`` of nanoseconds.
+
+    Parameters
+    ----------
+    value : int, datetime64, Timestamp of pandas, or datetime with a time zone
+        A ``datetime64``, as well as a ``Timestamp`` without a time zone, is in UTC. A part of a nanosecond is cut off.
 
     Raises
     ------
     TypeError
-        If `value` is not an integer. The usual mistake is a float of seconds: convert it with `from_seconds`.
+        If `value` is of another type. The usual mistake is a float of seconds: convert it with `from_seconds`.
     ValueError
-        If it does not fit a signed 64-bit integer.
+        If it does not fit a signed 64-bit integer, is not a time (NaT), or is a ``datetime`` without a time zone.
     """
     if type(value) is int and STAMP_MIN <= value <= STAMP_MAX:
         return value
+    if isinstance(value, (datetime, np.datetime64)):
+        return _from_date(value)
     if isinstance(value, float):
         raise TypeError(f"a stamp is an int of nanoseconds, not the float {value!r}: use from_seconds({value!r})")
     if isinstance(value, bool):
@@ -88,17 +137,22 @@ def as_stamp(value: object) -> int:
     return stamp
 
 
-def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """Check that all values are stamps, and return them as an int64 array of shape (n,), in ns.
+def as_stamps(values: StampsLike) -> Stamps:
+    """Convert all values to stamps, an int64 array of shape (n,), in ns.
 
     An int64 array is returned without a copy.
+
+    Parameters
+    ----------
+    values : sequence or array of shape (n,)
+        Integers, or anything else that `as_stamp` converts; a ``DatetimeIndex`` of pandas too.
 
     Raises
     ------
     TypeError
-        If a value is not an integer. The usual mistake is a float of seconds: convert it with `from_seconds`.
+        If a value has another type. The usual mistake is a float of seconds: convert it with `from_seconds`.
     ValueError
-        If the shape is not (n,), or a value does not fit a signed 64-bit integer.
+        If the shape is not (n,), or a value is one that `as_stamp` refuses.
     """
     if isinstance(values, (list, tuple)):
         if set(map(type, values)) == {int}:
@@ -112,9 +166,40 @@ def as_stamps(values: npt.ArrayLike) -> npt.NDArray[np.int64]:
         array = np.asarray(values)
     if array.ndim != 1:
         raise ValueError(f"stamps must have shape (n,), got {array.shape}")
+    if array.dtype.kind == "M":
+        return _from_dates(array)
     if array.dtype.kind not in "iu" or array.dtype == np.uint64:
         return np.array([as_stamp(value) for value in array.tolist()], np.int64)
     return array.astype(np.int64, copy=False)
+
+
+def _from_date(date: datetime | np.datetime64) -> int:
+    # A Timestamp of pandas has nanoseconds, which its methods as a datetime cut off.
+    exact = getattr(date, "to_datetime64", None)
+    if isinstance(date, datetime) and exact is None:
+        if date.tzinfo is None:
+            raise ValueError(
+                f"{date!r} has no time zone: use .replace(tzinfo=datetime.UTC) if it is in UTC, or .astimezone() if it "
+                "is in local time"
+            )
+        return as_stamp((date - _EPOCH) // timedelta(microseconds=1) * 1_000)
+    return int(_from_dates(np.array([date if exact is None else exact()], "M8"))[0])
+
+
+def _from_dates(dates: npt.NDArray[Any]) -> Stamps:
+    """The stamps of an array of datetime64 of any unit."""
+    if np.isnat(dates).any():
+        raise ValueError("a stamp is a time, not NaT")
+    unit, count = np.datetime_data(dates.dtype)
+    ticks = dates.astype(np.int64)
+    if unit in _PARTS:
+        return np.array([tick * count // _PARTS[unit] for tick in ticks.tolist()], np.int64)
+    size = _UNITS.get(unit, 1) * count
+    beyond = np.abs(ticks) > STAMP_MAX // size
+    if beyond.any():
+        raise ValueError(f"{dates[beyond][0]!r} does not fit a stamp of 64-bit nanoseconds")
+    # Months and years have no fixed length.
+    return _from_dates(dates.astype("M8[D]")) if unit in ("Y", "M") else ticks * min(size, STAMP_MAX)
 
 
 def as_duration(seconds: float, name: str) -> float:
@@ -157,3 +242,10 @@ def format_duration(nanoseconds: int) -> str:
             digits = f"{nanoseconds / unit:.0f}" if size >= 100 * unit else f"{nanoseconds / unit:.3g}"
             return f"{digits} {name}"
     return f"{nanoseconds} ns"
+
+
+def format_age(nanoseconds: int) -> str:
+    """The text of an age: ``age 410 ms``; or ``2.5 s ahead``, if it is negative."""
+    if nanoseconds < 0:
+        return f"{format_duration(-nanoseconds)} ahead"
+    return f"age {format_duration(nanoseconds)}"

@@ -18,6 +18,11 @@ class BufferStatistics:
         Samples by their `Outcome`.
     waiting : int
         Lookups that wait now.
+    expired_ahead : int
+        Those of the expired samples whose frame had a newest stamp ahead of the clock: see `StampAhead`.
+    superseded : int
+        Those of the expired samples that came late, and name another parent than a newer sample that was published
+        before the buffer joined.
     looped : int
         Samples that formed a loop of parents at a past stamp, as late data can; they are among the samples above.
     """
@@ -27,6 +32,8 @@ class BufferStatistics:
     replaced: int
     expired: int
     waiting: int
+    expired_ahead: int = 0
+    superseded: int = 0
     looped: int = 0
 
 
@@ -85,6 +92,8 @@ class BusStatistics:
         Child frames that the bus knows now.
     buffers : tuple of BufferStatistics
     queues : tuple of QueueStatistics
+    ahead : int
+        Accepted samples whose stamps were more than `max_ahead` ahead of the clock.
     """
 
     samples: int
@@ -97,6 +106,7 @@ class BusStatistics:
     frames: int
     buffers: tuple[BufferStatistics, ...]
     queues: tuple[QueueStatistics, ...]
+    ahead: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,15 +6,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import any_samples, moving, newest_samples, static
 
-from tfbus import InvalidTransformError, TransformStamped
+from tfbus import InvalidTransformError, SimulatedClock, TransformStamped
 from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._ownership import OnConflict, Ownership
+from tfbus.bus._plausibility import Plausibility
 from tfbus.bus._topology import Topology
+from tfbus.geometry.bounds import MAX_TRANSLATION
 
 
 def topology(*batches: Sequence[TransformStamped], on_conflict: OnConflict = "last") -> Topology:
-    made = Topology(OnceLogger(logging.getLogger("tfbus")), Ownership(on_conflict), Announcer(lambda: 0))
+    made = Topology(
+        OnceLogger(logging.getLogger("tfbus")),
+        Ownership(on_conflict),
+        Plausibility(SimulatedClock(), MAX_TRANSLATION, 1.0, reject_ahead=False),
+        Announcer(lambda: 0),
+        lambda frame: made.remove(frame),
+    )
     for batch in batches:
         made.accept(tuple(batch), "raise")
     return made

@@ -282,3 +282,23 @@ def test_owning_reserves_nothing_before_the_block_is_entered() -> None:
     block = TransformBroadcaster(bus, "arm").owning("tool0")
     with bus.reserve("tool0", "other"), pytest.raises(InvalidTransformError), block:
         pytest.fail("the block began")
+
+
+def test_a_broadcaster_that_drops_goes_on_whatever_edges_others_publish(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(SimulatedClock())
+    TransformBroadcaster(bus, "stranger").send("base", "map", Transform())
+    robot = TransformBroadcaster(bus, "robot", invalid="drop")
+    for _ in range(3):
+        robot.send("map", "base", Transform())
+        robot.send_static("map", "base", Transform())
+        robot.send_all([("map", "base", Transform()), ("base", "arm", Transform())])
+    assert bus.statistics().rejected == {"cycle": 9}
+    assert bus.statistics().frames == 2
+    assert [message for message in caplog.messages if "dropped" in message] == [
+        "dropped a sample: the edge 'map' -> 'base' would close a loop of parents: base -> map -> base, "
+        "with edges from 'stranger'"
+    ]
+    with pytest.raises(InvalidTransformError, match="frame name"):
+        robot.send("/map", "base", Transform())
+    with pytest.raises(ValueError, match="invalid must be 'raise' or 'drop', not 'ignore'"):
+        TransformBroadcaster(bus, invalid="ignore")  # type: ignore[arg-type]

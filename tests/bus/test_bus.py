@@ -13,6 +13,7 @@ from support.samples import moving, static
 
 from tfbus import (
     Buffer,
+    BufferStatistics,
     Bus,
     BusClosedError,
     FutureExtrapolationError,
@@ -554,10 +555,11 @@ def test_statistics_count_everything_on_the_bus() -> None:
             "clock_resets": 0,
             "callbacks_failed": 0,
             "frames": 2,
-            "buffers": ({"offered": 3, "inserted": 3, "replaced": 0, "expired": 0, "waiting": 0, "looped": 0},),
+            "buffers": (asdict(BufferStatistics(offered=3, inserted=3, replaced=0, expired=0, waiting=0)),),
             "queues": (
                 {"kind": "stream", "overflow": "conflate", "capacity": 7, "pending": 2, "dropped": 0, "conflated": 0},
             ),
+            "ahead": 0,
         }
     buffer.close()
     assert bus.statistics().buffers == ()

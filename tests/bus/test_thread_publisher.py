@@ -11,7 +11,17 @@ from support.asking import Asked, settle
 from support.samples import moving, static
 from support.threads import threads_that
 
-from tfbus import LATEST, Buffer, Bus, BusClosedError, PointStamped, SimulatedClock, ThreadPublisher, TransformStamped
+from tfbus import (
+    LATEST,
+    Buffer,
+    Bus,
+    BusClosedError,
+    InvalidTransformError,
+    PointStamped,
+    SimulatedClock,
+    ThreadPublisher,
+    TransformStamped,
+)
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
@@ -369,3 +379,17 @@ async def test_closing_from_another_thread_is_an_error_while_an_on_close_callbac
     registration.close()
     assert in_thread(buffer.close if closes == "buffer" else bus.close) == []
     assert calls == []
+
+
+async def test_a_thread_hears_of_a_translation_that_is_too_long_and_a_stamp_ahead_is_counted() -> None:
+    bus = Bus(SimulatedClock(1), max_translation=10.0, reject_ahead=True)
+    with bus.threadsafe() as publish:
+
+        def drive() -> None:
+            publish(moving("a", "b", 1, 10.0))
+            with pytest.raises(InvalidTransformError, match="not physical"):
+                publish([moving("a", "b", 2), moving("a", "b", 3, 11.0)])
+            publish(moving("a", "b", 3_600_000_000_000))
+
+        await anyio.to_thread.run_sync(drive)
+    assert (bus.statistics().samples, bus.statistics().rejected) == (1, {"ahead": 1})

@@ -98,6 +98,6 @@ async def test_a_broadcaster_that_the_bus_rejects_logs_it_once_and_goes_on(
         await simulate(clock, robot)
         assert buffer.lookup_nowait("base_link", "base_laser").transform == tutorial.BASE_FROM_LASER
     assert [record.getMessage() for record in caplog.records] == [
-        "not sent: the edge 'base_link' -> 'base_laser' would close a loop of parents: "
+        "dropped a sample: the edge 'base_link' -> 'base_laser' would close a loop of parents: "
         "base_laser -> base_link -> base_laser, with edges from 'intruder'"
     ]

@@ -1,4 +1,5 @@
 import copy
+import json
 import pickle
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
@@ -15,6 +16,7 @@ COPIES = [
     pytest.param(copy.deepcopy, id="deepcopy"),
     pytest.param(lambda data: pickle.loads(pickle.dumps(data)), id="pickle"),
     pytest.param(lambda data: replace(data, stamp=data.stamp), id="replace"),
+    pytest.param(lambda data: type(data).from_dict(json.loads(json.dumps(data.to_dict(), allow_nan=False))), id="JSON"),
 ]
 
 OWNERS = [data for data in HOLDERS if isinstance(data, (Polygon, PoseWithCovarianceStamped))]

@@ -1,6 +1,6 @@
 import copy
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, assert_type
 
 import numpy as np
 import pytest
@@ -147,3 +147,8 @@ class Landmark(PointStamped):
 def test_a_subclass_is_transformed_as_its_base_class() -> None:
     moved = do_transform(Landmark("B", 0, (1.0, 2.0, 3.0)), ANSWER)
     assert moved.point == pytest.approx((-9.0, 18.0, 27.0), abs=1e-13)
+
+
+def test_type_checkers_see_the_type_that_was_given() -> None:
+    assert_type(do_transform(PointStamped("B", 0, (1.0, 2.0, 3.0)), ANSWER), PointStamped)
+    assert_type(do_transform(PointCloud("B", 0, np.zeros((1, 3))), ANSWER), PointCloud)

@@ -56,7 +56,7 @@ def test_a_polygon_may_have_no_corners() -> None:
 @given(transforms(), vectors(), vectors())
 def test_a_vector_is_the_difference_of_two_points(t: Transform, p: Vector, q: Vector) -> None:
     def moved(point: Vector) -> Vector:
-        return do_transform(PointStamped("B", 0, point), sample).point  # type: ignore[no-any-return]
+        return do_transform(PointStamped("B", 0, point), sample).point
 
     sample = TransformStamped("A", "B", 0, t)
     vector = Vector3Stamped("B", 0, tuple(np.subtract(q, p)))

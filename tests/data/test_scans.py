@@ -208,3 +208,8 @@ def test_ranges_that_are_no_numbers_are_refused() -> None:
 def test_one_ray_needs_no_increment() -> None:
     scan = LaserScan("sonar", 0, np.array([2.0]), angle_min=math.pi / 2, angle_increment=0.0)
     np.testing.assert_allclose(scan.to_points().points, [(0.0, 2.0, 0.0)], atol=1e-15)
+
+
+def test_only_frame_stamp_and_ranges_are_positional() -> None:
+    with pytest.raises(TypeError):
+        LaserScan("laser", 0, [1.0], 0.0, angle_min=0.0, angle_increment=0.1)  # type: ignore[misc, arg-type]

@@ -1,4 +1,5 @@
 import copy
+import json
 import pickle
 from collections.abc import Iterator
 from typing import Any
@@ -9,7 +10,8 @@ from hypothesis import given
 from support.strategies import samples
 
 from tfbus import LATEST, InvalidTransformError, Transform, TransformStamped
-from tfbus.geometry.stamped import as_batch
+from tfbus.geometry.rows import IDENTITY
+from tfbus.geometry.stamped import as_batch, qualified_answer
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MOVE = Transform((1.0, 2.0, 3.0))
@@ -170,3 +172,22 @@ def test_other_values_than_a_batch_are_a_type_error_that_shows_them(samples: Any
 def test_an_element_of_a_batch_that_is_no_sample_is_a_type_error(bad: Any) -> None:
     with pytest.raises(TypeError, match="expected a TransformStamped"):
         as_batch([FIRST, bad])
+
+
+@given(samples())
+def test_a_sample_comes_back_from_json(sample: TransformStamped) -> None:
+    data = json.loads(json.dumps(sample.to_dict()))
+    assert data["type"] == "TransformStamped"
+    assert type(data["stamp"]) is int
+    assert TransformStamped.from_dict(data) == sample
+
+
+def test_an_answer_with_a_policy_comes_back_with_its_use_of_the_policy() -> None:
+    answer = qualified_answer("map", "base", 5, IDENTITY, False, 3, 4)
+    data = json.loads(json.dumps(answer.to_dict()))
+    back = TransformStamped.from_dict(data)
+    assert back == answer
+    assert (back.extrapolated_by, back.gap) == (3, 4)
+    for wrong in ({"gap": None}, {"extrapolated_by": "3"}, {"more": 1}, {"stamp": 0.5}, {"parent": "/map"}):
+        with pytest.raises(ValueError, match=r"gap|extrapolated_by|more|stamp|/map"):
+            TransformStamped.from_dict({**data, **wrong})

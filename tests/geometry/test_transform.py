@@ -1,4 +1,5 @@
 import copy
+import json
 import math
 import pickle
 from collections.abc import Sequence
@@ -481,3 +482,16 @@ def test_a_transform_pickles_and_copies() -> None:
     for protocol in range(2, pickle.HIGHEST_PROTOCOL + 1):
         assert pickle.loads(pickle.dumps(t, protocol)) == t
     assert copy.copy(t) == copy.deepcopy(t) == t
+
+
+@given(transforms())
+def test_a_transform_comes_back_from_json_to_the_last_bit(a: Transform) -> None:
+    assert Transform.from_dict(json.loads(json.dumps(a.to_dict()))) == a
+
+
+def test_the_plain_data_of_a_transform_are_two_lists() -> None:
+    data = {"translation": [1.0, 2.0, 3.0], "rotation": [0.0, 0.0, 0.0, 1.0]}
+    assert Transform((1, 2, 3)).to_dict() == data
+    for wrong in ({"rotation": [0.0, 0.0, 1.0]}, {"rotation": [0.0] * 4}, {"translation": "123"}, {"stamp": 1}):
+        with pytest.raises(ValueError, match=r"rotation|translation|stamp"):
+            Transform.from_dict({**data, **wrong})

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from support.samples import over, tree_of
 from support.strategies import rotations, transforms, vectors
 
-from tfbus import InvalidTransformError, Transform, TransformArray
+from tfbus import SECOND, InvalidTransformError, Transform, TransformArray
 from tfbus.geometry.rows import Quaternion, Vector
 from tfbus.tree._lookup_many import ONE_BY_ONE
 
@@ -303,3 +303,118 @@ def test_transforms_compose_with_transforms_only(other: Any) -> None:
     for a, b in ((ahead(1.0, 2.0), other), (other, ahead(1.0, 2.0))):
         with pytest.raises(TypeError):
             operator.matmul(a, b)
+
+
+# Stamps
+
+
+def test_stamps_are_kept_with_their_transforms() -> None:
+    days = np.array(["1970-01-01", "1970-01-02", "1970-01-03"], "M8[D]")
+    steps = TransformArray(np.eye(3), [ONE] * 3, days)
+    day = 86_400 * SECOND
+    assert steps.stamps is not None
+    assert steps.stamps.tolist() == [0, day, 2 * day]
+    kept = {
+        "slice": (steps[::2], [0, 2 * day]),
+        "mask": (steps[[False, True, True]], [day, 2 * day]),
+        "indices": (steps[[2, 0]], [2 * day, 0]),
+        "inverse": (steps.inverse(), [0, day, 2 * day]),
+        "with one": (steps @ Transform(), [0, day, 2 * day]),
+        "one with": (Transform() @ steps, [0, day, 2 * day]),
+        "with itself": (steps @ steps, [0, day, 2 * day]),
+        "with none": (steps @ ahead(0.0, 1.0, 2.0), [0, day, 2 * day]),
+        "none with": (ahead(0.0, 1.0, 2.0) @ steps, [0, day, 2 * day]),
+        "pickle": (pickle.loads(pickle.dumps(steps)), [0, day, 2 * day]),
+    }
+    for name, (some, expected) in kept.items():
+        assert some.stamps is not None, name
+        assert some.stamps.tolist() == expected, name
+
+
+def test_a_product_of_different_stamps_has_none() -> None:
+    one, other = (TransformArray([[0, 0, 0]], [ONE], [stamp]) for stamp in (1, 2))
+    assert (one @ other).stamps is None
+    assert ahead(1.0).stamps is None
+    assert (ahead(1.0) @ ahead(1.0)).stamps is None
+
+
+def test_stamps_cannot_be_changed() -> None:
+    given_stamps = np.array([1, 2])
+    steps = TransformArray(np.zeros((2, 3)), [ONE] * 2, given_stamps)
+    given_stamps[:] = 7
+    for some in (steps, steps[:1], steps[[0]], copy.deepcopy(steps)):
+        assert some.stamps is not None
+        assert some.stamps[0] == 1
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            some.stamps.flags.writeable = True
+
+
+@pytest.mark.parametrize("stamps", [[], [1], [1, 2, 3]])
+def test_there_is_one_stamp_for_each_transform(stamps: list[int]) -> None:
+    with pytest.raises(ValueError, match=rf"{len(stamps)} stamps for 2 transforms"):
+        TransformArray(np.zeros((2, 3)), [ONE] * 2, stamps)
+
+
+def test_the_repr_has_the_span_and_the_number_of_missing_transforms() -> None:
+    steps = TransformArray(np.zeros((2, 3)), [ONE] * 2, [2 * SECOND, SECOND])
+    assert repr(steps) == "<TransformArray of 2 from 1.000 s to 2.000 s>"
+    assert repr(steps[:0]) == "<TransformArray of 0>"
+    assert repr(ahead(math.nan, 0.0, math.nan)) == "<TransformArray of 3, 2 are NaN>"
+
+
+# Conversions
+
+
+@given(
+    st.lists(
+        st.one_of(
+            transforms(),
+            st.builds(
+                lambda roll, pitch, yaw: Transform.from_xyz_rpy((0, 0, 0), (roll, pitch, yaw)),
+                st.floats(-4.0, 4.0),
+                st.sampled_from((math.pi / 2, -math.pi / 2)),
+                st.floats(-4.0, 4.0),
+            ),
+        ),
+        max_size=5,
+    )
+)
+def test_wxyz_and_rpy_are_those_of_each_transform(poses: list[Transform]) -> None:
+    steps = array_of(poses)
+    assert steps.as_wxyz().tolist() == [list(pose.as_wxyz()) for pose in poses]
+    expected = np.reshape([pose.as_rpy() for pose in poses], (-1, 3))
+    np.testing.assert_allclose(steps.as_rpy(), expected, rtol=0, atol=4e-15)
+
+
+def test_a_missing_transform_has_no_angles() -> None:
+    assert np.isnan(ahead(math.nan, 0.0).as_rpy()).tolist() == [[True] * 3, [False] * 3]
+
+
+def test_rotations_go_to_scipy_and_back() -> None:
+    pytest.importorskip("scipy")
+    turn = Transform((1.0, 2.0, 3.0), (0.1, -0.7, 0.1, -0.7))
+    steps = TransformArray([turn.translation] * 2, [turn.rotation] * 2, [1, 2])
+    back = TransformArray.from_scipy(steps.translations, steps.as_scipy(), steps.stamps)
+    assert_close(back, [turn, turn])
+    assert back.stamps is not None
+    assert back.stamps.tolist() == [1, 2]
+    np.testing.assert_allclose(steps.as_scipy().apply([1, 2, 3])[1], steps[1].apply(np.array([1, 2, 3])) - [1, 2, 3])
+    assert Transform.from_scipy(turn.translation, turn.as_scipy()).is_close(turn)
+    np.testing.assert_allclose(turn.as_scipy().as_matrix(), turn.matrix()[:3, :3], rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match="transform 1 is NaN"):
+        ahead(0.0, math.nan).as_scipy()
+
+
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_data_frame_has_a_row_for_each_transform(library: str) -> None:
+    pytest.importorskip(library)
+    frame = TransformArray([[1, 2, 3], [4, 5, 6]], [ONE, HALF_TURN_ABOUT_Z], [10, 20]).to_dataframe(library)
+    assert type(frame).__module__.startswith(library)
+    assert list(frame.columns) == ["stamp_ns", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+    assert frame.to_numpy().tolist() == [[10, 1, 2, 3, 0, 0, 0, 1], [20, 4, 5, 6, 0, 0, 1, 0]]
+    assert list(ahead(0.0).to_dataframe(library).columns) == ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+
+
+def test_a_data_frame_is_of_pandas_or_polars() -> None:
+    with pytest.raises(ValueError, match="'pandas' or 'polars', not 'os'"):
+        ahead(0.0).to_dataframe("os")

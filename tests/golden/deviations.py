@@ -22,6 +22,7 @@ DEVIATIONS = {
     "norm of 1 %": Deviation("design", "the tolerance is 1 % of the norm; ROS 1's is 1 % of its square"),
     "tiny turn": Deviation("design", "an answer is good to 1e-9 rad however little a frame has turned"),
     "infinity": Deviation("design", "infinity comes out of a later lookup as NaN, so it is refused as NaN is"),
+    "not physical": Deviation("design", "a longer translation is no measurement, and a chain of them is infinite"),
     "slash": Deviation("design", "a name is taken as it is or refused, never changed"),
     "reserved name": Deviation("design", "NO_PARENT is a name like any other"),
     "cycle": Deviation("design", "a loop of parents is refused, so that its sender hears of it"),

@@ -1,6 +1,7 @@
 """The demos as a user runs them."""
 
 import cmath
+import json
 import math
 import re
 import runpy
@@ -16,6 +17,7 @@ import httpx
 import pytest
 from support.processes import new_domain
 from support.programs import Program
+from websockets.sync.client import connect
 
 from tfbus import SimulatedClock
 from tfbus.cli import tutorial
@@ -326,48 +328,81 @@ def server() -> Iterator[str]:
             for line in process.stderr:
                 if "startup complete" in line:
                     break
-            yield f"http://127.0.0.1:{listener.getsockname()[1]}/transforms"
+            yield f"127.0.0.1:{listener.getsockname()[1]}"
             process.terminate()
             log = process.communicate(timeout=30)[1]
             assert "Traceback" not in log
             assert "shutdown complete" in log
 
 
-def get(url: str) -> httpx.Response:
-    return httpx.get(url, timeout=30, trust_env=False)
+def get(path: str) -> httpx.Response:
+    return httpx.get(f"http://{path}", timeout=30, trust_env=False)
+
+
+def is_on_its_circle(answer: dict[str, Any]) -> bool:
+    x, y, _ = answer["transform"]["translation"]
+    return math.hypot(x, y) == pytest.approx(1.0)
 
 
 def test_the_web_application_answers_a_transform_as_json(server: str) -> None:
-    response = get(f"{server}/map/base_link")
+    response = get(f"{server}/transforms/map/base_link")
     assert response.status_code == 200
     answer = response.json()
-    x, y, z = answer["translation"]
-    qx, qy, qz, qw = answer["rotation"]
-    assert x * x + y * y == pytest.approx(1.0)
+    assert is_on_its_circle(answer)
+    x, y, z = answer["transform"]["translation"]
+    qx, qy, qz, qw = answer["transform"]["rotation"]
     # The robot looks along its circle, a quarter turn ahead of where it stands.
     assert (2 * qw * qz, 1 - 2 * qz * qz) == pytest.approx((x, -y))
     assert (z, qx, qy) == (0, 0, 0)
 
 
+def test_the_web_application_streams_changes_as_events(server: str) -> None:
+    with httpx.stream("GET", f"http://{server}/changes/map/base_link", timeout=30, trust_env=False) as response:
+        assert response.headers["content-type"].startswith("text/event-stream")
+        lines = [line for line, _ in zip(response.iter_lines(), range(4), strict=False)]
+    assert lines[1] == lines[3] == ""
+    first, second = (json.loads(line.removeprefix("data: ")) for line in (lines[0], lines[2]))
+    assert is_on_its_circle(first)
+    assert is_on_its_circle(second)
+    assert first["stamp"] < second["stamp"]
+
+
+def test_the_web_application_streams_poses_to_a_socket(server: str) -> None:
+    with connect(f"ws://{server}/poses/map/base_link", proxy=None) as poses:
+        first, second = (json.loads(poses.recv(timeout=30)) for _ in range(2))
+    assert is_on_its_circle(first)
+    assert is_on_its_circle(second)
+    assert first["stamp"] < second["stamp"]
+
+
+def test_the_web_application_has_a_page_and_shows_the_tree(server: str) -> None:
+    assert get(server).headers["content-type"].startswith("text/html")
+    assert [line.split()[-1] for line in get(f"{server}/tree").text.splitlines()] == [
+        "map",
+        "'odometry'",
+        "'calibration'",
+    ]
+
+
 def test_the_web_application_waits_for_a_transform_of_the_future(server: str) -> None:
-    stamp = get(f"{server}/map/base_link").json()["stamp"] + 200_000_000
-    response = get(f"{server}/map/base_link?at={stamp}&timeout=10")
+    stamp = get(f"{server}/transforms/map/base_link").json()["stamp"] + 200_000_000
+    response = get(f"{server}/transforms/map/base_link?at={stamp}&timeout=10")
     assert (response.status_code, response.json()["stamp"]) == (200, stamp)
 
 
 def test_the_web_application_says_504_when_the_time_is_up(server: str) -> None:
-    stamp = get(f"{server}/map/base_link").json()["stamp"] + 3_600_000_000_000
-    response = get(f"{server}/map/base_link?at={stamp}&timeout=0.1")
+    stamp = get(f"{server}/transforms/map/base_link").json()["stamp"] + 3_600_000_000_000
+    response = get(f"{server}/transforms/map/base_link?at={stamp}&timeout=0.1")
     assert response.status_code == 504
     assert re.search(r"frame 'base_link': asked for .* short\), from 'odometry'", response.json()["error"])
 
 
 def test_the_web_application_says_404_with_close_matches_for_an_unknown_frame(server: str) -> None:
-    response = get(f"{server}/map/base_lnk?timeout=0.1")
+    response = get(f"{server}/transforms/map/base_lnk?timeout=0.1")
     assert response.status_code == 404
     assert response.json()["close_matches"] == ["base_link"]
 
 
 @pytest.mark.parametrize("question", ["at=5", "at=1.5", "timeout=-1", "timeout=nan", "at=99999999999999999999"])
 def test_the_web_application_says_400_for_a_question_without_an_answer(server: str, question: str) -> None:
-    assert get(f"{server}/map/base_link?{question}").status_code == 400
+    assert get(f"{server}/transforms/map/base_link?{question}").status_code == 400

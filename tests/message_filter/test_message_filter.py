@@ -1343,3 +1343,29 @@ async def test_a_message_is_dropped_when_a_target_that_it_does_not_wait_for_yet_
         bus.publish(driving("laser", "arm", 11))
         await settle()
         assert (pairs.pending, pairs.dropped) == (0, {"too old": 1})
+
+
+async def test_a_message_of_a_frame_that_is_ahead_is_dropped_and_the_error_says_why(streams: Streams) -> None:
+    send, receive = streams
+    bus = Bus(SimulatedClock(100 * SECOND))
+    drops = DroppedMessages()
+    bus.publish(moving("map", "laser", 3700 * SECOND, authority="peer"))
+    async with MessageFilter(receive, Buffer(bus), "map", on_drop=drops) as pairs:
+        bus.publish(moving("map", "laser", 3700 * SECOND, authority="peer"))
+        await send.send(Scan(100 * SECOND))
+        await settle()
+        assert pairs.dropped == {"too old": 1}
+    (_, _, error) = drops.all[0]
+    assert isinstance(error, PastExtrapolationError)
+    assert error.ahead == 3600 * SECOND
+
+
+async def test_a_filter_of_a_buffer_that_joined_late_gives_no_pair_by_an_old_parent(streams: Streams) -> None:
+    send, receive = streams
+    bus = Bus(SimulatedClock(100 * SECOND))
+    bus.publish(moving("map", "laser", 95 * SECOND))
+    async with MessageFilter(receive, Buffer(bus), "map") as pairs:
+        bus.publish([moving("old", "laser", 94 * SECOND), static("map", "old")])
+        await send.send(Scan(94 * SECOND))
+        await settle()
+        assert (pairs.pending, pairs.delivered) == (1, 0)

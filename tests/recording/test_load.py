@@ -207,3 +207,16 @@ def test_a_lookup_in_a_loaded_tree_is_not_stale_after_the_shape_has_changed(tmp_
     assert tree.parent("b", 7) == "z"
     forest = forest_of(tree)
     assert (forest.changed, forest.new_parents) == (set(), set())
+
+
+def test_a_translation_that_is_not_physical_is_left_out_unless_the_bound_is_raised(tmp_path: Path) -> None:
+    far = moving("map", "a", 2, 1e13)
+    lines = [(1, "/tf", [moving("map", "a", 1), far]), (3, "/tf", [moving("map", "a", 3, -1e13)])]
+    path = write_mcap(tmp_path / "run.mcap", lines)
+    problems: Counter[str] = Counter()
+    assert load(path, problems=problems).edges()[0].samples == 1
+    assert problems == {"not physical": 2}
+    wide = load(path, problems=problems, max_translation=1e13)
+    assert (wide.edges()[0].samples, wide.max_translation) == (3, 1e13)
+    with pytest.raises(ValueError, match="max_translation"):
+        load(path, max_translation=0.0)

@@ -29,6 +29,7 @@ from tfbus import (
     FrameRemoved,
     RecordingError,
     SimulatedClock,
+    SystemClock,
 )
 from tfbus.bus.sample_queue import TimedBatch
 from tfbus.geometry.stamped import Batch
@@ -679,3 +680,11 @@ def test_play_continues_where_seek_says_at_any_time(
             assert heard.entries == expected
 
     run(play)
+
+
+async def test_recorded_stamps_are_not_compared_with_the_clock(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", (1, (moving("map", "base", 2 * 10**18, 1.0),)))
+    for clock in (SimulatedClock(5), SystemClock()):
+        bus = Bus(clock, reject_ahead=True)
+        await Player(bus, path, rate=math.inf).play()
+        assert (bus.statistics().samples, bus.statistics().rejected) == (1, {})

@@ -250,3 +250,17 @@ def test_the_grippers_of_a_pr2_are_where_the_recorded_transforms_of_the_real_rob
         if name in limits and np.clip(position, *limits[name]) != position
     ]
     assert counted.violations == Counter(beyond) != {}
+
+
+def test_a_publisher_that_drops_goes_on_whatever_edges_others_publish() -> None:
+    bus = Bus(SimulatedClock())
+    model = RobotModel(
+        "r", ("base", "a", "b"), (Joint("fix", "fixed", "base", "a"), Joint("turn", "revolute", "a", "b"))
+    )
+    bus.publish(static("a", "base", authority="stranger"))
+    with pytest.raises(InvalidTransformError):
+        RobotStatePublisher(bus, model)
+    robot = RobotStatePublisher(bus, model, invalid="drop")
+    bus.publish(static("b", "a", authority="stranger"))
+    robot.publish({"turn": 0.5})
+    assert bus.statistics().rejected == {"cycle": 3}

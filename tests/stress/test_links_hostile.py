@@ -211,7 +211,7 @@ class Flood(threading.Thread):
         try:
             # What is sent before the victim's subscription has arrived here reaches nobody.
             live = self.session.declare_publisher(f"{self.prefix}/live/{'f' * 32}")
-            while not live.matching_status.matching:
+            while not live.matching_status.matching:  # type: ignore[attr-defined]
                 time.sleep(0.01)
             for number in range(200):
                 self.send(number)

@@ -14,14 +14,15 @@ from tfbus.errors import (
     MAY_COME,
     BusClosedError,
     ClockResetError,
+    ExtrapolationError,
     LookupTimeoutError,
     TransformLookupError,
     UnknownFrameError,
 )
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import LATEST, Latest, as_duration, from_seconds
-from tfbus.tree.lookup import answer
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from_seconds
+from tfbus.tree.lookup import Bounds, answer
 from tfbus.tree.question import Question
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import Waiter, without_traceback
@@ -37,6 +38,8 @@ class Lookups:
         The clock of timeouts and ages.
     check_thread : callable
         Raises unless the calling thread may wait here.
+    newest_plausible : callable
+        Gives the greatest stamp, in ns, that is not ahead of the clock now.
     local_names : LocalNames, optional
         Translates the answers. Questions, errors and log lines have the names of the bus.
     """
@@ -46,37 +49,49 @@ class Lookups:
         live: LiveTree,
         clock: Clock,
         check_thread: Callable[[], object],
+        newest_plausible: Callable[[], int],
         local_names: LocalNames | None = None,
     ) -> None:
         self._live = live
         self._clock = clock
         self._check_thread = check_thread
+        self._newest_plausible = newest_plausible
         self._local_names = local_names
         self._report = HangingReport(live.waiting, clock)
 
-    def not_before(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> int | None:
-        """The oldest stamp that counts as `LATEST` now, in ns; None for any."""
+    def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
+        """The stamps that count as `LATEST` now; None for any."""
         if at is not LATEST and source_at is not LATEST:
             raise TypeError("max_age goes with LATEST: an answer at a given stamp never gets newer")
         if as_duration(max_age, "max_age") == math.inf:
             return None
-        return self._clock.now() - from_seconds(max_age)
+        now, age = self._clock.now(), from_seconds(max_age)
+        return Bounds(max(now - age, STAMP_MIN), min(now + age, STAMP_MAX))
+
+    def note_ahead(self, error: ExtrapolationError) -> None:
+        """Write into an error by how much the newest stamp of its edge is ahead of the clock."""
+        if error.newest is not None and error.newest > self._newest_plausible():
+            error.ahead = error.newest - self._clock.now()
 
     def lookup_nowait(self, question: Question) -> TransformStamped:
         """The answer, or an error at once."""
-        not_before = None
+        bounds = None
         if question.max_age is not None:
-            not_before = self.not_before(question.max_age, question.at, question.source_at)
-        found = answer(
-            self._live.forest,
-            question.target,
-            question.source,
-            question.at,
-            question.source_at,
-            question.fixed,
-            not_before,
-            question.policy,
-        )
+            bounds = self.bounds(question.max_age, question.at, question.source_at)
+        try:
+            found = answer(
+                self._live.forest,
+                question.target,
+                question.source,
+                question.at,
+                question.source_at,
+                question.fixed,
+                bounds,
+                question.policy,
+            )
+        except ExtrapolationError as error:
+            self.note_ahead(error)
+            raise
         return found if self._local_names is None else self._local_names.answer(found)
 
     async def lookup(

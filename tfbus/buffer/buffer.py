@@ -9,7 +9,7 @@ from tfbus.buffer._waiting_lookup import Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
 from tfbus.data import Stamped, do_transform
-from tfbus.errors import TransformLookupError
+from tfbus.errors import ExtrapolationError, TransformLookupError
 from tfbus.frames import as_prefix
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
@@ -36,7 +36,9 @@ class Buffer:
     Parameters
     ----------
     bus : Bus
-        It fills the buffer from now on, first with the latched samples, and holds it until `close`.
+        It fills the buffer from now on, first with the latched samples, and holds it until `close`. A late sample that
+        names another parent than a newer one from before the buffer joined is left out, and counted as `superseded`:
+        it would be taken for the newest.
     keep : float or None
         Length of the history of each frame, in s before that frame's newest stamp; None keeps everything. A late
         sample then costs more the longer the history is, because all samples after it are moved: in the middle of a
@@ -50,7 +52,8 @@ class Buffer:
         Start with a copy of its history, as far as `keep` reaches. With a buffer of the same bus, this one then answers
         as if it had been there from the beginning. Otherwise the latched samples of this bus are added, and the stamps
         of both must be of the same time: a sample older than its window expires. A closed buffer still has the frames
-        that were removed after it was closed.
+        that were removed after it was closed. Where the prefill contradicts the bus, the bus is right: a frame with
+        another newest parent, or one that would close a loop with newest edges of the bus, is left out or removed.
 
     Raises
     ------
@@ -92,9 +95,9 @@ class Buffer:
                 raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
             bus._check_thread()
             self._forest = forest_of(tree).copy_within(window)
-        self._tree = tree_of(self._forest, keep)
+        self._tree = tree_of(self._forest, keep, bus.max_translation)
         self._live = LiveTree(self._forest, bus._announce_past_loop)
-        self._lookups = Lookups(self._live, bus.clock, bus._check_thread, self._local_names)
+        self._lookups = Lookups(self._live, bus.clock, bus._check_thread, bus._newest_plausible, self._local_names)
         bus._attach(self._live)
 
     @property
@@ -123,7 +126,8 @@ class Buffer:
         at : int or LATEST
             ns.
         max_age : float, optional
-            Count a `LATEST` answer older than this many s as not yet arrived.
+            Count a `LATEST` answer older than this many s as not yet arrived, and refuse one that is further ahead of
+            the clock.
         source_at, fixed, tolerance, max_gap, extrapolate
             As `TransformTree.lookup`.
 
@@ -132,21 +136,25 @@ class Buffer:
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
         """
-        not_before = None if max_age is None else self._lookups.not_before(max_age, at, source_at)
+        bounds = None if max_age is None else self._lookups.bounds(max_age, at, source_at)
         names = self._local_names
         policy = None
         if tolerance == 0.0 and max_gap is None and extrapolate is None:
-            if names is None and source_at is None and fixed is None and not_before is None:
+            if names is None and source_at is None and fixed is None and bounds is None:
                 # Nearly all questions are plain, and a call on the way costs a fifth of the answer.
                 plain = self._forest.paths.answer(target, source, at)
                 if plain is not None:
                     return plain
         else:
             policy = policy_of(tolerance, max_gap, extrapolate)
-        if names is None:
-            return answer(self._forest, target, source, at, source_at, fixed, not_before, policy)
-        via = None if fixed is None else names.on_bus(fixed)
-        found = answer(self._forest, names.on_bus(target), names.on_bus(source), at, source_at, via, not_before, policy)
+        try:
+            if names is None:
+                return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
+            via = None if fixed is None else names.on_bus(fixed)
+            found = answer(self._forest, names.on_bus(target), names.on_bus(source), at, source_at, via, bounds, policy)
+        except ExtrapolationError as error:
+            self._lookups.note_ahead(error)
+            raise
         # Not `names.answer`, which costs a fifth of this lookup: the local names are at hand.
         return renamed(found, target, source)
 
@@ -179,7 +187,7 @@ class Buffer:
             In s on the bus's clock; None waits for ever.
         max_age : float, optional
             Count a `LATEST` answer older than this many s as not yet arrived, so that a dead broadcaster cannot
-            answer for ever.
+            answer for ever; and refuse one that is further ahead of the clock, which would answer as long.
         source_at : int or LATEST, optional
             Take source at this stamp instead, and carry it to `at` through `fixed`.
         fixed : str, optional
@@ -200,6 +208,8 @@ class Buffer:
             If it is older than an edge's window.
         GapError
             If the stamp lies in a gap that is too long.
+        AheadError
+            If the answer is further ahead of the clock than `max_age`.
         BusClosedError
             If there is no answer and no more samples will come.
         ClockResetError
@@ -265,8 +275,7 @@ class Buffer:
             As `lookup`.
         """
         question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
-        moved: DataT = do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
-        return moved
+        return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
 
     def transform_nowait(
         self,
@@ -290,8 +299,7 @@ class Buffer:
             As `transform`.
         """
         question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
-        moved: DataT = do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
-        return moved
+        return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
 
     def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
         """Whether `lookup_nowait` with the same arguments has an answer now."""
@@ -332,7 +340,8 @@ class Buffer:
         max_rate : float, optional
             Give no more than this many answers per s on the bus's clock. Only the last, after the end, may come sooner.
         max_age : float, optional
-            Ignore answers that are older than this many s. An answer that was given is not withdrawn when it gets old.
+            Ignore answers that are older than this many s, or further ahead of the clock. An answer that was given is
+            not withdrawn when it gets old.
         tolerance, max_gap, extrapolate
             As `lookup`.
 
@@ -379,16 +388,21 @@ class Buffer:
         See `TransformTree.explain`; ages are counted from the clock's now.
         """
         asked = self._on_bus(Question(target, source, at))
+        bounds = None if max_age is None else self._lookups.bounds(max_age, at, None)
         found = self.tree.explain(
             asked.target,
             asked.source,
             at,
-            not_before=None if max_age is None else self._lookups.not_before(max_age, at, None),
+            not_before=None if bounds is None else bounds.not_before,
+            not_after=None if bounds is None else bounds.not_after,
             tolerance=tolerance,
             max_gap=max_gap,
             extrapolate=extrapolate,
             now=self._clock.now(),
         )
+        for error in found.errors:
+            if isinstance(error, ExtrapolationError):
+                self._lookups.note_ahead(error)
         return found if self._local_names is None else self._local_names.explanation(found, target, source)
 
     def pending(self) -> tuple[PendingLookup, ...]:

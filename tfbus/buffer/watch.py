@@ -10,7 +10,7 @@ from tfbus._aio.one_reader import OneReader
 from tfbus.buffer._hanging_report import REPORT_AFTER
 from tfbus.buffer._waiting_lookup import Lookups
 from tfbus.clock import Clock
-from tfbus.errors import MAY_COME, ClockResetError, TransformLookupError, UnknownFrameError
+from tfbus.errors import MAY_COME, AheadError, ClockResetError, TransformLookupError, UnknownFrameError
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import SECOND, STAMP_MAX, is_real, to_seconds
@@ -18,6 +18,9 @@ from tfbus.tree.question import Question
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import Waiter, without_traceback
 from tfbus.waiting.watch_index import WatchState
+
+_NO_ANSWER = (*MAY_COME, AheadError)
+"""The errors that a later sample, or the same one later, may resolve."""
 
 
 class Watch:
@@ -47,7 +50,7 @@ class Watch:
             if not is_frame(name):
                 raise UnknownFrameError(frame=name, known=live.forest.known_frames())
         if question.max_age is not None:
-            lookups.not_before(question.max_age, question.at, question.source_at)
+            lookups.bounds(question.max_age, question.at, question.source_at)
         self.skipped = 0
         self._question = question
         self._min_translation = _threshold(min_translation, "min_translation", "m", math.inf)
@@ -67,7 +70,7 @@ class Watch:
         live.watching.add(self._state)
         try:
             self._update()
-        except MAY_COME:
+        except _NO_ANSWER:
             return
         # The reader has not seen this answer. It was looked up to count the updates from here on.
         self._state.outdated = True
@@ -114,7 +117,7 @@ class Watch:
                 continue
             try:
                 answer = self._update()
-            except MAY_COME as error:
+            except _NO_ANSWER as error:
                 blocker = without_traceback(error)
             else:
                 if self._is_change(answer):
@@ -134,7 +137,7 @@ class Watch:
         state.updates = 0
         try:
             answer = self._lookups.lookup_nowait(self._question)
-        except MAY_COME:
+        except _NO_ANSWER:
             self._live.watching.set_no_answer(state)
             raise
         self._live.watching.set_answer(state, self._live.forest, answer.stamp)

@@ -17,6 +17,7 @@ from tfbus.events import (
     PastLoop,
     Reparented,
     SampleRejected,
+    StampAhead,
 )
 from tfbus.statistics import QueueStatistics
 
@@ -29,8 +30,8 @@ class EventQueue:
 
     A conflict of authorities is given once for each frame and pair of them. From then on a new parent or kind of that
     frame is given once for each authority that claims it. A rejected sample is given once for each frame, authority and
-    reason, and a loop of parents in the past once for each frame, authority and parent. All of this begins anew when
-    the frame is removed or added, and when the clock jumps back.
+    reason; a stamp ahead of the clock, for each frame and authority; and a loop of parents in the past, for each frame,
+    authority and parent. All of this begins anew when the frame is removed or added, and when the clock jumps back.
 
     If one authority moves a frame to and fro, every move is an event, because that may be intended. If the queue is
     full, such a frame pushes out its own events and no others.
@@ -40,8 +41,8 @@ class EventQueue:
     capacity : int
         How many events may be pending, at least one; those of `known` and of `put_staleness` do not count,
         and are never dropped.
-    known : iterable of FrameAdded
-        An event for each frame that has a parent at the beginning.
+    known : iterable of FrameAdded or StampAhead
+        An event for each frame that has a parent at the beginning, and for each of them that is ahead of the clock.
 
     Attributes
     ----------
@@ -49,7 +50,7 @@ class EventQueue:
         Number of events lost to the capacity.
     """
 
-    def __init__(self, capacity: int, known: Iterable[FrameAdded] = ()) -> None:
+    def __init__(self, capacity: int, known: Iterable[FrameAdded | StampAhead] = ()) -> None:
         check_capacity(capacity)
         self.capacity = capacity
         self.dropped = 0
@@ -57,6 +58,8 @@ class EventQueue:
         self._events: deque[Event] = deque()
         self._conflicts: dict[str, SeenKeys] = {}
         self._refusals: dict[str | None, SeenKeys] = {}
+        for event in self._kept:
+            self._is_repetition(event)
 
     def __len__(self) -> int:
         return len(self._kept) + len(self._events)
@@ -102,10 +105,9 @@ class EventQueue:
         if isinstance(event, AuthorityConflict):
             seen = self._conflicts.setdefault(event.frame, SeenKeys(_CLAIMS))
             key = frozenset((event.authority, event.other))
-        elif isinstance(event, (SampleRejected, PastLoop)):
+        elif isinstance(event, (SampleRejected, StampAhead, PastLoop)):
             seen = self._refusals.setdefault(event.frame, SeenKeys(_CLAIMS))
-            of_what = event.reason if isinstance(event, SampleRejected) else event.parent
-            key = (type(event), event.authority, of_what)
+            key = (type(event), event.authority, _what(event))
             if len(self._refusals) > _REFUSED_FRAMES:
                 del self._refusals[next(iter(self._refusals))]
         elif isinstance(event, Reparented) and event.frame in self._conflicts:
@@ -117,3 +119,10 @@ class EventQueue:
         else:
             return False
         return not seen.add(key)
+
+
+def _what(event: SampleRejected | StampAhead | PastLoop) -> str | None:
+    """That of which an event tells once, beside its frame and authority."""
+    if isinstance(event, SampleRejected):
+        return event.reason
+    return event.parent if isinstance(event, PastLoop) else None

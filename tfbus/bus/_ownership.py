@@ -1,7 +1,9 @@
 """The right to publish a child: by reservation, or by being its first authority if the policy says so."""
 
+import math
 from collections.abc import Mapping
-from typing import Literal, get_args
+from itertools import pairwise
+from typing import Literal, Protocol, get_args
 
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
@@ -10,6 +12,13 @@ from tfbus.registration import Registration
 from tfbus.tree.cycles import NewestEdge
 
 OnConflict = Literal["last", "reject"]
+
+
+class DatedEdge(NewestEdge, Protocol):
+    """The newest edge of one child. `since` is greater for a parent that was published later."""
+
+    @property
+    def since(self) -> int: ...
 
 
 class Ownership:
@@ -37,6 +46,11 @@ class Ownership:
     def restricts(self) -> bool:
         """Whether some sample could be refused."""
         return self._first_keeps or len(self._reserved) > 0
+
+    @property
+    def reserves(self) -> bool:
+        """Whether some frame is reserved."""
+        return len(self._reserved) > 0
 
     def remembers(self, frame: str) -> bool:
         """Whether a frame without an edge is kept for its first authority."""
@@ -105,12 +119,60 @@ class Ownership:
                 refused.append(_refusal(sample, owner, reason))
         return tuple(allowed), refused
 
+    def intruder(
+        self, error: InvalidTransformError, edges: Mapping[str, DatedEdge], batch: Batch
+    ) -> InvalidTransformError | None:
+        """The error of the edge by somebody else that keeps a reserved frame from its place.
+
+        Parameters
+        ----------
+        error : InvalidTransformError
+            Of a sample that closes a loop of parents.
+        edges : mapping of child to its newest edge
+        batch : tuple of TransformStamped
+            The batch that the sample is in.
+
+        Returns
+        -------
+        InvalidTransformError or None
+            The error of the edge in the loop that was published last by an authority that does not own the frame of
+            the sample. None if that frame is not reserved for its sender, or all other edges are of the sender or of
+            authorities that have reserved them: then the sample itself is the wrong one.
+        """
+        frame, owner = error.child, error.authority
+        if frame is None or owner is None or self.reserved_for(frame) != owner:
+            return None
+        found: InvalidTransformError | None = None
+        newest = -1.0
+        for child, parent in pairwise(error.loop[1:]):
+            authority, since = _origin(child, parent, edges, batch)
+            if since > newest and authority != owner and self.reserved_for(child) != authority:
+                newest = since
+                found = InvalidTransformError(
+                    f"the edge {parent!r} -> {child!r} from {authority!r} would hang {child!r} below {frame!r}, which "
+                    f"{owner!r} has reserved and puts below {child!r}",
+                    reason="reserved",
+                    parent=parent,
+                    child=child,
+                    authority=authority,
+                    owner=owner,
+                )
+        return found
+
     def _release(self, frame: str) -> None:
         authority, times = self._reserved[frame]
         if times > 1:
             self._reserved[frame] = (authority, times - 1)
         else:
             del self._reserved[frame]
+
+
+def _origin(child: str, parent: str, edges: Mapping[str, DatedEdge], batch: Batch) -> tuple[str, float]:
+    """The authority of an edge in a loop, and how late it was published."""
+    for sample in reversed(batch):
+        if sample.child == child and sample.parent == parent:
+            return sample.authority, math.inf
+    return edges[child].authority, edges[child].since
 
 
 def _refusal(sample: TransformStamped, owner: str, reason: str) -> InvalidTransformError:

@@ -5,35 +5,63 @@ of a bad edge at once.
 """
 
 from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from copy import copy
-from typing import Literal
+from typing import Literal, get_args
 
 from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._ownership import Ownership
+from tfbus.bus._plausibility import Plausibility
 from tfbus.errors import InvalidTransformError
-from tfbus.events import AuthorityConflict, FrameAdded, FrameRemoved, KindChanged, Reparented, SampleRejected
+from tfbus.events import (
+    AuthorityConflict,
+    FrameAdded,
+    FrameRemoved,
+    KindChanged,
+    Reparented,
+    SampleRejected,
+    StampAhead,
+)
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
+from tfbus.stamps import STAMP_MIN, format_duration
 from tfbus.tree.cycles import NewestEdge, admit
 
 _FORMER_PARENTS = 1_000
 
+Invalid = Literal["raise", "drop"]
+
+
+def as_invalid(invalid: Invalid) -> Invalid:
+    """The argument `invalid`; `ValueError` if it is neither."""
+    if invalid not in get_args(Invalid):
+        raise ValueError(f"invalid must be 'raise' or 'drop', not {invalid!r}")
+    return invalid
+
 
 class _Edge:
-    """The newest edge of one child.
+    """The newest edge of one child, and the authority of its newest sample.
 
+    `last` is the authority of its last sample, which may have been a late one.
     `trusted` is the authority whose moving samples under the same parent need no judgement; None if there is none.
+    `since` numbers the parents of all frames in the order in which they were published.
+    `before` is the newest stamp before the batch whose number is `turn`, which may have to be taken back.
     """
 
-    __slots__ = ("authority", "newest", "parent", "static", "trusted")
+    __slots__ = ("authority", "before", "last", "newest", "parent", "since", "static", "trusted", "turn")
 
-    def __init__(self, parent: str, static: bool, authority: str) -> None:
+    def __init__(self, parent: str, static: bool, authority: str, since: int) -> None:
         self.parent = parent
         self.static = static
         self.newest: int | None = None
         self.authority = authority
+        self.last = authority
         self.trusted: str | None = None
+        self.since = since
+        self.turn = 0
+        self.before: int | None = None
 
 
 class Topology:
@@ -44,8 +72,12 @@ class Topology:
     log : OnceLogger
     ownership : Ownership
         Says who may publish which child.
+    plausibility : Plausibility
+        Judges translations and stamps.
     announcer : Announcer
         Announces changes and refusals.
+    evict : callable
+        Removes a frame from the bus and all buffers.
 
     Attributes
     ----------
@@ -55,20 +87,37 @@ class Topology:
         Samples that were refused, by reason.
     reparented, kind_changes, conflicts : int
         Number of samples that gave a child another newest parent, another kind, or another authority than before.
+    ahead : int
+        Accepted samples that were ahead of the clock.
     """
 
-    def __init__(self, log: OnceLogger, ownership: Ownership, announcer: Announcer) -> None:
+    def __init__(
+        self,
+        log: OnceLogger,
+        ownership: Ownership,
+        plausibility: Plausibility,
+        announcer: Announcer,
+        evict: Callable[[str], object],
+    ) -> None:
         self._log = log
         self._ownership = ownership
+        self._plausibility = plausibility
+        self._square = plausibility.max_translation**2
+        # No stamp up to this one is ahead of the clock, which only goes forward between two calls of `clock_jumped`.
+        self._horizon = STAMP_MIN
         self._announcer = announcer
+        self._evict = evict
+        self._parents = 0
+        self._turn = 0
         self._newest: dict[str, _Edge] = {}
         # Every parent of a newest edge, and some that were one.
-        self._parents: set[str] = set()
+        self._named: set[str] = set()
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
         self.reparented = 0
         self.kind_changes = 0
         self.conflicts = 0
+        self.ahead = 0
 
     def __len__(self) -> int:
         return len(self._newest)
@@ -84,6 +133,10 @@ class Topology:
         """The newest edge of a child, if it has one."""
         return self._newest.get(child)
 
+    def moving(self) -> dict[str, NewestEdge]:
+        """The newest edge of each moving child."""
+        return {child: known for child, known in self._newest.items() if not known.static}
+
     def known(self) -> list[FrameAdded]:
         """An event for each child that has a parent, as if it were new."""
         now = self._announcer.now()
@@ -91,7 +144,23 @@ class Topology:
             FrameAdded(now, child, known.parent, known.authority, known.static) for child, known in self._newest.items()
         ]
 
-    def accept(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
+    def known_ahead(self) -> list[StampAhead]:
+        """An event for each child whose newest sample is ahead of the clock."""
+        now, newest = self._announcer.now(), self._plausibility.newest_plausible()
+        return [
+            StampAhead(now, child, known.newest, known.authority)
+            for child, known in self._newest.items()
+            if known.newest is not None and known.newest > newest
+        ]
+
+    def is_ahead(self, child: str, newest: int, authority: str) -> bool:
+        """Whether a child's newest stamp (ns) is ahead of the clock, so that right samples expire; then it is told."""
+        if newest <= self._plausibility.newest_plausible():
+            return False
+        self._tell_ahead(child, newest, authority)
+        return True
+
+    def accept(self, batch: Batch, invalid: Invalid) -> Batch:
         """Judge a batch, record the samples that may be committed, and return them.
 
         Raises
@@ -101,18 +170,31 @@ class Topology:
             nothing was noted.
         """
         newest = self._newest
-        for sample in batch:
-            parent, child, _, _, authority, static = sample._fields
-            known = newest.get(child)
-            if known is None or known.parent != parent or known.trusted != authority or static:
-                return self._judge(batch, invalid)
+        horizon = self._horizon
+        square = self._square
+        self._turn = turn = self._turn + 1
         # Nearly always all samples continue known edges, so that only the stamps are new.
         for sample in batch:
-            fields = sample._fields
-            known = newest[fields[1]]
-            if known.newest is None or fields[2] > known.newest:
-                known.newest = fields[2]
-        return batch
+            parent, child, stamp, row, authority, static = sample._fields
+            known = newest.get(child)
+            if known is None or known.parent != parent or known.trusted != authority or static:
+                break
+            if stamp > horizon and stamp > (horizon := self._renew_horizon()):
+                break
+            x, y, z, _, _, _, _ = row
+            # Not `>`, which is false for NaN.
+            if not x * x + y * y + z * z <= square:
+                break
+            if known.newest is None or stamp > known.newest:
+                # One loop, in which stamps may have to be taken back, is a fifth faster than two.
+                if known.turn != turn:
+                    known.turn = turn
+                    known.before = known.newest
+                known.newest = stamp
+        else:
+            return batch
+        self._take_back(batch, turn)
+        return self._judge(batch, invalid)
 
     def reserve(self, child: str, authority: str) -> Registration:
         """Let only one authority publish a child; see `Ownership.reserve`."""
@@ -145,14 +227,50 @@ class Topology:
         # A copy, because the traceback of the original keeps the sender's variables alive.
         self._announcer.announce(SampleRejected(self._announcer.now(), reason, child, parent, authority, copy(error)))
 
-    def _judge(self, batch: Batch, invalid: Literal["raise", "drop"]) -> Batch:
-        refused: list[InvalidTransformError] = []
+    @contextmanager
+    def recorded_time(self) -> Iterator[None]:
+        """A ``with`` for samples whose stamps are of another clock; none of them is ahead."""
+        try:
+            with self._plausibility.recorded_time():
+                yield
+        finally:
+            self._horizon = STAMP_MIN
+
+    def clock_jumped(self) -> None:
+        """Note that a jump of the clock was announced."""
+        self._plausibility.clock_jumped = True
+        self._horizon = STAMP_MIN
+
+    def _take_back(self, batch: Batch, turn: int) -> None:
+        """Undo what `accept` has recorded of a batch."""
+        for sample in batch:
+            known = self._newest.get(sample.child)
+            if known is not None and known.turn == turn:
+                known.turn = 0
+                known.newest = known.before
+
+    def _renew_horizon(self) -> int:
+        newest = self._plausibility.newest_plausible()
+        # Nothing tells when a clock that nobody has set is advanced for the first time.
+        if self._plausibility.clock_is_set:
+            self._horizon = newest
+        return newest
+
+    def _judge(self, batch: Batch, invalid: Invalid) -> Batch:
+        batch, refused, ahead = self._plausibility.split(batch)
         if self._ownership.restricts:
-            batch, refused = self._ownership.split(batch, self._newest)
-        if len(self._parents) > 2 * len(self._newest) + _FORMER_PARENTS:
-            self._parents = {known.parent for known in self._newest.values()}
-        accepted, looped = admit(self._newest, batch, self._parents)
+            batch, unowned = self._ownership.split(batch, self._newest)
+            refused += unowned
+        if len(self._named) > 2 * len(self._newest) + _FORMER_PARENTS:
+            self._named = {known.parent for known in self._newest.values()}
+        accepted, looped = admit(self._newest, batch, self._named)
+        if looped and self._ownership.reserves and not (refused and invalid == "raise"):
+            accepted, looped = self._defend(batch, refused, invalid)
         refused += looped
+        rejects_ahead = self._plausibility.rejects_ahead
+        if rejects_ahead:
+            for sample in ahead:
+                self._tell_ahead(sample.child, sample.stamp, sample.authority)
         for error in refused:
             self.reject(error.reason, error)
         if refused and invalid == "raise":
@@ -160,22 +278,64 @@ class Topology:
         for error in refused:
             self._log.warning((error.reason, error.child, error.authority), "dropped a sample: %s", error)
         for sample in accepted:
-            self._parents.add(sample.parent)
+            self._named.add(sample.parent)
             self._record(sample)
+        if ahead and not rejects_ahead:
+            stored = set(map(id, accepted))
+            for sample in ahead:
+                if id(sample) in stored:
+                    self.ahead += 1
+                    self._tell_ahead(sample.child, sample.stamp, sample.authority)
         return accepted
+
+    def _defend(
+        self,
+        batch: Batch,
+        refused: list[InvalidTransformError],
+        invalid: Invalid,
+    ) -> tuple[Batch, list[InvalidTransformError]]:
+        """Let the owners of reserved frames win against the edges of others that close a loop with theirs.
+
+        Such an edge is refused (`refused` gets its error) if it is in the same batch, else it is removed from the bus.
+
+        Returns
+        -------
+        accepted, looped
+            As of `admit`.
+        """
+        edges = dict(self._newest)
+        removed: list[InvalidTransformError] = []
+        _, looped = admit(edges, batch, self._named)
+        while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
+            rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
+            if len(rest) < len(batch):
+                batch = rest
+                refused.append(intruder)
+            else:
+                del edges[_child(intruder)]
+                removed.append(intruder)
+            _, looped = admit(edges, batch, self._named)
+        if invalid == "drop" or not (looped or refused):
+            for error in removed:
+                self.reject(error.reason, error)
+                self._log.warning(("intruder", error.child, error.authority), "removed a frame: %s", error)
+                self._evict(_child(error))
+        # Whoever was told of a removal may have published.
+        return admit(self._newest, batch, self._named)
 
     def _record(self, sample: TransformStamped) -> None:
         parent, child, stamp, _, authority, static = sample._fields
         announcer = self._announcer
         known = self._newest.get(child)
         if known is None:
-            known = self._newest[child] = _Edge(parent, static, authority)
+            self._parents += 1
+            known = self._newest[child] = _Edge(parent, static, authority, self._parents)
             if announcer.has_listeners:
                 announcer.announce(FrameAdded(announcer.now(), child, parent, authority, static))
-        if known.authority != authority:
+        if known.last != authority:
             if self._ownership.reserved_for(child) is None:
-                self._conflict(child, authority, known.authority)
-            known.authority = authority
+                self._conflict(child, authority, known.last)
+            known.last = authority
         if known.static != static:
             self.kind_changes += 1
             kind = "static" if static else "moving"
@@ -185,14 +345,29 @@ class Topology:
                 announcer.announce(KindChanged(announcer.now(), child, static, authority))
         if static or known.newest is None or stamp >= known.newest:
             known.newest = None if static else stamp
+            known.authority = authority
             if known.parent != parent:
                 self._reparent(child, parent, known.parent, authority)
-                known.parent = parent
-        known.trusted = None if static else authority
+                self._parents += 1
+                known.parent, known.since = parent, self._parents
+        known.trusted = None if static or known.authority != authority else authority
         if static:
             self.latched[child] = sample
         else:
             self.latched.pop(child, None)
+
+    def _tell_ahead(self, child: str, newest: int, authority: str) -> None:
+        now = self._announcer.now()
+        ahead = format_duration(newest - now)
+        self._log.warning(
+            ("ahead", child, authority),
+            "frame %r has a sample from %r that is %s ahead of the clock: right samples are older, and expire",
+            child,
+            authority,
+            ahead,
+        )
+        if self._announcer.has_listeners:
+            self._announcer.announce(StampAhead(now, child, newest, authority))
 
     def _conflict(self, child: str, authority: str, other: str) -> None:
         self.conflicts += 1
@@ -208,3 +383,12 @@ class Topology:
         self._log.info(key, "frame %r moves from %r to %r, says %r", child, old_parent, parent, authority)
         if self._announcer.has_listeners:
             self._announcer.announce(Reparented(self._announcer.now(), child, parent, old_parent, authority))
+
+
+def _is_edge(sample: TransformStamped, error: InvalidTransformError) -> bool:
+    return (sample.child, sample.parent, sample.authority) == (error.child, error.parent, error.authority)
+
+
+def _child(error: InvalidTransformError) -> str:
+    assert error.child is not None
+    return error.child

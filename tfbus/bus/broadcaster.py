@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
+from tfbus.bus._topology import Invalid, as_invalid
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.frames import as_prefix
@@ -23,21 +24,35 @@ class TransformBroadcaster:
         with the same frames can share a bus. The methods take names without it.
     shared : iterable of str
         Names without a prefix, because they are the same for all robots, such as ``{"map"}``.
+    invalid : {"raise", "drop"}
+        What to do with a sample that the bus refuses, as in `Bus.publish`. ``"drop"`` is for a program that must go on
+        whatever edges others publish: the sample is left out, counted, and logged once. A bad name, stamp or transform
+        is an error all the same.
 
     Raises
     ------
     ValueError
-        If the prefix, or a shared name, is empty or starts with a slash, or a shared name starts with the prefix.
+        If the prefix, or a shared name, is empty or starts with a slash, or a shared name starts with the prefix; or
+        if `invalid` is neither.
     TypeError
         If an argument is of another type, or there are shared names but no prefix.
     """
 
-    def __init__(self, bus: Bus, authority: str = "", *, prefix: str | None = None, shared: Iterable[str] = ()) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        authority: str = "",
+        *,
+        prefix: str | None = None,
+        shared: Iterable[str] = (),
+        invalid: Invalid = "raise",
+    ) -> None:
         if not isinstance(authority, str):
             raise TypeError(f"authority must be a str, not {authority!r}")
         self.bus = bus
         self.authority = authority
         self._prefix = as_prefix(prefix, shared)
+        self._invalid = as_invalid(invalid)
 
     def send(self, parent: str, child: str, transform: Transform, at: int | None = None) -> None:
         """Publish where `child` is, seen from `parent`.
@@ -53,12 +68,12 @@ class TransformBroadcaster:
         Raises
         ------
         InvalidTransformError
-            If a name or the stamp is bad, or the edge would close a loop of parents. Nothing is stored.
+            If a name or the stamp is bad, or the bus refuses the sample, as `Bus.publish` says. Nothing is stored.
         BusClosedError, TypeError
         """
         if self._prefix is not None:
             parent, child = self._on_bus(parent), self._on_bus(child)
-        self.bus.publish(TransformStamped(parent, child, self._stamp(at), transform, self.authority))
+        self.bus.publish(TransformStamped(parent, child, self._stamp(at), transform, self.authority), self._invalid)
 
     def send_all(self, samples: Iterable[TransformStamped | tuple[str, str, Transform]], at: int | None = None) -> None:
         """Publish several at once; they are seen all or not at all.
@@ -77,7 +92,7 @@ class TransformBroadcaster:
         BusClosedError, TypeError
         """
         stamp = self._stamp(at)
-        self.bus.publish([self._sample(sample, stamp) for sample in samples])
+        self.bus.publish([self._sample(sample, stamp) for sample in samples], self._invalid)
 
     def send_static(self, parent: str, child: str, transform: Transform) -> None:
         """Publish a transform that holds at every stamp. Later subscribers get it too; sending it again replaces it.
@@ -88,11 +103,14 @@ class TransformBroadcaster:
             As `send`.
         """
         parent, child = self._on_bus(parent), self._on_bus(child)
-        self.bus.publish(TransformStamped(parent, child, self.bus.clock.now(), transform, self.authority, static=True))
+        sample = TransformStamped(parent, child, self.bus.clock.now(), transform, self.authority, static=True)
+        self.bus.publish(sample, self._invalid)
 
     @contextmanager
     def owning(self, *frames: str) -> Iterator[None]:
         """Own frames inside a ``with``: no other authority may publish them, and at its end they are removed.
+
+        No edge of somebody else can keep them from the place that this broadcaster gives them: see `Bus.reserve`.
 
         All samples of a frame are removed, also those that this or another authority sent before the ``with`` began. A
         frame that was never published is left out. Once the bus is closed, nothing is removed.

@@ -7,16 +7,18 @@ nothing can be lost between "sent" and "buffered".
 
 import logging
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, suppress
 from threading import get_ident
 from types import TracebackType
-from typing import Literal
 
 from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
+from tfbus.bus._late_buffer import LateBuffer
 from tfbus.bus._owner_thread import OwnerThread
 from tfbus.bus._ownership import OnConflict, Ownership
+from tfbus.bus._plausibility import Plausibility
 from tfbus.bus._subscribers import BatchCallback, FrameCallback, Subscribers
-from tfbus.bus._topology import Topology
+from tfbus.bus._topology import Invalid, Topology, as_invalid
 from tfbus.bus.event_stream import EventStream
 from tfbus.bus.sample_queue import Overflow
 from tfbus.bus.stream import Stream
@@ -24,6 +26,7 @@ from tfbus.bus.thread_publisher import ThreadPublisher
 from tfbus.clock import Clock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.events import ClockReset, Event, PastLoop
+from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
 from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
 from tfbus.registration import Registration
 from tfbus.stamps import format_stamp
@@ -43,11 +46,21 @@ class Bus:
         What happens to samples of a child that another authority has published before: they are accepted and reported,
         or refused until the frame is removed, across jumps of the clock. The empty authority ``""`` is one like any
         other.
+    max_translation : float
+        The greatest magnitude of a translation, in m, at most 1e100; a longer one is refused as not physical.
+    max_ahead : float or None
+        How far, in s, the stamp of a moving sample may be ahead of the clock. One that is further ahead is announced as
+        `StampAhead`, logged once for each authority and frame, and counted. None for any distance: for a bus that
+        carries recorded time. A `Player` needs no None, and a `SimulatedClock` that nobody has set yet (at 0, without a
+        jump) has no stamp ahead of it.
+    reject_ahead : bool
+        Whether a sample that is further ahead is refused. Otherwise it is accepted; until the clock has reached it,
+        right samples of its frame are older than the newest, and expire if they are older than a buffer's window.
 
     Raises
     ------
-    ValueError
-        If `on_conflict` is none of them.
+    TypeError, ValueError
+        If an argument is none of these, or `reject_ahead` comes without a `max_ahead`.
 
     Notes
     -----
@@ -56,16 +69,28 @@ class Bus:
     Other threads publish through `threadsafe`.
     """
 
-    def __init__(self, clock: Clock | None = None, on_conflict: OnConflict = "last") -> None:
+    def __init__(
+        self,
+        clock: Clock | None = None,
+        on_conflict: OnConflict = "last",
+        *,
+        max_translation: float = MAX_TRANSLATION,
+        max_ahead: float | None = 1.0,
+        reject_ahead: bool = False,
+    ) -> None:
         self.clock: Clock = SystemClock() if clock is None else clock
         self._owner = OwnerThread()
         self._closed = False
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._events: list[EventStream] = []
         self._announcer = Announcer(self.clock.now, self._events)
-        self._topology = Topology(self._log, Ownership(on_conflict), self._announcer)
+        self._plausibility = Plausibility(self.clock, max_translation, max_ahead, reject_ahead)
+        self._topology = Topology(
+            self._log, Ownership(on_conflict), self._plausibility, self._announcer, self._remove_if_known
+        )
         self._subscribers = Subscribers(self._log, self._announcer)
         self._buffers: dict[LiveTree, int] = {}
+        self._late: dict[LiveTree, LateBuffer] = {}
         self._streams: list[Stream] = []
         self._threads: list[ThreadPublisher] = []
         self._samples = 0
@@ -79,9 +104,12 @@ class Bus:
         """Whether `close` was called."""
         return self._closed
 
-    def publish(
-        self, samples: TransformStamped | Iterable[TransformStamped], invalid: Literal["raise", "drop"] = "raise"
-    ) -> None:
+    @property
+    def max_translation(self) -> float:
+        """The greatest magnitude of a translation, in m."""
+        return self._plausibility.max_translation
+
+    def publish(self, samples: TransformStamped | Iterable[TransformStamped], invalid: Invalid = "raise") -> None:
         """Send one sample, or a batch that is seen all or not at all.
 
         When this returns, every buffer has the samples and the lookups that waited for them have been woken.
@@ -90,15 +118,16 @@ class Bus:
         ----------
         samples : TransformStamped or iterable of them
         invalid : {"raise", "drop"}
-            What to do with a sample that would close a loop of parents, or whose authority may not publish the child:
-            refuse the whole batch, or leave that sample out and count it. ``"drop"`` is for programs that pass on the
-            samples of others.
+            What to do with a sample that the bus refuses: raise an error and store nothing of the batch; or leave that
+            sample out, count it, and log it once for each reason, frame and authority. ``"drop"`` is for programs that
+            pass on the samples of others, and for those that must not end because of the edges of others.
 
         Raises
         ------
         InvalidTransformError
             If a sample would close a loop of parents, its child is reserved for another authority, or comes from
-            another one with ``on_conflict="reject"``. Nothing is stored.
+            another one with ``on_conflict="reject"``; if its translation is not finite or longer than
+            `max_translation`; with ``reject_ahead=True``, if its stamp is ahead of the clock. Nothing is stored.
         TypeError
             If something in it is not a `TransformStamped`.
         BusClosedError
@@ -111,7 +140,7 @@ class Bus:
         if self._closed:
             raise BusClosedError
         if invalid != "raise" and invalid != "drop":
-            raise ValueError(f"invalid must be 'raise' or 'drop', not {invalid!r}")
+            as_invalid(invalid)
         if type(samples) is TransformStamped:
             batch: Batch = (samples,)
         elif invalid == "raise":
@@ -125,8 +154,11 @@ class Bus:
         if not batch:
             return
         self._samples += len(batch)
-        for buffer in self._buffers:
-            buffer.insert(batch)
+        if self._late:
+            self._insert_into_late_buffers(batch)
+        else:
+            for buffer in self._buffers:
+                buffer.insert(batch)
         for stream in self._streams:
             stream.put(batch)
         if self._events:
@@ -232,6 +264,10 @@ class Bus:
         Earlier samples of another authority stay; later ones are refused with ``reason="reserved"``. One authority may
         reserve a frame several times.
 
+        No edge of somebody else can keep the frame from the place that `authority` gives it. An edge that would hang an
+        ancestor of the frame below it is refused. If such an edge was there before the frame had its parent, it is
+        removed, with its frame, when `authority` publishes; an edge of a frame that its own sender has reserved stays.
+
         Raises
         ------
         InvalidTransformError
@@ -253,21 +289,28 @@ class Bus:
         BusClosedError
         """
         self._check_usable()
-        return ThreadPublisher(capacity, self._attach_publisher, self._publish_from_thread, self._threads.remove)
+        return ThreadPublisher(
+            capacity, self._attach_publisher, self._check_from_thread, self._publish_from_thread, self._threads.remove
+        )
 
     def _attach(self, buffer: LiveTree) -> None:
         """Give a buffer the latched samples, and from now on all that are published. Called by `Buffer`."""
         self._check_usable()
         latched = tuple(self._topology.latched.values())
+        late = LateBuffer(buffer, self._topology.moving(), self._topology.newest)
+        buffer.is_ahead = self._topology.is_ahead
         self._buffers[buffer] = self._samples - len(latched)
         if latched:
-            buffer.insert(latched)
+            late.insert(latched)
+        if not late.has_caught_up:
+            self._late[buffer] = late
 
     def _detach(self, buffer: LiveTree) -> None:
         """Take a buffer off the bus, if it is on it. Called by `Buffer`."""
         if buffer.has_waiters:
             self._check_thread()
         self._buffers.pop(buffer, None)
+        self._late.pop(buffer, None)
 
     def remove_frame(self, frame: str) -> None:
         """Remove a frame from every buffer and from pending batches, and do not give it to later subscribers.
@@ -292,6 +335,8 @@ class Bus:
             stream.queue.forget(frame)
         for buffer in self._buffers:
             buffer.remove_frame(frame)
+        for late in self._late.values():
+            late.forget(frame)
         self._subscribers.notify_removed(frame)
 
     def statistics(self) -> BusStatistics:
@@ -311,6 +356,7 @@ class Bus:
                 *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
                 *(events.queue.statistics() for events in self._events),
             ),
+            ahead=self._topology.ahead,
         )
 
     def close(self) -> None:
@@ -362,6 +408,31 @@ class Bus:
         if events in self._events:
             self._events.remove(events)
 
+    def _insert_into_late_buffers(self, batch: Batch) -> None:
+        for buffer in self._buffers:
+            late = self._late.get(buffer)
+            if late is None:
+                buffer.insert(batch)
+                continue
+            late.insert(batch)
+            if late.has_caught_up:
+                del self._late[buffer]
+
+    def _remove_if_known(self, frame: str) -> None:
+        with suppress(UnknownFrameError):
+            self.remove_frame(frame)
+
+    def _newest_plausible(self) -> int:
+        """The greatest stamp, in ns, that is not ahead of the clock now. Called by buffers."""
+        return self._plausibility.newest_plausible()
+
+    def _recorded_time(self) -> AbstractContextManager[None]:
+        """A ``with`` for samples whose stamps are of another clock. Called by players."""
+        return self._topology.recorded_time()
+
+    def _check_from_thread(self, batch: Batch) -> None:
+        check_translations(batch, self._plausibility.max_translation)
+
     def _well_typed(self, samples: object) -> Batch:
         """The samples in a batch; anything else in it is counted as rejected."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
@@ -377,6 +448,7 @@ class Bus:
             self.publish(batch, invalid="drop")
 
     def _clock_jumped(self, before: int, after: int) -> None:
+        self._topology.clock_jumped()
         if after >= before:
             for events in self._events:
                 events.wake()
@@ -393,3 +465,5 @@ class Bus:
             stream.queue.discard_moving()
         for buffer in self._buffers:
             buffer.reset(before, after)
+        for late in self._late.values():
+            late.clear_moving()

@@ -21,6 +21,8 @@ class ThreadPublisher:
         How many moving samples may be pending; beyond that the oldest batches are dropped and counted.
     attach : callable
         Called on the loop when the ``with`` begins; raises if the bus is not for this loop.
+    check : callable
+        Called with each batch in the thread that hands it over; raises for a sample that is wrong in itself.
     deliver : callable
         Publishes one batch; called on the loop.
     detach : callable
@@ -31,12 +33,14 @@ class ThreadPublisher:
         self,
         capacity: int,
         attach: Callable[["ThreadPublisher"], object],
+        check: Callable[[Batch], object],
         deliver: Callable[[Batch], object],
         detach: Callable[["ThreadPublisher"], object],
     ) -> None:
         self.queue = SampleQueue(capacity, "drop_oldest")
         self._attach = attach
         self._lock = threading.Lock()
+        self._check = check
         self._deliver = deliver
         self._detach = detach
         self._waker = LoopWaker(self._drain)
@@ -65,6 +69,8 @@ class ThreadPublisher:
         ------
         TypeError
             If something in it is not a `TransformStamped`.
+        InvalidTransformError
+            If a translation is not finite, or longer than the `max_translation` of the bus.
         BusClosedError
             If the ``with`` has ended, or the bus or the event loop is closed.
         RuntimeError
@@ -72,9 +78,11 @@ class ThreadPublisher:
 
         Notes
         -----
-        A sample that only the bus can judge, such as one that closes a loop of parents, is dropped and counted there.
+        A sample that only the bus can judge, such as one that closes a loop of parents or is ahead of the clock, is
+        dropped and counted there.
         """
         batch = as_batch(samples)
+        self._check(batch)
         if not self._waker.bound:
             raise RuntimeError("enter the `with` of bus.threadsafe() on the event loop first")
         with self._lock:

@@ -4,20 +4,18 @@ A laser is mounted 0.1 m forward of the centre of the base and 0.2 m above it. A
 100 Hz; once a second, a listener transforms a point from the frame of the laser to that of the base and prints it.
 """
 
-import logging
 import math
 from collections.abc import Callable
 
 import anyio
 
-from tfbus._log import OnceLogger
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.broadcaster import TransformBroadcaster
 from tfbus.bus.bus import Bus
 from tfbus.cli.output import format_seconds
 from tfbus.clock import Clock, SimulatedClock
 from tfbus.data import PointStamped
-from tfbus.errors import InvalidTransformError, TransformError
+from tfbus.errors import TransformError
 from tfbus.geometry.rows import Vector
 from tfbus.geometry.transform import Transform
 from tfbus.stamps import LATEST, to_seconds
@@ -32,16 +30,12 @@ Print = Callable[[str], object]
 async def broadcast(bus: Bus, rate: float = 100.0) -> None:
     """Send the transform of the laser `rate` times a second, without drift and without end.
 
-    A transform that the bus rejects, because it conflicts with those of other authorities, is logged once; the next one
+    A transform that the bus refuses, because it conflicts with those of other authorities, is logged once; the next one
     is sent all the same.
     """
-    broadcaster = TransformBroadcaster(bus, authority="robot_tf_publisher")
-    log = OnceLogger(logging.getLogger("tfbus"))
+    broadcaster = TransformBroadcaster(bus, authority="robot_tf_publisher", invalid="drop")
     async for _ in bus.clock.ticks(rate):
-        try:
-            broadcaster.send(BASE, LASER, BASE_FROM_LASER)
-        except InvalidTransformError as error:
-            log.warning(error.reason, "not sent: %s", error)
+        broadcaster.send(BASE, LASER, BASE_FROM_LASER)
 
 
 async def listen(buffer: Buffer, rate: float = 1.0, *, lines: float = math.inf, output: Print = print) -> None:

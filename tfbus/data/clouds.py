@@ -13,11 +13,12 @@ from tfbus.data._header import check_header
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.geometry.read_only import read_only
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.plain import PlainData
 from tfbus.stamps import Latest, as_stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PointCloud(CopiedByFields):
+class PointCloud(CopiedByFields, PlainData):
     """Points of a sensor, optionally with an instant of each. Equal only to itself.
 
     The arrays are held as read-only views and not copied: their owner must not change them any more.

@@ -1,7 +1,8 @@
 """`do_transform`, which transforms data of any registered type into another frame."""
 
+from collections.abc import Callable
 from functools import singledispatch
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar, cast, overload
 
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import Latest
@@ -19,6 +20,32 @@ class Stamped(Protocol):
         """ns, or `LATEST`."""
 
 
+DataT = TypeVar("DataT")
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+
+class DoTransform(Protocol):
+    """The type of `do_transform`: a ``singledispatch`` function that returns what it is given."""
+
+    def __call__(self, data: DataT, transform: TransformStamped) -> DataT: ...
+
+    @overload
+    def register(self, cls: FunctionT) -> FunctionT: ...
+    @overload
+    def register(self, cls: type[Any]) -> Callable[[FunctionT], FunctionT]: ...
+    @overload
+    def register(self, cls: type[Any], func: FunctionT) -> FunctionT: ...
+    def register(self, cls: Any, func: Any = None) -> Any:
+        """Register a function for the type of its first parameter, or for `cls`."""
+
+    def dispatch(self, cls: type[Any]) -> Callable[..., Any]:
+        """The function for a type."""
+
+
+def _dispatched(function: Callable[[Any, TransformStamped], Any]) -> DoTransform:
+    return cast(DoTransform, singledispatch(function))
+
+
 def check_registered(data: object) -> None:
     """Raise `TypeError` unless `do_transform` knows the type of `data`; the message says how to register it."""
     if do_transform.dispatch(type(data)) is do_transform.dispatch(object):
@@ -27,7 +54,7 @@ def check_registered(data: object) -> None:
         raise TypeError(f"cannot transform a {kind}: {instead}register a function with @do_transform.register({kind})")
 
 
-@singledispatch
+@_dispatched
 def do_transform(data: Any, transform: TransformStamped) -> Any:  # noqa: ARG001 - the registered functions use it
     """Transform `data` into the target frame of `transform`; the result has the stamp of `transform`.
 

@@ -12,11 +12,12 @@ from tfbus.geometry.read_only import locked
 from tfbus.geometry.rows import Quaternion, Vector, as_rotation, rotate
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.plain import PlainData
 from tfbus.stamps import Latest
 
 
 @dataclass(frozen=True, slots=True)
-class PointStamped:
+class PointStamped(PlainData):
     """A position.
 
     Parameters
@@ -38,7 +39,7 @@ class PointStamped:
 
 
 @dataclass(frozen=True, slots=True)
-class Vector3Stamped:
+class Vector3Stamped(PlainData):
     """A direction with a length, such as a velocity or a normal: a transform rotates it but does not translate it.
 
     Parameters
@@ -60,7 +61,7 @@ class Vector3Stamped:
 
 
 @dataclass(frozen=True, slots=True)
-class QuaternionStamped:
+class QuaternionStamped(PlainData):
     """An orientation.
 
     Parameters
@@ -83,7 +84,7 @@ class QuaternionStamped:
 
 
 @dataclass(frozen=True, slots=True)
-class PoseStamped:
+class PoseStamped(PlainData):
     """A position and an orientation.
 
     Parameters
@@ -105,7 +106,7 @@ class PoseStamped:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Polygon(CopiedByFields):
+class Polygon(CopiedByFields, PlainData):
     """The corners of an area, in order; the last one is joined to the first. Equal only to itself.
 
     Parameters

@@ -1,7 +1,7 @@
 """`LaserScan`, a scan of a planar laser."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,12 @@ from tfbus.data._arrays import CopiedByFields, as_floats
 from tfbus.data._header import check_header
 from tfbus.data.clouds import PointCloud
 from tfbus.geometry.read_only import read_only
+from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LaserScan(CopiedByFields):
+class LaserScan(CopiedByFields, PlainData):
     """One sweep of a planar laser, with the fields of sensor_msgs/LaserScan. Equal only to itself.
 
     Ray i goes in the plane z = 0 of `frame` at the angle ``angle_min + i * angle_increment``, counterclockwise from x
@@ -55,14 +56,15 @@ class LaserScan(CopiedByFields):
     frame: str
     stamp: int | Latest
     ranges: npt.NDArray[Any]
-    angle_min: float = field(kw_only=True)
-    angle_increment: float = field(kw_only=True)
-    angle_max: float | None = field(default=None, kw_only=True)
-    time_increment: float = field(default=0.0, kw_only=True)
-    scan_time: float = field(default=0.0, kw_only=True)
-    range_min: float = field(default=0.0, kw_only=True)
-    range_max: float = field(default=math.inf, kw_only=True)
-    intensities: npt.NDArray[Any] | None = field(default=None, kw_only=True)
+    _: KW_ONLY
+    angle_min: float
+    angle_increment: float
+    angle_max: float | None = None
+    time_increment: float = 0.0
+    scan_time: float = 0.0
+    range_min: float = 0.0
+    range_max: float = math.inf
+    intensities: npt.NDArray[Any] | None = None
 
     def __post_init__(self) -> None:
         check_header(self)

@@ -13,11 +13,12 @@ from tfbus.geometry.read_only import locked
 from tfbus.geometry.rows import Vector, rotate
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.plain import PlainData
 from tfbus.stamps import Latest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseWithCovarianceStamped(CopiedByFields):
+class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     """A pose and its covariance. Equal only to itself.
 
     Parameters
@@ -54,7 +55,7 @@ class PoseWithCovarianceStamped(CopiedByFields):
 
 
 @dataclass(frozen=True, slots=True)
-class TwistStamped:
+class TwistStamped(PlainData):
     """The velocity of a body at the origin of a frame that is fixed to it.
 
     Parameters
@@ -90,7 +91,7 @@ class TwistStamped:
 
 
 @dataclass(frozen=True, slots=True)
-class WrenchStamped:
+class WrenchStamped(PlainData):
     """A force on a body, and its torque about the origin of a frame.
 
     Parameters

@@ -1,6 +1,6 @@
 """`TransformStamped`, a transform between two frames at an instant, and batches of such samples."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from tfbus._which_kernel import KERNEL
@@ -8,6 +8,7 @@ from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
 from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
+from tfbus.plain import from_fields
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_stamp, format_duration, format_stamp
 
 if KERNEL == "python":
@@ -16,6 +17,8 @@ else:
     from tfbus._kernel import Sample  # type: ignore[assignment]
 
 Fields = tuple[str, str, int, Row, str, bool]
+
+_KINDS = {"parent": str, "child": str, "stamp": int, "transform": Transform, "authority": str, "static": bool}
 
 _NO_BEGINNING = ("", "/")
 """The first characters of strings that are no frame names."""
@@ -117,6 +120,36 @@ class TransformStamped(Sample):
         }
         return TransformStamped(**{**fields, **changes})
 
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: ``"type"``, and the parameters under their names; the stamp is an ``int`` of ns."""
+        parent, child, stamp, row, authority, static = self._fields
+        return {
+            "type": "TransformStamped",
+            "parent": parent,
+            "child": child,
+            "stamp": stamp,
+            "transform": from_row(row).to_dict(),
+            "authority": authority,
+            "static": static,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "TransformStamped":
+        """The sample or answer that `to_dict` made `data` of.
+
+        Raises
+        ------
+        ValueError
+            If the data are not those of a `TransformStamped`. The message names the field.
+        """
+        if "gap" not in data:
+            return TransformStamped(**from_fields(TransformStamped, data, _KINDS))
+        fields = from_fields(TransformStamped, data, {**_KINDS, "extrapolated_by": int, "gap": int})
+        policy_use = fields.pop("extrapolated_by"), fields.pop("gap")
+        answer = TransformStamped(**fields)
+        target, source, stamp, row, _, static = answer._fields
+        return qualified_answer(target, source, stamp, row, static, *policy_use)
+
     def __eq__(self, other: object) -> bool:
         return self._fields == other._fields if isinstance(other, TransformStamped) else NotImplemented
 
@@ -151,6 +184,10 @@ class QualifiedTransform(TransformStamped):
     def gap(self) -> int:
         """The time in ns between two samples that were interpolated, on the edge where it is longest."""
         return self._policy_use[1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As that of a `TransformStamped`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
+        return {**super().to_dict(), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (type(self), self._fields, self._policy_use), getattr(self, "__dict__", None)

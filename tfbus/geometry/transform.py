@@ -8,7 +8,7 @@ A transform holds one tuple of seven floats, a row; `tfbus.geometry.rows` has th
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any, overload
 
@@ -33,6 +33,7 @@ from tfbus.geometry.rows import (
     invert,
     rotate,
 )
+from tfbus.plain import from_fields
 
 
 class Transform:
@@ -131,6 +132,16 @@ class Transform:
             raise InvalidTransformError(f"angle {angle!r} is not finite", reason="not finite")
         return cls.from_wxyz(translation, quaternions.axangle2quat((x / length, y / length, z / length), angle, True))
 
+    @classmethod
+    def from_scipy(cls, translation: Numbers, rotation: Any) -> "Transform":
+        """From a translation in m and one ``scipy.spatial.transform.Rotation``."""
+        return cls(translation, rotation.as_quat())
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Transform":
+        """The transform that `to_dict` made `data` of; `ValueError` if they are none."""
+        return cls(**from_fields(cls, data, {"translation": Vector, "rotation": Quaternion}))
+
     @property
     def translation(self) -> Vector:
         """(x, y, z) in m."""
@@ -174,6 +185,22 @@ class Transform:
             return (1.0, 0.0, 0.0), 0.0
         length = math.copysign(sine, w)
         return (x / length, y / length, z / length), 2.0 * math.atan2(sine, abs(w))
+
+    def as_scipy(self) -> Any:
+        """The rotation as a ``scipy.spatial.transform.Rotation``.
+
+        Raises
+        ------
+        ImportError
+            If scipy is not installed.
+        """
+        from scipy.spatial.transform import Rotation
+
+        return Rotation.from_quat(self.rotation)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON: ``"translation"`` [x, y, z] in m and ``"rotation"`` [x, y, z, w]."""
+        return {"translation": list(self.translation), "rotation": list(self.rotation)}
 
     def matrix(self) -> npt.NDArray[np.float64]:
         """A new homogeneous matrix of shape (4, 4)."""

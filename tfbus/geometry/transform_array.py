@@ -4,7 +4,9 @@ It holds seven columns, ``tx, ty, tz, qx, qy, qz, qw``, each an array over the t
 `tfbus.geometry.rows` take columns as well as the seven floats of a row, so each formula is written once.
 """
 
+import math
 from collections.abc import Iterator
+from importlib import import_module
 from typing import Any, overload
 
 import numpy as np
@@ -14,6 +16,7 @@ from tfbus.errors import InvalidTransformError
 from tfbus.geometry.read_only import locked
 from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Columns, Row, compose, invert, rotate
 from tfbus.geometry.transform import Transform, from_row
+from tfbus.stamps import StampsLike, as_stamps, format_stamp
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -29,11 +32,15 @@ class TransformArray:
     rotations : array of shape (n, 4)
         Unit quaternions (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given. NaN throughout,
         in a translation and its rotation, means that there is no transform.
+    stamps : sequence or array of shape (n,), optional
+        The stamp of each in ns, or dates as `as_stamp` accepts them.
 
     Raises
     ------
     InvalidTransformError
         If the shapes are wrong, or a row is not finite, or too far from a unit quaternion.
+    TypeError, ValueError
+        If the stamps are not stamps, or there is not one for each transform.
 
     Examples
     --------
@@ -46,11 +53,12 @@ class TransformArray:
     """
 
     __array_ufunc__ = None
-    __slots__ = ("_columns", "_policy_use")
+    __slots__ = ("_columns", "_policy_use", "_stamps")
     _columns: Floats
     _policy_use: Integers | None
+    _stamps: Integers | None
 
-    def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike) -> None:
+    def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike, stamps: StampsLike | None = None) -> None:
         moves = np.asarray(translations, np.float64)
         turns = np.asarray(rotations, np.float64)
         if moves.ndim != 2 or moves.shape[1] != 3 or turns.shape != (len(moves), 4):
@@ -72,6 +80,24 @@ class TransformArray:
         norms[np.abs(squares - 1.0) <= ROUNDING] = 1.0
         self._columns = locked(np.vstack((moves.T, turns.T / norms)))
         self._policy_use = None
+        self._stamps = None
+        if stamps is not None:
+            instants = as_stamps(stamps)
+            if len(instants) != len(moves):
+                raise ValueError(f"there are {len(instants)} stamps for {len(moves)} transforms")
+            self._stamps = locked(instants.copy())
+
+    @classmethod
+    def from_scipy(
+        cls, translations: npt.ArrayLike, rotations: Any, stamps: StampsLike | None = None
+    ) -> "TransformArray":
+        """From translations in m, shape (n, 3), and n rotations in a ``scipy.spatial.transform.Rotation``."""
+        return cls(translations, rotations.as_quat(), stamps)
+
+    @property
+    def stamps(self) -> Integers | None:
+        """The stamp of each in ns: a read-only array of shape (n,); None if they have none."""
+        return self._stamps
 
     @property
     def translations(self) -> Floats:
@@ -100,6 +126,63 @@ class TransformArray:
         A gap of more than 2^63 - 1 ns is given as 2^63 - 1.
         """
         return None if self._policy_use is None else self._policy_use[1]
+
+    def as_wxyz(self) -> Floats:
+        """The rotations in transforms3d's order, (w, x, y, z): a new array of shape (n, 4)."""
+        return np.ascontiguousarray(self._columns[[6, 3, 4, 5]].T)
+
+    def as_rpy(self) -> Floats:
+        """Roll, pitch, yaw of each in rad, as `Transform.as_rpy` gives them: a new array of shape (n, 3)."""
+        x, y, z, w = self._columns[3:]
+        low, high = np.hypot(x + z, w - y), np.hypot(x - z, w + y)
+        half_sum, half_difference = np.arctan2(x + z, w - y), np.arctan2(x - z, w + y)
+        half_sum = np.where(low <= ROUNDING, half_difference, half_sum)
+        half_difference = np.where((high <= ROUNDING) & (low > ROUNDING), half_sum, half_difference)
+        angles = half_sum + half_difference, half_sum - half_difference
+        # To the same turn as `math.remainder`, which is exact.
+        roll, yaw = (angle - math.tau * np.round(angle / math.tau) for angle in angles)
+        return np.stack((roll, math.pi / 2.0 - 2.0 * np.arctan2(low, high), yaw), axis=1)
+
+    def as_scipy(self) -> Any:
+        """The rotations as a ``scipy.spatial.transform.Rotation``; needs scipy.
+
+        Raises
+        ------
+        ImportError
+            If scipy is not installed.
+        ValueError
+            If a transform is NaN: select the valid ones before.
+        """
+        from scipy.spatial.transform import Rotation
+
+        if not self.valid.all():
+            raise ValueError(f"transform {int(self.valid.argmin())} is NaN: select the others with [transforms.valid]")
+        return Rotation.from_quat(self.rotations)
+
+    def to_dataframe(self, library: str = "pandas") -> Any:
+        """A data frame with one row for each transform; needs the library.
+
+        Its columns are ``stamp_ns`` if there are stamps, ``x_m``, ``y_m``, ``z_m``, ``qx``, ``qy``, ``qz``, ``qw``. A
+        transform that is NaN has NaN in all but the first. For dates there is ``pandas.to_datetime(data.stamp_ns)``.
+
+        Parameters
+        ----------
+        library : str
+            ``"pandas"`` or ``"polars"``.
+
+        Raises
+        ------
+        ImportError
+            If the library is not installed.
+        ValueError
+            If it is another one.
+        """
+        if library not in ("pandas", "polars"):
+            raise ValueError(f"library must be 'pandas' or 'polars', not {library!r}")
+        columns: dict[str, npt.NDArray[Any]] = {} if self._stamps is None else {"stamp_ns": self._stamps}
+        columns |= zip(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"), self._columns, strict=True)
+        # Copies, because a data frame may be written to.
+        return import_module(library).DataFrame({name: column.copy() for name, column in columns.items()})
 
     def matrices(self) -> Floats:
         """New homogeneous matrices of shape (n, 4, 4)."""
@@ -138,17 +221,27 @@ class TransformArray:
         return moved
 
     def inverse(self) -> "TransformArray":
-        """The inverse of each transform, without `extrapolated_by` and `gap`."""
-        return from_columns(np.stack(invert((*self._columns,))))
+        """The inverse of each transform at the same stamp, without `extrapolated_by` and `gap`."""
+        return from_columns(np.stack(invert((*self._columns,))), stamps=self._stamps)
 
     def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
-        """Compose with `other` one by one, or all with the same transform, without `extrapolated_by` and `gap`."""
+        """Compose with `other` one by one, or all with the same transform, without `extrapolated_by` and `gap`.
+
+        The stamps are those of the operand that has them; None if both have stamps, and those differ.
+        """
         columns = _columns_of(other, len(self))
-        return NotImplemented if columns is None else from_columns(np.stack(compose((*self._columns,), columns)))
+        if columns is None:
+            return NotImplemented
+        stamps = self._stamps
+        if isinstance(other, TransformArray) and other._stamps is not None:
+            stamps = other._stamps if stamps is None or np.array_equal(stamps, other._stamps) else None
+        return from_columns(np.stack(compose((*self._columns,), columns)), stamps=stamps)
 
     def __rmatmul__(self, other: Transform) -> "TransformArray":
         columns = _columns_of(other, len(self))
-        return NotImplemented if columns is None else from_columns(np.stack(compose(columns, (*self._columns,))))
+        if columns is None:
+            return NotImplemented
+        return from_columns(np.stack(compose(columns, (*self._columns,))), stamps=self._stamps)
 
     def __len__(self) -> int:
         return len(self._columns[0])
@@ -177,7 +270,11 @@ class TransformArray:
                 "list or an array"
             )
         if columns.ndim == 2:
-            return from_columns(columns, None if self._policy_use is None else self._policy_use[:, index])
+            return from_columns(
+                columns,
+                None if self._policy_use is None else self._policy_use[:, index],
+                None if self._stamps is None else self._stamps[index],
+            )
         x, y, z, qx, qy, qz, qw = columns.tolist()
         if x != x:
             raise InvalidTransformError(f"transform {index} is NaN: it has no value", reason="not finite")
@@ -187,10 +284,14 @@ class TransformArray:
         return (self[i] for i in range(len(self)))
 
     def __repr__(self) -> str:
-        return f"<TransformArray of {len(self)}>"
+        missing = len(self) - int(self.valid.sum())
+        span = ""
+        if self._stamps is not None and len(self):
+            span = f" from {format_stamp(int(self._stamps.min()))} to {format_stamp(int(self._stamps.max()))}"
+        return f"<TransformArray of {len(self)}{span}{f', {missing} are NaN' if missing else ''}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return from_columns, (self._columns, self._policy_use)
+        return from_columns, (self._columns, self._policy_use, self._stamps)
 
 
 def from_rows(rows: list[Row]) -> TransformArray:
@@ -198,7 +299,7 @@ def from_rows(rows: list[Row]) -> TransformArray:
     return from_columns(np.array(rows).T if rows else np.empty((7, 0)))
 
 
-def from_columns(columns: Floats, policy_use: Integers | None = None) -> TransformArray:
+def from_columns(columns: Floats, policy_use: Integers | None = None, stamps: Integers | None = None) -> TransformArray:
     """The transforms of valid columns, without a copy.
 
     Parameters
@@ -207,10 +308,13 @@ def from_columns(columns: Floats, policy_use: Integers | None = None) -> Transfo
         Must not be changed from now on.
     policy_use : integer array of shape (2, n), optional
         `extrapolated_by` and `gap` of each transform, in ns; must not be changed either.
+    stamps : integer array of shape (n,), optional
+        In ns; must not be changed either.
     """
     transforms = TransformArray.__new__(TransformArray)
     transforms._columns = locked(columns)
     transforms._policy_use = None if policy_use is None else locked(policy_use)
+    transforms._stamps = None if stamps is None else locked(stamps)
     return transforms
 
 

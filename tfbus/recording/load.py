@@ -5,6 +5,7 @@ import os
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping
 
+from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.recording import RecordedMessage, open_recording
 from tfbus.tree.cycles import NewestEdge, admit
@@ -17,11 +18,12 @@ def load(
     until: int | None = None,
     *,
     problems: Counter[str] | None = None,
+    max_translation: float = MAX_TRANSLATION,
 ) -> TransformTree:
     """Read all transforms of a recording, or of a part of it, into a tree that keeps them all.
 
-    Invalid transforms, and those that would close a loop of parents, are left out and counted, as are the damaged parts
-    of a file.
+    Invalid transforms, those that would close a loop of parents, and those that are further than `max_translation`, are
+    left out and counted, as are the damaged parts of a file.
 
     Parameters
     ----------
@@ -32,6 +34,8 @@ def load(
     problems : Counter, optional
         Gets the number of transforms and messages that were left out, by reason. Without it, they are logged as a
         warning.
+    max_translation : float
+        The greatest magnitude of a translation, in m, at most 1e100.
 
     Returns
     -------
@@ -40,11 +44,13 @@ def load(
 
     Raises
     ------
+    TypeError, ValueError
+        If `max_translation` is not greater than zero and at most 1e100.
     RecordingError
         If the recording cannot be read at all.
     """
     counted: Counter[str] = Counter() if problems is None else problems
-    tree = TransformTree(keep=None)
+    tree = TransformTree(keep=None, max_translation=max_translation)
     with open_recording(path) as recording:
         fill(tree, recording.messages(since, until), counted)
     if problems is None and counted:
@@ -59,14 +65,18 @@ def fill(tree: TransformTree, messages: Iterable[RecordedMessage], problems: Cou
     for _, batch, errors in messages:
         if errors:
             problems.update(error.reason for error in errors)
-        forest.commit(without_loops(forest.frames, batch, forest.names.parents, problems))
+        forest.commit(sound_samples(forest.frames, batch, forest.names.parents, problems, tree.max_translation))
     forest.forget_changes()
 
 
-def without_loops(
-    edges: Mapping[str, NewestEdge], batch: Batch, parents: Container[str], problems: Counter[str]
+def sound_samples(
+    edges: Mapping[str, NewestEdge],
+    batch: Batch,
+    parents: Container[str],
+    problems: Counter[str],
+    max_translation: float = MAX_TRANSLATION,
 ) -> Batch:
-    """Return the batch without the samples that would close a loop of parents, and count those.
+    """Return the batch without the samples that are too far away or would close a loop of parents, and count those.
 
     Parameters
     ----------
@@ -76,13 +86,24 @@ def without_loops(
     parents : container of str
         The frames that are a parent of one of the edges.
     problems : Counter
+    max_translation : float
+        In m.
     """
+    square = max_translation**2
     for sample in batch:
-        parent, child, _, _, _, _ = sample._fields
+        parent, child, _, row, _, _ = sample._fields
         edge = edges.get(child)
-        if edge is None or edge.parent != parent:
-            accepted, refused = admit(edges, batch, parents)
-            problems.update(error.reason for error in refused)
-            return accepted
-    # The usual case: no child has got another parent, so there is no new loop.
-    return batch
+        x, y, z, _, _, _, _ = row
+        # Not `>`, which is false for NaN.
+        if edge is None or edge.parent != parent or not x * x + y * y + z * z <= square:
+            break
+    else:
+        # The usual case: no child has got another parent, so there is no new loop.
+        return batch
+    near = tuple(sample for sample in batch if is_within(sample, max_translation))
+    if len(near) < len(batch):
+        far = (sample for sample in batch if not is_within(sample, max_translation))
+        problems.update(not_physical(sample, max_translation).reason for sample in far)
+    accepted, refused = admit(edges, near, parents)
+    problems.update(error.reason for error in refused)
+    return accepted

@@ -26,7 +26,8 @@ class Player:
     """Publishes the samples of a recording at the recorded pace or another: ``await player.play()``.
 
     Stamps and authorities are the recorded ones; leading slashes are removed from frame names. The bus counts the
-    samples that it refuses, such as a loop of parents.
+    samples that it refuses, such as a loop of parents. It does not compare their stamps with its clock: `max_ahead` is
+    for samples that are not recorded.
 
     On a bus with a `SimulatedClock` the player drives that clock: the clock jumps to the beginning of the recording and
     then advances from the log time of one message to that of the next, so timed tasks run as they did during the
@@ -223,7 +224,8 @@ class Player:
         self.bad.update(error.reason for error in message.errors)
         if not message.batch:
             return
-        self.bus.publish(message.batch, invalid="drop")
+        with self.bus._recorded_time():
+            self.bus.publish(message.batch, invalid="drop")
         self.played += len(message.batch)
         if self._simulated is None:
             for sample in message.batch:

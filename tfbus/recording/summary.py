@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.recording.load import without_loops
+from tfbus.recording.load import sound_samples
 from tfbus.recording.recording import RecordedMessage, Recording
 from tfbus.stamps import SECOND
 
@@ -113,7 +113,7 @@ def summarise(recording: Recording, messages: Iterable[RecordedMessage] | None =
         count += 1
         if errors:
             problems.update(error.reason for error in errors)
-        for sample in without_loops(frames, batch, named, problems):
+        for sample in sound_samples(frames, batch, named, problems):
             child = sample.child
             named.add(sample.parent)
             frame = frames.get(child)

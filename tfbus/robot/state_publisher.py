@@ -3,6 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -29,27 +30,38 @@ class RobotStatePublisher:
         can share a bus. The names of joints have no prefix.
     authority : str
         The sender: shown in errors and tools.
+    invalid : {"raise", "drop"}
+        What to do with a frame that the bus refuses, as in `Bus.publish`.
 
     Raises
     ------
     InvalidTransformError
         If the bus refuses a fixed joint, because it would close a loop of parents or belongs to another authority.
     ValueError
-        If the prefix starts with a slash.
+        If the prefix starts with a slash, or `invalid` is neither.
     BusClosedError, TypeError
     """
 
-    def __init__(self, bus: Bus, model: RobotModel, prefix: str = "", authority: str = "robot_state_publisher") -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        model: RobotModel,
+        prefix: str = "",
+        authority: str = "robot_state_publisher",
+        *,
+        invalid: Literal["raise", "drop"] = "raise",
+    ) -> None:
         as_prefix(prefix or None, ())
         self.bus = bus
         self.model = model
         self.prefix = prefix
         self.authority = authority
+        self._invalid = invalid
         self._messages = 0
         self._unknown = 0
         self._violations: Counter[str] = Counter()
         self._log = OnceLogger(logging.getLogger("tfbus"))
-        bus.publish(model.fixed_transforms(bus.clock.now(), authority, prefix))
+        bus.publish(model.fixed_transforms(bus.clock.now(), authority, prefix), invalid)
 
     def publish(self, positions: Mapping[str, Position], stamp: int | None = None) -> None:
         """Publish the transforms of the moving joints as one batch.
@@ -72,7 +84,7 @@ class RobotStatePublisher:
         BusClosedError, TypeError
         """
         stamp = self.bus.clock.now() if stamp is None else stamp
-        self.bus.publish(self.model.moving_transforms(positions, stamp, self.authority, self.prefix))
+        self.bus.publish(self.model.moving_transforms(positions, stamp, self.authority, self.prefix), self._invalid)
         self._messages += 1
         for name in self.model.unknown_joints(positions):
             self._unknown += 1

@@ -10,11 +10,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
-from tfbus.stamps import LATEST, Latest, format_duration, format_stamp, to_seconds
+from tfbus.stamps import LATEST, Latest, format_age, format_duration, format_stamp, to_seconds
 from tfbus.tree.extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import AT_A_TIME, Forest
 from tfbus.tree.history import FrameHistory
-from tfbus.tree.lookup import At, find
+from tfbus.tree.lookup import At, Bounds, find
 from tfbus.tree.policy import Policy
 from tfbus.tree.rendering import format_rate
 
@@ -38,7 +38,7 @@ class ExplainedEdge:
     newest : int or None
         The stamp of the newest sample, in ns; None if the edge is static or has none.
     age : float or None
-        How old the newest sample was at the `now` of the explanation, in s.
+        How old the newest sample was at the `now` of the explanation, in s; negative if it is ahead of it.
     rate : float or None
         Mean samples a second over the window; None for fewer than two.
     authority : str
@@ -134,7 +134,7 @@ def _cells(edge: ExplainedEdge, now: int | None, below: bool) -> list[str]:
     """The cells of one edge's line of text."""
     age = ""
     if edge.newest is not None and now is not None:
-        age = f"age {format_duration(now - edge.newest)}"
+        age = format_age(now - edge.newest)
     return [
         "!" if edge.error is not None else " ",
         f"{edge.parent} <- {edge.child}" if below else f"{edge.child} -> {edge.parent}",
@@ -175,11 +175,11 @@ class _Finding(NamedTuple):
 
 
 def explain(
-    forest: Forest, target: str, source: str, at: At, not_before: int | None, policy: Policy | None, now: int | None
+    forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, policy: Policy | None, now: int | None
 ) -> Explanation:
     """The explanation of a lookup; the parameters are those of `TransformTree.explain`. Takes the lock."""
     with forest.lock:
-        found = _find(forest, target, source, at, not_before, policy)
+        found = _find(forest, target, source, at, bounds, policy)
         if isinstance(found.raised, UnknownFrameError):
             return Explanation(target, source, at, None, now, errors=_unknown(forest, target, source))
         if now is None:
@@ -203,12 +203,12 @@ def explain(
     return Explanation(target, source, at, found.stamp, now, found.chain, found.half_chains, tuple(edges), errors)
 
 
-def _find(forest: Forest, target: str, source: str, at: At, not_before: int | None, policy: Policy | None) -> _Finding:
+def _find(forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, policy: Policy | None) -> _Finding:
     extrapolation = None if policy is None else Extrapolation(policy)
     stamp: int | None = None
     raised: TransformLookupError | None = None
     try:
-        stamp, _, _ = find(forest, target, source, at, not_before, extrapolation)
+        stamp, _, _ = find(forest, target, source, at, bounds, extrapolation)
     except UnknownFrameError as error:
         return _Finding(None, error, None)
     except DisconnectedError as error:

@@ -66,6 +66,8 @@ class Forest:
         Frames that have become a parent since `forget_changes`, so that they may have become known.
     looping : list of LoopingSample
         Samples since `forget_changes` that are part of a loop of parents at a past stamp.
+    expired_frames : list of str
+        The frame of each sample that expired since `forget_changes`.
     inserted, replaced, expired : int
         Number of samples that had each `Outcome`.
     looped : int
@@ -78,6 +80,7 @@ class Forest:
         "changed",
         "changing_paths",
         "expired",
+        "expired_frames",
         "frames",
         "inserted",
         "lock",
@@ -102,6 +105,7 @@ class Forest:
         self.looping: list[LoopingSample] = []
         self._suspects: list[TransformStamped] = []
         self._readers: dict[int, set[str]] = {}
+        self.expired_frames: list[str] = []
         self.inserted = 0
         self.replaced = 0
         self.expired = 0
@@ -175,6 +179,7 @@ class Forest:
             self.replaced += 1
         else:
             self.expired += 1
+            self.expired_frames.append(child)
         return outcome
 
     def remove(self, frame: str) -> None:
@@ -214,10 +219,11 @@ class Forest:
         self._suspects.clear()
 
     def forget_changes(self) -> None:
-        """Empty `changed`, `new_parents` and `looping`."""
+        """Empty `changed`, `new_parents`, `looping` and `expired_frames`."""
         self.changed.clear()
         self.new_parents.clear()
         self.looping.clear()
+        self.expired_frames.clear()
 
     def forget_paths(self) -> None:
         """Empty `paths` and `changing_paths`."""

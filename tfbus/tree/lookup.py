@@ -1,8 +1,10 @@
 """Lookups at one stamp: the stamp that `LATEST` means, the transform along the path, and the error if there is none."""
 
 from contextlib import suppress
+from typing import NamedTuple
 
 from tfbus.errors import (
+    AheadError,
     DisconnectedError,
     ExtrapolationError,
     FutureExtrapolationError,
@@ -11,7 +13,7 @@ from tfbus.errors import (
 )
 from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
-from tfbus.stamps import LATEST, Latest, as_stamp
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_stamp
 from tfbus.tree.extrapolation import Extrapolation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
@@ -23,7 +25,30 @@ Found = tuple[int, Row, bool]
 """Stamp in ns, row, and whether the whole path is static."""
 
 GO_TOGETHER = "source_at and fixed go together: source at its stamp, carried through the fixed frame"
-AT_LATEST_ONLY = "not_before goes with LATEST: an answer at a given stamp never gets newer"
+AT_LATEST_ONLY = "not_before and not_after go with LATEST: an answer at a given stamp never gets newer"
+
+
+class Bounds(NamedTuple):
+    """The oldest and the newest stamp that count as `LATEST`, in ns."""
+
+    not_before: int
+    not_after: int
+
+
+def bounds_of(not_before: int | None, not_after: int | None) -> Bounds | None:
+    """The bounds that two arguments make; None if they allow every stamp.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one is not a stamp.
+    """
+    if not_before is None and not_after is None:
+        return None
+    return Bounds(
+        STAMP_MIN if not_before is None else as_stamp(not_before),
+        STAMP_MAX if not_after is None else as_stamp(not_after),
+    )
 
 
 def answer(
@@ -33,25 +58,25 @@ def answer(
     at: At,
     source_at: At | None,
     fixed: str | None,
-    not_before: int | None,
+    bounds: Bounds | None,
     policy: Policy | None,
 ) -> TransformStamped:
     """The answer of `TransformTree.lookup`, without keywords: each of them costs a twentieth of a lookup."""
-    if policy is None and not_before is None and source_at is None and fixed is None:
+    if policy is None and bounds is None and source_at is None and fixed is None:
         found = forest.paths.answer(target, source, at)
         if found is not None:
             return found
-    if not_before is not None and at is not LATEST and source_at is not LATEST:
+    if bounds is not None and at is not LATEST and source_at is not LATEST:
         raise TypeError(AT_LATEST_ONLY)
     if type(at) is not int and at is not LATEST:
         at = as_stamp(at)
     extrapolation = None if policy is None else Extrapolation(policy)
     with forest.lock:
         if source_at is None and fixed is None:
-            stamp, row, static = find(forest, target, source, at, not_before, extrapolation)
+            stamp, row, static = find(forest, target, source, at, bounds, extrapolation)
         else:
             stamp, row, static = find_in_time_travel(
-                forest, target, source, at, source_at, fixed, not_before, extrapolation
+                forest, target, source, at, source_at, fixed, bounds, extrapolation
             )
     if extrapolation is None:
         return answer_of(target, source, stamp, row, static)
@@ -59,7 +84,7 @@ def answer(
 
 
 def find(
-    forest: Forest, target: str, source: str, at: At, not_before: int | None, extrapolation: Extrapolation | None = None
+    forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, extrapolation: Extrapolation | None = None
 ) -> Found:
     """Source in target at one stamp. The caller holds the lock; the errors are those of `TransformTree.lookup`."""
     path = forest.paths.find(target, source)
@@ -70,7 +95,7 @@ def find(
             at = path.static_stamp if len(path.frames) > 1 else _newest_stamp(forest, target)
         return as_stamp(at), path.row_at(0), True
     if at is LATEST:
-        return _find_latest(forest, path, not_before, extrapolation)
+        return _find_latest(forest, path, bounds, extrapolation)
     if extrapolation is not None:
         return at, _extrapolated(forest.find_path(target, source, at), at, extrapolation), False
     try:
@@ -95,17 +120,21 @@ def _extrapolated(path: Path, at: int, extrapolation: Extrapolation) -> Row:
     raise decisive
 
 
-def _find_latest(forest: Forest, path: Path, not_before: int | None, extrapolation: Extrapolation | None) -> Found:
+def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolation: Extrapolation | None) -> Found:
     """Source in target at the newest stamp that every moving edge has reached.
 
     Under a policy it is the newest stamp of any edge, as far as the lagging edge may be held.
     """
     common, lagging = path.newest_common()
     if extrapolation is not None:
-        newest = max(edge.newest for edge in path.moving if edge.newest is not None)
-        common = min(common + extrapolation.policy.hold, newest)
-    if not_before is not None and common < not_before:
-        raise _latest_error(path, lagging, not_before, extrapolation, 0)
+        common = min(common + extrapolation.policy.hold, max(map(_newest, path.moving)))
+    if bounds is not None and common < bounds.not_before:
+        raise _latest_error(path, lagging, bounds.not_before, extrapolation, 0)
+    if bounds is not None and common > bounds.not_after:
+        edge = lagging if extrapolation is None else max(path.moving, key=_newest)
+        raise AheadError(
+            child=edge.child, stamp=bounds.not_after, oldest=edge.oldest, newest=edge.newest, authority=edge.authority
+        )
     try:
         path_then = path
         if not path.permanent:
@@ -146,7 +175,7 @@ def find_in_time_travel(
     at: At,
     source_at: At | None,
     fixed: str | None,
-    not_before: int | None,
+    bounds: Bounds | None,
     extrapolation: Extrapolation | None = None,
 ) -> Found:
     """Source at its own stamp, carried through the fixed frame into target at another. The caller holds the lock."""
@@ -157,19 +186,24 @@ def find_in_time_travel(
     for name in (target, source, fixed):
         forest.check_known(name)
     try:
-        stamp, target_from_fixed, target_static = find(forest, target, fixed, at, not_before, extrapolation)
+        stamp, target_from_fixed, target_static = find(forest, target, fixed, at, bounds, extrapolation)
     except FutureExtrapolationError:
         # Waiting for this half is useless if waiting cannot help the other one: then that error is raised.
-        find(forest, fixed, source, source_at, not_before, extrapolation)
+        find(forest, fixed, source, source_at, bounds, extrapolation)
         raise
     except DisconnectedError:
         with suppress(DisconnectedError, FutureExtrapolationError):
-            find(forest, fixed, source, source_at, not_before, extrapolation)
+            find(forest, fixed, source, source_at, bounds, extrapolation)
         raise
-    source_stamp, fixed_from_source, source_static = find(forest, fixed, source, source_at, not_before, extrapolation)
+    source_stamp, fixed_from_source, source_static = find(forest, fixed, source, source_at, bounds, extrapolation)
     if at is LATEST and target_static and not source_static:
         stamp = source_stamp
     return stamp, compose(target_from_fixed, fixed_from_source), target_static and source_static
+
+
+def _newest(edge: FrameHistory) -> int:
+    """The newest stamp of an edge that has samples, in ns."""
+    return STAMP_MIN if edge.newest is None else edge.newest
 
 
 def _newest_stamp(forest: Forest, frame: str) -> int:

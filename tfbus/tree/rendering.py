@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from tfbus.stamps import format_duration, format_stamp
+from tfbus.stamps import format_age, format_duration, format_stamp
 from tfbus.tree.history import Edge
 
 _NOT_IN_YAML = re.compile(r"[\x7f-\xa0\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
@@ -35,7 +35,7 @@ def facts(edge: Edge, now: int) -> dict[str, str]:
     """The rate, age, span and authority of an edge as texts, as far as the edge has them."""
     known = {"rate": _rate(edge)}
     if edge.oldest is not None and edge.newest is not None:
-        known["age"] = f"age {format_duration(now - edge.newest)}"
+        known["age"] = format_age(now - edge.newest)
         known["span"] = f"span {format_duration(edge.newest - edge.oldest)}"
     if edge.authority:
         known["authority"] = f"from {edge.authority!r}"

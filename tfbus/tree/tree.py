@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from tfbus.data import PointCloud, TwistStamped
 from tfbus.errors import TransformLookupError
+from tfbus.geometry.bounds import MAX_TRANSLATION, as_max_translation, check_translations
 from tfbus.geometry.stamped import TransformStamped, as_batch
 from tfbus.geometry.transform_array import TransformArray
 from tfbus.stamps import LATEST, Latest, Stamps, as_duration, as_stamp, as_stamps, from_seconds
@@ -20,7 +21,7 @@ from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome
-from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer
+from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer, bounds_of
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.rendering import describe, to_dot, to_yaml
 
@@ -37,15 +38,19 @@ class TransformTree:
         Length of the history of each frame, in s before that frame's newest stamp; None keeps everything. A late
         sample then costs more the longer the history is, because all samples after it are moved: in the middle of a
         million samples some ms.
+    max_translation : float
+        The greatest magnitude of a translation, in m, at most 1e100; a longer one is refused as not physical, so that
+        every answer is finite.
 
     Raises
     ------
-    ValueError
-        If `keep` is negative or NaN.
+    TypeError, ValueError
+        If `keep` is negative or NaN, or `max_translation` is not greater than zero and at most 1e100.
 
     Attributes
     ----------
     keep : float or None
+    max_translation : float
 
     Examples
     --------
@@ -56,8 +61,9 @@ class TransformTree:
     (0.1, 0.0, 0.2)
     """
 
-    def __init__(self, keep: float | None = 10.0) -> None:
+    def __init__(self, keep: float | None = 10.0, *, max_translation: float = MAX_TRANSLATION) -> None:
         self.keep = keep
+        self.max_translation = as_max_translation(max_translation)
         self._forest = Forest(window_of(keep))
         self._filled_by_bus = False
 
@@ -69,7 +75,8 @@ class TransformTree:
         Raises
         ------
         InvalidTransformError
-            If it would close a loop of parents. Nothing is stored.
+            If it would close a loop of parents, or its translation is not finite or longer than `max_translation`.
+            Nothing is stored.
         TypeError
             If it is not a `TransformStamped`.
         """
@@ -81,12 +88,14 @@ class TransformTree:
         Raises
         ------
         InvalidTransformError
-            If a sample would close a loop of parents.
+            If a sample would close a loop of parents, or a translation is not finite or longer than `max_translation`.
         TypeError
             If something in it is not a `TransformStamped`.
         """
         self._check_writable("use bus.publish, or a copy() of the tree")
-        return self._forest.insert(as_batch(samples))
+        batch = as_batch(samples)
+        check_translations(batch, self.max_translation)
+        return self._forest.insert(batch)
 
     @property
     def inserted(self) -> int:
@@ -119,6 +128,7 @@ class TransformTree:
         source_at: At | None = None,
         fixed: str | None = None,
         not_before: int | None = None,
+        not_after: int | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -137,6 +147,8 @@ class TransformTree:
             The frame that stands still between the two stamps.
         not_before : int, optional
             Count a `LATEST` answer older than this (ns) as not yet arrived.
+        not_after : int, optional
+            Refuse a `LATEST` answer newer than this (ns), such as one from a clock that is ahead.
         tolerance : float
             In s. If an edge does not cover the stamp, or only by a gap that is too long, its nearest sample within this
             distance stands in.
@@ -162,9 +174,11 @@ class TransformTree:
             If the stamp is older than an edge's window.
         GapError
             If the stamp lies in a gap that is too long.
+        AheadError
+            If the `LATEST` answer is newer than `not_after`.
         TypeError
             If a stamp is a float, a frame is not a string, only one of `source_at` and `fixed` is given, or
-            `not_before` comes without a `LATEST`.
+            `not_before` or `not_after` comes without a `LATEST`.
 
         Notes
         -----
@@ -175,14 +189,15 @@ class TransformTree:
         """
         policy = None
         if tolerance == 0.0 and max_gap is None and extrapolate is None:
-            if source_at is None and fixed is None and not_before is None:
+            if source_at is None and fixed is None and not_before is None and not_after is None:
                 # Nearly all questions are plain, and a call on the way costs a fifth of the answer.
                 found = self._forest.paths.answer(target, source, at)
                 if found is not None:
                     return found
         else:
             policy = policy_of(tolerance, max_gap, extrapolate)
-        return answer(self._forest, target, source, at, source_at, fixed, not_before, policy)
+        bounds = bounds_of(not_before, not_after)
+        return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
     def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
@@ -199,6 +214,7 @@ class TransformTree:
         at: At = LATEST,
         *,
         not_before: int | None = None,
+        not_after: int | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -208,7 +224,7 @@ class TransformTree:
 
         Parameters
         ----------
-        target, source, at, not_before, tolerance, max_gap, extrapolate
+        target, source, at, not_before, not_after, tolerance, max_gap, extrapolate
             As `lookup`. Time travel has two halves; explain each of them.
         now : int, optional
             The stamp that ages are counted from, in ns; by default the newest in the tree.
@@ -219,11 +235,12 @@ class TransformTree:
             As `lookup`. A lookup without an answer is no error here.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
-        if not_before is not None and at is not LATEST:
+        bounds = bounds_of(not_before, not_after)
+        if bounds is not None and at is not LATEST:
             raise TypeError(AT_LATEST_ONLY)
         if at is not LATEST:
             at = as_stamp(at)
-        return explain(self._forest, target, source, at, not_before, policy, now)
+        return explain(self._forest, target, source, at, bounds, policy, now)
 
     def lookup_many(
         self,
@@ -431,7 +448,7 @@ class TransformTree:
 
     def copy(self) -> "TransformTree":
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
-        twin = TransformTree(self.keep)
+        twin = TransformTree(self.keep, max_translation=self.max_translation)
         twin._forest = self._forest.copy()
         return twin
 
@@ -460,9 +477,9 @@ class TransformTree:
             raise RuntimeError(f"a bus feeds this tree: {instead}")
 
 
-def tree_of(forest: Forest, keep: float | None) -> TransformTree:
+def tree_of(forest: Forest, keep: float | None, max_translation: float = MAX_TRANSLATION) -> TransformTree:
     """The tree over a forest that a bus fills. It cannot be changed, because a change would wake no waiting lookup."""
-    tree = TransformTree(keep)
+    tree = TransformTree(keep, max_translation=max_translation)
     tree._forest = forest
     tree._filled_by_bus = True
     return tree

@@ -36,6 +36,10 @@ class LiveTree:
         The reason why no more samples will come; None while they may.
     last_reset : ClockResetError or None
         The last jump back of the clock; a new object for each.
+    is_ahead : callable
+        Says whether the newest stamp of a frame, in ns, from an authority is ahead of the clock. The bus sets it.
+    expired_ahead, superseded : int
+        As in `BufferStatistics`; the bus counts the superseded ones.
     """
 
     def __init__(self, forest: Forest, on_loop: Callable[[LoopingSample], object] | None = None) -> None:
@@ -45,6 +49,9 @@ class LiveTree:
         self.watching = WatchIndex()
         self.end_reason: str | None = None
         self.last_reset: ClockResetError | None = None
+        self.is_ahead: Callable[[str, int, str], bool] = lambda _child, _newest, _authority: False
+        self.expired_ahead = 0
+        self.superseded = 0
         self._waiters = self.waiting.by_frame
         self._watches = self.watching.by_frame
         self._end_callbacks: dict[Registration, Callable[[], object]] = {}
@@ -67,6 +74,10 @@ class LiveTree:
         if self._watches:
             _wake(self.watching.mark([sample._fields[1] for sample in batch]))
         if not plain:
+            for frame in self.forest.expired_frames:
+                history = self.forest.frames.get(frame)
+                if history is not None and history.newest is not None:
+                    self.expired_ahead += self.is_ahead(frame, history.newest, history.authority)
             self._wake_for_new_topology()
 
     def park(self, waiter: Waiter, error: TransformLookupError) -> None:
@@ -134,7 +145,14 @@ class LiveTree:
         """The counters, with the number of samples that the bus has offered."""
         forest = self.forest
         return BufferStatistics(
-            offered, forest.inserted, forest.replaced, forest.expired, len(self.waiting), forest.looped
+            offered,
+            forest.inserted,
+            forest.replaced,
+            forest.expired + self.superseded,
+            len(self.waiting),
+            self.expired_ahead,
+            self.superseded,
+            forest.looped,
         )
 
     def _limits(self, waiter: Waiter, error: TransformLookupError | None) -> list[tuple[str, int]]:

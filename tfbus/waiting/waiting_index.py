@@ -18,6 +18,7 @@ from itertools import count
 
 from tfbus.errors import (
     MAY_COME,
+    AheadError,
     DisconnectedError,
     FutureExtrapolationError,
     GapError,
@@ -94,6 +95,8 @@ def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
     """
     if isinstance(error, FutureExtrapolationError):
         return (error.child, *error.others)
+    if isinstance(error, AheadError):
+        return (error.child,)
     if isinstance(error, UnknownFrameError):
         return (error.frame,)
     if isinstance(error, DisconnectedError):

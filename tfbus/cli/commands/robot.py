@@ -4,11 +4,15 @@ import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import anyio
+
 from tfbus.bus.bus import Bus
+from tfbus.cli._static_frames import publish_static
 from tfbus.cli.arguments import Flag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_numbers, format_transform, printable, say, warn
 from tfbus.errors import InvalidRobotError, InvalidTransformError
+from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
 from tfbus.geometry.transform import Transform
 from tfbus.robot.joint import Joint, Position
 from tfbus.robot.model import RobotModel
@@ -29,7 +33,8 @@ def robot(
 ) -> None:
     """Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at zero.
 
-    Fixed joints are published once, the others again and again. A position beyond the limits of its joint is reported
+    Fixed joints are published once, the others again and again. A frame that is refused, because an edge of another
+    program is in its way, is tried again. A position beyond the limits of its joint is reported
     and published all the same.
 
     Example: tfbus robot arm.urdf shoulder=0.5 elbow=-1.2 --tree
@@ -51,7 +56,8 @@ def robot(
     model = _read_model(file)
     positions = {**model.zeros(), **_parse_positions(model, position)}
     try:
-        count = len(model.transforms(positions, 0, AUTHORITY, prefix))
+        transforms = model.transforms(positions, 0, AUTHORITY, prefix)
+        check_translations(tuple(transforms), MAX_TRANSLATION)
         violations = model.violations(positions)
     except InvalidTransformError as error:
         raise UsageError(str(error)) from None
@@ -62,10 +68,12 @@ def robot(
         return
 
     async def publish(bus: Bus) -> None:
-        say(f"publishing {count} frames of {model.name!r} on domain {link.domain!r} at {rate:g} Hz, until Ctrl-C")
-        bus.publish(model.fixed_transforms(bus.clock.now(), AUTHORITY, prefix))
-        async for _ in bus.clock.ticks(rate):
-            bus.publish(model.moving_transforms(positions, bus.clock.now(), AUTHORITY, prefix))
+        where = f"on domain {link.domain!r} at {rate:g} Hz"
+        say(f"publishing {len(transforms)} frames of {model.name!r} {where}, until Ctrl-C")
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(publish_static, bus, model.fixed_transforms(bus.clock.now(), AUTHORITY, prefix))
+            async for _ in bus.clock.ticks(rate):
+                bus.publish(model.moving_transforms(positions, bus.clock.now(), AUTHORITY, prefix), invalid="drop")
 
     link.run(publish)
 

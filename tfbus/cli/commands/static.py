@@ -6,10 +6,12 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
+from tfbus.cli._static_frames import publish_static
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_transform, say
 from tfbus.errors import InvalidTransformError
+from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
 from tfbus.geometry.rows import Quaternion, Vector
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
@@ -29,7 +31,8 @@ def static(
 ) -> None:
     """Publish the static transform of CHILD in PARENT, until Ctrl-C.
 
-    Programs that join later receive it too. After the end, programs that have it keep it; those that join do not get
+    Programs that join later receive it too. If an edge of another program is in its way, it is tried again once a
+    second. After the end, programs that have it keep it; those that join do not get
     it.
 
     Example: tfbus static base_link base_laser --xyz 0.1 0 0.2 --rpy 0 0 1.5708
@@ -52,9 +55,9 @@ def static(
     sample = _sample(parent, child, xyz, rpy, quaternion, authority)
 
     async def publish(bus: Bus) -> None:
-        bus.publish(sample.replace(stamp=bus.clock.now()))
         numbers = format_transform(sample.transform)
         say(f"publishing {child!r} in {parent!r} on domain {link.domain!r}, until Ctrl-C: {numbers}")
+        await publish_static(bus, [sample.replace(stamp=bus.clock.now())])
         await anyio.sleep_forever()
 
     link.run(publish)
@@ -71,6 +74,7 @@ def _sample(
         else:
             transform = Transform.from_xyz_rpy(xyz, (0, 0, 0) if rpy is None else rpy)
         sample = TransformStamped(parent, child, 0, transform, authority, static=True)
+        check_translations((sample,), MAX_TRANSLATION)
     except InvalidTransformError as error:
         raise UsageError(str(error)) from None
     unsendable = refusal(sample)

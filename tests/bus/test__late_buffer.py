@@ -1,0 +1,242 @@
+"""Buffers that join late: their newest edges are those of the bus, whatever they have not seen."""
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+from support.samples import any_samples, moving, over, static, tree_of, x_of
+
+from tfbus import (
+    SECOND,
+    Buffer,
+    Bus,
+    DisconnectedError,
+    InvalidTransformError,
+    SimulatedClock,
+    TransformStamped,
+    TransformTree,
+    UnknownFrameError,
+)
+
+FRAMES = "abcd"
+NANO = 1e-9
+
+
+def bus_with(*batches: list[TransformStamped]) -> Bus:
+    bus = Bus(SimulatedClock(100 * SECOND))
+    for batch in batches:
+        bus.publish(batch)
+    return bus
+
+
+# What is superseded
+
+
+def test_a_late_sample_with_an_old_parent_is_not_the_newest_of_a_buffer_that_missed_the_new_one() -> None:
+    bus = Bus(SimulatedClock(100 * SECOND))
+    early = Buffer(bus)
+    bus.publish(moving("a", "x", 5 * SECOND))
+    late = Buffer(bus)
+    bus.publish(moving("x", "b", 6 * SECOND))
+    bus.publish(moving("b", "x", 4 * SECOND, 7.0))
+    assert x_of(early.tree, "b", "x") == 0.0
+    assert x_of(late.tree, "b", "x") == 0.0
+    counted = bus.statistics().buffers[1]
+    assert (counted.offered, counted.inserted, counted.expired, counted.superseded) == (2, 1, 1, 1)
+
+
+def test_a_late_sample_with_the_newest_parent_is_stored_and_so_is_every_sample_after_the_newest() -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus)
+    bus.publish([moving("a", "x", 40, 4.0), moving("old", "x", 45)])
+    assert x_of(late.tree, "a", "x", 40) == 4.0
+    assert late.tree.frames() == ["a", "x"]
+    bus.publish([moving("a", "x", 50, 5.0), moving("old", "x", 45, 1.0)])
+    assert (late.tree.parent("x", 45), late.tree.parent("x")) == ("old", "a")
+    assert bus.statistics().buffers[0].superseded == 1
+
+
+@pytest.mark.parametrize("newer", [moving("b", "x", 60), static("b", "x")])
+def test_a_new_parent_ends_the_waiting_for_the_sample_that_was_missed(newer: TransformStamped) -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus)
+    bus.publish([newer, moving("c", "x", 45)])
+    assert bus.statistics().buffers[0].superseded == 0
+    assert late.tree.parent("x") == ("b" if not newer.static else "c")
+
+
+def test_a_removed_frame_and_a_jump_back_of_the_clock_supersede_nothing() -> None:
+    clock = SimulatedClock(100 * SECOND)
+    bus = Bus(clock)
+    bus.publish([moving("a", "x", 50), moving("a", "y", 50)])
+    late = Buffer(bus)
+    bus.remove_frame("x")
+    bus.publish(moving("b", "x", 40))
+    clock.set(0)
+    bus.publish(moving("b", "y", 40))
+    assert (late.tree.parent("x"), late.tree.parent("y")) == ("b", "b")
+    assert bus.statistics().buffers[0].superseded == 0
+
+
+def test_a_buffer_that_has_caught_up_or_is_closed_is_forgotten() -> None:
+    bus = bus_with([moving("a", "x", 50), static("a", "y")])
+    first, second = Buffer(bus), Buffer(bus)
+    assert len(bus._late) == 2
+    second.close()
+    assert len(bus._late) == 1
+    bus.publish(moving("a", "x", 50))
+    assert bus._late == {}
+    assert first.tree.parent("x") == "a"
+
+
+# What a prefill contradicts
+
+
+def test_a_prefilled_frame_with_another_newest_parent_than_on_the_bus_is_left_out() -> None:
+    bus = bus_with([moving("a", "x", 50), moving("a", "y", 50)])
+    late = Buffer(bus, prefill=tree_of(moving("b", "x", 60), moving("a", "y", 40, 3.0), static("b", "z")))
+    assert late.tree.frames() == ["a", "b", "y", "z"]
+    assert x_of(late.tree, "a", "y", 40) == 3.0
+    bus.publish(moving("b", "y", 45))
+    assert late.tree.parent("y") == "a"
+
+
+def test_a_prefilled_static_frame_gives_way_to_a_moving_one_of_the_bus() -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    assert Buffer(bus, prefill=tree_of(static("a", "x"))).tree.frames() == []
+
+
+def test_a_prefilled_edge_that_closes_a_loop_with_the_bus_is_removed() -> None:
+    bus = bus_with([moving("a", "x", 50), static("x", "y")])
+    late = Buffer(bus, prefill=tree_of(moving("y", "a", 40), moving("y", "z", 40)))
+    assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("x", "y"), ("y", "z")]
+    bus.publish(moving("z", "p", 60))
+    bus.publish(moving("p", "y", 60))
+    assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("z", "p"), ("p", "y")]
+
+
+def test_only_the_prefilled_edges_in_the_loop_are_removed() -> None:
+    bus = bus_with()
+    late = Buffer(
+        bus, prefill=tree_of(*[moving(p, c, 40) for p, c in (("a", "b"), ("b", "c"), ("b", "d"), ("r", "a"))])
+    )
+    bus.publish(moving("c", "b", 60))
+    assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("r", "a"), ("c", "b"), ("b", "d")]
+
+
+def test_samples_of_a_prefill_that_are_ahead_of_the_bus_give_way_when_the_bus_reparents() -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus, prefill=tree_of(*over("a", "x", (50, 90)), keep=None))
+    bus.publish(moving("a", "x", 60))
+    assert late.tree.edges()[0].newest == 90
+    bus.publish(moving("b", "x", 70))
+    assert [(edge.parent, edge.newest) for edge in late.tree.edges()] == [("b", 70)]
+
+
+# Any history
+
+samples = any_samples(FRAMES, 12)
+trees = st.lists(samples, max_size=6)
+
+
+def newest_of(bus: Bus) -> dict[str, tuple[str, bool]]:
+    return {edge.frame: (edge.parent, edge.static) for edge in bus._topology.known()}
+
+
+class LateBuffers(RuleBasedStateMachine):
+    """Buffers that join a bus at any moment, with any window and any prefill."""
+
+    buffers = Bundle("buffers")
+
+    @initialize(target=buffers)
+    def begin(self) -> Buffer:
+        self.clock = SimulatedClock(1_000)
+        self.bus = Bus(self.clock)
+        self.open: list[Buffer] = []
+        return self.join(None, None)
+
+    def join(self, keep: int | None, prefill: Buffer | TransformTree | None) -> Buffer:
+        buffer = Buffer(self.bus, None if keep is None else keep * NANO, prefill=prefill)
+        self.open.append(buffer)
+        return buffer
+
+    @rule(target=buffers, keep=st.none() | st.integers(0, 12))
+    def join_empty(self, keep: int | None) -> Buffer:
+        return self.join(keep, None)
+
+    @rule(target=buffers, keep=st.none() | st.integers(0, 12), other=buffers)
+    def join_prefilled(self, keep: int | None, other: Buffer) -> Buffer:
+        return self.join(keep, other)
+
+    @rule(target=buffers, stored=trees)
+    def join_with_a_foreign_tree(self, stored: list[TransformStamped]) -> Buffer:
+        tree = TransformTree(keep=None)
+        for sample in stored:
+            with suppress(InvalidTransformError):
+                tree.insert(sample)
+        return self.join(None, tree)
+
+    @rule(target=buffers, buffer=consumes(buffers))
+    def leave(self, buffer: Buffer) -> object:
+        buffer.close()
+        if buffer in self.open:
+            self.open.remove(buffer)
+        # It may still be the prefill of others.
+        return multiple(buffer)
+
+    @rule(batch=st.lists(samples, min_size=1, max_size=3))
+    def publish(self, batch: list[TransformStamped]) -> None:
+        self.bus.publish(batch, invalid="drop")
+
+    @rule(frame=st.sampled_from(FRAMES))
+    def remove(self, frame: str) -> None:
+        with suppress(UnknownFrameError):
+            self.bus.remove_frame(frame)
+
+    @rule()
+    def jump_back(self) -> None:
+        self.clock.set(self.clock.now() - 1)
+
+    @invariant()
+    def the_newest_edges_of_each_buffer_are_those_of_the_bus(self) -> None:
+        newest = newest_of(self.bus)
+        for buffer in self.open:
+            for edge in buffer.tree.edges():
+                if edge.samples and edge.child in newest:
+                    assert (edge.parent, edge.static) == newest[edge.child]
+
+    @invariant()
+    def no_buffer_holds_a_loop_even_with_what_it_has_not_seen(self) -> None:
+        parents = {child: parent for child, (parent, _) in newest_of(self.bus).items()}
+        for buffer in self.open:
+            own = {edge.child: edge.parent for edge in buffer.tree.edges() if edge.samples}
+            check_no_loop({**own, **parents})
+
+    @invariant()
+    def every_sample_is_counted(self) -> None:
+        for counted in self.bus.statistics().buffers:
+            assert counted.offered == counted.inserted + counted.replaced + counted.expired
+            assert counted.superseded <= counted.expired
+
+
+def check_no_loop(parents: dict[str, str]) -> None:
+    for frame in parents:
+        walk = [frame]
+        while walk[-1] in parents:
+            walk.append(parents[walk[-1]])
+            assert len(walk) <= len(parents) + 1, walk
+
+
+TestLateBuffers = LateBuffers.TestCase
+TestLateBuffers.settings = settings(stateful_step_count=25)
+
+
+def test_a_loop_that_a_late_buffer_would_have_held_is_none_for_any_question() -> None:
+    bus = bus_with([moving("a", "x", 5)])
+    late = Buffer(bus)
+    bus.publish([moving("x", "b", 6), moving("b", "x", 4)])
+    with pytest.raises((DisconnectedError, UnknownFrameError)):
+        late.lookup_nowait("a", "b")
+    assert late.explain("x", "b").answerable

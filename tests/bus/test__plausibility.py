@@ -1,0 +1,275 @@
+"""Translations that are too long, and stamps that are ahead of the clock."""
+
+import logging
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from support.samples import moving, over, static
+
+from tfbus import (
+    LATEST,
+    SECOND,
+    AheadError,
+    Buffer,
+    Bus,
+    InvalidTransformError,
+    PastExtrapolationError,
+    PointStamped,
+    SampleRejected,
+    SimulatedClock,
+    StampAhead,
+    SystemClock,
+    Transform,
+    TransformStamped,
+    TransformTree,
+    do_transform,
+)
+from tfbus.bus._plausibility import Plausibility
+from tfbus.stamps import STAMP_MAX
+
+pytestmark = pytest.mark.anyio
+
+HOUR = 3600 * SECOND
+NOW = 100 * SECOND
+
+
+def bus_at(now: int = NOW, **options: Any) -> Bus:
+    return Bus(SimulatedClock(now), **options)
+
+
+# Translations
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_translation_beyond_the_bound_is_refused_at_the_door_of_a_bus(known: bool) -> None:
+    bus = bus_at()
+    buffer = Buffer(bus)
+    if known:
+        bus.publish(moving("a", "b", NOW, 1e12))
+    for x in (1.1e12, -1e308):
+        with pytest.raises(InvalidTransformError, match="not physical"):
+            bus.publish([moving("a", "b", NOW + 1, 1.0), moving("a", "b", NOW + 2, x)])
+    bus.publish([moving("a", "b", NOW + 3, 2e12), moving("a", "b", NOW + 4, 5.0)], invalid="drop")
+    assert bus.statistics().rejected == {"not physical": 3}
+    assert buffer.lookup_nowait("a", "b", NOW + 4).transform.translation == (5.0, 0.0, 0.0)
+    assert buffer.tree.edges()[0].samples == 1 + known
+
+
+def test_a_bound_that_was_raised_lets_it_in_and_one_that_was_lowered_does_not() -> None:
+    wide, narrow = bus_at(max_translation=1e100), bus_at(max_translation=10.0)
+    for stamp in (NOW, NOW + 1):
+        wide.publish(moving("a", "b", stamp, 1e100))
+        narrow.publish(moving("a", "b", stamp, 10.0))
+    with pytest.raises(InvalidTransformError, match="at most 10 m"):
+        narrow.publish(moving("a", "b", NOW + 2, 10.1))
+    assert (wide.max_translation, Buffer(narrow).tree.max_translation) == (1e100, 10.0)
+
+
+def test_a_batch_that_is_refused_leaves_no_newest_stamp_behind() -> None:
+    bus = bus_at()
+    bus.publish([*over("a", "x", (NOW,), 0.0), moving("a", "y", NOW)])
+    with pytest.raises(InvalidTransformError):
+        bus.publish([*over("a", "x", (NOW + 5, NOW + 9), 0.0), moving("a", "y", NOW, 1e13)])
+    bus.publish(moving("b", "x", NOW + 1))
+    edge = bus._topology.newest("x")
+    assert edge is not None
+    assert (edge.parent, edge.newest) == ("b", NOW + 1)
+
+
+def test_a_tree_and_its_copy_refuse_what_is_not_physical() -> None:
+    tree = TransformTree(max_translation=5.0)
+    for each in (tree, tree.copy()):
+        with pytest.raises(InvalidTransformError, match="not physical"):
+            each.insert_many([moving("a", "b", 0), moving("a", "b", 1, 6.0)])
+        assert each.frames() == []
+        each.insert(moving("a", "b", 0, 5.0))
+
+
+def test_every_answer_is_finite_for_a_long_chain_of_edges_at_the_greatest_bound() -> None:
+    tree = TransformTree(max_translation=1e100)
+    for stamp, sign in ((0, 1.0), (1, -1.0)):
+        turned = Transform.from_axis_angle((1.0, 2.0, 3.0), sign * 3.0, (sign * 5e99, 5e99, -5e99))
+        tree.insert_many([TransformStamped(f"f{k}", f"f{k + 1}", stamp, turned) for k in range(500)])
+    answer = tree.lookup("f0", "f500", 1)
+    many = tree.lookup_many("f500", "f0", np.array([0, 1]))
+    twist = tree.twist("f500", "f0", 1)
+    moved = do_transform(PointStamped("f500", 1, (1e100, -1e100, 1e100)), answer).point
+    numbers = (*answer.transform.translation, *many.translations.ravel(), *twist.linear, *twist.angular, *moved)
+    assert all(map(math.isfinite, numbers))
+
+
+# Stamps
+
+
+def test_a_stamp_ahead_of_the_clock_is_announced_logged_once_and_counted(caplog: pytest.LogCaptureFixture) -> None:
+    bus = bus_at()
+    with bus.events() as events:
+        bus.publish(moving("map", "base", NOW + SECOND, authority="odometry"))
+        assert bus.statistics().ahead == 0
+        for k in range(3):
+            bus.publish(moving("map", "base", NOW + HOUR + k, authority="peer"))
+        found = [events.queue.get() for _ in range(len(events.queue))]
+    assert [event for event in found if isinstance(event, StampAhead)] == [StampAhead(NOW, "base", NOW + HOUR, "peer")]
+    assert bus.statistics().ahead == 3
+    assert [record.getMessage() for record in caplog.records if "ahead" in record.getMessage()] == [
+        "frame 'base' has a sample from 'peer' that is 3600 s ahead of the clock: right samples are older, and expire"
+    ]
+    with bus.events() as later:
+        found = [later.queue.get() for _ in range(len(later.queue))]
+    assert StampAhead(NOW, "base", NOW + HOUR + 2, "peer") in found
+
+
+def test_a_bus_that_rejects_them_keeps_the_frame_alive() -> None:
+    bus = bus_at(reject_ahead=True)
+    buffer = Buffer(bus)
+    with bus.events() as events:
+        with pytest.raises(InvalidTransformError) as caught:
+            bus.publish(moving("map", "base", NOW + HOUR, authority="peer"))
+        bus.publish([moving("map", "base", NOW + HOUR), moving("map", "base", NOW, 1.0)], invalid="drop")
+        found = [events.queue.get() for _ in range(len(events.queue))]
+    assert str(caught.value) == (
+        "frame 'base': the stamp 3700.000 s from 'peer' is 3600 s ahead of the clock (at most 1 s)"
+    )
+    assert (caught.value.reason, bus.statistics().rejected, bus.statistics().ahead) == ("ahead", {"ahead": 2}, 0)
+    assert buffer.lookup_nowait("map", "base").stamp == NOW
+    assert {type(event) for event in found} >= {StampAhead, SampleRejected}
+
+
+def test_what_expires_because_of_a_stamp_ahead_says_so() -> None:
+    bus = bus_at()
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "base", NOW + HOUR, authority="peer"))
+    for k in range(3):
+        bus.publish(moving("map", "base", NOW + k, authority="odometry"))
+    (counted,) = bus.statistics().buffers
+    assert (counted.expired, counted.expired_ahead) == (3, 3)
+    with pytest.raises(PastExtrapolationError) as caught:
+        buffer.lookup_nowait("map", "base", NOW)
+    assert caught.value.ahead == HOUR
+    assert str(caught.value).endswith(
+        "from 'peer'; its newest stamp is 3600 s ahead of the clock, and right samples expire"
+    )
+    assert "3600 s ahead  " in str(buffer.explain("map", "base"))
+    assert "3600 s ahead of the clock, and right samples expire" in str(buffer.explain("map", "base", NOW))
+    assert "3600 s ahead  " in buffer.describe()
+
+
+def test_an_ordinary_late_sample_expires_without_a_word_about_the_clock(caplog: pytest.LogCaptureFixture) -> None:
+    bus = bus_at()
+    buffer = Buffer(bus)
+    bus.publish([moving("map", "base", NOW), moving("map", "base", NOW - 20 * SECOND)])
+    (counted,) = bus.statistics().buffers
+    assert (counted.expired, counted.expired_ahead) == (1, 0)
+    with pytest.raises(PastExtrapolationError) as caught:
+        buffer.lookup_nowait("map", "base", NOW - 20 * SECOND)
+    assert caught.value.ahead == 0
+    assert caplog.records == []
+
+
+class SteppedClock(SystemClock):
+    """A clock of the machine that somebody sets back; it announces nothing."""
+
+    step = 0
+
+    def now(self) -> int:
+        return NOW + self.step
+
+
+def test_a_clock_of_the_machine_that_was_set_back_is_noticed_when_samples_expire() -> None:
+    clock = SteppedClock()
+    bus = Bus(clock)
+    Buffer(bus)
+    bus.publish(moving("map", "base", NOW, authority="odometry"))
+    clock.step = -HOUR
+    with bus.events() as events:
+        bus.publish(moving("map", "base", NOW - HOUR, authority="odometry"))
+        found = [events.queue.get() for _ in range(len(events.queue))]
+    assert StampAhead(NOW - HOUR, "base", NOW, "odometry") in found
+    assert bus.statistics().buffers[0].expired_ahead == 1
+
+
+def test_max_age_bounds_the_future_as_well() -> None:
+    bus = bus_at()
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "base", NOW + 2 * SECOND, authority="peer"))
+    assert buffer.lookup_nowait("map", "base", max_age=2.0).stamp == NOW + 2 * SECOND
+    with pytest.raises(AheadError) as caught:
+        buffer.lookup_nowait("map", "base", max_age=1.5)
+    assert (caught.value.child, caught.value.stamp, caught.value.ahead) == ("base", NOW + 3 * SECOND // 2, 2 * SECOND)
+    assert isinstance(buffer.explain("map", "base", max_age=1.5).errors[0], AheadError)
+    assert buffer.can_transform("map", "base", max_age=9.2e9)
+
+
+@pytest.mark.every_loop
+async def test_an_awaited_lookup_of_an_answer_ahead_fails_at_once_and_a_watch_waits_for_the_clock() -> None:
+    clock = SimulatedClock(NOW)
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        bus.publish(moving("map", "base", NOW + 5 * SECOND, 5.0))
+        with pytest.raises(AheadError):
+            await buffer.lookup("map", "base", max_age=1.0)
+        with pytest.raises(AheadError):
+            await buffer.transform(PointStamped("base", LATEST, (0, 0, 0)), "map", max_age=1.0)
+        with buffer.watch("map", "base", max_age=1.0) as changes:
+            assert len(buffer.pending()) == 0
+            await clock.advance(4.5)
+            bus.publish(moving("map", "base", NOW + 9 * SECOND // 2, 4.5))
+            assert (await anext(changes)).stamp == NOW + 5 * SECOND
+
+
+@pytest.mark.parametrize("clock", [SimulatedClock(), SystemClock()])
+def test_a_clock_that_nobody_has_set_and_a_bus_without_a_bound_have_no_stamp_ahead(clock: Any) -> None:
+    bus = Bus(clock) if isinstance(clock, SimulatedClock) else Bus(clock, max_ahead=None)
+    for k in range(3):
+        bus.publish(moving("map", "base", STAMP_MAX - 10 + k))
+    assert bus.statistics().ahead == 0
+
+
+async def test_a_simulated_clock_counts_from_its_first_move() -> None:
+    advanced, jumped = SimulatedClock(), SimulatedClock()
+    buses = [Bus(advanced), Bus(jumped)]
+    for bus in buses:
+        bus.publish(moving("map", "base", HOUR))
+    await advanced.advance(1.0)
+    jumped.set(0)
+    for bus in buses:
+        bus.publish(moving("map", "base", 2 * HOUR))
+        assert bus.statistics().ahead == 1
+
+
+def test_a_jump_forward_of_the_clock_takes_the_bound_along() -> None:
+    clock = SimulatedClock(NOW)
+    bus = Bus(clock)
+    bus.publish(moving("map", "base", NOW))
+    clock.set(HOUR)
+    bus.publish(moving("map", "base", HOUR + SECOND))
+    assert bus.statistics().ahead == 0
+
+
+def test_a_static_sample_and_recorded_time_are_never_ahead(caplog: pytest.LogCaptureFixture) -> None:
+    bus = bus_at(reject_ahead=True)
+    bus.publish(static("map", "base", stamp=NOW + HOUR))
+    with bus._recorded_time():
+        bus.publish(moving("map", "arm", NOW + HOUR))
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+    with pytest.raises(InvalidTransformError, match="ahead of the clock"):
+        bus.publish(moving("map", "arm", NOW + HOUR))
+
+
+@pytest.mark.parametrize(
+    ("options", "kind"),
+    [
+        ({"max_ahead": -1.0}, ValueError),
+        ({"max_ahead": "1"}, TypeError),
+        ({"max_ahead": None, "reject_ahead": True}, ValueError),
+        ({"max_translation": 0.0}, ValueError),
+    ],
+)
+def test_bounds_that_make_no_sense_are_errors(options: Any, kind: type[Exception]) -> None:
+    with pytest.raises(kind):
+        Bus(SimulatedClock(), **options)
+
+
+def test_infinity_is_no_bound() -> None:
+    assert Plausibility(SystemClock(), 1.0, math.inf, reject_ahead=False).newest_plausible() == STAMP_MAX

@@ -1,0 +1,167 @@
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfbus import LATEST, Latest, Transform
+from tfbus.plain import PlainData, from_plain, to_plain
+
+
+@dataclass(frozen=True, slots=True)
+class Inner(PlainData):
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Outer(PlainData):
+    name: str
+    at: int | Latest
+    share: float
+    maybe: str | None
+    flag: bool
+    parts: tuple[Inner, ...]
+    pair: tuple[str, int]
+    counts: Mapping[str, int]
+    error: Exception = field(compare=False)
+
+
+WHOLE = Outer("a", LATEST, 0.5, None, True, (Inner(1), Inner(2)), ("x", 3), {"b": 4}, KeyError("k"))
+PLAIN = {
+    "type": "Outer",
+    "name": "a",
+    "at": "LATEST",
+    "share": 0.5,
+    "maybe": None,
+    "flag": True,
+    "parts": [{"type": "Inner", "count": 1}, {"type": "Inner", "count": 2}],
+    "pair": ["x", 3],
+    "counts": {"b": 4},
+    "error": {"type": "KeyError", "message": "'k'"},
+}
+
+
+def test_a_dataclass_becomes_its_fields_and_comes_back() -> None:
+    assert WHOLE.to_dict() == PLAIN
+    back = Outer.from_dict(json.loads(json.dumps(PLAIN)))
+    assert back == WHOLE
+    assert repr(back.error) == """Exception("KeyError: 'k'")"""
+
+
+def test_the_type_may_be_left_out() -> None:
+    assert Inner.from_dict({"count": 1}) == Inner(1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"type": "Inner"}, "a Outer cannot be made of the data of a 'Inner'"),
+        ({"name": 5}, "Outer.name cannot be 5"),
+        ({"at": "latest"}, "Outer.at cannot be 'latest'"),
+        ({"at": 1.0}, "Outer.at cannot be 1.0"),
+        ({"at": True}, "Outer.at cannot be True"),
+        ({"share": "0.5"}, "Outer.share cannot be '0.5'"),
+        ({"share": True}, "Outer.share cannot be True"),
+        ({"flag": 1}, "Outer.flag cannot be 1"),
+        ({"flag": None}, "Outer.flag cannot be None"),
+        ({"parts": {}}, "Outer.parts cannot be {}"),
+        ({"parts": [5]}, r"Outer.parts\[0\] cannot be 5"),
+        ({"parts": [{"count": 1}, {"count": "1"}]}, r"Outer.parts\[1\] .*Inner.count cannot be '1'"),
+        ({"pair": ["x"]}, "Outer.pair cannot be"),
+        ({"pair": ["x", 1, 2]}, "Outer.pair cannot be"),
+        ({"counts": [1]}, "Outer.counts cannot be"),
+        ({"counts": {1: 1}}, "Outer.counts cannot be"),
+        ({"counts": {"b": "c"}}, r"Outer.counts\['b'\] cannot be 'c'"),
+        ({"error": "KeyError"}, "Outer.error cannot be"),
+        ({"more": 1}, "Outer has no field 'more'"),
+    ],
+)
+def test_wrong_fields_are_refused_by_name(changes: dict[str, Any], problem: str) -> None:
+    with pytest.raises(ValueError, match=problem):
+        Outer.from_dict({**PLAIN, **changes})
+
+
+def test_a_missing_field_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="Inner needs the field 'count'"):
+        Inner.from_dict({})
+
+
+@pytest.mark.parametrize("data", [None, 5, "Inner", [1]])
+def test_a_dataclass_is_made_of_a_mapping_only(data: Any) -> None:
+    with pytest.raises(ValueError, match="a Inner is a dict of its fields, not"):
+        Inner.from_dict(data)
+
+
+@given(st.floats())
+def test_a_float_comes_back_to_the_last_bit_and_is_json(value: float) -> None:
+    text = json.dumps(to_plain(value), allow_nan=False)
+    back = from_plain(float, json.loads(text), "value")
+    assert math.isnan(back) if math.isnan(value) else (back, math.copysign(1, back)) == (value, math.copysign(1, value))
+
+
+def test_a_float_may_be_written_as_an_integer() -> None:
+    assert type(from_plain(float, 1, "value")) is float
+
+
+@pytest.mark.parametrize("value", [np.int64(5), np.float32(0.5)])
+def test_numbers_of_numpy_become_plain_numbers(value: Any) -> None:
+    assert type(to_plain(value)) in (int, float)
+    assert to_plain(value) == value
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.array([[1.5, math.nan, math.inf], [-math.inf, -0.0, 1e-300]]),
+        np.array([[0.1, 0.2, 0.3]], np.float32),
+        np.zeros((0, 3), np.float32),
+        np.array([2**63 - 1, -(2**63)]),
+        np.array([255, 0], np.uint8),
+        np.array([True, False]),
+    ],
+)
+def test_an_array_comes_back_with_its_dtype_and_shape(array: npt.NDArray[Any]) -> None:
+    data = json.loads(json.dumps(to_plain(array), allow_nan=False))
+    back = from_plain(npt.NDArray[Any], data, "array")
+    assert (back.dtype, back.shape) == (array.dtype, array.shape)
+    np.testing.assert_array_equal(back, array)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        [1, 2],
+        {"dtype": "float64", "shape": [2]},
+        {"dtype": "float64", "shape": [2], "values": [1.0, 2.0], "more": 1},
+        {"dtype": "object", "shape": [1], "values": [1]},
+        {"dtype": "U3", "shape": [1], "values": ["abc"]},
+        {"dtype": "no such", "shape": [1], "values": [1]},
+        {"dtype": "float64", "shape": [3], "values": [1.0, 2.0]},
+        {"dtype": "float64", "shape": "x", "values": [1.0]},
+        {"dtype": "float64", "shape": [1], "values": 5},
+        {"dtype": "float64", "shape": [1], "values": ["1.0"]},
+        {"dtype": "float64", "shape": [1], "values": [None]},
+        {"dtype": "int64", "shape": [1], "values": [1.5]},
+        {"dtype": "int64", "shape": [1], "values": ["NaN"]},
+        {"dtype": "uint8", "shape": [1], "values": [256]},
+        {"dtype": "bool", "shape": [1], "values": [1]},
+    ],
+)
+def test_wrong_data_of_an_array_are_refused(data: Any) -> None:
+    with pytest.raises(ValueError, match=r"^array "):
+        from_plain(npt.NDArray[Any], data, "array")
+
+
+def test_a_value_without_plain_data_is_a_type_error() -> None:
+    with pytest.raises(TypeError, match="no plain data for <object"):
+        to_plain(object())
+
+
+def test_objects_with_to_dict_are_converted_by_it() -> None:
+    assert to_plain((Transform(), None)) == [Transform().to_dict(), None]

@@ -1,0 +1,211 @@
+"""Plain data, as JSON has them: the half of `to_dict` and `from_dict` that all classes share.
+
+Numbers, texts and None stay; a tuple becomes a list, a mapping a dict, and `LATEST` the text ``"LATEST"``. A number
+that is not finite becomes a text, because JSON has no such numbers: ``"NaN"``, ``"Infinity"`` or ``"-Infinity"``, as in
+the JSON of protobuf. An array becomes a dict of its dtype, its shape, and its values, row by row.
+"""
+
+import math
+import types
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from tfbus.stamps import LATEST, Latest
+
+_NOT_FINITE = ("NaN", "Infinity", "-Infinity")
+
+
+class PlainData:
+    """A base of dataclasses that gives them `to_dict` and `from_dict`."""
+
+    __slots__ = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as plain data for JSON, with the name of the class as ``"type"``; stamps are ``int`` of ns."""
+        values = {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
+        return {"type": type(self).__name__, **values}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """The object that `to_dict` made `data` of.
+
+        Raises
+        ------
+        ValueError
+            If a field is missing, unknown or of another kind, or the class refuses its value. The message names it.
+        """
+        return cls(**from_fields(cls, data, _kinds_of_fields(cls)))  # type: ignore[arg-type]
+
+
+def to_plain(value: Any) -> Any:
+    """Plain data of a value.
+
+    Raises
+    ------
+    TypeError
+        If there are none for its type.
+    """
+    if value is None or isinstance(value, (bool, str)):
+        return value
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return _plain_float(float(value))
+    if isinstance(value, Latest):
+        return value.value
+    if isinstance(value, Mapping):
+        return {name: to_plain(part) for name, part in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [to_plain(part) for part in value]
+    if isinstance(value, np.ndarray):
+        values = value.ravel().tolist()
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            values = [_plain_float(part) for part in values]
+        return {"dtype": value.dtype.name, "shape": list(value.shape), "values": values}
+    if isinstance(value, BaseException) and not hasattr(value, "to_dict"):
+        return {"type": type(value).__name__, "message": str(value)}
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    raise TypeError(f"there are no plain data for {value!r}")
+
+
+def from_fields(cls: type, data: Mapping[str, Any], kinds: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of plain data of a class.
+
+    Parameters
+    ----------
+    cls : type
+        Its name must be the ``"type"`` of the data, if there is one.
+    data : mapping
+    kinds : mapping of str to type
+        The type of each field; the data must have all of them, and no others.
+
+    Raises
+    ------
+    ValueError
+        If they have not, or a field is of another kind. The message names it.
+    """
+    if not isinstance(data, Mapping):
+        raise ValueError(f"a {cls.__name__} is a dict of its fields, not {data!r}")  # noqa: TRY004 - the data are wrong
+    given = dict(data)
+    kind = given.pop("type", cls.__name__)
+    if kind != cls.__name__:
+        raise ValueError(f"a {cls.__name__} cannot be made of the data of a {kind!r}")
+    for name in given.keys() ^ kinds.keys():
+        raise ValueError(f"{cls.__name__} {'needs the' if name in kinds else 'has no'} field {name!r}")
+    return {name: from_plain(kind, given[name], f"{cls.__name__}.{name}") for name, kind in kinds.items()}
+
+
+def from_plain(hint: Any, value: Any, name: str) -> Any:
+    """The value of type `hint` of its plain data.
+
+    Raises
+    ------
+    ValueError
+        If the plain data are of another kind. The message has `name`.
+    """
+    problem = ""
+    for kind in get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,):
+        read = _READERS.get(get_origin(kind) or kind, _read_dict)
+        try:
+            found = read(kind, value, name)
+        except ValueError as error:
+            problem = f": {error}"
+        else:
+            if found is not _OTHER:
+                return found
+    raise ValueError(f"{name} cannot be {value!r}{problem}")
+
+
+_OTHER = object()
+"""The answer of a reader for data of another kind."""
+
+
+def _read_exact(kind: type, value: Any, _name: str) -> Any:
+    return value if type(value) is kind else _OTHER
+
+
+def _read_dict(kind: Any, value: Any, _name: str) -> Any:
+    return kind.from_dict(value) if isinstance(value, Mapping) else _OTHER
+
+
+def _read_float(_kind: Any, value: Any, _name: str) -> Any:
+    if value in _NOT_FINITE and isinstance(value, str):
+        return float(value)
+    return float(value) if type(value) in (int, float) else _OTHER
+
+
+def _read_latest(_kind: Any, value: Any, _name: str) -> Any:
+    return LATEST if value == LATEST.value else _OTHER
+
+
+def _read_tuple(kind: Any, value: Any, name: str) -> Any:
+    parts = get_args(kind)
+    if not isinstance(value, (list, tuple)):
+        return _OTHER
+    if parts[-1] is not Ellipsis and len(parts) != len(value):
+        return _OTHER
+    hints = [parts[0]] * len(value) if parts[-1] is Ellipsis else parts
+    return tuple(
+        from_plain(hint, part, f"{name}[{i}]") for i, (hint, part) in enumerate(zip(hints, value, strict=True))
+    )
+
+
+def _read_mapping(kind: Any, value: Any, name: str) -> Any:
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        return _OTHER
+    return {key: from_plain(get_args(kind)[1], part, f"{name}[{key!r}]") for key, part in value.items()}
+
+
+def _read_array(_kind: Any, value: Any, name: str) -> Any:
+    if not isinstance(value, Mapping) or value.keys() != {"dtype", "shape", "values"}:
+        return _OTHER
+    try:
+        dtype = np.dtype(value["dtype"])
+        if dtype.kind not in "biuf":
+            return _OTHER
+        values = value["values"]
+        # numpy would cut the fractions off, and read numbers in any text.
+        wanted = {"b": (bool,), "f": (int, float)}.get(dtype.kind, (int,))
+        if not all(type(part) in wanted or (dtype.kind == "f" and part in _NOT_FINITE) for part in values):
+            return _OTHER
+        return np.array(values, dtype).reshape(value["shape"])
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} is not an array: {error}") from None
+
+
+def _read_error(_kind: Any, value: Any, _name: str) -> Any:
+    # An error of another library comes back as its text.
+    if not isinstance(value, Mapping) or value.keys() != {"type", "message"}:
+        return _OTHER
+    return Exception(f"{value['type']}: {value['message']}")
+
+
+_READERS: dict[Any, Any] = {
+    types.NoneType: _read_exact,
+    bool: _read_exact,
+    int: _read_exact,
+    str: _read_exact,
+    float: _read_float,
+    Latest: _read_latest,
+    tuple: _read_tuple,
+    Mapping: _read_mapping,
+    np.ndarray: _read_array,
+    Exception: _read_error,
+}
+
+
+def _plain_float(value: float) -> float | str:
+    if math.isfinite(value):
+        return value
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+@cache
+def _kinds_of_fields(cls: Any) -> dict[str, Any]:
+    hints = get_type_hints(cls)
+    return {field.name: hints[field.name] for field in fields(cls)}
