@@ -13,19 +13,7 @@ import tfbus
 
 PACKAGE = Path(tfbus.__file__).parent
 
-GROUND = (
-    "stamps",
-    "plain",
-    "errors",
-    "events",
-    "frames",
-    "registration",
-    "statistics",
-    "clock",
-    "_log",
-    "_aio",
-    "_which_kernel",
-)
+GROUND = ("stamps", "plain", "errors", "events", "frames", "registration", "statistics", "clock", "_log", "_aio")
 
 # Each room with the rooms that it may import. It may import from the ground, and from the rooms that those may import.
 ROOMS: dict[str, tuple[str, ...]] = {

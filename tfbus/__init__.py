@@ -4,7 +4,6 @@ A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of 
 seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
 """
 
-from tfbus._which_kernel import KERNEL
 from tfbus.buffer.buffer import Buffer
 from tfbus.buffer.watch import Watch
 from tfbus.bus.broadcaster import TransformBroadcaster
@@ -67,6 +66,7 @@ from tfbus.events import (
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.geometry.transform_array import TransformArray
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.message_filter.message_filter import MessageFilter
 from tfbus.registration import Registration
 from tfbus.robot.joint import Joint, Mimic

@@ -15,10 +15,10 @@ from support.programs import PATIENCE, TFBUS
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
-from tfbus._which_kernel import KERNEL
 from tfbus.cli import app
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import LinkOptions
+from tfbus.geometry.which_kernel import KERNEL
 
 LINK = ("--domain STR", "--listen STR...", "--connect STR...", "--backend CHOICE")
 URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"

@@ -15,7 +15,7 @@ from support.samples import moving, over, static, tree_of
 from support.threads import threads_that
 
 from tfbus import LATEST, TransformLookupError, TransformTree
-from tfbus._which_kernel import KERNEL
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._kernel import History
 
 pytestmark = pytest.mark.thorough

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from tfbus._which_kernel import KERNEL
 from tfbus.geometry import _python_sample
 from tfbus.geometry.rows import Row
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree import _python_kernel
 
 try:

@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 
 from tfbus import Transform
-from tfbus._which_kernel import KERNEL
 from tfbus.geometry.rows import Row
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree.history import FrameHistory
 
 

@@ -5,8 +5,8 @@ import pytest
 from support.samples import moving, over, static, tree_of
 
 from tfbus import TransformStamped, TransformTree, UnknownFrameError
-from tfbus._which_kernel import KERNEL
 from tfbus.geometry.rows import Row
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Query, copy_paths
 from tfbus.tree.history import Samples
 from tfbus.tree.tree import forest_of

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.both_kernels import needs_both, tfbus_on
 from support.strategies import TODAY, rotations, vectors
 
-from tfbus._which_kernel import KERNEL
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree import _kernel
 

@@ -5,7 +5,7 @@ import pytest
 from support.samples import moving, over, static, tree_of
 
 from tfbus import PastExtrapolationError, TransformTree
-from tfbus._which_kernel import KERNEL
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._copied_paths import Query
 from tfbus.tree._plain_columns import plain_columns
 from tfbus.tree.tree import forest_of

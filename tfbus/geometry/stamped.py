@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from tfbus._which_kernel import KERNEL
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
 from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.plain import from_fields
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_stamp, format_duration, format_stamp
 

@@ -1,6 +1,6 @@
 """The kernel that runs: the compiled one, or its definition in Python."""
 
-from tfbus._which_kernel import KERNEL
+from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._python_kernel import Columns, Held
 
 if KERNEL == "python":
