@@ -7,7 +7,11 @@ from support.both_kernels import COMPILED, needs_both
 
 from tfbus.geometry.which_kernel import KERNEL
 
-SHOW = "from tfbus import TransformStamped; from tfbus.geometry.which_kernel import KERNEL; print(KERNEL, TransformStamped.__mro__[1].__module__)"
+SHOW = """
+from tfbus import TransformStamped
+from tfbus.geometry.which_kernel import KERNEL
+print(KERNEL, TransformStamped.__mro__[1].__module__)
+"""
 
 
 def run(wanted: str | None, script: str = SHOW) -> subprocess.CompletedProcess[str]:
