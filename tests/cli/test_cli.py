@@ -36,6 +36,7 @@ URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
         ("query", ("FILE", "TARGET", "SOURCE", "--at SECONDS", "--every SECONDS", "--csv", "--json")),
         ("record", ("FILE", "--duration FLOAT", "--overwrite", *LINK)),
         ("robot", ("FILE", "POSITION", "--tree", "--rate FLOAT", "--prefix STR", *LINK)),
+        ("router", ("--listen STR", "--connect STR", "--backend")),
         ("static", ("PARENT", "CHILD", "--xyz", "--rpy", "--quaternion", "--authority STR", *LINK)),
         ("tree", ("--duration FLOAT", "--watch", "--rate FLOAT", "--dot PATH", "--json", *LINK)),
     ],
@@ -64,8 +65,8 @@ def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Com
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = ["broadcast", "demo", "echo", "info", "listen", "play", "query", "record", "robot", "static", "tree"]
-    assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands
+    commands = "broadcast demo echo info listen play query record robot router static tree"
+    assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands.split()
 
 
 @pytest.mark.parametrize(

@@ -443,6 +443,43 @@ def test_a_host_that_is_cut_off_is_lost_and_comes_back(hosts: Hosts, processes: 
     apart.ask("until", static=["map lidar"])
 
 
+def test_two_that_lose_each_other_while_both_hear_a_third_are_together_again(hosts: Hosts, processes: Crowd) -> None:
+    domain, known = new_domain(), f"tcp/{hosts[0][0]}:17447"
+    members = [
+        processes.begin(
+            {
+                "domain": domain,
+                "listen": known if number == 0 else f"tcp/{address}:17448",
+                "connect": [known][:number],
+                "lease": 1.0,
+                "drop_lost": True,
+            },
+            prefix=prefix,
+            backend=BACKENDS[number],
+        )
+        for number, (address, prefix) in enumerate(hosts)
+    ]
+    meet(*members)
+    _, one, other = members
+    one.ask("statics", names=["lidar"])
+    other.ask("until", static=["lidar"])
+    for change in ("add", "delete"):
+        for (_, prefix), (address, _) in ((hosts[1], hosts[2]), (hosts[2], hosts[1])):
+            route = ["ip", "route", change, "blackhole", f"{address}/32"]
+            subprocess.run([*prefix, *route], check=True, timeout=PATIENCE)
+        if change == "add":
+            other.ask("until", lacks=["lidar"], peers=1)
+            one.ask("until", peers=1)
+            one.ask("statics", names=["camera"])
+            # The third one hears both all the while.
+            members[0].ask("until", static=["lidar", "camera"], peers=2)
+    meet(*members)
+    other.ask("until", static=["lidar", "camera"])
+    one.ask("stream", authority="wheels", batches=10, rate=100.0)
+    other.ask("until", last={"wheels": 9})
+    assert other.ask("facts")["tallies"]["wheels"]["missing"] == 0
+
+
 def test_hosts_without_an_address_hear_only_themselves(hosts: Hosts, processes: Crowd) -> None:
     domain = {"domain": new_domain()}
     (_, first), (_, second), _ = hosts

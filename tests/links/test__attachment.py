@@ -17,7 +17,8 @@ from tfbus.links._attachment import (
     pack,
     unpack,
 )
-from tfbus.links._outbox import RemovedFrame
+from tfbus.links._entries import MovingFrame, RemovedFrame
+from tfbus.links._state import StateStep
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 ONE, OTHER = b"0123456789abcdef", b"another origin !"
@@ -28,13 +29,34 @@ RUNS = st.tuples(NAMES | st.sampled_from(("", "odometry")), st.booleans(), st.in
 
 entries_of_any_kind: st.SearchStrategy[list[Entry]] = st.lists(
     st.builds(PublishedBatch, ORIGINS, NUMBERS, st.lists(RUNS, max_size=4).map(tuple))
-    | st.builds(RemovedFrame, ORIGINS, NUMBERS, NAMES, st.booleans()),
+    | st.builds(RemovedFrame, ORIGINS, NUMBERS, NAMES, st.booleans())
+    | st.builds(MovingFrame, NAMES),
     max_size=6,
 )
 
 
-def header(origins: int = 0, authorities: int = 0, entries: int = 0, number: int = 1, version: int = VERSION) -> bytes:
-    return struct.pack("<BBHIQ", version, origins, authorities, entries, number)
+STEPS = st.builds(
+    lambda since, number, digest, final, message: StateStep(
+        min(since, number), max(since, number), digest, final, message
+    ),
+    NUMBERS,
+    NUMBERS,
+    NUMBERS,
+    st.booleans(),
+    NUMBERS,
+)
+
+
+def header(
+    origins: int = 0,
+    authorities: int = 0,
+    entries: int = 0,
+    number: int = 1,
+    version: int = VERSION,
+    claim: tuple[int, int, int, int, int] = (0, 0, 0, 0, 0),
+) -> bytes:
+    kind, *step = claim
+    return struct.pack("<BBBxHIQQQQQ", version, kind, origins, authorities, entries, number, *step)
 
 
 def entry(kind: int, origin: int = 0, size: int = 0, sequence: int = 1) -> bytes:
@@ -54,10 +76,10 @@ def reason_of(data: bytes) -> str:
 # Both ways.
 
 
-@given(number=NUMBERS, entries=entries_of_any_kind)
+@given(number=NUMBERS, entries=entries_of_any_kind, step=st.none() | STEPS)
 @settings(max_examples=40)
-def test_unpacking_gives_back_what_was_packed(number: int, entries: list[Entry]) -> None:
-    assert unpack(pack(number, entries)) == Attachment(number, tuple(entries))
+def test_unpacking_gives_back_what_was_packed(number: int, entries: list[Entry], step: StateStep | None) -> None:
+    assert unpack(pack(number, entries, step)) == Attachment(number, tuple(entries), step)
 
 
 def test_an_attachment_is_laid_out_as_its_module_says() -> None:
@@ -66,6 +88,10 @@ def test_an_attachment_is_laid_out_as_its_module_says() -> None:
         RemovedFrame(OTHER, 8, "köln"),
         RemovedFrame(ONE, 9, "b", lost=True),
     ]
+    assert pack(5, [MovingFrame("b")], StateStep(6, 7, 8, message=9)) == (
+        header(1, 0, 1, number=5, claim=(2, 6, 7, 8, 9)) + bytes(16) + entry(3, 0, 1, 0) + b"b"
+    )
+    assert pack(5, [], StateStep(6, 7, 0, final=False)) == header(number=5, claim=(1, 6, 7, 0, 0))
     assert pack(5, entries) == (
         header(2, 2, 3, number=5)
         + ONE
@@ -167,7 +193,7 @@ def test_the_most_that_is_allowed_comes_back(entries: list[Entry]) -> None:
 
 def test_other_versions_are_not_read() -> None:
     assert reason_of(b"") == "version"
-    for version in (0, 2, 255):
+    for version in (0, 1, VERSION + 1, 255):
         assert reason_of(header(version=version)) == "version"
     assert unpack(header()) == Attachment(1, ())
 
@@ -189,7 +215,9 @@ def test_an_attachment_that_is_cut_off_or_too_long_is_refused() -> None:
 
 
 def test_an_attachment_without_meaning_is_refused() -> None:
-    assert reason_of(header(1, 0, 1) + ONE + entry(3)) == "attachment"
+    assert reason_of(header(1, 0, 1) + ONE + entry(4)) == "attachment"
+    assert reason_of(header(claim=(3, 0, 0, 0, 0))) == "attachment"
+    assert reason_of(header(claim=(1, 8, 7, 0, 0))) == "attachment"
     assert reason_of(header(1, 0, 1) + ONE + entry(0, origin=1)) == "attachment"
     assert reason_of(header(0, 0, 1) + entry(1)) == "attachment"
     assert reason_of(header(1, 1, 1) + ONE + b"\0\0" + entry(0, size=1) + run(authority=1)) == "attachment"
@@ -199,7 +227,7 @@ def test_an_attachment_without_meaning_is_refused() -> None:
 
 
 # Counts that lie, each in as many bytes as one attachment may have.
-ROOM = MAX_BYTES - 16
+ROOM = MAX_BYTES - len(header())
 LIES = [
     pytest.param(header(entries=2**32 - 1) + bytes(ROOM), id="entries"),
     pytest.param(header(entries=MAX_ENTRIES + 1) + bytes(ROOM), id="an entry too many"),
@@ -285,4 +313,4 @@ def check(data: bytes) -> None:
         attachment = unpack(data)
     except MalformedMessageError:
         return
-    assert unpack(pack(attachment.number, attachment.entries)) == attachment
+    assert unpack(pack(attachment.number, attachment.entries, attachment.step)) == attachment

@@ -52,7 +52,7 @@ class Bridge:
             for end in self.domain.ends:
                 end.endpoint.send()
             wires = [wire for wire in self.domain.wires.values() if wire.packets]
-            if not wires:
+            if not wires and not self.domain.pass_time():
                 return
             for wire in wires:
                 while wire.packets:

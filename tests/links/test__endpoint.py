@@ -8,10 +8,12 @@ from typing import Any
 import pytest
 from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.samples import moving
+from support.wires import Domain
 
 from tfbus import Bus, Event, SimulatedClock
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
-from tfbus.links._endpoint import Endpoint
+from tfbus.links._endpoint import CLAIM_PERIOD, Endpoint
+from tfbus.links._message import Message
 from tfbus.links._outbox import Turn
 from tfbus.links._peers import MAX_PEERS
 from tfbus.links._receive_queue import Presence, Received
@@ -24,13 +26,9 @@ class NotingCarrier(ForeignCarrier):
     def __init__(self) -> None:
         super().__init__(ForeignWorld())
         self.turns: list[Turn] = []
-        self.joined: list[tuple[str, bool]] = []
 
     def send(self, turn: Turn) -> None:
         self.turns.append(turn)
-
-    def peer_joined(self, peer: str, again: bool) -> None:
-        self.joined.append((peer, again))
 
 
 class Scene:
@@ -90,7 +88,6 @@ def test_a_peer_is_announced_when_it_joins_and_leaves_and_the_carrier_knows_who_
             PeerLost(7, "world", "driver", ("foreign",), ("a", "b")),
             PeerJoined(7, "world", "driver"),
         ]
-        assert here.carrier.joined == [("driver", False), ("driver", True)]
         assert here.endpoint.peers.present == ("driver",)
         assert here.bus.statistics().frames == 2
 
@@ -142,3 +139,30 @@ def test_a_detached_endpoint_forgets_its_peers_and_keeps_their_frames() -> None:
     made.bus.publish(moving("map", "b", 1))
     made.endpoint.send()
     assert made.carrier.turns == []
+
+
+def test_a_link_claims_its_state_ever_less_often_while_nothing_happens() -> None:
+    domain = Domain()
+    bus = Bus(SimulatedClock())
+    end, other = domain.join(bus), domain.join(Bus(SimulatedClock()))
+    wire = domain.wires[end, other]
+
+    def claims(until: float) -> list[float]:
+        """The times at which the end claims its state."""
+        found = []
+        while domain.time <= until:
+            due = end.endpoint.reconcile()
+            if any(isinstance(packet, Message) for packet in wire.packets):
+                found.append(domain.time)
+            wire.packets.clear()
+            domain.time = due
+        return found
+
+    assert claims(until=40.0) == [0.0, 2.0, 6.0, 14.0, 24.0, 34.0]
+    sent = domain.time
+    bus.publish(moving("map", "a", 1))
+    end.endpoint.send()
+    wire.packets.clear()
+    assert [round(time - sent, 6) for time in claims(until=sent + 7.5)] == [CLAIM_PERIOD, 3.0, 7.0]
+    for made in (end, other):
+        made.leave()

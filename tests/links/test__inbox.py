@@ -12,20 +12,33 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import strategies as some
 from support.samples import moving, static
-from support.wires import End, size_of
+from support.wires import Domain, End, size_of
 
 from tfbus import Buffer, Bus, BusClosedError, FrameAdded, PeerLost, PeerRejected, SimulatedClock, TransformStamped
 from tfbus.bus._ownership import OnConflict
 from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
-from tfbus.links._message import Message
-from tfbus.links._outbox import RemovedFrame
+from tfbus.links._entries import RemovedFrame
+from tfbus.links._inbox import ReceivedBatch
+from tfbus.links._message import Message, read_message
 from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence
+from tfbus.links._relay import LARGEST_JUMP, Relay
 from tfbus.tf_message import encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
 Batch = tuple[TransformStamped, ...]
+
+
+class Wire(Domain):
+    """Notes what goes out."""
+
+    def __init__(self, receiver: "Receiver") -> None:
+        super().__init__()
+        self._receiver = receiver
+
+    def put(self, sender: End, message: Message) -> None:  # noqa: ARG002 - there is only one
+        self._receiver.sent.append(message)
 
 
 class Receiver:
@@ -39,9 +52,10 @@ class Receiver:
         drop_lost: bool = False,
     ) -> None:
         self.bus = Bus(SimulatedClock(), on_conflict)
+        self.bus._relay = Relay(self.bus, 0)
         self.heard: list[Batch] = []
         self.bus.subscribe(self.heard.append)
-        self.end = End("here", self.bus, lambda _, message: self.sent.append(message), frames, max_frames, drop_lost)
+        self.end = Wire(self).join(self.bus, frames, max_frames, drop_lost)
         self.sent: list[Message] = []
         self.inbox = self.end.endpoint.inbox
         self.peers = self.end.endpoint.peers
@@ -68,6 +82,13 @@ class Receiver:
         self.sent.clear()
         self.end.endpoint.send()
         return self.sent
+
+    def said(self) -> ReceivedBatch:
+        """End a turn of the event loop; returns the one batch that goes out."""
+        (message,) = self.turn()
+        (entry,) = read_message(message.payload, message.attachment).entries
+        assert isinstance(entry, ReceivedBatch)
+        return entry
 
     def receive(
         self,
@@ -125,7 +146,7 @@ def spoilt(samples: Sequence[TransformStamped], x: float = math.nan) -> bytes:
 def test_a_message_is_published_batch_by_batch_with_everything_that_was_said() -> None:
     first = [moving("map", "a", 1, 1.0, "slam"), static("a", "b", 2.0, 5), moving("map", "c", 2, authority="odometry")]
     second = [moving("map", "a", 3, authority="slam")]
-    entries: list[Entry] = [batch(first, ORIGIN, 8), RemovedFrame(OTHER, 3, "c"), batch(second, ORIGIN, 9)]
+    entries: list[Entry] = [batch(first, ORIGIN, 8), RemovedFrame(OTHER, 9, "c"), batch(second, ORIGIN, 9)]
     with receiver() as here, Buffer(here.bus) as buffer:
         here.receive_bytes(encode([*first, *second]), pack(1, entries))
         assert here.heard == [tuple(first), tuple(second)]
@@ -266,7 +287,7 @@ def test_a_repeated_removal_spares_samples_that_others_have_published_since() ->
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=1)
         here.remove("a", sequence=2)
-        here.receive(moving("map", "a", 1), origin=OTHER)
+        here.receive(moving("map", "a", 1), origin=OTHER, sequence=3)
         here.remove("a", sequence=2)
         assert here.bus.statistics().frames == 1
         here.bus.remove_frame("a")
@@ -278,13 +299,13 @@ def test_a_repeated_removal_spares_samples_that_others_have_published_since() ->
 def test_removing_the_frame_of_others_removes_their_samples_up_to_now() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 5), sequence=5)
-        here.remove("a", origin=OTHER, sequence=1)
+        here.remove("a", origin=OTHER, sequence=6)
         here.receive(moving("map", "a", 4), sequence=4)
         here.receive(moving("map", "a", 5), sequence=5)
         assert here.bus.statistics().frames == 0
-        here.receive(moving("map", "a", 6), sequence=6)
+        here.receive(moving("map", "a", 6), sequence=7)
         here.bus.remove_frame("a")
-        here.receive(moving("map", "a", 6), sequence=6)
+        here.receive(moving("map", "a", 6), sequence=7)
         assert here.bus.statistics().frames == 0
 
 
@@ -332,16 +353,16 @@ def test_the_loss_of_a_frame_removes_only_what_that_peer_has_brought() -> None:
 def test_after_a_loss_a_removal_counts_as_ever() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=18)
-        here.remove("a", origin=OTHER, sequence=20)
-        here.receive(moving("map", "a", 1), sequence=19)
+        here.remove("a", origin=OTHER, sequence=19)
+        here.receive(moving("map", "a", 1), sequence=20)
         here.remove("a", origin=OTHER, sequence=15, lost=True)
         assert here.frames == []
         here.receive(moving("map", "a", 1), origin=OTHER, sequence=18)
         assert here.frames == []
-        here.receive(moving("map", "a", 1), sequence=19)
+        here.receive(moving("map", "a", 1), sequence=20)
         assert here.frames == ["a"]
         here.remove("a", sequence=30)
-        here.receive(moving("map", "a", 1), sequence=19)
+        here.receive(moving("map", "a", 1), sequence=20)
         assert here.frames == []
 
 
@@ -361,13 +382,34 @@ def test_after_the_loss_of_a_peer_only_later_peers_may_repeat_its_last_samples(d
         assert here.counts[1:3] == (3, 3)
 
 
-def test_the_highest_of_all_sequences_does_no_harm() -> None:
+def test_a_number_that_no_bus_can_have_given_is_refused_and_later_ones_are_news() -> None:
     with receiver() as here:
-        here.receive(moving("map", "a", 1), sequence=2**64 - 1)
-        here.receive(moving("map", "a", 2), sequence=2**64 - 1)
-        here.remove("a", sequence=2**64 - 1)
-        here.receive(moving("map", "a", 3), origin=OTHER)
-        assert here.counts[1:3] == (2, 1)
+        here.receive(moving("map", "a", 1), sequence=7)
+        for number in (2**64 - 1, 7 + LARGEST_JUMP + 1):
+            here.receive(moving("map", "a", 2), moving("map", "b", 2), sequence=number)
+            here.remove("a", sequence=number)
+        assert here.peers.rejected == {"number": 6}
+        assert here.frames == ["a"]
+        here.receive(moving("map", "a", 3), sequence=8)
+        here.receive(moving("map", "a", 4), sequence=8 + LARGEST_JUMP)
+        assert here.counts[1:3] == (3, 0)
+
+
+def test_a_number_of_this_bus_that_somebody_has_made_up_does_not_hide_what_it_says_later() -> None:
+    with receiver() as here:
+        here.bus.publish([static("map", "s", 1.0), static("map", "t"), moving("map", "m", 1)])
+        here.turn()
+        origin = here.end.relay.origin
+        here.receive(static("map", "s", 2.0), moving("map", "m", 2), origin=origin, sequence=500)
+        said_again = here.said()
+        assert (said_again.origin, said_again.samples) == (origin, [static("map", "s", 1.0)])
+        assert said_again.sequence > 500
+        here.remove("t", origin=origin, sequence=900)
+        said_again = here.said()
+        assert (said_again.sequence > 900, said_again.samples) == (True, [static("map", "t")])
+        here.bus.publish(moving("map", "m", 3))
+        assert here.said().sequence > said_again.sequence
+        assert [len(heard) for heard in here.heard] == [3, 1]
 
 
 def test_samples_of_this_bus_itself_are_no_news() -> None:
@@ -424,7 +466,7 @@ def test_samples_that_close_a_loop_one_after_the_other_are_refused_and_the_bus_g
 TWO = [moving("map", "a", 1), moving("map", "b", 1)]
 MALFORMED = [
     pytest.param(encode(TWO), b"", "version", id="no attachment"),
-    pytest.param(encode(TWO), b"\2" + bytes(15), "version", id="another version"),
+    pytest.param(encode(TWO), b"\1" + bytes(60), "version", id="another version"),
     pytest.param(encode(TWO), pack(1, [batch(TWO)])[:-1], "attachment", id="cut off"),
     pytest.param(b"", pack(1, [batch(TWO)]), "truncated", id="no message"),
     pytest.param(encode(TWO)[:-1], pack(1, [batch(TWO)]), "truncated", id="a message cut off"),

@@ -9,9 +9,10 @@ from support.samples import moving, static
 from tfbus import SECOND, InvalidTransformError, TransformStamped
 from tfbus.links._attachment import MAX_ENTRIES, PublishedBatch, pack, unpack
 from tfbus.links._carrier import SendReport
+from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch
-from tfbus.links._message import FULL_MESSAGE, MAX_BYTES, Message, MessageWriter, message_to_keep, read_message
-from tfbus.links._outbox import OutgoingBatch, RemovedFrame
+from tfbus.links._message import FULL_MESSAGE, MAX_BYTES, Message, MessageWriter, can_hold, read_message, write_answer
+from tfbus.links._state import StateStep
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
@@ -49,7 +50,7 @@ class Writer:
 def entries_of(message: Message) -> list[ReceivedBatch | RemovedFrame]:
     received = read_message(message.payload, message.attachment)
     assert received.errors == []
-    return received.entries
+    return [entry for entry in received.entries if not isinstance(entry, MovingFrame)]
 
 
 def contents(message: Message) -> list[Batch | RemovedFrame]:
@@ -93,17 +94,39 @@ def test_every_batch_is_read_as_it_was_written(wanted: list[Batch]) -> None:
     assert writer.report.not_sent == {}
 
 
-def test_live_messages_are_numbered_and_a_message_to_keep_has_no_number() -> None:
+def test_live_messages_are_numbered_and_an_answer_has_no_number() -> None:
     writer = Writer()
     numbers = []
     for stamp in range(3):
         writer.add(moving("map", "a", stamp))
         numbers += [unpack(message.attachment).number for message in writer.write()]
     assert numbers == [1, 2, 3]
-    kept = message_to_keep(OutgoingBatch(OTHER, 2, [static("map", "s", authority="calibration")]))
-    assert kept is not None
-    assert unpack(kept.attachment).number == 0
-    assert unpack(kept.attachment).entries == (PublishedBatch(OTHER, 2, (("calibration", True, 1),)),)
+    answer = write_answer(
+        [OutgoingBatch(OTHER, 2, [static("map", "s", authority="calibration")]), MovingFrame("m")], StateStep(3, 9, 77)
+    )
+    unpacked = unpack(answer.attachment)
+    assert (answer.number, unpacked.number, unpacked.step) == (0, 0, StateStep(3, 9, 77))
+    assert unpacked.entries == (PublishedBatch(OTHER, 2, (("calibration", True, 1),)), MovingFrame("m"))
+
+
+STEP = StateStep(4, 6, 99)
+
+
+def steps(messages: list[Message]) -> list[tuple[int, StateStep | None]]:
+    """The number of each message, and what it claims."""
+    return [(message.number, unpack(message.attachment).step) for message in messages]
+
+
+def test_the_step_of_a_turn_is_in_its_only_message_or_behind_all_of_them() -> None:
+    writer = MessageWriter(SendReport(print))
+    batch = OutgoingBatch(ORIGIN, 1, [moving("map", "a", 1)] * FULL_MESSAGE)
+    bad = OutgoingBatch(ORIGIN, 2, [moving("map", "a", 2**62)])
+    assert steps(writer.write([OutgoingBatch(ORIGIN, 1, [moving("map", "a", 1)])], STEP)) == [
+        (1, STEP._replace(message=1))
+    ]
+    assert steps(writer.write([batch, batch], STEP)) == [(2, None), (3, None), (0, STEP._replace(message=3))]
+    assert steps(writer.write([bad], STEP)) == [(0, STEP._replace(message=3))]
+    assert steps([writer.claim(STEP)]) == [(0, STEP._replace(message=3))]
 
 
 @pytest.mark.thorough
@@ -189,7 +212,7 @@ def test_samples_that_no_message_can_hold_are_counted_while_the_rest_of_their_ba
     assert writer.report.not_sent == {reason: 3}
     assert len(writer.refused) == 3
     assert all(isinstance(error, InvalidTransformError) and error.reason == reason for error in writer.refused)
-    assert message_to_keep(OutgoingBatch(ORIGIN, 1, [bad])) is None
+    assert not can_hold(bad)
 
 
 def test_a_turn_without_a_message_uses_no_number() -> None:

@@ -3,7 +3,8 @@ from hypothesis import strategies as st
 from support.samples import moving, static
 
 from tfbus import TransformStamped
-from tfbus.links._outbox import Outbox, OutgoingBatch, RemovedFrame
+from tfbus.links._entries import OutgoingBatch, RemovedFrame
+from tfbus.links._outbox import Outbox
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
 Kept = dict[str, tuple[TransformStamped, ...] | RemovedFrame | None]

@@ -22,6 +22,7 @@ from support.asking import Asked
 from tfbus import (
     LATEST,
     SECOND,
+    AheadError,
     Buffer,
     Bus,
     BusClosedError,
@@ -106,6 +107,11 @@ class State(Enum):
     FUTURE = auto()
     UNKNOWN = auto()
     PAST = auto()
+    AHEAD = auto()
+
+
+FAILURES = {State.PAST: PastExtrapolationError, State.AHEAD: AheadError}
+"""The errors of lookups that no longer wait."""
 
 
 @dataclass
@@ -139,7 +145,9 @@ class Model:
         """The frame, its parent, and so on up to the root."""
         return [frame, *self.climb(PARENT[frame])] if frame in self.edges else [frame]
 
-    def leg(self, target: str, source: str, at: int | None, not_before: float) -> tuple[State, int, float]:
+    def leg(
+        self, target: str, source: str, at: int | None, not_before: float, not_after: float
+    ) -> tuple[State, int, float]:
         """State, stamp and x of the source in the target."""
         ups, downs = self.climb(source), self.climb(target)
         if ups[-1] != downs[-1]:
@@ -150,7 +158,9 @@ class Model:
             if not all(moving):
                 return State.FUTURE, 0, 0.0
             at = min(map(max, moving), default=0)
-            if moving and (at < not_before or at < max(map(min, moving))):
+            if moving and not not_before <= at <= not_after:
+                return State.FUTURE if at < not_before else State.AHEAD, 0, 0.0
+            if moving and at < max(map(min, moving)):
                 return State.FUTURE, 0, 0.0
         if any(stamps and at < min(stamps) for stamps in moving):
             return State.PAST, 0, 0.0
@@ -160,13 +170,14 @@ class Model:
         return State.ANSWER, at, x
 
     def look(self, ask: Ask, now: float) -> tuple[State, int, float]:
-        not_before = float("-inf") if ask.max_age is None else now - ask.max_age
+        age = float("inf") if ask.max_age is None else ask.max_age
+        bounds = now - age, now + age
         if not all(named(frame, self.edges) for frame in (ask.target, ask.source, ask.fixed or ask.target)):
             return State.UNKNOWN, 0, 0.0
         if ask.fixed is None:
-            return self.leg(ask.target, ask.source, ask.at, not_before)
-        first = self.leg(ask.target, ask.fixed, ask.at, not_before)
-        second = self.leg(ask.fixed, ask.source, ask.source_at, not_before)
+            return self.leg(ask.target, ask.source, ask.at, *bounds)
+        first = self.leg(ask.target, ask.fixed, ask.at, *bounds)
+        second = self.leg(ask.fixed, ask.source, ask.source_at, *bounds)
         if first[0] is State.ANSWER or second[0] is State.PAST:
             # Of a leg on which nothing moves, no stamp is the latest.
             by_source = ask.at is None and not self.moves(ask.target, ask.fixed) and self.moves(ask.fixed, ask.source)
@@ -295,7 +306,7 @@ class Game:
         ask, asked = waiting.ask, waiting.asked
         model = self.models[ask.buffer]
         state, stamp, x = model.look(ask, self.clock.now() / SECOND)
-        fresh, waiting.fresh = waiting.fresh, False
+        waiting.fresh = False
         if waiting.cancelled_first:
             assert asked.cancelled
         elif waiting.reset:
@@ -304,9 +315,8 @@ class Game:
             assert (asked.answer.parent, asked.answer.child) == (ask.target, ask.source)
             assert asked.answer.stamp == stamp * SECOND
             assert asked.answer.transform.translation == pytest.approx((x, 0.0, 0.0))
-        elif state is State.PAST and (fresh or model.closed or (asked.ended and not asked.cancelled)):
-            # Otherwise it need not know yet: it is parked under one edge, and the past is that of another.
-            assert isinstance(asked.error, PastExtrapolationError)
+        elif state in FAILURES:
+            assert isinstance(asked.error, FAILURES[state])
         elif model.closed:
             assert isinstance(asked.error, BusClosedError)
         elif waiting.cancelled_last:
@@ -322,9 +332,8 @@ class Game:
     def still_waits_as_time_passes(self, waiting: Waiting) -> bool:
         state, _, _ = self.models[waiting.ask.buffer].look(waiting.ask, self.clock.now() / SECOND)
         assert state is not State.ANSWER
-        if state is State.PAST and waiting.asked.ended:
-            assert isinstance(waiting.asked.error, PastExtrapolationError)
-        elif waiting.deadline <= self.elapsed:
+        assert state not in FAILURES
+        if waiting.deadline <= self.elapsed:
             assert isinstance(waiting.asked.error, LookupTimeoutError)
             assert waiting.asked.error.__cause__ is not None
         else:

@@ -39,14 +39,14 @@ class Stranger:
         self.origin = uuid4().bytes
         self._sequence = 0
         found: Queue[zenoh.Sample] = Queue()
-        watch = self.session.liveliness().declare_subscriber(f"{self.prefix}/@alive/*", found.put, history=True)
+        watch = self.session.liveliness().declare_subscriber(f"{self.prefix}/*/@alive/*/*", found.put, history=True)
         for _ in range(2):
             found.get(timeout=PATIENCE)
         watch.undeclare()
 
     def put(self, payload: bytes, attachment: bytes | None, key: str | None = None) -> None:
         block = zenoh.CongestionControl.BLOCK
-        where = key or f"{self.prefix}/live/{self.id}"
+        where = key or f"{self.prefix}/~/live/{self.id}"
         self.session.put(where, payload, attachment=attachment, congestion_control=block)
 
     def message(self, *samples: TransformStamped) -> Message:
@@ -138,7 +138,7 @@ def test_values_that_are_not_numbers_are_refused_and_the_loop_has_time_for_other
 
 def test_too_many_frame_names_are_refused_and_the_first_ones_go_with_their_peer(scene: Scene) -> None:
     stranger = scene.stranger
-    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/@alive/{stranger.id}")
+    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{stranger.id}/0")
     for group in range(40):
         stranger.send(*[moving("map", f"frame {group} {i}", 1) for i in range(5_000)])
     stranger.send(moving("map", "frame 0 0", 2, 7.0))
@@ -157,17 +157,17 @@ def test_too_many_frame_names_are_refused_and_the_first_ones_go_with_their_peer(
 def test_forged_senders_are_limited_in_number_and_keep_no_announced_peer_out(scene: Scene) -> None:
     stranger = scene.stranger
     for _ in range(2 * MAX_PEERS):
-        stranger.send(moving("map", "base", 1), key=f"{stranger.prefix}/live/{uuid4().hex}")
+        stranger.send(moving("map", "base", 1), key=f"{stranger.prefix}/~/live/{uuid4().hex}")
     # All places are taken, so not even the marker comes in.
     payload, attachment = stranger.message(moving("map", "last", 1))
     known = scene.friend.ask("facts")["ids"][0]
-    stranger.put(payload, attachment, f"{stranger.prefix}/live/{known}")
+    stranger.put(payload, attachment, f"{stranger.prefix}/~/live/{known}")
     scene.victim.ask("until", has=["last"])
     (link,) = scene.victim.ask("facts")["links"]
     assert link["rejected"]["too many peers"] >= MAX_PEERS
     scene.check_announced("too many peers")
     # A peer that announces itself gets in all the same.
-    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/@alive/{stranger.id}")
+    token = stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{stranger.id}/0")
     scene.victim.wait(event="PeerJoined", peer=stranger.id)
     stranger.send(moving("map", "newcomer", 1))
     scene.victim.ask("until", has=["newcomer"])
@@ -177,9 +177,9 @@ def test_forged_senders_are_limited_in_number_and_keep_no_announced_peer_out(sce
 def test_a_thousand_tokens_are_a_thousand_peers_and_go_with_their_session(scene: Scene) -> None:
     stranger = scene.stranger
     names = [uuid4().hex for _ in range(2 * MAX_PEERS)] + [f"robot{i}" for i in range(100)] + ["*", "**"]
-    tokens = [stranger.session.liveliness().declare_token(f"{stranger.prefix}/@alive/{name}") for name in names]
+    tokens = [stranger.session.liveliness().declare_token(f"{stranger.prefix}/~/@alive/{name}/0") for name in names]
     known = scene.friend.ask("facts")["ids"][0]
-    stranger.send(moving("map", "last", 1), key=f"{stranger.prefix}/live/{known}")
+    stranger.send(moving("map", "last", 1), key=f"{stranger.prefix}/~/live/{known}")
     scene.victim.ask("until", has=["last"], peers=MAX_PEERS)
     scene.victim.ask("until", peers=MAX_PEERS)
     scene.check_announced("key", "too many peers")
@@ -210,7 +210,7 @@ class Flood(threading.Thread):
     def run(self) -> None:
         try:
             # What is sent before the victim's subscription has arrived here reaches nobody.
-            live = self.session.declare_publisher(f"{self.prefix}/live/{'f' * 32}")
+            live = self.session.declare_publisher(f"{self.prefix}/~/live/{'f' * 32}")
             while not live.matching_status.matching:  # type: ignore[attr-defined]
                 time.sleep(0.01)
             for number in range(200):
@@ -226,17 +226,17 @@ class Flood(threading.Thread):
         def put(key: str, payload: bytes, attachment: bytes) -> None:
             self.session.put(f"{self.prefix}/{key}", payload, attachment=attachment, congestion_control=block)
 
-        put("live/nobody", b"", b"")
+        put("~/live/nobody", b"", b"")
         for _ in range(20):
-            put(f"live/{me}", rng.randbytes(rng.randrange(2_000)), rng.randbytes(rng.randrange(200)))
-            put(f"live/{uuid4().hex}", b"", rng.randbytes(20))
-            put(f"static/{me}/{rng.randrange(100)}", rng.randbytes(50), rng.randbytes(50))
-        put(f"static/{self.victim}/lidar", b"\x01", b"\x01")
+            put(f"~/live/{me}", rng.randbytes(rng.randrange(2_000)), rng.randbytes(rng.randrange(200)))
+            put(f"~/live/{uuid4().hex}", b"", rng.randbytes(20))
+            put(f"~/live/{me}", rng.randbytes(50), rng.randbytes(50))
+        put(f"~/live/{self.victim}", b"\x01", b"\x01")
         # A million names, all from one peer.
         payload = NAMED.replace(b"a" * 8, b"%08d" % number)
-        put(f"live/{'f' * 32}", payload, pack(0, [PublishedBatch(b"f" * 16, number, (("flood", False, 5_000),))]))
+        put(f"~/live/{'f' * 32}", payload, pack(0, [PublishedBatch(b"f" * 16, number, (("flood", False, 5_000),))]))
         if number % 50 == 0:
-            put(f"live/{me}", bytes(MAX_BYTES + 1), b"")
+            put(f"~/live/{me}", bytes(MAX_BYTES + 1), b"")
 
 
 def messages_counted(link: dict[str, Any]) -> int:

@@ -32,8 +32,6 @@ def test_without_loss_every_bus_receives_every_batch_once_whole_and_in_order(gra
         for child in frames_of(net.buses[0]):
             assert len({buffer.tree.parent(child) for buffer in buffers}) == 1
         assert sum(end.endpoint.inbox.lost for end in net.ends) == 0
-        for end in net.ends:
-            end.carrier.drop_tombstones()
         late = net.add_bus()
         net.domains[-1].join(late)
         net.settle()
@@ -76,10 +74,12 @@ def test_when_peers_are_lost_and_found_all_agree_in_the_end_whether_their_frames
 
 @given(
     graph=st.sampled_from((MESH, CHAIN, RING, RING_WITH_A_TAIL, TWO_BRIDGES)),
-    steps=steps_of("part", "part", "meet", "overtake", "drop", "repeat", "join"),
+    steps=steps_of("part", "part", "meet", "overtake", "drop", "repeat", "join", "freeze", "expel", "contend"),
 )
 @settings(suppress_health_check=[HealthCheck.too_slow])
-def test_when_messages_are_lost_besides_all_agree_in_the_end(graph: Graph, steps: list[Step]) -> None:
+def test_whatever_is_lost_late_repeated_cut_frozen_removed_by_others_or_contended_all_agree_in_the_end(
+    graph: Graph, steps: list[Step]
+) -> None:
     with Network(graph) as net:
         Model(net).live(steps)
 

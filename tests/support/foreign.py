@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 from tfbus import InvalidTransformError, Transform, TransformStamped
 from tfbus.links._carrier import SendReport
+from tfbus.links._entries import OutgoingBatch
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
-from tfbus.links._outbox import OutgoingBatch, Turn
+from tfbus.links._outbox import Turn
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Received
 from tfbus.tf_message import MalformedMessageError
@@ -102,9 +103,6 @@ class ForeignCarrier:
             except InvalidTransformError as error:
                 errors.append(error)
         return ReceivedMessage([ReceivedBatch(samples, {"foreign"})], errors=errors)
-
-    def peer_joined(self, peer: str, again: bool) -> None:
-        raise AssertionError(f"nobody tells that {peer} is present here, again or not: {again}")
 
     async def run(self) -> None:
         """Nothing takes time."""

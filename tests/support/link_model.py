@@ -7,6 +7,7 @@ from support.samples import moving, static
 from support.wires import Network, latched
 
 from tfbus import Bus, TransformStamped
+from tfbus.links._receive_queue import Presence
 
 Step = tuple[str, int, int, list[int]]
 """A kind of step, the number of a bus, the number of a place, and some more numbers."""
@@ -32,6 +33,7 @@ class Model:
     def __init__(self, net: Network) -> None:
         self.net = net
         self._stamp = 0
+        self._frozen: set[Bus] = set()
 
     def do(self, step: str, who: int, where: int, numbers: list[int]) -> None:
         net = self.net
@@ -48,6 +50,14 @@ class Model:
             self._stamp += 1
             bus.publish((static if where % 2 else moving)("map", "shared", stamp=self._stamp, x=float(self._stamp)))
             net.settle()
+        elif step == "contend":
+            self._stamp += 1
+            bus.publish(static("map", "contended", stamp=self._stamp, x=float(self._stamp)))
+        elif step == "freeze":
+            self._frozen.symmetric_difference_update({bus})
+        elif step == "expel":
+            if frames := sorted(frames_of(bus)):
+                bus.remove_frame(frames[where % len(frames)])
         elif step == "banish":
             net.settle()
             if frames := sorted(frames_of(bus)):
@@ -65,10 +75,12 @@ class Model:
         elif wires:
             wire = wires[where % len(wires)]
             place = numbers[0] % len(wire.packets)
-            if step == "deliver":
-                wire.deliver()
-            elif step == "overtake":
-                wire.deliver(place)
+            if step in ("deliver", "overtake"):
+                if wire.receiver.bus not in self._frozen:
+                    wire.deliver(place if step == "overtake" else 0)
+            elif isinstance(wire.packets[place], Presence):
+                # The network tells for sure who is there.
+                return
             elif step == "drop":
                 del wire.packets[place]
             elif step == "repeat":
@@ -99,9 +111,9 @@ class Model:
     def move_on(self) -> None:
         """Publish all frames that have turned moving once more, so that every bus hears of the change."""
         for member, bus in enumerate(self.net.buses):
-            for number in range(3):
-                if f"{member}.{number}" not in latched(bus):
-                    bus.publish(moving("map", f"{member}.{number}", 10**9))
+            for frame in sorted(frames_of(bus) - latched(bus).keys()):
+                if frame.startswith(f"{member}."):
+                    bus.publish(moving("map", frame, 10**9))
         self.net.settle()
 
     def check_nothing_went_wrong(self) -> None:
@@ -116,7 +128,7 @@ class Model:
         for heard in self.net.heard:
             newest: dict[str, int] = {}
             for batch in heard:
-                last = {sample.child: sample.stamp for sample in batch}
+                last = {sample.child: sample.stamp for sample in batch if sample.child != "contended"}
                 for child, stamp in last.items():
                     known = newest.get(child, -1)
                     assert stamp > known or (say_again and stamp == known)
@@ -125,15 +137,12 @@ class Model:
     def check_no_echo(self) -> None:
         for member, heard in enumerate(self.net.heard):
             for batch in heard:
-                own = [sample.child.startswith(f"{member}.") for sample in batch]
+                own = [sample.child.startswith(f"{member}.") for sample in batch if sample.child != "contended"]
                 assert all(own) if type(batch[0]) is TransformStamped else not any(own)
 
     def check_all_agree(self) -> None:
-        """Check that all buses have the static frames that their publisher has."""
-        for member, bus in enumerate(self.net.buses):
-            for other in self.net.buses:
-                theirs, own = (
-                    {child: sample for child, sample in known.items() if child.startswith(f"{member}.")}
-                    for known in (latched(other), latched(bus))
-                )
-                assert theirs == own
+        """Check that all buses have the same frames, and the same static samples."""
+        first = self.net.buses[0]
+        for other in self.net.buses[1:]:
+            assert frames_of(other) == frames_of(first)
+            assert latched(other) == latched(first)

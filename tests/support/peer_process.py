@@ -10,7 +10,7 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -27,6 +27,7 @@ from tfbus import (
     Transform,
     TransformBroadcaster,
     TransformStamped,
+    UnknownFrameError,
 )
 from tfbus.geometry.stamped import Batch
 from tfbus.links.zenoh import ZenohLink
@@ -151,7 +152,9 @@ class Program:
         broadcaster.send_static("map", frame, Transform((float(times), 0.0, 0.0)))
 
     async def do_remove(self, frame: str) -> None:
-        self.bus.remove_frame(frame)
+        # Another process may have been faster.
+        with suppress(UnknownFrameError):
+            self.bus.remove_frame(frame)
 
     async def do_lookup(self, target: str, source: str, at: int | None = None) -> dict[str, Any]:
         """Wait for a transform for as long as it takes."""
@@ -229,6 +232,7 @@ class Program:
             "bus": {"samples": statistics.samples, "rejected": statistics.rejected, "frames": statistics.frames},
             "static": sorted(self.static),
             "moving": sorted(self.moving),
+            "x": self.x,
             "longest_pause": self.longest_pause,
             "megabytes": pages * 4096 / 1e6,
         }

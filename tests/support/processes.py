@@ -61,8 +61,14 @@ class PeerProcess:
         """Send a command; returns its number for `finish`."""
         number = next(_numbers)
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps({"id": number, "do": do, **arguments}) + "\n")
-        self._process.stdin.flush()
+        try:
+            self._process.stdin.write(json.dumps({"id": number, "do": do, **arguments}) + "\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            self._process.wait(PATIENCE)
+            for reader in self._readers:
+                reader.join(PATIENCE)
+            raise EOFError(f"the process has ended with {self._process.returncode}; {self.errors}") from None
         return number
 
     def finish(self, number: int) -> dict[str, Any]:

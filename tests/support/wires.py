@@ -7,16 +7,17 @@ from typing import Any
 
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import SendReport
-from tfbus.links._endpoint import Endpoint
+from tfbus.links._endpoint import LONGEST_CLAIM_PERIOD, Endpoint
 from tfbus.links._inbox import ReceivedMessage
-from tfbus.links._message import Message, MessageWriter, message_to_keep, read_message
+from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
 from tfbus.links._outbox import Turn
 from tfbus.links._provenance import ReceivedTransform
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links._relay import relay_of
+from tfbus.links._state import StateEntry, StateStep
 
 Batch = tuple[TransformStamped, ...]
-Packet = Message | Presence
+Packet = Message | Presence | Question | Answer
 Graph = Sequence[Sequence[int]]
 """The buses of each of several domains, by their numbers."""
 
@@ -30,44 +31,47 @@ TWO_BRIDGES: Graph = [[0, 1, 2], [1, 2, 3]]
 
 
 class WireCarrier:
-    """Puts a link's messages on wires, and keeps static frames for late joiners as zenoh's caches do."""
+    """Puts a link's messages, questions and answers on wires."""
 
-    def __init__(self, id: str, put: Callable[[Message], object]) -> None:  # noqa: A002 - the protocol calls it so
+    def __init__(
+        self,
+        id: str,  # noqa: A002 - the protocol calls it so
+        put: Callable[[Message], object],
+        put_to: Callable[[str, Question | Answer], object],
+    ) -> None:
         self.id = id
         self.refused: list[Exception] = []
-        self.kept: dict[str, Message] = {}
         self._put = put
+        self._put_to = put_to
         self._writer = MessageWriter(SendReport(self.refused.append))
 
     async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
         """A wire needs no opening."""
 
     def send(self, turn: Turn) -> None:
-        """Put the live messages on the wires, and behind them what has changed of the static frames."""
-        for live in self._writer.write(turn.entries):
-            self._put(live)
-        for frame, entry in turn.statics.items():
-            if entry is None:
-                self.kept.pop(frame, None)
-            elif (message := message_to_keep(entry)) is not None:
-                self.kept[frame] = message
-                self._put(message)
+        for message in self._writer.write(turn.entries, turn.step):
+            self._put(message)
 
     def read(self, content: Any) -> ReceivedMessage:
         return read_message(content.payload, content.attachment)
 
-    def peer_joined(self, peer: str, again: bool) -> None:
-        """`Domain.meet` delivers again what is kept."""
+    def can_hold(self, sample: TransformStamped) -> bool:
+        return can_hold(sample)
+
+    def claim(self, step: StateStep) -> None:
+        self._put(self._writer.claim(step))
+
+    def ask(self, peer: str, since: int) -> None:
+        self._put_to(peer, Question(since, self.id))
+
+    def answer(self, question: Question, entries: list[StateEntry], step: StateStep) -> None:
+        self._put_to(question.handle, Answer(write_answer(entries, step)))
 
     async def run(self) -> None:
         """Nothing takes time."""
 
     async def close(self) -> None:
         """A wire needs no closing."""
-
-    def drop_tombstones(self) -> None:
-        """Keep no removals any more."""
-        self.kept = {frame: message for frame, message in self.kept.items() if message.samples}
 
 
 class End:
@@ -77,16 +81,25 @@ class End:
         self,
         name: str,
         bus: Bus,
-        put: Callable[["End", Message], object],
+        domain: "Domain",
         frames: Collection[str] | None,
         max_frames: int = 10_000,
         drop_lost: bool = False,
     ) -> None:
         self.id = name
         self.bus = bus
-        self.carrier = WireCarrier(name, lambda message: put(self, message))
+        self.carrier = WireCarrier(
+            name, lambda message: domain.put(self, message), lambda peer, packet: domain.put_to(self, peer, packet)
+        )
         self.endpoint = Endpoint(
-            bus, name, self.carrier, lambda: None, frames=frames, drop_lost=drop_lost, max_frames=max_frames
+            bus,
+            name,
+            self.carrier,
+            lambda: None,
+            frames=frames,
+            drop_lost=drop_lost,
+            max_frames=max_frames,
+            now=lambda: domain.time,
         )
         self.relay = relay_of(bus)
         self.endpoint.attach()
@@ -104,7 +117,7 @@ class Wire:
     def __init__(self, sender: End, receiver: End) -> None:
         self.sender = sender
         self.receiver = receiver
-        self.packets: deque[Packet] = deque([Presence.JOINED, *sender.carrier.kept.values()])
+        self.packets: deque[Packet] = deque([Presence.JOINED])
 
     def deliver(self, place: int = 0) -> None:
         packet = self.packets[place]
@@ -113,9 +126,10 @@ class Wire:
 
 
 class Domain:
-    """Ends that are joined to one another, each to each."""
+    """Ends that are joined to one another, each to each, in a time of their own."""
 
     def __init__(self) -> None:
+        self.time = 0.0
         self.ends: list[End] = []
         self.wires: dict[tuple[End, End], Wire] = {}
         self._names = iter(range(10**6))
@@ -123,8 +137,8 @@ class Domain:
     def join(
         self, bus: Bus, frames: Collection[str] | None = None, max_frames: int = 10_000, drop_lost: bool = False
     ) -> End:
-        """A new end; what the others keep for late joiners is on its way to it."""
-        new = End(f"{id(self)} {next(self._names)}", bus, self._put, frames, max_frames, drop_lost)
+        """A new end."""
+        new = End(f"{id(self)} {next(self._names)}", bus, self, frames, max_frames, drop_lost)
         for other in self.ends:
             self.meet(other, new)
         self.ends.append(new)
@@ -150,10 +164,30 @@ class Domain:
             elif receiver is end:
                 del self.wires[sender, receiver]
 
-    def _put(self, sender: End, message: Message) -> None:
+    def put(self, sender: End, message: Message) -> None:
         for wire in self.wires.values():
             if wire.sender is sender:
                 wire.packets.append(message)
+
+    def put_to(self, sender: End, receiver: str, packet: Question | Answer) -> None:
+        for wire in self.wires.values():
+            if wire.sender is sender and wire.receiver.id == receiver:
+                wire.packets.append(packet)
+
+    def pass_time(self) -> bool:
+        """Let time pass until somebody asks a question; returns whether anybody does."""
+        due = [time for end in self.ends if (time := end.endpoint.next_question()) is not None]
+        self.time = max(self.time, *due, 0.0)
+        for end in self.ends:
+            end.endpoint.reconcile()
+        return bool(due)
+
+    def claim(self) -> None:
+        """Have all ends claim their states."""
+        self.time += LONGEST_CLAIM_PERIOD
+        for end in self.ends:
+            end.endpoint.send()
+            end.endpoint.reconcile()
 
 
 class Network:
@@ -205,21 +239,21 @@ class Network:
 
     def settle(self) -> None:
         """Send and deliver everything until nothing moves any more; an echo would go on for ever."""
-        for _ in range(100):
+        for _ in range(1_000):
             for bus in self.buses:
                 self.send(bus)
-            if not self.wires:
-                return
             for wire in self.wires:
                 while wire.packets:
                     wire.deliver()
+            asked = [domain.pass_time() for domain in self.domains]
+            if not self.wires and not any(asked) and not any(end.endpoint.outbox.pending for end in self.ends):
+                return
         raise AssertionError("the network does not come to rest")
 
     def recover(self) -> None:
-        """Deliver once more all that is kept for late joiners, as zenoh does for what a receiver has missed."""
+        """Have all ends claim their states, so that each asks for what it has missed."""
         for domain in self.domains:
-            for wire in domain.wires.values():
-                wire.packets.extend(wire.sender.carrier.kept.values())
+            domain.claim()
         self.settle()
 
     def published(self, member: int) -> list[Batch]:

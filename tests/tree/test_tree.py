@@ -461,7 +461,7 @@ def test_a_sample_takes_at_most_100_bytes(insert: Callable[[TransformTree, Any],
         for stamp in stamps:
             # A new string for each sample, as a link makes it.
             authority = bytes.decode(b"odometry")
-            insert(tree, tuple(moving(parent, child, stamp, stamp / 3, authority) for parent, child in edges))
+            insert(tree, tuple(moving(parent, child, stamp, stamp / SECOND, authority) for parent, child in edges))
     assert {edge.samples for edge in tree.edges()} == {500}
 
 

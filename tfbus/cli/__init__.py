@@ -24,6 +24,7 @@ from tfbus.cli.commands.play import play
 from tfbus.cli.commands.query import query
 from tfbus.cli.commands.record import record
 from tfbus.cli.commands.robot import robot
+from tfbus.cli.commands.router import router
 from tfbus.cli.commands.static import static
 from tfbus.cli.commands.tree import tree
 from tfbus.cli.output import warn
@@ -39,7 +40,7 @@ app = App(
     version=lambda: f"{version('tfbus')} ({kernel} kernel)",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query):
+for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, router):
     app.command(command)
 
 

@@ -35,6 +35,10 @@ class LinkOptions:
     connect
         Connect to a program that listens at this address; may be given several times. Programs without an address
         listen at tcp/127.0.0.1:17447.
+    robot
+        The robot whose frames this program publishes.
+    robots
+        Hear only these robots, such as r1 or r*; may be given several times.
     backend
         The event loop to run on.
     """
@@ -42,6 +46,8 @@ class LinkOptions:
     domain: str = "tf"
     listen: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    robot: Annotated[str | None, Parameter(show_default=False)] = None
+    robots: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     backend: Backend = "asyncio"
 
     def run(self, program: Callable[[Bus], Awaitable[T]]) -> T:
@@ -81,7 +87,14 @@ class LinkOptions:
             raise UsageError('joining a domain needs a package more: pip install "tfbus[cli,zenoh]"') from None
         async with AsyncExitStack() as stack:
             try:
-                link = ZenohLink(bus, self.domain, listen=self.listen or None, connect=self.connect or None)
+                link = ZenohLink(
+                    bus,
+                    self.domain,
+                    listen=self.listen or None,
+                    connect=self.connect or None,
+                    robot=self.robot,
+                    robots=self.robots or None,
+                )
                 await stack.enter_async_context(link)
             except ValueError as error:
                 raise UsageError(str(error)) from None

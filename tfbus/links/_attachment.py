@@ -1,16 +1,18 @@
-"""The attachment of a message between links: the origin, number and authority of its samples, and removals.
+"""The attachment of a message between links: the origin, number and authority of its samples, removals, and a claim.
 
 ROS's TFMessage has no fields for these. A message holds the samples of several batches one after the other; its
 attachment says how many samples belong to which batch, in the order in which batches and removals happened. Little
 endian::
 
-    version u8, origins u8, authorities u16, entries u32, number u64
+    version u8, claim u8, origins u8, 0 u8, authorities u16, entries u32, number u64
+    since u64, state u64, digest u64, message u64: a `StateStep`; claim is 0 without one, 1, or 2 for the final step
     origins      16 bytes each
     authorities  length u16, UTF-8
     entries      kind u8, origin u8, runs u16, sequence u64, and then
         batch    runs times: authority u16, static u16, samples u32
         removal  the length of the name in place of runs, UTF-8
         loss     as a removal
+        moving   as a removal, of an origin that does not matter: the name of a moving frame
 
 Reading one costs time in proportion to its bytes; handling an entry may cost more, so both have a limit.
 """
@@ -20,19 +22,22 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 
-from tfbus.links._outbox import RemovedFrame
+from tfbus.links._entries import MovingFrame, RemovedFrame
+from tfbus.links._state import StateStep
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
-VERSION = 1
+VERSION = 2
 ORIGIN_BYTES = 16
 MAX_BYTES = 2**20
 MAX_ENTRIES = 10_000
 
-_HEADER = struct.Struct("<BBHIQ")
+_HEADER = struct.Struct("<BBBxHIQQQQQ")
 _ENTRY = struct.Struct("<BBHQ")
 _RUN = struct.Struct("<HHI")
 _LENGTH = struct.Struct("<H")
-_BATCH, _REMOVAL, _LOSS = 0, 1, 2
+_BATCH, _REMOVAL, _LOSS, _MOVING = 0, 1, 2, 3
+_NO_STEP, _STEP, _FINAL_STEP = 0, 1, 2
+_NO_ORIGIN = bytes(ORIGIN_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +64,7 @@ class PublishedBatch:
         return sum(count for _, _, count in self.runs)
 
 
-Entry = PublishedBatch | RemovedFrame
+Entry = PublishedBatch | RemovedFrame | MovingFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +73,7 @@ class Attachment:
 
     number: int
     entries: tuple[Entry, ...]
+    step: StateStep | None = None
 
     def tags(self) -> Iterator[tuple[str, bool]]:
         """Authority and static flag of each sample of the message."""
@@ -76,7 +82,7 @@ class Attachment:
         return chain.from_iterable(repeat((authority, static), count) for authority, static, count in runs)
 
 
-def pack(number: int, entries: Sequence[Entry]) -> bytes:
+def pack(number: int, entries: Sequence[Entry], step: StateStep | None = None) -> bytes:
     """The bytes of an attachment.
 
     Raises
@@ -92,18 +98,25 @@ def pack(number: int, entries: Sequence[Entry]) -> bytes:
     authorities: dict[str, int] = {}
     body = bytearray()
     for entry in entries:
+        if isinstance(entry, MovingFrame):
+            origin = origins.setdefault(_NO_ORIGIN, len(origins))
+            name = _name(entry.frame)
+            body += _pack(_ENTRY, _MOVING, origin, len(name), 0) + name
+            continue
         origin = origins.setdefault(entry.origin, len(origins))
         if isinstance(entry, RemovedFrame):
-            name = entry.frame.encode()
-            if len(name) > MAX_NAME:
-                raise ValueError(f"too much for one attachment: a frame name of {len(name)} bytes")
+            name = _name(entry.frame)
             kind = _LOSS if entry.lost else _REMOVAL
             body += _pack(_ENTRY, kind, origin, len(name), entry.sequence) + name
         else:
             body += _pack(_ENTRY, _BATCH, origin, len(entry.runs), entry.sequence)
             for authority, static, count in entry.runs:
                 body += _pack(_RUN, authorities.setdefault(authority, len(authorities)), static, count)
-    head = bytearray(_pack(_HEADER, VERSION, len(origins), len(authorities), len(entries), number))
+    claim, claimed = _NO_STEP, (0, 0, 0, 0)
+    if step is not None:
+        claim = _FINAL_STEP if step.final else _STEP
+        claimed = step.since, step.number, step.digest, step.message
+    head = bytearray(_pack(_HEADER, VERSION, claim, len(origins), len(authorities), len(entries), number, *claimed))
     for origin_bytes in origins:
         head += origin_bytes
     for authority in authorities:
@@ -137,7 +150,7 @@ def unpack(data: bytes) -> Attachment:
 
 
 def _unpack(data: bytes) -> Attachment:
-    _, origin_count, authority_count, entry_count, number = _HEADER.unpack_from(data)
+    _, claim, origin_count, authority_count, entry_count, number, *claimed = _HEADER.unpack_from(data)
     if entry_count > MAX_ENTRIES:
         raise MalformedMessageError("oversized", f"the attachment has {entry_count} entries, more than {MAX_ENTRIES}")
     at = _HEADER.size + ORIGIN_BYTES * origin_count
@@ -153,9 +166,12 @@ def _unpack(data: bytes) -> Attachment:
     for _ in range(entry_count):
         kind, origin, size, sequence = _ENTRY.unpack_from(data, at)
         at += _ENTRY.size
-        if kind in (_REMOVAL, _LOSS) and size <= MAX_NAME:
+        if kind in (_REMOVAL, _LOSS, _MOVING) and size <= MAX_NAME:
             frame = data[at : at + size].decode()
-            entries.append(RemovedFrame(origins[origin], sequence, frame, kind == _LOSS))
+            if kind == _MOVING:
+                entries.append(MovingFrame(frame))
+            else:
+                entries.append(RemovedFrame(origins[origin], sequence, frame, kind == _LOSS))
             at += size
         elif kind == _BATCH:
             runs = _RUN.iter_unpack(data[at : at + _RUN.size * size])
@@ -167,7 +183,20 @@ def _unpack(data: bytes) -> Attachment:
     # Slicing past the end raises nothing, so the end is checked.
     if at != len(data):
         raise IndexError
-    return Attachment(number, tuple(entries))
+    return Attachment(number, tuple(entries), _step(claim, *claimed))
+
+
+def _step(claim: int, since: int, state: int, digest: int, message: int) -> StateStep | None:
+    if claim > _FINAL_STEP or since > state:
+        raise IndexError
+    return None if claim == _NO_STEP else StateStep(since, state, digest, claim == _FINAL_STEP, message)
+
+
+def _name(frame: str) -> bytes:
+    name = frame.encode()
+    if len(name) > MAX_NAME:
+        raise ValueError(f"too much for one attachment: a frame name of {len(name)} bytes")
+    return name
 
 
 def _pack(layout: struct.Struct, *values: object) -> bytes:

@@ -2,11 +2,13 @@
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
+from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._outbox import Turn
-from tfbus.links._receive_queue import Received
+from tfbus.links._receive_queue import Question, Received
+from tfbus.links._state import StateEntry, StateStep
 
 
 class SendReport:
@@ -52,8 +54,8 @@ class Carrier(Protocol):
     The link decides what goes out, what is news and what is refused; a carrier decides how it is written, and keeps
     static frames for late joiners as its network allows. A carrier is used by one link, and opened once.
 
-    The event loop calls everything here, in this order: `open`; then, while `run` runs as a task, `send`, `read` and
-    `peer_joined`; when `run` has been cancelled, a last `send` may have come, and `close` is called.
+    The event loop calls everything here, in this order: `open`; then, while `run` runs as a task, `send` and `read`;
+    when `run` has been cancelled, a last `send` may have come, and `close` is called.
 
     Attributes
     ----------
@@ -102,9 +104,6 @@ class Carrier(Protocol):
             If nothing of it can be used; it is counted by its reason.
         """
 
-    def peer_joined(self, peer: str, again: bool) -> None:
-        """A peer has announced itself; `again` if it was lost before, so that its frames were forgotten here."""
-
     async def run(self) -> None:
         """Do what takes time, such as declaring what is kept for late joiners, until cancelled; may return early.
 
@@ -116,4 +115,34 @@ class Carrier(Protocol):
 
         The closing has to begin before the first checkpoint, because asyncio's own cancellation knows no shield, and
         has to return within about a second, whatever the network does.
+        """
+
+
+@runtime_checkable
+class AskableCarrier(Carrier, Protocol):
+    """A carrier whose peers tell of their presence, number their state, and can be asked for it.
+
+    A link over it converges: whatever was lost on the way, each peer that claims a state which the link does not hold
+    is asked for it, until both agree. Every message that ends a turn carries the turn's `step`.
+    """
+
+    def can_hold(self, sample: TransformStamped) -> bool:
+        """Whether a message can hold a sample."""
+
+    def claim(self, step: StateStep) -> None:
+        """Tell all peers the state of this link, while there is nothing else to send; must not block or raise."""
+
+    def ask(self, peer: str, since: int) -> None:
+        """Ask a peer for the changes of its state behind a number; must not block or raise.
+
+        Then `receive` is called with an `Answer` from that peer, one without a message if there is none in a while.
+        """
+
+    def answer(self, question: Question, entries: list[StateEntry], step: StateStep) -> None:
+        """Answer a question that came as an item.
+
+        Raises
+        ------
+        ValueError
+            If one message cannot hold so many entries; fewer may do.
         """

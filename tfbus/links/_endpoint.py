@@ -3,17 +3,26 @@
 import logging
 from collections.abc import Callable, Collection
 from copy import copy
+from math import inf
+from time import monotonic
 
-from tfbus._log import OnceLogger, SeenKeys
+from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
-from tfbus.links._carrier import Carrier
+from tfbus.links._asker import Asker
+from tfbus.links._carrier import AskableCarrier, Carrier
 from tfbus.links._inbox import Inbox
 from tfbus.links._outbox import Outbox
-from tfbus.links._peers import MAX_PEERS, Peers
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links._peers import Peers
+from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links._reconciler import Reconciler
 from tfbus.links._relay import relay_of
+from tfbus.links._state import CHUNK
 from tfbus.tf_message import MalformedMessageError
+
+CLAIM_PERIOD = 1.0
+LONGEST_CLAIM_PERIOD = 10.0
+"""s; a link claims its state so long after it has sent something, and then after twice that time, up to the longest."""
 
 
 class Endpoint:
@@ -33,6 +42,10 @@ class Endpoint:
         Whether the frames of a lost peer leave the bus.
     max_frames : int
         How many frames one peer may have.
+    now : callable
+        Returns a monotonic time in s.
+    wake : callable
+        Called when `reconcile` has to be called earlier than it said before.
 
     Attributes
     ----------
@@ -51,6 +64,8 @@ class Endpoint:
         frames: Collection[str] | None = None,
         drop_lost: bool = False,
         max_frames: int = 10_000,
+        now: Callable[[], float] = monotonic,
+        wake: Callable[[], object] = lambda: None,
     ) -> None:
         self._bus = bus
         self._name = name
@@ -58,10 +73,18 @@ class Endpoint:
         self._drop_lost = drop_lost
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._relay = relay_of(bus)
-        self._joined_before = SeenKeys(MAX_PEERS)
+        self._askable = carrier if isinstance(carrier, AskableCarrier) else None
+        self._now = now
+        self._claimed_at = -CLAIM_PERIOD
+        self._claim_period = CLAIM_PERIOD
         self.peers = Peers(self._report)
-        self.outbox = Outbox(frames, notify)
+        self.outbox = Outbox(frames, notify, None if self._askable is None else self._askable.can_hold)
         self.inbox = Inbox(bus, self._relay, self.outbox, frames, max_frames, self.peers)
+        self._reconciler = (
+            None
+            if self._askable is None
+            else Reconciler(self.inbox, self.peers, self._askable.ask, Asker(now), wake, max_frames)
+        )
 
     def attach(self) -> None:
         """Join the bus: from now on, all that is latched or published gathers in the outbox.
@@ -83,6 +106,28 @@ class Endpoint:
         turn = self.outbox.flush()
         if turn.entries or turn.statics:
             self._carrier.send(turn)
+            self._claimed_at = self._now()
+            self._claim_period = CLAIM_PERIOD
+
+    def next_question(self) -> float | None:
+        """When the next peer is to be asked; None while nothing is missing."""
+        return None if self._reconciler is None else self._reconciler.next_due()
+
+    def reconcile(self) -> float:
+        """Ask whoever is to be asked, and claim the state if it is time; returns when to call this again."""
+        if self._reconciler is None or self._askable is None:
+            return inf
+        self._reconciler.run()
+        due = self._claimed_at + self._claim_period
+        if self._now() >= due:
+            self._claimed_at = self._now()
+            self._claim_period = min(2 * self._claim_period, LONGEST_CLAIM_PERIOD)
+            due = self._claimed_at + self._claim_period
+            # Those that this link does not hear may hear it.
+            if not self.outbox.pending:
+                self._askable.claim(self.outbox.step())
+        asking = self.next_question()
+        return due if asking is None else min(due, asking)
 
     def handle(self, item: Received) -> None:
         """Handle one item that the carrier has received; nothing in it makes this raise."""
@@ -94,12 +139,43 @@ class Endpoint:
                 self._peer_left(item.sender)
             elif isinstance(content, MalformedMessageError):
                 self.peers.reject(item.sender, content.reason, content)
+            elif isinstance(content, Question):
+                self._answer(content)
+            elif isinstance(content, Answer):
+                self._take_answer(item.sender, content)
             else:
                 self.inbox.receive(item.sender, self._carrier.read(content))
+                if self._reconciler is not None:
+                    self._reconciler.heard(item.sender)
         except MalformedMessageError as error:
             self.peers.reject(item.sender, error.reason, error)
         except Exception as error:  # noqa: BLE001 - no peer, and no subscriber, may end the event loop
             self.peers.reject(item.sender, "not published", error)
+
+    def _answer(self, question: Question) -> None:
+        if self._askable is None:
+            return
+        limit = CHUNK
+        while limit:
+            try:
+                self._askable.answer(question, *self.outbox.state.changes(question.since, limit))
+            except ValueError:
+                limit //= 2
+            else:
+                return
+
+    def _take_answer(self, sender: str, answer: Answer) -> None:
+        if self._reconciler is None:
+            return
+        try:
+            message = None if answer.message is None else self._carrier.read(answer.message)
+        except MalformedMessageError:
+            self._reconciler.unanswered(sender)
+            raise
+        if message is None:
+            self._reconciler.unanswered(sender)
+        else:
+            self._reconciler.answered(sender, message)
 
     def _peer_joined(self, sender: str) -> None:
         evicted = self.peers.make_room(sender)
@@ -108,12 +184,15 @@ class Endpoint:
         peer = self.peers.find(sender)
         if peer is not None and not peer.present:
             peer.present = True
-            self._carrier.peer_joined(sender, again=not self._joined_before.add(sender))
+            if self._reconciler is not None:
+                self._reconciler.joined(peer)
             self._bus._announce(PeerJoined(self._bus.clock.now(), self._name, sender))
 
     def _peer_left(self, sender: str) -> None:
         peer = self.peers.forget(sender)
         if peer is not None:
+            if self._reconciler is not None:
+                self._reconciler.left(peer)
             frames = self._relay.lose(peer, self.outbox, self._drop_lost)
             authorities = tuple(sorted(peer.authorities))
             self._bus._announce(PeerLost(self._bus.clock.now(), self._name, sender, authorities, frames))

@@ -1,14 +1,17 @@
 """The inbox of a link: it publishes on the bus what peers have sent, within the limits of each peer."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from tfbus.bus.bus import Bus
 from tfbus.errors import InvalidTransformError
-from tfbus.links._outbox import Outbox, RemovedFrame
+from tfbus.links._entries import MovingFrame, RemovedFrame
+from tfbus.links._mirror import Mirror
+from tfbus.links._outbox import Outbox
 from tfbus.links._peers import MAX_AUTHORITIES, Peer, Peers
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.links._relay import Relay
+from tfbus.links._state import StateStep
 
 _LARGEST_GAP = 2**32
 
@@ -56,11 +59,14 @@ class ReceivedMessage:
         that was kept for late joiners, or one of a sender that does not number.
     errors : list of InvalidTransformError
         One for each sample that was refused; `entries` has the others.
+    step : StateStep or None
+        What the message claims to tell of the peer's state, if it claims that.
     """
 
-    entries: list[ReceivedBatch | RemovedFrame]
+    entries: list[ReceivedBatch | RemovedFrame | MovingFrame]
     number: int = 0
     errors: list[InvalidTransformError] = field(default_factory=list)
+    step: StateStep | None = None
 
 
 class Inbox:
@@ -103,37 +109,94 @@ class Inbox:
         self.duplicates = 0
 
     def receive(self, sender: str, message: ReceivedMessage) -> None:
-        """Publish and remove what a message of a peer says."""
+        """Publish and remove what a live message of a peer says."""
         peer = self._peers.find(sender)
         if peer is None or self._bus.closed:
             return
+        step = message.step
+        newest = message.number or (0 if step is None else step.message)
+        if message.number or step is None:
+            self.messages += 1
+        missing = self._count_gap(peer, newest, was_sent=message.number > 0)
+        if missing and peer.mirror is not None:
+            peer.mirror.lost_message()
+        self._take(peer, message, live=message.number > 0)
+        if peer.mirror is not None and step is not None:
+            if step.number - peer.mirror.number > _LARGEST_GAP:
+                error = ValueError(f"a state with the number {step.number}, {peer.mirror.number} was the newest")
+                self._peers.reject(sender, "number", error)
+            else:
+                peer.mirror.claimed(step)
+
+    def receive_answer(self, sender: str, message: ReceivedMessage) -> bool:
+        """Publish and remove what an answer says of a peer's state; returns whether it has told anything.
+
+        When a peer has told its whole state, the frames that it brought before and does not bring now are removed.
+        """
+        peer, step = self._peers.get(sender), message.step
+        if peer is None or peer.mirror is None or step is None or self._bus.closed:
+            return False
         self.messages += 1
-        self._count_gap(peer, message.number)
+        mirror = peer.mirror
+        before = mirror.number
+        if step.since == 0:
+            mirror.begins_anew()
+        elif step.since != before:
+            return False
+        self._take(peer, message, live=False)
+        mirror.answered(step)
+        if mirror.agrees and mirror.take_whole() and not self._bus.closed:
+            self._relay.keep_only(peer, mirror, self._outbox)
+        return mirror.number > before
+
+    def _take(self, peer: Peer, message: ReceivedMessage, live: bool) -> None:
         for error in message.errors:
-            self._peers.reject(sender, error.reason, error)
-        live = message.number > 0
+            self._peers.reject(peer.id, error.reason, error)
+        together: list[ReceivedBatch] = []
         for entry in message.entries:
+            if isinstance(entry, ReceivedBatch):
+                if peer.mirror is not None:
+                    _note(peer.mirror, entry)
+                together.append(entry)
+                # The batches of an answer were never one batch, but nothing is between them.
+                if not live and entry.origin is not None:
+                    continue
+            self._publish(peer, together, live)
+            together.clear()
             if self._bus.closed:
                 # A subscriber may have closed it since the last entry.
                 return
             if isinstance(entry, ReceivedBatch):
-                if self._admit_authorities(peer, entry):
-                    self._publish(peer, entry, live)
-            elif self._frames is None or entry.frame in self._frames:
+                continue
+            if peer.mirror is not None:
+                peer.mirror.entry(entry)
+            if not isinstance(entry, RemovedFrame) or not self._admit_number(peer, entry.sequence, 1):
+                continue
+            if self._frames is None or entry.frame in self._frames:
                 provenance = Provenance(entry.origin, entry.sequence, self._outbox, peer, live, entry.lost)
                 self._relay.remove(provenance, entry.frame)
+        self._publish(peer, together, live)
 
-    def _publish(self, peer: Peer, batch: ReceivedBatch, live: bool) -> None:
-        samples: list[ReceivedTransform] = batch.samples
-        if self._frames is not None:
-            samples = [sample for sample in samples if sample.child in self._frames]
-        if batch.origin is None:
-            published, refused = self._relay.publish_foreign(self._outbox, peer, samples, self._max_frames)
-        else:
-            provenance = Provenance(batch.origin, batch.sequence, self._outbox, peer, live)
-            published, refused = self._relay.publish(provenance, samples, self._max_frames)
+    def _publish(self, peer: Peer, batches: Sequence[ReceivedBatch], live: bool) -> None:
+        received: list[tuple[Provenance, list[ReceivedTransform]]] = []
+        count = published = refused = 0
+        for batch in batches:
+            if not self._admit_number(peer, batch.sequence, len(batch.samples)):
+                continue
+            if not self._admit_authorities(peer, batch):
+                continue
+            samples = batch.samples
+            if self._frames is not None:
+                samples = [sample for sample in samples if sample.child in self._frames]
+            count += len(samples)
+            if batch.origin is None:
+                published, refused = self._relay.publish_foreign(self._outbox, peer, samples, self._max_frames)
+            else:
+                received.append((Provenance(batch.origin, batch.sequence, self._outbox, peer, live), samples))
+        if received:
+            published, refused = self._relay.publish(received, self._max_frames)
         self.samples += published
-        self.duplicates += len(samples) - published - refused
+        self.duplicates += count - published - refused
         if refused:
             error = ValueError(f"the peer has announced more than {self._max_frames} frames")
             self._peers.reject(peer.id, "too many frames", error, refused)
@@ -149,10 +212,45 @@ class Inbox:
                 peer.authorities.add(authority)
         return True
 
-    def _count_gap(self, peer: Peer, number: int) -> None:
-        if number > peer.number:
-            missing = number - peer.number - 1
-            # Nobody has sent so many messages: a larger gap means that the number is made up.
-            if peer.number and missing <= _LARGEST_GAP:
-                self.lost += missing
+    def _admit_number(self, peer: Peer, number: int, count: int) -> bool:
+        """Refuse a number that no bus can have given; else all later ones of its origin would be no news."""
+        if self._relay.is_plausible(number):
+            return True
+        error = ValueError(f"a batch with the number {number}, which is too far ahead of all others")
+        self._peers.reject(peer.id, "number", error, count)
+        return False
+
+    def _count_gap(self, peer: Peer, number: int, was_sent: bool) -> bool:
+        """Count the live messages that have not come; returns whether there are any.
+
+        Parameters
+        ----------
+        number : int
+            That of the newest live message; 0 for a message that does not tell it.
+        was_sent : bool
+            Whether that is the message which has come, rather than one before it.
+        """
+        if not number:
+            return False
+        missing = number - peer.number - was_sent
+        # Nobody has sent so many messages: a larger gap means that one of the two numbers is made up.
+        if abs(missing) > _LARGEST_GAP:
             peer.number = number
+            return True
+        if number <= peer.number:
+            return False
+        known = peer.number > 0
+        peer.number = number
+        if known:
+            self.lost += missing
+        return missing > 0
+
+
+def _note(mirror: Mirror, batch: ReceivedBatch) -> None:
+    """Note in a peer's mirror which frames it brings with a batch."""
+    for sample in batch.samples:
+        _, child, _, _, _, static = sample._fields
+        if static:
+            mirror.static(child, batch.origin or b"", batch.sequence)
+        elif not mirror.has_moving(child):
+            mirror.moving(child)

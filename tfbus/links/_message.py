@@ -11,9 +11,10 @@ from tfbus.errors import InvalidTransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._attachment import PublishedBatch, pack, unpack
 from tfbus.links._carrier import SendReport
+from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
-from tfbus.links._outbox import OutgoingBatch, RemovedFrame
 from tfbus.links._provenance import ReceivedTransform
+from tfbus.links._state import StateStep
 from tfbus.tf_message import decode, encode, refusal
 
 FULL_MESSAGE = 5_000
@@ -22,16 +23,17 @@ MAX_BYTES = 2**22
 """The largest message that is sent or accepted: some 30,000 samples, which keep the receiver's loop for a while."""
 _LONGEST_AUTHORITY = 65_535
 
-_Entry = OutgoingBatch | RemovedFrame
+_Entry = OutgoingBatch | RemovedFrame | MovingFrame
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message as it goes out: a TFMessage, its attachment, and the number of its samples."""
+    """One message as it goes out: a TFMessage, its attachment, the number of its samples, and its own if it is live."""
 
     payload: bytes
     attachment: bytes
     samples: int
+    number: int = 0
 
 
 class MessageWriter:
@@ -47,8 +49,26 @@ class MessageWriter:
         self._report = report
         self._number = 0
 
-    def write(self, entries: Sequence[_Entry]) -> list[Message]:
-        """The messages that hold all entries in order; batches stay whole."""
+    def write(self, entries: Sequence[_Entry], step: StateStep | None = None) -> list[Message]:
+        """The messages that hold all entries in order, and the step that they are; batches stay whole."""
+        if step is None:
+            return self._write(entries)
+        if sum(map(_size, entries)) < FULL_MESSAGE:
+            try:
+                message = _message(entries, self._number + 1, step._replace(message=self._number + 1))
+            except ValueError:
+                # Written below once more, without what cannot be sent.
+                pass
+            else:
+                self._number += 1
+                return [message]
+        return [*self._write(entries), self.claim(step)]
+
+    def claim(self, step: StateStep) -> Message:
+        """A message without a number and without entries, which claims a state."""
+        return _message([], 0, step._replace(message=self._number))
+
+    def _write(self, entries: Sequence[_Entry]) -> list[Message]:
         messages: list[Message] = []
         gathered: list[_Entry] = []
         size = 0
@@ -80,7 +100,7 @@ class MessageWriter:
 
     def _sendable(self, entry: _Entry) -> _Entry | None:
         """The part of an entry that a message can hold: the entry itself if that is all, None if it is nothing."""
-        if isinstance(entry, RemovedFrame):
+        if not isinstance(entry, OutgoingBatch):
             try:
                 pack(0, [entry])
             except ValueError as error:
@@ -96,13 +116,20 @@ class MessageWriter:
         return OutgoingBatch(entry.origin, entry.sequence, kept) if kept else None
 
 
-def message_to_keep(entry: _Entry) -> Message | None:
-    """A message without a number, to be kept for late joiners; None if no message can hold the entry."""
-    try:
-        return _message([entry], 0)
-    except ValueError:
-        # It could not go out live either, and was reported there.
-        return None
+def can_hold(sample: TransformStamped) -> bool:
+    """Whether a message can hold a sample."""
+    return _refusal(sample) is None
+
+
+def write_answer(entries: Sequence[_Entry], step: StateStep) -> Message:
+    """The answer to a question for changes of a state; each of the entries has to fit into a message.
+
+    Raises
+    ------
+    ValueError
+        If one message cannot hold all of them.
+    """
+    return _message(entries, 0, step)
 
 
 def read_message(payload: bytes, attachment: bytes) -> ReceivedMessage:
@@ -116,15 +143,15 @@ def read_message(payload: bytes, attachment: bytes) -> ReceivedMessage:
     unpacked = unpack(attachment)
     decoded = decode(payload, unpacked.tags(), ReceivedTransform)
     entries = list(_received_entries(unpacked.entries, decoded.samples))
-    return ReceivedMessage(entries, unpacked.number, decoded.errors)
+    return ReceivedMessage(entries, unpacked.number, decoded.errors, unpacked.step)
 
 
 def _received_entries(
-    entries: Sequence[PublishedBatch | RemovedFrame], samples: Sequence[ReceivedTransform | None]
-) -> Iterator[ReceivedBatch | RemovedFrame]:
+    entries: Sequence[PublishedBatch | RemovedFrame | MovingFrame], samples: Sequence[ReceivedTransform | None]
+) -> Iterator[ReceivedBatch | RemovedFrame | MovingFrame]:
     start = 0
     for entry in entries:
-        if isinstance(entry, RemovedFrame):
+        if not isinstance(entry, PublishedBatch):
             yield entry
             continue
         end = start + entry.count
@@ -133,18 +160,19 @@ def _received_entries(
         start = end
 
 
-def _message(entries: Sequence[_Entry], number: int) -> Message:
+def _message(entries: Sequence[_Entry], number: int, step: StateStep | None = None) -> Message:
     """A message of all entries; raises `ValueError` if one message cannot hold them."""
     samples: list[TransformStamped] = []
     for entry in entries:
         if isinstance(entry, OutgoingBatch):
             samples += entry.samples
     payload = encode(samples)
-    attachment = pack(number, [_published(entry) if isinstance(entry, OutgoingBatch) else entry for entry in entries])
+    published = [_published(entry) if isinstance(entry, OutgoingBatch) else entry for entry in entries]
+    attachment = pack(number, published, step)
     size = len(payload) + len(attachment)
     if size > MAX_BYTES:
         raise ValueError(f"a message of {len(samples)} samples has {size} bytes, more than {MAX_BYTES}")
-    return Message(payload, attachment, len(samples))
+    return Message(payload, attachment, len(samples), number)
 
 
 def _published(batch: OutgoingBatch) -> PublishedBatch:

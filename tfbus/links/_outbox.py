@@ -1,42 +1,13 @@
 """The outbox of a link: what is published and removed gathers in it until the turn of the event loop ends."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
+from tfbus.links._state import LinkState, StateStep
 
-
-class OutgoingBatch:
-    """Samples of one batch and one origin, as they go out.
-
-    Attributes
-    ----------
-    origin : bytes
-        The bus on which the batch was published first, 16 bytes.
-    sequence : int
-        The batch's number on that bus.
-    samples : sequence of TransformStamped
-    """
-
-    __slots__ = ("origin", "samples", "sequence")
-
-    def __init__(self, origin: bytes, sequence: int, samples: Sequence[TransformStamped]) -> None:
-        self.origin = origin
-        self.sequence = sequence
-        self.samples = samples
-
-
-@dataclass(frozen=True, slots=True)
-class RemovedFrame:
-    """A tombstone: a frame was removed, by the batch number `sequence` of the bus `origin`.
-
-    With `lost`, the sender has lost the peer that brought the frame, so only what the sender itself brought is removed.
-    """
-
-    origin: bytes
-    sequence: int
-    frame: str
-    lost: bool = False
+_NO_ORIGIN = bytes(16)
 
 
 @dataclass(slots=True)
@@ -50,16 +21,19 @@ class Turn:
     statics : dict of str to OutgoingBatch, RemovedFrame or None
         The static frames whose state for late joiners has changed: the newest sample of each as a batch of its own, its
         tombstone, or None if the frame is not to be kept any more.
+    step : StateStep or None
+        What the entries change of the link's state; for carriers whose peers ask for it.
     """
 
     entries: list[OutgoingBatch | RemovedFrame]
     statics: dict[str, OutgoingBatch | RemovedFrame | None]
+    step: StateStep | None = None
 
 
 class Outbox:
     """The sending half of a link.
 
-    It also follows which static frames the link has sent, for the carrier keeps those for late joiners.
+    It also follows which frames the link brings: late joiners, and peers that have missed something, are told those.
 
     Parameters
     ----------
@@ -67,26 +41,38 @@ class Outbox:
         The children that may go out; None for all.
     notify : callable
         Called when something was added.
+    can_hold : callable, optional
+        Whether a message can hold a sample; the state is to hold no other.
 
     Attributes
     ----------
     pending : int
         How many samples and removals wait to go out.
+    state : LinkState
     """
 
-    def __init__(self, frames: Collection[str] | None, notify: Callable[[], object]) -> None:
+    def __init__(
+        self,
+        frames: Collection[str] | None,
+        notify: Callable[[], object],
+        can_hold: Callable[[TransformStamped], bool] | None = None,
+    ) -> None:
         self._frames = frames
         self._notify = notify
+        self._can_hold = can_hold
         self._entries: list[OutgoingBatch | RemovedFrame] = []
         self._kept: set[str] = set()
         self._changes: dict[str, OutgoingBatch | RemovedFrame | None] = {}
+        self._told = 0
+        self._silent = False
         self.pending = 0
+        self.state = LinkState()
 
     def add_batch(self, batch: OutgoingBatch, echo: bool = False) -> None:
         """Add samples that were published.
 
-        An echo, samples that came in by this very link, does not go out; it only replaces what is kept of frames that
-        this link has sent before.
+        An echo, samples that came in by this very link, does not go out. Of frames that this link has sent before, it
+        replaces what is kept, and takes them out of the link's state, for now another link brings them.
         """
         if self._frames is not None:
             wanted = tuple(sample for sample in batch.samples if sample.child in self._frames)
@@ -96,7 +82,7 @@ class Outbox:
         if not echo:
             self._entries.append(batch)
             self.pending += len(batch.samples)
-        if self._follow_statics(batch, echo) or not echo:
+        if self._follow(batch, echo) or not echo:
             self._notify()
 
     def add_removal(self, removal: RemovedFrame, echo: bool = False) -> None:
@@ -107,31 +93,70 @@ class Outbox:
         if not echo:
             self._entries.append(removal)
             self.pending += 1
+        brought = self.state.brings(frame)
         kept = frame in self._kept
         if kept:
             self._kept.remove(frame)
             # A peer that is lost here may be present elsewhere, so its loss is no tombstone for others.
             self._changes[frame] = None if echo and removal.lost else removal
-        if kept or not echo:
+        # Those that hear of it by the link which brought the removal are told by that one.
+        if brought or not echo:
+            self._change(frame, removal, echo)
+        if kept or brought or not echo:
             self._notify()
 
     def flush(self) -> Turn:
         """Remove and return all that has gathered."""
-        turn = Turn(self._entries, self._changes)
+        turn = Turn(self._entries, self._changes, self.step())
         self._entries, self._changes, self.pending = [], {}, 0
+        self._told, self._silent = self.state.number, False
         return turn
 
-    def _follow_statics(self, batch: OutgoingBatch, echo: bool) -> bool:
-        """Note the static frames of a batch; returns whether anything changes for late joiners."""
+    def step(self) -> StateStep:
+        """What has changed of the state since the last turn."""
+        # What no entry tells has to be asked for.
+        since = self.state.number if self._silent else self._told
+        return StateStep(since, self.state.number, self.state.digest)
+
+    def _follow(self, batch: OutgoingBatch, echo: bool) -> bool:
+        """Note the frames of a batch; returns whether anything changes for late joiners."""
         changed = False
         for sample in batch.samples:
             _, child, _, _, _, static = sample._fields
             if static and (not echo or child in self._kept):
                 self._kept.add(child)
-                self._changes[child] = OutgoingBatch(batch.origin, batch.sequence, (sample,))
+                self._changes[child] = single = OutgoingBatch(batch.origin, batch.sequence, (sample,))
+                if echo or not self._holds(sample):
+                    self._release(child, echo)
+                else:
+                    self._change(child, single)
                 changed = True
-            elif child in self._kept:
+                continue
+            if child in self._kept:
                 self._kept.remove(child)
                 self._changes[child] = None
                 changed = True
+            entry = self.state.entry(child)
+            if not echo:
+                if not isinstance(entry, MovingFrame) and self._holds(sample):
+                    self._change(child, MovingFrame(child))
+            elif static or not isinstance(entry, MovingFrame):
+                changed = self._release(child, echo) or changed
         return changed
+
+    def _holds(self, sample: TransformStamped) -> bool:
+        return self._can_hold is None or self._can_hold(sample)
+
+    def _release(self, frame: str, silent: bool) -> bool:
+        """Bring a frame no more, if it was brought, because another link does; returns whether it was."""
+        if not self.state.brings(frame):
+            return False
+        entry = self.state.entry(frame)
+        # The number of what is lost, and not that of what has come in its place.
+        origin, sequence = (entry.origin, entry.sequence) if isinstance(entry, OutgoingBatch) else (_NO_ORIGIN, 0)
+        self._change(frame, RemovedFrame(origin, sequence, frame, lost=True), silent)
+        return True
+
+    def _change(self, frame: str, entry: OutgoingBatch | MovingFrame | RemovedFrame, silent: bool = False) -> None:
+        self.state.change(frame, entry)
+        self._silent = self._silent or silent

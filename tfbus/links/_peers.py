@@ -5,6 +5,7 @@ from collections.abc import Callable
 from itertools import count
 
 from tfbus._log import SeenKeys
+from tfbus.links._mirror import Mirror
 
 MAX_PEERS = 1_000
 MAX_AUTHORITIES = 1_000
@@ -34,11 +35,13 @@ class Peer:
         The authorities whose samples it has sent.
     frames : set of (bytes, str)
         Origin and child of all frames that it was the first to bring; their number is limited.
+    mirror : Mirror or None
+        What it has told of its state, once it is present, if the carrier can ask it.
     reported : SeenKeys
         The reasons of refusals that were reported.
     """
 
-    __slots__ = ("age", "authorities", "frames", "id", "number", "present", "reported")
+    __slots__ = ("age", "authorities", "frames", "id", "mirror", "number", "present", "reported")
 
     def __init__(self, id: str) -> None:  # noqa: A002 - the wire calls it so
         self.id = id
@@ -47,6 +50,7 @@ class Peer:
         self.number = 0
         self.authorities: set[str] = set()
         self.frames: set[tuple[bytes, str]] = set()
+        self.mirror: Mirror | None = None
         self.reported = SeenKeys(_REMEMBERED_REASONS)
 
 
@@ -84,6 +88,10 @@ class Peers:
                 return None
             peer = self._peers[id] = Peer(id)
         return peer
+
+    def get(self, id: str) -> Peer | None:  # noqa: A002
+        """The peer of an id, if it is known."""
+        return self._peers.get(id)
 
     def make_room(self, id: str) -> Peer | None:  # noqa: A002
         """Evict a peer that has not announced itself, if all places are taken, for a new one that has.

@@ -17,8 +17,8 @@ class Provenance:
         Its number on that bus; later ones have higher numbers.
     outbox : object
         The outbox of the link that brought it: what came in there does not go out there.
-    peer : Peer
-        The other end of that link.
+    peer : Peer or None
+        The other end of that link; None for this bus's own.
     live : bool
         Whether it came in order with everything else of that peer, rather than out of what is kept for late joiners.
     lost : bool
@@ -28,7 +28,7 @@ class Provenance:
     __slots__ = ("live", "lost", "origin", "outbox", "peer", "sequence")
 
     def __init__(
-        self, origin: bytes, sequence: int, outbox: object, peer: Peer, live: bool = True, lost: bool = False
+        self, origin: bytes, sequence: int, outbox: object, peer: Peer | None, live: bool = True, lost: bool = False
     ) -> None:
         self.origin = origin
         self.sequence = sequence
@@ -36,6 +36,11 @@ class Provenance:
         self.peer = peer
         self.live = live
         self.lost = lost
+
+    @property
+    def rank(self) -> tuple[int, bytes]:
+        """Of two things that were said of a frame, the one of the higher rank holds."""
+        return self.sequence, self.origin
 
 
 class ReceivedTransform(TransformStamped):

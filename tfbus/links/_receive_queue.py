@@ -21,6 +21,24 @@ class Presence(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class Question:
+    """The content of an item that asks for the changes of this link's state behind a number.
+
+    `handle` is what the carrier needs to answer.
+    """
+
+    since: int
+    handle: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The content of an item that answers a question to the sender; `message` is None if there was no answer."""
+
+    message: Any
+
+
+@dataclass(frozen=True, slots=True)
 class Received:
     """One item that a carrier has received.
 
@@ -29,8 +47,8 @@ class Received:
     sender : str
         The id of the peer; empty if it is unknown.
     content : Any
-        A `Presence`; a `MalformedMessageError`, for which the carrier has refused a message; or a message, which the
-        carrier's `read` decodes on the event loop.
+        A `Presence`; a `MalformedMessageError`, for which the carrier has refused a message; a `Question` or an
+        `Answer`; or a message, which the carrier's `read` decodes on the event loop.
     size : int
         Bytes that the content keeps in memory.
     moving : bool

@@ -5,24 +5,34 @@ ways, for a bus with two links passes on by each what came by the other. So a sa
 higher than that of the newest sample of the same origin and child; then no ring of buses has an echo. Batches of a
 world that has no origins, such as ROS, get this bus as their origin.
 
+A bus numbers on from the highest number that it has seen of any origin (Lamport, "Time, clocks, and the ordering of
+events in a distributed system", 1978). So of two things that are said of one frame, such as a static sample and a
+removal, the one of the higher number was said with the other in mind, or without knowing it; that one holds on every
+bus, in whatever order they come. The first number is the machine's time in microseconds, so that what a program says
+when it is started again holds against what it has said before, although it knows nothing of that.
+
 Removals are remembered with their numbers, so that a copy on a slower way does not bring the frame back. Their memory
 is bounded: of the removals that leave it, only the highest number of each origin is remembered, and live samples of
 unknown frames below that number count as outdated.
 """
 
-from collections.abc import Iterable, Sequence
-from itertools import count, groupby
+from collections.abc import Container, Iterable
+from itertools import groupby
+from time import time_ns
 from typing import NamedTuple
 from uuid import uuid4
 
 from tfbus.bus.bus import Bus
 from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.links._outbox import Outbox, OutgoingBatch, RemovedFrame
+from tfbus.links._entries import OutgoingBatch, RemovedFrame
+from tfbus.links._outbox import Outbox
 from tfbus.links._peers import Peer, next_age
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.registration import Registration
 
+LARGEST_JUMP = 2**52
+"""A number may be so far ahead of all that came before: 142 years in us, for some machines begin in 1970."""
 _REMEMBERED_REMOVALS = 10_000
 _REMEMBERED_ORIGINS = 1_000
 
@@ -46,6 +56,12 @@ class Relay:
     There is one relay a bus, from `relay_of`. While no link is attached, it does nothing and remembers nothing but its
     origin and its numbers: by those the bus knows its own samples when its links have ended and others begin.
 
+    Parameters
+    ----------
+    bus : Bus
+    number : int
+        The number before the first one.
+
     Attributes
     ----------
     origin : bytes
@@ -54,16 +70,18 @@ class Relay:
 
     _registration: Registration
 
-    def __init__(self, bus: Bus) -> None:
+    def __init__(self, bus: Bus, number: int) -> None:
         self.origin = uuid4().bytes
-        self._numbers = count(1)
+        self._number = number
         self._bus = bus
         self._outboxes: list[Outbox] = []
         self._newest: dict[bytes, dict[str, int]] = {}
         self._brought_by: dict[tuple[bytes, str], Peer] = {}
         self._removals: dict[tuple[bytes, str], _Removal] = {}
         self._outdated_up_to: dict[bytes, int] = {}
-        self._last_sender: dict[str, Peer | None] = {}
+        self._latest: dict[str, Provenance] = {}
+        self._settled: dict[str, tuple[int, bytes]] = {}
+        self._removed: dict[str, tuple[int, bytes]] = {}
         self._removing: tuple[str, Provenance] | None = None
 
     def attach(self, outbox: Outbox) -> None:
@@ -75,7 +93,7 @@ class Relay:
         """
         if not self._outboxes:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
-        self._bus.subscribe(lambda batch: self._send(batch, [outbox])).close()
+        self._bus.subscribe(lambda batch: self._send_latched(batch, outbox)).close()
         self._outboxes.append(outbox)
 
     def detach(self, outbox: Outbox) -> None:
@@ -83,16 +101,24 @@ class Relay:
         self._outboxes.remove(outbox)
         if not self._outboxes:
             self._registration.close()
-            for memory in (self._newest, self._brought_by, self._removals, self._outdated_up_to, self._last_sender):
+            for memory in (self._newest, self._brought_by, self._removals, self._outdated_up_to):
                 memory.clear()
+            for by_frame in (self._latest, self._settled, self._removed):
+                by_frame.clear()
 
-    def publish(self, provenance: Provenance, samples: Iterable[ReceivedTransform], max_frames: int) -> tuple[int, int]:
-        """Publish those samples of a received batch that are news.
+    def is_plausible(self, number: int) -> bool:
+        """Whether a number may be one that a bus has given by now."""
+        return number - self._number <= LARGEST_JUMP
+
+    def publish(
+        self, received: Iterable[tuple[Provenance, Iterable[ReceivedTransform]]], max_frames: int
+    ) -> tuple[int, int]:
+        """Publish those samples of some received batches that are news, as one batch.
 
         Parameters
         ----------
-        provenance : Provenance
-        samples : iterable of ReceivedTransform
+        received : iterable of (Provenance, iterable of ReceivedTransform)
+            All of one peer.
         max_frames : int
             How many frames the peer may have.
 
@@ -101,9 +127,16 @@ class Relay:
         published, refused : int
             Samples that were published, and samples whose frames are too many; all others are no news.
         """
-        if provenance.origin == self.origin:
-            return 0, 0
-        return self._publish_news(provenance, samples, max_frames)
+        news: list[ReceivedTransform] = []
+        refused = 0
+        for provenance, samples in received:
+            if provenance.origin != self.origin:
+                refused += self._find_news(provenance, samples, max_frames, news)
+            elif provenance.sequence > self._number:
+                self._outnumber(provenance.sequence, {sample.child for sample in samples})
+        if news:
+            self._bus.publish(news, invalid="drop")
+        return len(news), refused
 
     def publish_foreign(
         self, outbox: Outbox, peer: Peer, samples: Iterable[ReceivedTransform], max_frames: int
@@ -113,8 +146,12 @@ class Relay:
         The batch gets this bus as its origin and the next number of this bus. It goes out by all links but the one that
         brought it, whose outbox is `outbox`. Parameters and results are those of `publish`.
         """
-        provenance = Provenance(self.origin, next(self._numbers), outbox, peer)
-        return self._publish_news(provenance, samples, max_frames)
+        provenance = Provenance(self.origin, self._next_number(), outbox, peer)
+        news: list[ReceivedTransform] = []
+        refused = self._find_news(provenance, samples, max_frames, news)
+        if news:
+            self._bus.publish(news, invalid="drop")
+        return len(news), refused
 
     def remove(self, provenance: Provenance, frame: str) -> None:
         """Remove a frame from the bus, unless newer samples of it have come from the same origin.
@@ -122,15 +159,30 @@ class Relay:
         If the frame was lost rather than removed, it goes only if that peer was the last to bring it.
         """
         if provenance.origin == self.origin:
+            if provenance.sequence > self._number and not provenance.lost:
+                self._outnumber(provenance.sequence, {frame})
             return
+        self._number = max(self._number, provenance.sequence)
+        latest = self._latest.get(frame)
         if provenance.lost:
             # Others may still bring it, on another way.
-            news = self._last_sender.get(frame) is provenance.peer
+            news = latest is not None and latest.peer is provenance.peer
         else:
             newest = self._newest.get(provenance.origin, {}).get(frame, -1)
             news = newest < provenance.sequence and not self._is_outdated(provenance, frame)
+            if provenance.rank <= self._removed.get(frame, _LOWEST) or (latest and provenance.rank < latest.rank):
+                news = False
         if news:
             self._remove_from_bus(frame, provenance)
+
+    def keep_only(self, peer: Peer, kept: Container[str], outbox: Outbox) -> None:
+        """Remove the frames that a peer was the last to bring, before it was lost too, and does not bring now."""
+        gone = [
+            frame
+            for frame, latest in self._latest.items()
+            if latest.peer is not None and latest.peer.id == peer.id and latest.outbox is outbox and frame not in kept
+        ]
+        self._remove_lost(gone, peer, outbox)
 
     def lose(self, peer: Peer, outbox: Outbox, drop: bool) -> tuple[str, ...]:
         """Forget a peer.
@@ -148,54 +200,65 @@ class Relay:
         tuple of str
             Those frames, sorted.
         """
-        frames = tuple(sorted(frame for frame, last in self._last_sender.items() if last is peer))
+        frames = tuple(sorted(frame for frame, latest in self._latest.items() if latest.peer is peer))
         lost_at = next_age()
         for origin, child in tuple(peer.frames):
             self._remember_removal(origin, child, _Removal(self._newest[origin][child], lost_at))
             self._release(origin, child)
-        for frame in frames:
-            # A subscriber that hears of one removal may have removed or published other frames.
-            if self._last_sender.get(frame) is peer:
-                if drop and not self._bus.closed:
-                    provenance = Provenance(self.origin, next(self._numbers), outbox, peer, lost=True)
-                    self._remove_from_bus(frame, provenance)
-                else:
-                    self._last_sender[frame] = None
+        if drop:
+            self._remove_lost(frames, peer, outbox)
         return frames
 
-    def _publish_news(
-        self, provenance: Provenance, samples: Iterable[ReceivedTransform], max_frames: int
-    ) -> tuple[int, int]:
-        refused = 0
+    def _remove_lost(self, frames: Iterable[str], peer: Peer, outbox: Outbox) -> None:
+        for frame in frames:
+            latest = self._latest.get(frame)
+            # A subscriber that hears of one removal may have removed or published other frames, or closed the bus.
+            if not self._bus.closed and latest is not None and latest.peer is not None and latest.peer.id == peer.id:
+                lost = Provenance(self.origin, self._next_number(), outbox, peer, lost=True)
+                self._remove_from_bus(frame, lost)
+
+    def _find_news(
+        self,
+        provenance: Provenance,
+        samples: Iterable[ReceivedTransform],
+        max_frames: int,
+        news: list[ReceivedTransform],
+    ) -> int:
+        """Add the samples of one batch that are news; returns how many others are of frames that are too many."""
+        refused, before = 0, len(news)
+        peer = provenance.peer
+        assert peer is not None
+        self._number = max(self._number, provenance.sequence)
+        rank = provenance.rank
         newest = self._newest.setdefault(provenance.origin, {})
-        news = []
         for sample in samples:
-            child = sample._fields[1]
+            fields = sample._fields
+            child = fields[1]
+            if (child in self._settled or child in self._removed or fields[5]) and self._is_outranked(sample, rank):
+                continue
             known = newest.get(child)
             if known is not None:
                 if known >= provenance.sequence:
                     continue
             # Otherwise the child is new in this batch, and this is not its first sample there.
-            elif (provenance.origin, child) not in provenance.peer.frames:
+            elif (provenance.origin, child) not in peer.frames:
                 if self._is_outdated(provenance, child):
                     continue
-                if len(provenance.peer.frames) >= max_frames:
+                if len(peer.frames) >= max_frames:
                     refused += 1
                     continue
-                self._assign(provenance, child)
+                self._assign(provenance.origin, peer, child)
             sample._provenance = provenance
             news.append(sample)
         # Only now, for a batch may have several samples of one child.
-        for sample in news:
+        for sample in news[before:] if before else news:
             newest[sample._fields[1]] = provenance.sequence
         if not newest:
             del self._newest[provenance.origin]
-        if news:
-            self._bus.publish(news, invalid="drop")
-        return len(news), refused
+        return refused
 
     def _remove_from_bus(self, frame: str, provenance: Provenance) -> None:
-        if frame not in self._last_sender:
+        if frame not in self._latest:
             # None of its samples was passed on, so no link has to be told.
             self._forget_frame(frame, provenance)
             return
@@ -209,43 +272,90 @@ class Relay:
             self._removing = None
 
     def _on_batch(self, batch: Batch) -> None:
-        for sample in batch:
-            provenance = _provenance_of(sample)
-            self._last_sender[sample._fields[1]] = None if provenance is None else provenance.peer
-        self._send(batch, self._outboxes)
-
-    def _send(self, batch: Batch, outboxes: Sequence[Outbox]) -> None:
-        for provenance, samples in groupby(batch, _provenance_of):
+        for provenance, group in groupby(batch, _provenance_of):
             if provenance is None:
-                outgoing, brought_by = OutgoingBatch(self.origin, next(self._numbers), tuple(samples)), None
-            else:
-                outgoing = OutgoingBatch(provenance.origin, provenance.sequence, tuple(samples))
-                brought_by = provenance.outbox
-            for outbox in outboxes:
-                outbox.add_batch(outgoing, echo=outbox is brought_by)
+                provenance = Provenance(self.origin, self._next_number(), None, None)
+            samples = tuple(group)
+            for sample in samples:
+                fields = sample._fields
+                self._latest[fields[1]] = provenance
+                if fields[5]:
+                    self._settled[fields[1]] = provenance.rank
+            outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
+            for outbox in self._outboxes:
+                outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
+
+    def _send_latched(self, batch: Batch, outbox: Outbox) -> None:
+        def known(sample: TransformStamped) -> Provenance | None:
+            return _provenance_of(sample) or self._latest.get(sample.child)
+
+        for provenance, group in groupby(batch, known):
+            if provenance is None:
+                provenance = Provenance(self.origin, self._next_number(), None, None)
+            samples = tuple(group)
+            for sample in samples:
+                self._latest[sample.child] = provenance
+                self._settled[sample.child] = provenance.rank
+            outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
+            outbox.add_batch(outgoing, echo=outbox is provenance.outbox)
 
     def _on_removal(self, frame: str) -> None:
         if self._removing is not None and self._removing[0] == frame:
             provenance = self._removing[1]
         else:
-            provenance = Provenance(self.origin, next(self._numbers), None, _NOBODY)
-        self._last_sender.pop(frame, None)
+            provenance = Provenance(self.origin, self._next_number(), None, None)
+        self._latest.pop(frame, None)
         self._forget_frame(frame, provenance)
         removal = RemovedFrame(provenance.origin, provenance.sequence, frame, provenance.lost)
         for outbox in self._outboxes:
             outbox.add_removal(removal, echo=outbox is provenance.outbox)
 
     def _forget_frame(self, frame: str, provenance: Provenance) -> None:
-        lost_at, told_by = (next_age(), provenance.peer.id) if provenance.lost else (None, "")
+        lost_at, told_by = None, ""
+        self._settled.pop(frame, None)
+        if provenance.lost and provenance.peer is not None:
+            lost_at, told_by = next_age(), provenance.peer.id
+        else:
+            self._removed.pop(frame, None)
+            self._removed[frame] = provenance.rank
+            if len(self._removed) > _REMEMBERED_REMOVALS:
+                del self._removed[next(iter(self._removed))]
         for origin in [origin for origin, newest in self._newest.items() if frame in newest]:
             self._remember_removal(origin, frame, _Removal(self._newest[origin][frame], lost_at, told_by))
             self._release(origin, frame)
         self._remember_removal(provenance.origin, frame, _Removal(provenance.sequence, lost_at, told_by))
 
-    def _assign(self, provenance: Provenance, child: str) -> None:
+    def _is_outranked(self, sample: ReceivedTransform, rank: tuple[int, bytes]) -> bool:
+        """Whether something else that was said of the frame holds: a removal, or a static sample of another bus."""
+        _, child, _, _, _, static = sample._fields
+        if rank < self._settled.get(child, _LOWEST) or rank < self._removed.get(child, _LOWEST):
+            return True
+        latest = self._latest.get(child)
+        return static and latest is not None and rank < latest.rank
+
+    def _next_number(self) -> int:
+        self._number += 1
+        return self._number
+
+    def _outnumber(self, number: int, frames: Iterable[str]) -> None:
+        """Number on from a number of this bus that somebody has made up, and say again what it may have hidden."""
+        self._number = number
+        for frame in sorted(frames):
+            latest = self._latest.get(frame)
+            if latest is None or latest.origin != self.origin:
+                continue
+            again = Provenance(self.origin, self._next_number(), latest.outbox, latest.peer)
+            for outbox in self._outboxes:
+                held = outbox.state.entry(frame)
+                if isinstance(held, OutgoingBatch) and held.origin == self.origin:
+                    self._latest[frame] = again
+                    self._settled[frame] = again.rank
+                    outbox.add_batch(OutgoingBatch(again.origin, again.sequence, held.samples))
+
+    def _assign(self, origin: bytes, peer: Peer, child: str) -> None:
         """Count a frame of an origin for the peer that was the first to bring it."""
-        provenance.peer.frames.add((provenance.origin, child))
-        self._brought_by[provenance.origin, child] = provenance.peer
+        peer.frames.add((origin, child))
+        self._brought_by[origin, child] = peer
 
     def _release(self, origin: bytes, child: str) -> None:
         """Count a frame of an origin for nobody any more."""
@@ -261,7 +371,7 @@ class Relay:
         if removal is None:
             # What is kept for late joiners holds now, however old it is.
             return provenance.live and provenance.sequence <= self._outdated_up_to.get(provenance.origin, -1)
-        if removal.sequence == provenance.sequence and removal.lost_at is not None:
+        if removal.sequence == provenance.sequence and removal.lost_at is not None and provenance.peer is not None:
             return provenance.peer.age < removal.lost_at and provenance.peer.id != removal.told_by
         return removal.sequence >= provenance.sequence
 
@@ -282,13 +392,13 @@ class Relay:
             del self._outdated_up_to[next(iter(self._outdated_up_to))]
 
 
-_NOBODY = Peer("")
+_LOWEST = (-1, b"")
 
 
 def relay_of(bus: Bus) -> Relay:
     """The relay of a bus, which its links share; the bus itself holds it."""
     if not isinstance(bus._relay, Relay):
-        bus._relay = Relay(bus)
+        bus._relay = Relay(bus, time_ns() // 1_000)
     return bus._relay
 
 

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterable
+from time import monotonic
 from types import TracebackType
 from typing import Self
 
@@ -94,7 +95,9 @@ class Link:
             frames=None if frames is None else frozenset(frames),
             drop_lost=drop_lost,
             max_frames=max_frames,
+            wake=self._stir,
         )
+        self._stirred: anyio.Event | None = None
         self._send_report = SendReport(self._warn_not_sent)
         self._receive_queue = ReceiveQueue(capacity)
         self._received = LoopWaker(self._handle_received)
@@ -144,6 +147,7 @@ class Link:
         self._jumps = self.bus.clock.on_jump(self._clock_jumped)
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._carrier.run)
+        self._tasks.start_soon(self._keep_agreed)
         # Items that came before the link was attached are still in the queue.
         self._received.wake()
         return self
@@ -162,6 +166,18 @@ class Link:
             await close_task_group(self._tasks)
         finally:
             await self._carrier.close()
+
+    async def _keep_agreed(self) -> None:
+        """Ask peers for what was missed, and claim the own state now and then."""
+        while True:
+            due = self._endpoint.reconcile()
+            self._stirred = anyio.Event()
+            with anyio.move_on_after(due - monotonic()):
+                await self._stirred.wait()
+
+    def _stir(self) -> None:
+        if self._stirred is not None:
+            self._stirred.set()
 
     def _schedule_send(self) -> None:
         if self._endpoint.outbox.pending >= _FULL_TURN:

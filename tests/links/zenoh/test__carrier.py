@@ -9,11 +9,14 @@ from support.processes import free_ports, new_domain, until
 from support.samples import moving, static
 
 from tfbus.links._carrier import SendReport
+from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
-from tfbus.links._outbox import OutgoingBatch, RemovedFrame, Turn
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links._outbox import Turn
+from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links._state import StateStep
 from tfbus.links.zenoh._carrier import ZenohCarrier
-from tfbus.links.zenoh._settings import settings
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._settings import patch_settings, settings
 
 pytestmark = pytest.mark.anyio
 
@@ -23,9 +26,9 @@ ORIGIN = b"0123456789abcdef"
 class End:
     """A carrier, the items that it has received, and the errors of what it could not send."""
 
-    def __init__(self, prefix: str, address: str, listens: bool) -> None:
+    def __init__(self, domain: str, address: str, listens: bool) -> None:
         config = settings(address if listens else [], None if listens else address, None, 2.0)
-        self.carrier = ZenohCarrier(config, prefix, uuid4().hex)
+        self.carrier = ZenohCarrier(config, lambda where: patch_settings(where, None, 2.0), Keys(domain, uuid4().hex))
         self.errors: list[Exception] = []
         self.report = SendReport(self.errors.append)
         self._items: Queue[Received] = Queue()
@@ -33,18 +36,18 @@ class End:
     def put(self, item: Received) -> None:
         self._items.put(item)
 
-    async def next(self) -> ReceivedMessage | Presence:
-        """The next item, read."""
+    async def next(self) -> ReceivedMessage | Presence | Question | Answer:
+        """The content of the next item, read if it is a message."""
         await until(lambda: not self._items.empty())
         content = self._items.get().content
-        return content if isinstance(content, Presence) else self.carrier.read(content)
+        return content if isinstance(content, Presence | Question | Answer) else self.carrier.read(content)
 
 
 @asynccontextmanager
 async def ends() -> AsyncIterator[tuple[End, End]]:
     """Two open carriers that run and know of each other."""
-    prefix, address = f"tfbus/{new_domain()}", f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    both = End(prefix, address, listens=True), End(prefix, address, listens=False)
+    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    both = End(domain, address, listens=True), End(domain, address, listens=False)
     async with anyio.create_task_group() as tasks:
         for end in both:
             await end.carrier.open(end.put, end.report)
@@ -61,7 +64,7 @@ def kept(name: str, x: float = 0.0) -> OutgoingBatch:
     return OutgoingBatch(ORIGIN, 1, (static("map", name, x),))
 
 
-def frames(message: ReceivedMessage | Presence) -> list[str]:
+def frames(message: object) -> list[str]:
     assert isinstance(message, ReceivedMessage)
     return [sample.child for entry in message.entries if isinstance(entry, ReceivedBatch) for sample in entry.samples]
 
@@ -77,30 +80,45 @@ async def test_the_entries_of_a_turn_go_out_as_one_numbered_message_and_are_coun
         assert (here.report.messages, here.report.samples, here.errors) == (1, 2, [])
 
 
-async def test_static_frames_are_kept_as_messages_without_a_number_and_what_no_message_can_hold_is_not() -> None:
+async def test_a_question_is_answered_with_entries_and_a_step_and_claims_go_to_all() -> None:
     async with ends() as (here, there):
-        names = [f"{number}" for number in range(150)]
-        bad = OutgoingBatch(ORIGIN, 1, (static("map", "bad", authority="\ud800"),))
-        here.carrier.send(Turn([], {"bad": bad, **{name: kept(name) for name in names}}))
-        found: set[str] = set()
-        while len(found) < 150:
-            message = await there.next()
-            assert isinstance(message, ReceivedMessage)
-            assert message.number == 0
-            found.update(frames(message))
-        assert found == set(names)
+        there.carrier.ask(here.carrier.id, 5)
+        question = await here.next()
+        assert isinstance(question, Question)
+        assert question.since == 5
+        here.carrier.answer(question, [kept("lidar"), MovingFrame("base")], StateStep(5, 7, 99))
+        answer = await there.next()
+        assert isinstance(answer, Answer)
+        message = there.carrier.read(answer.message)
+        assert (frames(message), message.entries[1:]) == (["lidar"], [MovingFrame("base")])
+        assert (message.number, message.step) == (0, StateStep(5, 7, 99))
+        here.carrier.claim(StateStep(7, 7, 99))
+        claim = await there.next()
+        assert isinstance(claim, ReceivedMessage)
+        assert (claim.entries, claim.number, claim.step) == ([], 0, StateStep(7, 7, 99))
         assert here.report.messages == 0, "only live messages are counted"
 
 
-async def test_a_peer_that_joins_again_has_what_it_keeps_delivered_again() -> None:
+async def test_a_question_that_nobody_answers_ends_without_an_answer() -> None:
     async with ends() as (here, there):
-        here.carrier.send(Turn([], {"lidar": kept("lidar")}))
-        assert frames(await there.next()) == ["lidar"]
-        there.carrier.peer_joined(here.carrier.id, again=False)
-        here.carrier.send(Turn([], {"camera": kept("camera")}))
-        assert frames(await there.next()) == ["camera"], "a new peer delivers by itself"
-        there.carrier.peer_joined(here.carrier.id, again=True)
-        assert {frames(await there.next())[0] for _ in range(2)} == {"lidar", "camera"}
+        there.carrier.ask(uuid4().hex, 0)
+        answer = await there.next()
+        assert answer == Answer(None)
+        await there.carrier.close()
+        there.carrier.ask(here.carrier.id, 0)
+        assert await there.next() == Answer(None)
+
+
+async def test_an_answer_that_one_message_cannot_hold_is_refused() -> None:
+    async with ends() as (here, there):
+        there.carrier.ask(here.carrier.id, 0)
+        question = await here.next()
+        assert isinstance(question, Question)
+        long = OutgoingBatch(ORIGIN, 1, [static("map", "a")] * 100_000)
+        with pytest.raises(ValueError, match="more than"):
+            here.carrier.answer(question, [long], StateStep(0, 1, 0))
+        here.carrier.answer(question, [], StateStep(0, 0, 0))
+        assert isinstance(await there.next(), Answer)
 
 
 async def test_failures_to_send_are_reported_and_never_raised() -> None:

@@ -11,8 +11,9 @@ import zenoh
 from support.processes import PATIENCE, free_ports, new_domain
 
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.zenoh._session import ZenohSession
+from tfbus.links._receive_queue import Answer, Presence, Received
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._session import MOST_QUESTIONS, ZenohSession
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError
 
@@ -22,10 +23,14 @@ A, B = uuid4().hex, uuid4().hex
 class End:
     """One session, and the items that it has received."""
 
-    def __init__(self, id: str, prefix: str, config: zenoh.Config) -> None:  # noqa: A002
+    def __init__(self, id: str, domain: str, config: zenoh.Config) -> None:  # noqa: A002
         self.id = id
         self.items: Queue[Received] = Queue()
-        self.session = ZenohSession(config, prefix, id, self.items.put)
+        self.session = ZenohSession(config, Keys(domain, id), self.items.put, self._note)
+
+    def _note(self, link: str, name: str, presence: Presence) -> None:
+        assert name == FIRST_SESSION
+        self.items.put(Received(link, presence))
 
     def next(self) -> Received:
         return self.items.get(timeout=PATIENCE)
@@ -44,21 +49,21 @@ def address() -> str:
 
 
 @pytest.fixture
-def prefix() -> str:
-    return f"tfbus/{new_domain()}"
+def domain() -> str:
+    return new_domain()
 
 
 Join = Callable[[str], End]
 
 
 @pytest.fixture
-def join(address: str, prefix: str) -> Iterator[Join]:
+def join(address: str, domain: str) -> Iterator[Join]:
     """Opens a session; the first one is where others connect to."""
     with ExitStack() as stack:
         ends: list[End] = []
 
         def open_one(id: str) -> End:  # noqa: A002
-            end = End(id, prefix, settings([] if ends else address, address if ends else None, None, 2.0))
+            end = End(id, domain, settings([] if ends else address, address if ends else None, None, 2.0))
             stack.callback(end.session.close)
             end.session.open()
             ends.append(end)
@@ -68,11 +73,11 @@ def join(address: str, prefix: str) -> Iterator[Join]:
 
 
 @contextmanager
-def stranger(address: str, prefix: str) -> Iterator[zenoh.Session]:
+def stranger(address: str, domain: str) -> Iterator[zenoh.Session]:
     """A program that speaks zenoh and has no link; it has found a program that has one."""
     session = zenoh.open(settings([], address, None, 2.0))
     found: Queue[zenoh.Sample] = Queue()
-    watch = session.liveliness().declare_subscriber(f"{prefix}/@alive/*", found.put, history=True)
+    watch = session.liveliness().declare_subscriber(f"tfbus/{domain}/*/@alive/*/*", found.put, history=True)
     try:
         found.get(timeout=PATIENCE)
         watch.undeclare()
@@ -105,157 +110,170 @@ def test_a_live_message_is_received_as_payload_and_attachment_with_its_size(join
     assert first.next() == Received(B, (b"", b""), 0, moving=True)
 
 
-def test_a_static_message_is_received_by_present_peers_and_by_late_joiners(join: Join) -> None:
-    first = join(A)
-    assert first.session.statics.publish({"lidar": Message(b"old", b"1", 1)}) == []
-    second = join(B)
-    assert second.up_to(A, (b"old", b"1"))[-1] == Received(A, (b"old", b"1"), 4, moving=False)
-    assert first.session.statics.publish({"lidar": Message(b"new", b"2", 1)}) == []
-    assert second.up_to(A, (b"new", b"2"))[-1] == Received(A, (b"new", b"2"), 4, moving=False)
-
-
-def test_resubscribing_delivers_static_messages_again(join: Join) -> None:
+def test_a_question_and_its_answer_are_received(join: Join) -> None:
     first, second = join(A), join(B)
     meet(first, second)
-    assert first.session.statics.publish({"lidar": Message(b"there", b"", 1)}) == []
-    assert second.next() == Received(A, (b"there", b""), 5, moving=False)
-    second.session.resubscribe_statics()
-    assert second.next() == Received(A, (b"there", b""), 5, moving=False)
-    # Each message from now on comes once.
-    assert first.session.statics.publish({"lidar": Message(b"new", b"", 1)}) == []
-    assert second.next() == Received(A, (b"new", b""), 3, moving=False)
-    first.session.put(Message(b"last", b"", 0))
-    assert second.next() == Received(A, (b"last", b""), 4, moving=True)
+    second.session.ask(A, 2**40)
+    question = first.next()
+    assert (question.sender, question.content.since, question.moving) == ("", 2**40, False)
+    first.session.answer([(question.content.handle, Message(b"payload", b"beside", 1))])
+    assert second.next() == Received(A, Answer((b"payload", b"beside")), 13)
 
 
-def test_neither_a_static_message_nor_the_end_overtakes_a_live_message(join: Join) -> None:
+def test_a_question_that_is_not_answered_ends(join: Join) -> None:
+    first, second = join(A), join(B)
+    meet(first, second)
+    second.session.ask(A, 0)
+    first.next().content.handle.drop()
+    assert second.next() == Received(A, Answer(None))
+
+
+def test_questions_are_limited_in_number_and_malformed_ones_are_dropped(join: Join, address: str, domain: str) -> None:
+    first = join(A)
+    with stranger(address, domain) as session:
+        key = f"tfbus/{domain}/~/state/{A}"
+        for payload in (None, b"", bytes(7), bytes(9)):
+            assert list(session.get(key, payload=payload)) == []
+        replies = [session.get(key, payload=bytes(8)) for _ in range(MOST_QUESTIONS + 1)]
+        questions = [first.next().content for _ in range(MOST_QUESTIONS)]
+        assert list(replies[-1]) == []
+        first.session.answer([(question.handle, Message(b"payload", b"", 0)) for question in questions])
+        assert [len(list(reply)) for reply in replies[:-1]] == [1] * MOST_QUESTIONS
+        again = session.get(key, payload=bytes(8))
+        first.session.answer([(first.next().content.handle, Message(b"payload", b"", 0))])
+        assert len(list(again)) == 1
+
+
+def test_the_end_does_not_overtake_a_live_message(join: Join) -> None:
     first, second = join(A), join(B)
     meet(first, second)
     for number in range(200):
-        message = Message(b"%d" % number, b"", 1)
-        first.session.put(message)
-        assert first.session.statics.publish({f"frame {number}": message}) == []
+        first.session.put(Message(b"%d" % number, b"", 1))
     first.session.close()
-    came = [(int(item.content[0]), item.moving) for item in second.up_to(A, Presence.LEFT)[:-1]]
-    assert [number for number, moving in came if moving] == list(range(200))
-    # A static message may come later, when zenoh asks for the cache of a new key.
-    assert all((number, True) in came[:place] for place, (number, moving) in enumerate(came) if not moving)
+    came = [item.content for item in second.up_to(A, Presence.LEFT)[:-1]]
+    assert came == [(b"%d" % number, b"") for number in range(200)]
 
 
-def test_a_message_without_an_attachment_is_received_with_an_empty_one(join: Join, address: str, prefix: str) -> None:
+def test_a_message_without_an_attachment_is_received_with_an_empty_one(join: Join, address: str, domain: str) -> None:
     first = join(A)
-    with stranger(address, prefix) as session:
-        session.put(f"{prefix}/live/{B}", b"payload")
+    with stranger(address, domain) as session:
+        session.put(f"tfbus/{domain}/~/live/{B}", b"payload")
         assert first.next() == Received(B, (b"payload", b""), 7, moving=True)
 
 
 KEYS_WITHOUT_A_LINK = [
     "**",
     "tfbus/**",
-    "{prefix}/**",
-    "{prefix}/*/{id}",
-    "{prefix}/live/*",
-    "{prefix}/live/robot",
-    "{prefix}/live/{id}0",
-    "{prefix}/live/ä",
-    "{prefix}/static/*/*",
-    "{prefix}/static/robot/lidar",
-    "*/*/static/{id}/lidar",
-    "{prefix}/live/" + "x" * 5_000,
+    "tfbus/{domain}/**",
+    "tfbus/{domain}/*/*/{id}",
+    "tfbus/{domain}/*/live/{id}",
+    "tfbus/{domain}/~/live/*",
+    "tfbus/{domain}/~/live/robot",
+    "tfbus/{domain}/~/live/{id}0",
+    "tfbus/{domain}/~/live/ä",
+    "tfbus/{domain}/ä/live/{id}",
+    "tfbus/{domain}/~/live/" + "x" * 5_000,
 ]
 
 
 @pytest.mark.parametrize("key", KEYS_WITHOUT_A_LINK)
 def test_a_message_whose_key_names_no_link_is_refused(
-    key: str, join: Join, address: str, prefix: str, capfd: pytest.CaptureFixture[str]
+    key: str, join: Join, address: str, domain: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     first = join(A)
-    with stranger(address, prefix) as session:
-        session.put(key.format(prefix=prefix, id=B), b"payload")
+    with stranger(address, domain) as session:
+        session.put(key.format(domain=domain, id=B), b"payload")
         item = first.next()
-        session.put(f"{prefix}/live/{B}", b"the next one")
+        session.put(f"tfbus/{domain}/~/live/{B}", b"the next one")
         *others, _ = first.up_to(B, (b"the next one", b""))
     assert (item.sender, item.moving, item.content.reason) == ("", False, "key")
     assert len(str(item.content)) < 400
-    # A key may be for both subscribers, live and static.
-    assert {other.content.reason for other in others} <= {"key"}
+    assert others == []
     assert "error" not in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("key", ["{prefix}/live/{id}/more", "{prefix}/static/{id}", "{prefix}/{id}", "{prefix}/live"])
-def test_other_keys_of_the_domain_are_not_received(key: str, join: Join, address: str, prefix: str) -> None:
+@pytest.mark.parametrize("key", ["~/live/{id}/more", "live/{id}", "~/state/{id}", "{id}"])
+def test_other_keys_of_the_domain_are_not_received(key: str, join: Join, address: str, domain: str) -> None:
     first = join(A)
-    with stranger(address, prefix) as session:
-        session.put(key.format(prefix=prefix, id=B), b"payload")
-        session.put(f"{prefix}/live/{B}", b"the next one")
+    with stranger(address, domain) as session:
+        session.put(f"tfbus/{domain}/{key.format(id=B)}", b"payload")
+        session.put(f"tfbus/{domain}/~/live/{B}", b"the next one")
         assert first.next().content == (b"the next one", b"")
 
 
-@pytest.mark.parametrize("token", ["{prefix}/@alive/*", "{prefix}/@alive/robot", "*/*/@alive/{id}"])
-def test_a_token_whose_key_names_no_link_is_refused(token: str, join: Join, address: str, prefix: str) -> None:
+@pytest.mark.parametrize(
+    "token",
+    [
+        "tfbus/{domain}/~/@alive/*/0",
+        "tfbus/{domain}/~/@alive/robot/0",
+        "tfbus/{domain}/~/@alive/{id}/x",
+        "*/*/*/@alive/{id}/0",
+    ],
+)
+def test_a_token_whose_key_names_no_link_is_refused(token: str, join: Join, address: str, domain: str) -> None:
     first = join(A)
-    with stranger(address, prefix) as session:
-        declared = session.liveliness().declare_token(token.format(prefix=prefix, id=B))
+    with stranger(address, domain) as session:
+        declared = session.liveliness().declare_token(token.format(domain=domain, id=B))
         item = first.next()
         assert (item.sender, item.content.reason) == ("", "key")
         declared.undeclare()
 
 
-def test_deletions_are_not_received(join: Join, address: str, prefix: str) -> None:
+def test_deletions_are_not_received(join: Join, address: str, domain: str) -> None:
     first = join(A)
-    with stranger(address, prefix) as session:
-        session.delete(f"{prefix}/live/{B}")
-        session.put(f"{prefix}/live/{B}", b"the next one")
+    with stranger(address, domain) as session:
+        session.delete(f"tfbus/{domain}/~/live/{B}")
+        session.put(f"tfbus/{domain}/~/live/{B}", b"the next one")
         assert first.next().content == (b"the next one", b"")
 
 
 @pytest.mark.parametrize("sizes", [(MAX_BYTES + 1, 0), (0, MAX_BYTES + 1), (MAX_BYTES, 1)])
-def test_a_message_that_is_too_large_is_refused(sizes: tuple[int, int], join: Join, address: str, prefix: str) -> None:
+def test_a_message_that_is_too_large_is_refused(sizes: tuple[int, int], join: Join, address: str, domain: str) -> None:
     first = join(A)
-    with stranger(address, prefix) as session:
+    with stranger(address, domain) as session:
         payload, attachment = map(bytes, sizes)
         block = zenoh.CongestionControl.BLOCK
-        session.put(f"{prefix}/live/{B}", payload, attachment=attachment, congestion_control=block)
+        session.put(f"tfbus/{domain}/~/live/{B}", payload, attachment=attachment, congestion_control=block)
         item = first.next()
     assert isinstance(item.content, MalformedMessageError)
     assert (item.sender, item.content.reason) == (B, "oversized")
     assert item.size == 0
 
 
-def test_the_largest_message_is_received(join: Join, address: str, prefix: str) -> None:
+def test_the_largest_message_is_received(join: Join, address: str, domain: str) -> None:
     first = join(A)
-    with stranger(address, prefix) as session:
+    with stranger(address, domain) as session:
         block = zenoh.CongestionControl.BLOCK
-        session.put(f"{prefix}/live/{B}", bytes(MAX_BYTES), congestion_control=block)
+        session.put(f"tfbus/{domain}/~/live/{B}", bytes(MAX_BYTES), congestion_control=block)
         item = first.next()
     assert (item.size, item.content) == (MAX_BYTES, (bytes(MAX_BYTES), b""))
 
 
-def test_a_port_in_use_is_an_os_error_with_its_number(prefix: str) -> None:
+def test_a_port_in_use_is_an_os_error_with_its_number(domain: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         config = settings(f"tcp/127.0.0.1:{server.getsockname()[1]}", None, None, 2.0)
         with pytest.raises(OSError, match="zenoh cannot open a session") as caught:
-            ZenohSession(config, prefix, A, print).open()
+            ZenohSession(config, Keys(domain, A), print, print).open()
     assert caught.value.errno == errno.EADDRINUSE
     assert ".rs:" not in str(caught.value)
 
 
-def test_an_os_error_that_only_zenoh_has_found_has_no_number(prefix: str) -> None:
+def test_an_os_error_that_only_zenoh_has_found_has_no_number(domain: str) -> None:
     config = settings("tls/127.0.0.1:0", None, None, 2.0)
     with pytest.raises(OSError, match="private key") as caught:
-        ZenohSession(config, prefix, A, print).open()
+        ZenohSession(config, Keys(domain, A), print, print).open()
     assert caught.value.errno is None
 
 
-def test_a_client_that_reaches_nobody_raises(prefix: str, address: str) -> None:
+def test_a_client_that_reaches_nobody_raises(domain: str, address: str) -> None:
     config = settings(None, address, {"mode": "client"}, 2.0)
     with pytest.raises(OSError, match="Unable to connect"):
-        ZenohSession(config, prefix, A, print).open()
+        ZenohSession(config, Keys(domain, A), print, print).open()
 
 
-def test_a_session_closed_before_it_was_open_does_not_stay_open(join: Join, prefix: str, address: str) -> None:
+def test_a_session_closed_before_it_was_open_does_not_stay_open(join: Join, domain: str, address: str) -> None:
     first = join(A)
-    second = End(B, prefix, settings([], address, None, 2.0))
+    second = End(B, domain, settings([], address, None, 2.0))
     second.session.close()
     second.session.open()
     third = join(uuid4().hex)

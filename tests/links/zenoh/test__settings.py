@@ -235,18 +235,16 @@ async def test_nobody_joins_over_tls_without_a_certificate(certificates: Path) -
             assert link.peers == (welcome.id,)
 
 
-@pytest.mark.anyio
-async def test_access_control_lets_a_guest_listen_and_not_publish(certificates: Path) -> None:
-    address = f"tls/127.0.0.1:{free_ports(1)[0]}"
-    domain = new_domain()
-    read_only = {
+def denied_to_guests(*messages: str) -> dict[str, Any]:
+    """The setting by which guests may not send some kinds of messages of zenoh."""
+    return {
         "access_control": {
             "enabled": True,
             "default_permission": "allow",
             "rules": [
                 {
                     "id": "publishing",
-                    "messages": ["put", "delete", "reply"],
+                    "messages": messages,
                     "flows": ["ingress"],
                     "permission": "deny",
                     "key_exprs": ["tfbus/**"],
@@ -256,6 +254,27 @@ async def test_access_control_lets_a_guest_listen_and_not_publish(certificates: 
             "policies": [{"rules": ["publishing"], "subjects": ["guests"]}],
         }
     }
+
+
+@pytest.mark.anyio
+async def test_a_guest_whose_answers_are_not_denied_brings_static_frames(certificates: Path) -> None:
+    address, domain = f"tls/127.0.0.1:{free_ports(1)[0]}", new_domain()
+    control = tls(certificates, "robot") | denied_to_guests("put", "delete")
+    with Bus() as robot, Bus() as guest, Buffer(robot) as own:
+        guest.publish(static("map", "too early"))
+        async with (
+            ZenohLink(robot, domain, listen=address, config=control),
+            ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")),
+        ):
+            with anyio.fail_after(30):
+                await own.lookup("map", "too early")
+
+
+@pytest.mark.anyio
+async def test_access_control_lets_a_guest_listen_and_not_publish(certificates: Path) -> None:
+    address = f"tls/127.0.0.1:{free_ports(1)[0]}"
+    domain = new_domain()
+    read_only = denied_to_guests("put", "delete", "reply")
     with Bus() as robot, Bus() as guest, Buffer(robot) as own, Buffer(guest) as buffer:
         guest.publish(static("map", "too early"))
         async with ZenohLink(robot, domain, listen=address, config=tls(certificates, "robot") | read_only) as link:

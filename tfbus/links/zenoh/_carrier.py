@@ -1,108 +1,133 @@
 """The carrier of links over zenoh."""
 
-import math
+from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
-from itertools import islice
+from threading import Thread
 
 import anyio
 import anyio.to_thread
 import zenoh
 
+from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._carrier import SendReport
 from tfbus.links._inbox import ReceivedMessage
-from tfbus.links._message import Message, MessageWriter, message_to_keep, read_message
-from tfbus.links._outbox import OutgoingBatch, RemovedFrame, Turn
-from tfbus.links._receive_queue import Received
-from tfbus.links.zenoh._session import ZenohSession
+from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
+from tfbus.links._outbox import Turn
+from tfbus.links._receive_queue import Question, Received
+from tfbus.links._state import StateEntry, StateStep
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._newest import NewestSamples
+from tfbus.links.zenoh._sessions import ZenohSessions
 
-_STATICS_PER_CALL = 100
-_TOMBSTONE_LIFETIME = 5.0
 _CLOSING_TIME = 1.0
 
 
 class ZenohCarrier:
-    """Carries the messages of one link over a zenoh session; see `tfbus.links._carrier.Carrier`.
-
-    Static frames are kept in zenoh's caches. Declaring a key there may take a while, so a worker thread does it.
+    """Carries the messages of one link over zenoh; see `tfbus.links._carrier.AskableCarrier`.
 
     Parameters
     ----------
     config : zenoh.Config
-    prefix : str
-        The beginning of all keys of the domain.
-    id : str
-        The link's name, a part of all its keys.
+    patch_config : callable
+        The configuration of a session that connects to one address only.
+    keys : Keys
+    slow_rate : float
+        How many times a second the newest samples go out by the slow key, while somebody subscribes to it.
     """
 
-    def __init__(self, config: zenoh.Config, prefix: str, id: str) -> None:  # noqa: A002 - the wire calls it so
-        self.id = id
+    def __init__(
+        self,
+        config: zenoh.Config,
+        patch_config: Callable[[str], zenoh.Config],
+        keys: Keys,
+        slow_rate: float = 1.0,
+    ) -> None:
+        self.id = keys.link
+        self._slow_period = 1 / slow_rate
+        self._newest = NewestSamples()
         self._config = config
-        self._prefix = prefix
-        self._changes: dict[str, OutgoingBatch | RemovedFrame | None] = {}
-        self._must_resubscribe = False
+        self._patch_config = patch_config
+        self._keys = keys
+        self._answers: deque[tuple[zenoh.Query, Message]] = deque()
         self._woken = anyio.Event()
 
     async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
         """Open the session; raises `OSError` if it cannot listen where it should, or as a client reaches nobody."""
         self._report = report
         self._writer = MessageWriter(report)
-        self._session = ZenohSession(self._config, self._prefix, self.id, receive)
+        self._sessions = ZenohSessions(self._config, self._patch_config, self._keys, receive)
         # The session closes itself if it is abandoned before it is open.
-        await anyio.to_thread.run_sync(self._session.open, abandon_on_cancel=True)
+        await anyio.to_thread.run_sync(self._sessions.open, abandon_on_cancel=True)
 
     def send(self, turn: Turn) -> None:
         """Send live messages at once; while the network is congested, zenoh drops them."""
-        for message in self._writer.write(turn.entries):
-            try:
-                self._session.put(message)
-            except zenoh.ZError as error:
-                self._report.failed(error)
-            else:
+        self._newest.note(turn)
+        for message in self._writer.write(turn.entries, turn.step):
+            if self._put(message) and message.number:
                 self._report.sent(message.samples)
-        if turn.statics:
-            self._changes.update(turn.statics)
-            self._woken.set()
 
     def read(self, content: tuple[bytes, bytes]) -> ReceivedMessage:
         """Decode a payload and its attachment."""
         return read_message(*content)
 
-    def peer_joined(self, peer: str, again: bool) -> None:  # noqa: ARG002 - part of the protocol
-        """Have static frames come again after a loss, for zenoh does not deliver again what it has delivered before."""
-        if again:
-            self._must_resubscribe = True
-            self._woken.set()
+    def can_hold(self, sample: TransformStamped) -> bool:
+        """Whether a message can hold a sample."""
+        return can_hold(sample)
+
+    def claim(self, step: StateStep) -> None:
+        """Tell all peers the state of this link."""
+        self._newest.step = step
+        self._put(self._writer.claim(step))
+
+    def ask(self, peer: str, since: int) -> None:
+        """Ask a peer for the changes of its state behind a number."""
+        self._sessions.ask(peer, since)
+
+    def answer(self, question: Question, entries: list[StateEntry], step: StateStep) -> None:
+        """Answer a question; a worker thread sends the answers, because zenoh may wait for a peer that is frozen."""
+        self._answers.append((question.handle, write_answer(entries, step)))
+        self._woken.set()
 
     async def run(self) -> None:
-        """Keep zenoh's caches as the changes of static frames say."""
-        session = self._session
+        """Send answers, and dial peers that were lost."""
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(self._sessions.keep_connected)
+            tasks.start_soon(self._send_slowly)
+            await self._send_answers()
+
+    async def _send_answers(self) -> None:
         while True:
             self._woken = anyio.Event()
-            if self._must_resubscribe:
-                self._must_resubscribe = False
-                with suppress(zenoh.ZError):
-                    await anyio.to_thread.run_sync(session.resubscribe_statics)
-            if self._changes:
-                for error in await anyio.to_thread.run_sync(session.statics.publish, self._next_changes()):
-                    self._report.failed(error)
-                continue
-            with anyio.move_on_after(_TOMBSTONE_LIFETIME if session.statics.has_tombstones else math.inf):
-                await self._woken.wait()
-                continue
-            await anyio.to_thread.run_sync(session.statics.drop_tombstones)
+            while self._answers:
+                batch = list(self._answers)
+                self._answers.clear()
+                await anyio.to_thread.run_sync(self._sessions.answer, batch)
+            await self._woken.wait()
+
+    async def _send_slowly(self) -> None:
+        while True:
+            await anyio.sleep(self._slow_period)
+            try:
+                if self._sessions.is_heard_slowly():
+                    self._sessions.put_slowly(self._newest.take())
+            except zenoh.ZError as error:
+                self._report.failed(error)
 
     async def close(self) -> None:
-        """Close the session, or give up waiting for it."""
-        closing = self._session.close()
+        """Close the sessions, or give up waiting for them."""
+        closing = self._sessions.close()
         with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
+            await anyio.to_thread.run_sync(_join, closing, abandon_on_cancel=True)
 
-    def _next_changes(self) -> dict[str, Message | None]:
-        changes: dict[str, Message | None] = {}
-        for frame in list(islice(self._changes, _STATICS_PER_CALL)):
-            entry = self._changes.pop(frame)
-            message = None if entry is None else message_to_keep(entry)
-            if entry is None or message is not None:
-                changes[frame] = message
-        return changes
+    def _put(self, message: Message) -> bool:
+        try:
+            self._sessions.put(message)
+        except zenoh.ZError as error:
+            self._report.failed(error)
+            return False
+        return True
+
+
+def _join(threads: list[Thread]) -> None:
+    for thread in threads:
+        thread.join()

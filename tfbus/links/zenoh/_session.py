@@ -1,60 +1,73 @@
 """One zenoh session of a link: its keys, and what zenoh's threads receive."""
 
+import math
 import re
+import struct
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import suppress
+from time import monotonic
 from typing import Any
 
 import zenoh
 
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links._peers import MAX_PEERS
+from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._settings import without_source_location
-from tfbus.links.zenoh._statics import StaticKeys, subscribe_statics
 from tfbus.tf_message import MalformedMessageError
 
-_ID = re.compile("[0-9a-f]{32}")
 _LONGEST_SHOWN_KEY = 200
+MOST_QUESTIONS = 1_000
+_ANSWER_TIME = 2.0
+_TOGETHER = 0.02
+_EARLY = 0.9
+"""s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
+_SINCE = struct.Struct("<Q")
 
 
 class ZenohSession:
-    """A session and its keys: `open`, `resubscribe_statics` and `statics` block; `put` and `close` do not.
+    """A session and its keys: `open` and `answer` block; `put`, `ask` and `close` do not.
 
     Parameters
     ----------
     config : zenoh.Config
-    prefix : str
-        The beginning of all keys of the domain.
-    id : str
-        The link's name, a part of all its keys.
+    keys : Keys
     receive : callable
-        Called in zenoh's threads with each `Received` item; a message's content is a payload and its attachment.
+        Called in zenoh's threads with each `Received` item but presence; a message's content is a payload and its
+        attachment.
+    note_presence : callable
+        Called in zenoh's threads with a link, the name of a session of it, and its `Presence`.
+    name : str
+        The name of this session among those of the link.
 
     Attributes
     ----------
-    statics : StaticKeys
-        Exists once the session is open.
+    is_open : bool
     """
 
     def __init__(
         self,
         config: zenoh.Config,
-        prefix: str,
-        id: str,  # noqa: A002 - the wire calls it so
+        keys: Keys,
         receive: Callable[[Received], object],
+        note_presence: Callable[[str, str, Presence], object],
+        name: str = FIRST_SESSION,
     ) -> None:
         self._config = config
-        self._prefix = prefix
-        self._id = id
+        self._note_presence = note_presence
+        self._name = name
+        self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
         self._closed = False
         self._session: zenoh.Session | None = None
-        self._declared: tuple[object, ...] = ()
-        self._static_subscriber: Any = None
+        self.is_open = False
+        self._declared: list[object] = []
+        self._questions = 0
         self._close_at_exit: weakref.finalize[..., ZenohSession] | None = None
 
     def open(self) -> None:
@@ -83,45 +96,93 @@ class ZenohSession:
         try:
             session = zenoh.open(self._config)
         except zenoh.ZError as error:
-            raise _as_os_error(error) from error
+            raise as_os_error(error) from error
         with self._lock:
             self._session = session
             abandoned = self._closed
         if abandoned:
-            _close(session)
+            close_session(session)
             return
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
-        self._close_at_exit = weakref.finalize(self, _close, session)
-        self.statics = StaticKeys(session, f"{self._prefix}/static/{self._id}")
-        self._live = session.declare_publisher(
-            f"{self._prefix}/live/{self._id}", congestion_control=zenoh.CongestionControl.DROP
-        )
-        self.resubscribe_statics()
-        remote, alive = zenoh.Locality.REMOTE, session.liveliness()
-        # zenoh undeclares what nobody refers to.
-        self._declared = (
-            session.declare_subscriber(f"{self._prefix}/live/*", _directly(self._receive_live), allowed_origin=remote),
-            alive.declare_subscriber(f"{self._prefix}/@alive/*", _directly(self._receive_presence), history=True),
-            alive.declare_token(f"{self._prefix}/@alive/{self._id}"),
-        )
-
-    def resubscribe_statics(self) -> None:
-        """Have all existing static frames delivered, also those that were delivered before; for a worker thread.
-
-        Raises
-        ------
-        zenoh.ZError
-            If the session is closed.
-        """
-        assert self._session is not None
-        before, receive = self._static_subscriber, _directly(self._receive_static)
-        self._static_subscriber = subscribe_statics(self._session, f"{self._prefix}/static/*/*", receive)
-        if before is not None:
-            before.undeclare()
+        self._close_at_exit = weakref.finalize(self, close_session, session)
+        drop, remote, keys = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE, self._keys
+        self._live = session.declare_publisher(keys.own("live"), congestion_control=drop)
+        self._slow = session.declare_publisher(keys.own("slow"), congestion_control=drop)
+        # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
+        self._declared = [
+            *(
+                session.declare_subscriber(key, _directly(self._receive_live), allowed_origin=remote)
+                for key in keys.heard("live")
+            ),
+            *(
+                session.declare_subscriber(key, _directly(self._receive_slow(rate)), allowed_origin=remote)
+                for key, rate in keys.slow()
+            ),
+            *(
+                session.liveliness().declare_subscriber(key, _directly(self._receive_presence), history=True)
+                for key in keys.heard("@alive")
+            ),
+            session.declare_queryable(keys.own("state"), _directly(self._receive_question)),
+            session.liveliness().declare_token(keys.token(self._name)),
+        ]
+        self.is_open = True
 
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested."""
         self._live.put(message.payload, attachment=message.attachment)
+
+    def put_slowly(self, message: Message) -> None:
+        """Send a message by the slow key, or drop it while the network is congested."""
+        self._slow.put(message.payload, attachment=message.attachment)
+
+    def is_heard_slowly(self) -> bool:
+        """Whether anybody subscribes to the slow key."""
+        return bool(self._slow.matching_status.matching)  # type: ignore[attr-defined]
+
+    def addresses(self) -> dict[str, str]:
+        """The address at which each directly connected session is reached, by the id of the session; may block."""
+        try:
+            assert self._session is not None
+            return {str(link.zid): link.dst for link in self._session.info.links()}
+        except zenoh.ZError:
+            return {}
+
+    def ask(self, peer: str, since: int) -> None:
+        """Ask a peer for the changes of its state behind a number; the answer is received as an item."""
+        answered = False
+
+        def take(reply: zenoh.Reply) -> None:
+            nonlocal answered
+            if reply.ok is not None and not answered:
+                answered = True
+                self._receive_message(peer, reply.ok, as_answer=True)
+
+        def end() -> None:
+            if not answered:
+                self._receive(Received(peer, Answer(None)))
+
+        try:
+            assert self._session is not None
+            self._session.get(
+                self._keys.of("state", peer),
+                zenoh.handlers.Callback(take, end, indirect=False),
+                payload=_SINCE.pack(since),
+                consolidation=zenoh.ConsolidationMode.NONE,
+                timeout=_ANSWER_TIME,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+        except zenoh.ZError:
+            self._receive(Received(peer, Answer(None)))
+
+    def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
+        """Answer questions; for a worker thread, because zenoh waits for a peer whose queue is full."""
+        for query, message in answers:
+            # A peer that has gone needs no answer.
+            with suppress(zenoh.ZError):
+                query.reply(self._keys.own("state"), message.payload, attachment=message.attachment)
+            query.drop()
+            with self._lock:
+                self._questions -= 1
 
     def close(self) -> threading.Thread:
         """Begin to close the session, also one that is still being opened.
@@ -136,49 +197,84 @@ class ZenohSession:
             session = self._session
         if self._close_at_exit is not None:
             self._close_at_exit.detach()
-        closing = threading.Thread(target=_close, args=(session,), daemon=False)
+        closing = threading.Thread(target=close_session, args=(session,), daemon=False)
         closing.start()
         return closing
 
     def _receive_live(self, sample: zenoh.Sample) -> None:
-        self._receive_message(sample, "live", moving=True)
+        sender = self._sender(sample, "live")
+        if sender is not None and sample.kind == zenoh.SampleKind.PUT:
+            self._receive_message(sender, sample)
 
-    def _receive_static(self, sample: zenoh.Sample) -> None:
-        self._receive_message(sample, "static", moving=False)
+    def _receive_slow(self, rate: float) -> Callable[[zenoh.Sample], None]:
+        period = 1 / rate
+        taken: dict[str, float] = {}
 
-    def _receive_message(self, sample: zenoh.Sample, kind: str, moving: bool) -> None:
-        sender = self._sender(sample, kind)
-        if sender is None or sample.kind != zenoh.SampleKind.PUT:
-            return
+        def receive(sample: zenoh.Sample) -> None:
+            sender = self._sender(sample, "slow")
+            if sender is None or sample.kind != zenoh.SampleKind.PUT:
+                return
+            now = monotonic()
+            # What belongs together comes in several messages at once.
+            since = now - taken.get(sender, -math.inf)
+            if _TOGETHER < since < _EARLY * period:
+                return
+            if since > _TOGETHER:
+                if len(taken) >= MAX_PEERS:
+                    taken.clear()
+                taken[sender] = now
+            self._receive_message(sender, sample)
+
+        return receive
+
+    def _receive_message(self, sender: str, sample: zenoh.Sample, as_answer: bool = False) -> None:
         size = len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment))
         if size > MAX_BYTES:
             self._refuse(sender, "oversized", f"{size} bytes, more than {MAX_BYTES}")
+            return
+        # Copies, for the sample would keep the whole buffer in which it came.
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        message = sample.payload.to_bytes(), attachment
+        if as_answer:
+            self._receive(Received(sender, Answer(message), size))
         else:
-            # Copies, for the sample would keep the whole buffer in which it came.
-            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            message = sample.payload.to_bytes(), attachment
-            self._receive(Received(sender, message, size, moving))
+            self._receive(Received(sender, message, size, moving=True))
 
     def _receive_presence(self, sample: zenoh.Sample) -> None:
-        sender = self._sender(sample, "@alive")
-        if sender is not None:
+        found = self._keys.session(str(sample.key_expr))
+        if found is None:
+            self._refuse_key(sample)
+        elif found[0] != self._keys.link:
             present = sample.kind == zenoh.SampleKind.PUT
-            self._receive(Received(sender, Presence.JOINED if present else Presence.LEFT))
+            self._note_presence(*found, Presence.JOINED if present else Presence.LEFT)
+
+    def _receive_question(self, query: zenoh.Query) -> None:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        with self._lock:
+            admitted = len(payload) == _SINCE.size and self._questions < MOST_QUESTIONS
+            self._questions += admitted
+        if admitted:
+            self._receive(Received("", Question(_SINCE.unpack(payload)[0], query)))
+        else:
+            # Whoever means it asks again.
+            query.drop()
 
     def _sender(self, sample: zenoh.Sample, kind: str) -> str | None:
         """The peer that a sample is from; None for this link's own, and for a key without an id, which is refused."""
+        sender = self._keys.sender(str(sample.key_expr), kind)
+        if sender is None:
+            self._refuse_key(sample)
+        return None if sender == self._keys.link else sender
+
+    def _refuse_key(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
-        sender = key.removeprefix(f"{self._prefix}/{kind}/").partition("/")[0]
-        if not _ID.fullmatch(sender):
-            self._refuse("", "key", f"there is no link's id in its key {key[:_LONGEST_SHOWN_KEY]!r}")
-            return None
-        return None if sender == self._id else sender
+        self._refuse("", "key", f"there is no link's id in its key {key[:_LONGEST_SHOWN_KEY]!r}")
 
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
         self._receive(Received(sender, MalformedMessageError(reason, detail)))
 
 
-def _close(session: zenoh.Session | None) -> None:
+def close_session(session: zenoh.Session | None) -> None:
     """Close a session, if there is one; a second call does nothing."""
     if session is not None:
         # zenoh may give up waiting for a peer; that peer notices the end by itself.
@@ -186,12 +282,13 @@ def _close(session: zenoh.Session | None) -> None:
             session.close()
 
 
-def _directly(callback: Callable[[zenoh.Sample], object]) -> Any:
+def _directly(callback: Callable[[Any], object]) -> Any:
     # Otherwise each subscriber has a thread of its own, and one overtakes the other.
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
-def _as_os_error(error: zenoh.ZError) -> OSError:
+def as_os_error(error: zenoh.ZError) -> OSError:
+    """The error of a session that cannot be opened, with its `errno`, if there is one."""
     text = f"zenoh cannot open a session: {without_source_location(error)}"
     number = re.search(r"\(os error (\d+)\)", text)
     return OSError(int(number[1]), text) if number else OSError(text)

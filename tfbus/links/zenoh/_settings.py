@@ -66,8 +66,6 @@ def settings(
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
         "scouting/delay": 100,
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
-        # Caches for late joiners tell messages apart by time.
-        "timestamping/enabled": True,
         # It would leave a file open for each link that has ended.
         "transport/shared_memory/enabled": False,
         # Larger messages are not even assembled.
@@ -86,6 +84,16 @@ def settings(
             why = without_source_location(error)
             raise ValueError(f"zenoh does not take {value!r} for its setting {path!r}: {why}") from None
     return result
+
+
+def patch_settings(address: str, config: Mapping[str, Any] | None, lease: float) -> zenoh.Config:
+    """The configuration of a session that connects to one address, and to nobody that it hears of there."""
+    own = {
+        path: value
+        for path, value in (config or {}).items()
+        if path not in ("id", "mode") and path.partition("/")[0] not in ("listen", "connect", "scouting")
+    }
+    return settings([], address, own | {"scouting/gossip/enabled": False}, lease)
 
 
 def without_source_location(error: Exception) -> str:

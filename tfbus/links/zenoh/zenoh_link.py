@@ -1,15 +1,10 @@
 """A link over zenoh: what is published on its bus reaches every other bus of the domain, and the other way round.
 
-The keys of a domain, where *link* is 32 hexadecimal digits that each link draws at random::
-
-    tfbus/domain/live/link            all that is published and removed, one message a turn of the link's event loop
-    tfbus/domain/static/link/child    the newest sample of a static frame, kept for late joiners
-    tfbus/domain/@alive/link          a liveliness token
-
-A static sample thus comes on two ways, in its batch and by itself; the relay takes the first and drops the other.
+`tfbus.links.zenoh._keys` lists the keys. Static frames, removals, and whatever else the network has lost of a link's
+state come with the answers to questions; see `tfbus.links._state`.
 """
 
-import re
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import uuid4
@@ -22,9 +17,8 @@ except ImportError:
 from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
-from tfbus.links.zenoh._settings import Addresses, settings
-
-_LONGEST_DOMAIN = 200
+from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
+from tfbus.links.zenoh._settings import Addresses, patch_settings, settings
 
 
 class ZenohLink(Link):
@@ -47,6 +41,16 @@ class ZenohLink(Link):
         link that has an address meets them only if it connects there as well.
     config : mapping of str to any, optional
         Settings of zenoh by their path, laid over those of the link: TLS, access control, routers.
+    robot : str, optional
+        The robot whose frames this link brings: letters, digits, ``-``, ``_`` and ``.``.
+    robots : iterable of str, or mapping of str to float, optional
+        Hear only the links of these robots; ``*`` in a name stands for any letters. What others send never leaves their
+        machines for this link, and they are no peers of it. By default, it hears all, with and without a robot. A
+        mapping gives a rate in Hz for each: of a robot with a finite rate come the static frames and the newest sample
+        of each moving one, at most so often, and no more often than its links send that, by their `slow_rate`;
+        `math.inf` is for everything.
+    slow_rate : float
+        How often this link sends the newest sample of each moving frame to those that asked for less than all, in Hz.
     frames : iterable of str, optional
         Send and take only these children; by default all.
     drop_lost : bool
@@ -63,15 +67,17 @@ class ZenohLink(Link):
     ----------
     bus : Bus
     domain : str
+    robot : str or None
     id : str
         The name of this end for its peers.
 
     Raises
     ------
     ValueError
-        If `domain` cannot be part of a key, a number is out of range, or zenoh does not take an address or a setting.
+        If `domain` or the name of a robot cannot be part of a key, a number is out of range, or zenoh does not take an
+        address or a setting.
     TypeError
-        If `frames` is one name, or a number or an address is of another type.
+        If `frames` or `robots` is one name, or a number or an address is of another type.
     OSError
         On entering, if it cannot listen where it should, or as a client reaches nobody.
     BusClosedError, RuntimeError
@@ -82,8 +88,10 @@ class ZenohLink(Link):
     Notes
     -----
     Nothing here blocks the event loop: while the network is congested, live messages are dropped, which the other end
-    counts as `lost`; static frames are recovered. Anyone who can reach the link can publish and remove any frame. The
-    removal of a moving frame is not repeated if the network loses it.
+    counts as `lost`. Static frames and removals are recovered: each link numbers what it brings and what it has
+    removed, tells the number with every message, and now and then when it has nothing else to tell; whoever has missed
+    something asks for it. A peer whose connection breaks is dialled again where it was reached before. Anyone who can
+    reach the link can publish and remove any frame.
     """
 
     def __init__(
@@ -94,25 +102,42 @@ class ZenohLink(Link):
         listen: Addresses | None = None,
         connect: Addresses | None = None,
         config: Mapping[str, Any] | None = None,
+        robot: str | None = None,
+        robots: Iterable[str] | Mapping[str, float] | None = None,
+        slow_rate: float = 1.0,
         frames: Iterable[str] | None = None,
         drop_lost: bool = False,
         lease: float = 2.0,
         max_frames: int = 10_000,
         capacity: int = 10_000,
     ) -> None:
-        self.domain = _check_domain(domain)
-        carrier = ZenohCarrier(settings(listen, connect, config, lease), f"tfbus/{domain}", uuid4().hex)
+        if isinstance(robots, str):
+            raise TypeError(f"robots must be several names, not {robots!r}")
+        rates = robots if isinstance(robots, Mapping) else dict.fromkeys(("*",) if robots is None else robots, math.inf)
+        for rate in (*rates.values(), slow_rate):
+            # Not a number is not greater either.
+            if not rate > 0:
+                raise ValueError(f"a rate must be greater than zero, got {rate!r} Hz")
+        if slow_rate == math.inf:
+            raise ValueError("slow_rate must be finite")
+        heard = {robots_expression(robot): rate for robot, rate in rates.items()}
+        self.domain = check_domain(domain)
+        self.robot = robot
+        # Peers tell by the id of a session at which address they have reached a link. It must not begin with 0.
+        link = f"{uuid4().int | 1 << 127:032x}"
+        own = {"id": link, **(config or {})}
+        carrier = ZenohCarrier(
+            settings(listen, connect, own, lease),
+            lambda address: patch_settings(address, config, lease),
+            Keys(
+                domain,
+                link,
+                NO_ROBOT if robot is None else check_robot(robot),
+                tuple(robot for robot, rate in heard.items() if rate == math.inf),
+                tuple((robot, rate) for robot, rate in heard.items() if rate < math.inf),
+            ),
+            slow_rate,
+        )
         super().__init__(
             bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
         )
-
-
-def _check_domain(domain: str) -> str:
-    if domain.endswith("/static"):
-        raise ValueError(f"the domain {domain!r} would hear the static frames of {domain.removesuffix('/static')!r}")
-    if len(domain) > _LONGEST_DOMAIN or not re.fullmatch(r"[\w.-]+(/[\w.-]+)*", domain, re.ASCII):
-        raise ValueError(
-            "a domain is made of letters, digits, '-', '_' and '.', with '/' between them, "
-            f"{_LONGEST_DOMAIN} at most, not {domain!r}"
-        )
-    return domain

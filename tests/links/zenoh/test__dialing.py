@@ -1,0 +1,57 @@
+from tfbus.links.zenoh._dialing import FIRST_PAUSE, LONG_PAUSE, MOST_PEERS, SHORT_PAUSE, SHORT_TIME, Dialing
+
+
+class Scene:
+    def __init__(self) -> None:
+        self.time = 50.0
+        self.dialing = Dialing(lambda: self.time)
+
+    def next(self) -> tuple[float, list[tuple[str, str]]]:
+        """How long it takes until somebody is dialled, and who is."""
+        due = self.dialing.next_due()
+        assert due is not None
+        waited, self.time = due - self.time, due
+        return waited, self.dialing.take_due()
+
+
+def test_a_peer_that_was_reached_and_is_lost_is_dialled_until_it_is_back() -> None:
+    scene = Scene()
+    scene.dialing.reached("a", "tcp/here:1")
+    assert scene.dialing.next_due() is None
+    scene.dialing.left("a")
+    assert scene.dialing.take_due() == []
+    waits = []
+    for _ in range(5):
+        waited, who = scene.next()
+        waits.append(round(waited, 6))
+        assert who == [("a", "tcp/here:1")]
+    assert waits == [FIRST_PAUSE, 2 * FIRST_PAUSE, 4 * FIRST_PAUSE, SHORT_PAUSE, SHORT_PAUSE]
+    scene.dialing.joined("a")
+    assert scene.dialing.next_due() is None
+    scene.dialing.left("a")
+    assert round(scene.next()[0], 6) == FIRST_PAUSE
+
+
+def test_after_a_while_the_pauses_are_long() -> None:
+    scene = Scene()
+    scene.dialing.reached("a", "tcp/here:1")
+    scene.dialing.left("a")
+    scene.time += SHORT_TIME + 1
+    assert scene.dialing.take_due() == [("a", "tcp/here:1")]
+    assert scene.next() == (LONG_PAUSE, [("a", "tcp/here:1")])
+
+
+def test_a_peer_that_was_never_reached_is_not_dialled() -> None:
+    scene = Scene()
+    scene.dialing.left("a")
+    assert scene.dialing.next_due() is None
+
+
+def test_only_the_newest_peers_are_remembered() -> None:
+    scene = Scene()
+    for number in range(MOST_PEERS + 1):
+        scene.dialing.reached(f"{number}", "tcp/here:1")
+        scene.dialing.left(f"{number}")
+    assert len(scene.next()[1]) == MOST_PEERS
+    scene.dialing.left("0")
+    assert "0" not in [peer for peer, _ in scene.next()[1]]

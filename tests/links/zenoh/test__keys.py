@@ -1,0 +1,82 @@
+import pytest
+import zenoh
+
+from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
+
+A, B = "a" * 32, "b" * 32
+
+
+def hears(one: Keys, other: Keys, kind: str) -> bool:
+    """Whether what one link sends under a kind of key is what another has subscribed to."""
+    own = zenoh.KeyExpr(one.token("0") if kind == "@alive" else one.own(kind))
+    return any(own.intersects(zenoh.KeyExpr(key)) for key in other.heard(kind))
+
+
+@pytest.mark.parametrize("kind", ["live", "@alive"])
+def test_links_of_one_domain_hear_each_other_and_no_other_domain(kind: str) -> None:
+    plain, robot = Keys("yard", A), Keys("yard", B, "r1")
+    assert hears(plain, robot, kind)
+    assert hears(robot, plain, kind)
+    for domain in ("yard/r1", "yard/live", "yard/~", "yar", "r1"):
+        for mine in (plain, robot):
+            for robots in (("*",), ("r$*",)):
+                other = Keys(domain, B, "r1", robots)
+                assert not hears(mine, other, kind)
+                assert not hears(other, mine, kind)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "robots", "others"),
+    [
+        ("r1", ["r1"], ["r12", "x1", NO_ROBOT]),
+        ("r*", ["r", "r1", "r12"], ["x1", NO_ROBOT]),
+        ("*1", ["1", "r1"], ["r12"]),
+        ("r*-*", ["r-", "r1-2"], ["r1"]),
+        ("*", ["r1", NO_ROBOT], []),
+        ("**", ["r1", NO_ROBOT], []),
+    ],
+)
+def test_a_link_hears_the_robots_of_its_patterns(pattern: str, robots: list[str], others: list[str]) -> None:
+    mine = Keys("yard", A, robots=(robots_expression(pattern),))
+    assert [hears(Keys("yard", B, robot), mine, "live") for robot in robots] == [True] * len(robots)
+    assert [hears(Keys("yard", B, robot), mine, "live") for robot in others] == [False] * len(others)
+
+
+@pytest.mark.parametrize("robot", [NO_ROBOT, "r1", "r-1.x_"])
+def test_the_sender_is_in_a_key(robot: str) -> None:
+    keys, other = Keys("yard/arm", A), Keys("yard/arm", B, robot)
+    assert keys.sender(other.own("live"), "live") == B
+    assert [keys.session(other.token(name)) for name in ("0", A, "x", "")] == [(B, "0"), (B, A), None, None]
+    assert keys.session(other.own("@alive")) is None
+    assert keys.sender(other.own("state"), "live") is None
+    assert zenoh.KeyExpr(keys.of("state", B)).intersects(zenoh.KeyExpr(other.own("state")))
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["**", "tfbus/yard/**", "tfbus/yard/*/live/" + A, "tfbus/yard/r1/live/*", "tfbus/yard/r1/live/robot",
+     "tfbus/yard/r1/live/" + A + "0", "tfbus/yard/r1/live/" + A + "/more", "tfbus/other/r1/live/" + A,
+     "tfbus/yard/$*/live/" + A, "live/" + A],
+)  # fmt: skip
+def test_a_key_that_names_no_link_has_no_sender(key: str) -> None:
+    assert Keys("yard", B).sender(key, "live") is None
+
+
+@pytest.mark.parametrize("domain", ["", "a b", "a//b", "/a", "a/", "a/*", "@a", "$a", "~", "ä", "x" * 201])
+def test_a_domain_that_can_be_no_part_of_a_key_is_named(domain: str) -> None:
+    with pytest.raises(ValueError, match="domain"):
+        check_domain(domain)
+
+
+def test_domains_and_robots_have_letters_digits_and_some_signs() -> None:
+    assert check_domain("yard-1/arm_2.x") == "yard-1/arm_2.x"
+    assert check_robot("r-1_2.x") == "r-1_2.x"
+
+
+@pytest.mark.parametrize("robot", ["", "a/b", "*", "~", "a b", "@r", "x" * 201])
+def test_a_robot_that_can_be_no_part_of_a_key_is_named(robot: str) -> None:
+    with pytest.raises(ValueError, match="robot"):
+        check_robot(robot)
+    if robot != "*":
+        with pytest.raises(ValueError, match="robot"):
+            robots_expression(robot)

@@ -1,0 +1,105 @@
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from queue import Queue
+from time import monotonic
+from uuid import uuid4
+
+import anyio
+import anyio.to_thread
+import pytest
+from support.processes import free_ports, new_domain, until
+
+from tfbus.links._message import Message
+from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links.zenoh._dialing import Dialing
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._sessions import ZenohSessions
+from tfbus.links.zenoh._settings import patch_settings, settings
+
+pytestmark = pytest.mark.anyio
+
+
+class End:
+    """The sessions of one link, which listen at an address of their own and connect to nobody."""
+
+    def __init__(self, domain: str) -> None:
+        self.id = f"{uuid4().int | 1 << 127:032x}"
+        self.address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+        self.items: Queue[Received] = Queue()
+        self.dialing = Dialing(monotonic)
+        config = settings(self.address, [], {"id": self.id}, 2.0)
+        self.sessions = ZenohSessions(
+            config, lambda where: patch_settings(where, None, 2.0), Keys(domain, self.id), self.items.put, self.dialing
+        )
+
+    async def next(self) -> Received:
+        await until(lambda: not self.items.empty())
+        return self.items.get()
+
+    def lose(self, other: "End") -> None:
+        """Have another end be one that was lost."""
+        self.dialing.reached(other.id, other.address)
+        self.dialing.left(other.id)
+
+
+@asynccontextmanager
+async def ends(count: int = 2) -> AsyncIterator[list[End]]:
+    domain = new_domain()
+    made = [End(domain) for _ in range(count)]
+    async with anyio.create_task_group() as tasks:
+        for end in made:
+            await anyio.to_thread.run_sync(end.sessions.open)
+            tasks.start_soon(end.sessions.keep_connected)
+        yield made
+        tasks.cancel_scope.cancel()
+    for end in made:
+        for closing in end.sessions.close():
+            await anyio.to_thread.run_sync(closing.join)
+
+
+async def test_a_lost_peer_is_reached_again_by_a_patch_that_carries_everything() -> None:
+    async with ends() as (here, there):
+        here.lose(there)
+        assert await here.next() == Received(there.id, Presence.JOINED)
+        assert await there.next() == Received(here.id, Presence.JOINED)
+        here.sessions.put(Message(b"to there", b"", 1))
+        assert await there.next() == Received(here.id, (b"to there", b""), 8, moving=True)
+        there.sessions.put(Message(b"to here", b"", 1))
+        assert await here.next() == Received(there.id, (b"to here", b""), 7, moving=True)
+        for asking, asked in ((here, there), (there, here)):
+            asking.sessions.ask(asked.id, 7)
+            question = (await asked.next()).content
+            assert isinstance(question, Question)
+            answers = [(question.handle, Message(b"answer", b"", 0))]
+            await anyio.to_thread.run_sync(asked.sessions.answer, answers)
+            assert await asking.next() == Received(asked.id, Answer((b"answer", b"")), 6)
+
+
+async def test_a_patch_ends_with_its_peer_and_is_made_again() -> None:
+    async with ends() as (here, there):
+        here.lose(there)
+        assert (await here.next()).content is Presence.JOINED
+        for closing in there.sessions.close():
+            await anyio.to_thread.run_sync(closing.join)
+        assert await here.next() == Received(there.id, Presence.LEFT)
+
+
+async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
+    async with ends(3) as (here, there, gone):
+        here.dialing.reached(gone.id, there.address)
+        here.dialing.left(gone.id)
+        # It has seen the patch, which has noticed the mistake when it goes.
+        assert await there.next() == Received(here.id, Presence.JOINED)
+        here.dialing.joined(gone.id)
+        assert await there.next() == Received(here.id, Presence.LEFT)
+        assert here.items.empty()
+
+
+async def test_nobody_at_the_address_is_tried_again() -> None:
+    async with ends() as (here, there):
+        here.dialing.reached(there.id, f"tcp/127.0.0.1:{free_ports(1)[0]}")
+        here.dialing.left(there.id)
+        await until(lambda: (here.dialing.next_due() or 0) > monotonic() + 0.5)
+        assert here.items.empty()
+        here.lose(there)
+        assert await here.next() == Received(there.id, Presence.JOINED)

@@ -1,0 +1,187 @@
+"""Faults at random between processes in network namespaces: some seconds after each, all buses hold the same frames.
+
+`FAULT_SECONDS` and `FAULT_SEED` in the environment make it last longer, or begin otherwise.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from itertools import count
+from random import Random
+from typing import Any
+from uuid import uuid4
+
+import pytest
+from support.processes import PATIENCE, Crowd, PeerProcess, crowd, new_domain
+
+pytestmark = pytest.mark.thorough
+
+SECONDS = float(os.environ.get("FAULT_SECONDS", "60"))
+SEED = int(os.environ.get("FAULT_SEED", "1"))
+HOSTS = 4
+WHOLE_AGAIN = 10.0
+"""s; so long after a fault all buses are equal."""
+LEASE = 2.0
+
+
+class Host:
+    """A network namespace with an address, in which a process may live."""
+
+    def __init__(self, name: str, number: int) -> None:
+        self.name = name
+        self.address = f"10.98.77.{number}"
+        self.prefix = ("ip", "netns", "exec", name)
+
+    def run(self, *command: str) -> None:
+        subprocess.run([*self.prefix, *command], check=True, capture_output=True, timeout=PATIENCE)
+
+    def cut(self, other: "Host") -> None:
+        self.run("ip", "route", "add", "blackhole", f"{other.address}/32")
+
+    def mend(self, other: "Host") -> None:
+        self.run("ip", "route", "delete", "blackhole", f"{other.address}/32")
+
+
+@pytest.fixture
+def hosts() -> Iterator[list[Host]]:
+    ip = shutil.which("ip")
+    if ip is None or os.geteuid() != 0:
+        pytest.skip("network namespaces need root and the program ip")
+    tag = uuid4().hex[:6]
+    switch, made = f"tg{tag}s", [Host(f"tg{tag}{number}", number) for number in range(1, HOSTS + 1)]
+
+    def call(*arguments: str) -> None:
+        done = subprocess.run([ip, *arguments], capture_output=True, text=True, timeout=PATIENCE, check=False)
+        if done.returncode:
+            pytest.skip(f"no network namespaces here: {done.stderr.strip()}")
+
+    try:
+        for name in (switch, *(host.name for host in made)):
+            call("netns", "add", name)
+        call("-n", switch, "link", "add", "bridge", "type", "bridge")
+        call("-n", switch, "link", "set", "bridge", "up")
+        for host in made:
+            call("-n", switch, "link", "add", host.name, "type", "veth", "peer", "eth0", "netns", host.name)
+            call("-n", switch, "link", "set", host.name, "master", "bridge", "up")
+            call("-n", host.name, "address", "add", f"{host.address}/24", "dev", "eth0")
+            call("-n", host.name, "link", "set", "eth0", "up")
+            call("-n", host.name, "link", "set", "lo", "up")
+        yield made
+    finally:
+        for name in (switch, *(host.name for host in made)):
+            subprocess.run([ip, "netns", "delete", name], capture_output=True, timeout=PATIENCE, check=False)
+
+
+class World:
+    """A process in each of some namespaces, which publish and remove frames while faults befall them."""
+
+    def __init__(self, hosts: list[Host], processes: Crowd, rng: Random) -> None:
+        self._hosts = hosts
+        self._processes = processes
+        self._rng = rng
+        self._domain = new_domain()
+        self._numbers = count()
+        self._cut: list[tuple[Host, Host]] = []
+        self._stopped: list[PeerProcess] = []
+        self.faults: list[str] = []
+        self.slowest = 0.0
+        self.members: list[PeerProcess] = []
+        for host in hosts:
+            self.members.append(self._start(host))
+
+    def _start(self, host: Host) -> PeerProcess:
+        first = self._hosts[0]
+        options: dict[str, Any] = {"domain": self._domain, "lease": LEASE, "drop_lost": True}
+        if host is first:
+            options |= {"listen": f"tcp/{host.address}:17447"}
+        else:
+            options |= {"listen": f"tcp/{host.address}:17448", "connect": f"tcp/{first.address}:17447"}
+        process = self._processes.add(options, prefix=host.prefix, backend=self._rng.choice(("asyncio", "trio")))
+        name = host.address.rpartition(".")[2]
+        process.ask("statics", names=[f"{name}/{frame}" for frame in "abc"], x=float(next(self._numbers)))
+        return process
+
+    def fault(self) -> None:
+        """Break something."""
+        rng, hosts = self._rng, self._hosts
+        kind = rng.choice(("kill", "stop", "cut", "cut", "isolate", "cut all"))
+        self.faults.append(kind)
+        if kind == "kill":
+            which = rng.randrange(len(hosts))
+            self.members[which].kill()
+            self.members[which] = self._start(hosts[which])
+        elif kind == "stop":
+            victim = rng.choice(self.members)
+            victim.signal(signal.SIGSTOP)
+            self._stopped.append(victim)
+        else:
+            if kind == "cut":
+                pairs = [tuple(rng.sample(hosts, 2))]
+            elif kind == "isolate":
+                alone = rng.choice(hosts)
+                pairs = [(alone, other) for other in hosts if other is not alone]
+            else:
+                pairs = [(one, other) for place, one in enumerate(hosts) for other in hosts[:place]]
+            for one, other in pairs:
+                one.cut(other)
+                other.cut(one)
+                self._cut.append((one, other))
+
+    def live(self) -> None:
+        """Publish and remove here and there, while something is broken; then let it stay so for a while."""
+        for _ in range(self._rng.randrange(1, 8)):
+            process = self._rng.choice([one for one in self.members if one not in self._stopped])
+            frame = f"{self._rng.randrange(1, len(self._hosts) + 1)}/{self._rng.choice('abcd')}"
+            known = process.ask("facts")
+            if frame in known["static"] and self._rng.random() < 0.4:
+                process.ask("remove", frame=frame)
+            else:
+                process.ask("statics", names=[frame], x=float(next(self._numbers)))
+        time.sleep(self._rng.choice((0.1, 0.5, 2.0, 5.0)))
+
+    def mend(self) -> None:
+        """Repair everything."""
+        for one, other in self._cut:
+            one.mend(other)
+            other.mend(one)
+        for process in self._stopped:
+            process.signal(signal.SIGCONT)
+        self._cut.clear()
+        self._stopped.clear()
+
+    def check_equal(self) -> None:
+        """Wait until all buses hold the same frames with the same values."""
+        began = time.monotonic()
+        while True:
+            held = [process.ask("facts") for process in self.members]
+            if all(facts["x"] == held[0]["x"] and facts["links"][0]["peers"] == HOSTS - 1 for facts in held):
+                break
+            if time.monotonic() - began > WHOLE_AGAIN:
+                views = [(facts["links"][0]["peers"], sorted(facts["x"].items())) for facts in held]
+                raise AssertionError(f"not equal {WHOLE_AGAIN:g} s after {self.faults[-1]!r}: {views}")
+            time.sleep(0.05)
+        self.slowest = max(self.slowest, time.monotonic() - began)
+
+
+@pytest.fixture
+def processes() -> Iterator[Crowd]:
+    with crowd() as together:
+        yield together
+
+
+def test_after_each_fault_all_buses_hold_the_same_frames(
+    hosts: list[Host], processes: Crowd, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = World(hosts, processes, Random(SEED))
+    world.check_equal()
+    until = time.monotonic() + SECONDS
+    while time.monotonic() < until:
+        world.fault()
+        world.live()
+        world.mend()
+        world.check_equal()
+    with capsys.disabled():
+        print(f"\n{len(world.faults)} faults, at most {world.slowest:.1f} s until all buses were equal")

@@ -1,0 +1,53 @@
+"""``tfbus router``."""
+
+import os
+from typing import Annotated
+
+import anyio
+from cyclopts import Parameter
+
+from tfbus.cli._event_loop import run
+from tfbus.cli.arguments import Backend, UsageError
+from tfbus.cli.output import say
+
+_MEETING_POINT = "tcp/127.0.0.1:17447"
+
+
+def router(
+    *,
+    listen: Annotated[tuple[str, ...], Parameter(negative="")] = (_MEETING_POINT,),
+    connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
+    backend: Backend = "asyncio",
+) -> None:
+    """Pass on what programs of all domains send each other, until Ctrl-C.
+
+    For programs that cannot reach each other, and for fleets. Programs connect to it with --connect.
+
+    Example: tfbus router --listen tcp/192.168.1.5:7447
+
+    Parameters
+    ----------
+    listen
+        Listen at this address; may be given several times.
+    connect
+        Connect to another router that listens at this address; may be given several times.
+    backend
+        The event loop to run on.
+    """
+    try:
+        from tfbus.links.zenoh import ZenohRouter
+    except ImportError:
+        raise UsageError('a router needs a package more: pip install "tfbus[cli,zenoh]"') from None
+
+    async def route() -> None:
+        try:
+            async with ZenohRouter(listen, connect=connect):
+                say(f"routing at {' and '.join(listen)} …")
+                await anyio.sleep_forever()
+        except OSError as error:
+            why = os.strerror(error.errno) if error.errno else error
+            raise UsageError(f"cannot listen at {' or '.join(listen)}: {why}") from None
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+
+    run(route, backend)

@@ -1,0 +1,71 @@
+"""The times at which a link dials peers that it has lost, at the addresses where it had reached them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+FIRST_PAUSE = 0.3
+SHORT_PAUSE = 2.0
+LONG_PAUSE = 30.0
+"""s between two attempts: at first, for a while, and then for as long as the peer is remembered."""
+SHORT_TIME = 120.0
+"""s; so long after the loss the pause is short."""
+MOST_PEERS = 1_000
+"""So many lost peers are remembered, the newest."""
+
+
+@dataclass(slots=True)
+class _Lost:
+    since: float
+    due: float
+    pause: float = FIRST_PAUSE
+
+
+class Dialing:
+    """Remembers where peers were reached, and decides when to try again.
+
+    A link that has dialled another one gives up when their connection breaks: zenoh repeats only the addresses that
+    were given to it, and not those that it has heard of from other peers.
+
+    Parameters
+    ----------
+    now : callable
+        Returns a monotonic time in s.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._addresses: dict[str, str] = {}
+        self._lost: dict[str, _Lost] = {}
+
+    def reached(self, peer: str, address: str) -> None:
+        """A peer has been reached at an address."""
+        self._addresses.pop(peer, None)
+        self._addresses[peer] = address
+        if len(self._addresses) > MOST_PEERS:
+            oldest = next(iter(self._addresses))
+            del self._addresses[oldest]
+            self._lost.pop(oldest, None)
+
+    def joined(self, peer: str) -> None:
+        """A peer is there."""
+        self._lost.pop(peer, None)
+
+    def left(self, peer: str) -> None:
+        """A peer is lost."""
+        if peer in self._addresses:
+            now = self._now()
+            self._lost[peer] = _Lost(now, now + FIRST_PAUSE)
+
+    def next_due(self) -> float | None:
+        """When to call `take_due` again; None while nobody is lost."""
+        return min((lost.due for lost in self._lost.values()), default=None)
+
+    def take_due(self) -> list[tuple[str, str]]:
+        """The peers to dial now, with their addresses."""
+        now = self._now()
+        due = [peer for peer, lost in self._lost.items() if lost.due <= now]
+        for peer in due:
+            lost = self._lost[peer]
+            lost.pause = min(2 * lost.pause, SHORT_PAUSE) if now - lost.since < SHORT_TIME else LONG_PAUSE
+            lost.due = now + lost.pause
+        return [(peer, self._addresses[peer]) for peer in due]

@@ -1,0 +1,55 @@
+"""The newest sample of each moving frame that a link has sent, for peers to which less than all is enough."""
+
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._message import Message, can_hold, write_answer
+from tfbus.links._outbox import Turn
+from tfbus.links._state import StateStep
+
+_PER_MESSAGE = 1_000
+
+
+class NewestSamples:
+    """Keeps one sample of each moving frame until it is taken.
+
+    Static frames and removals are not in it: whoever hears only this is told the state of the link, and asks for them.
+
+    Attributes
+    ----------
+    step : StateStep or None
+        The newest claim of the link.
+    """
+
+    def __init__(self) -> None:
+        self.step: StateStep | None = None
+        self._newest: dict[str, tuple[bytes, int, TransformStamped]] = {}
+
+    def note(self, turn: Turn) -> None:
+        """Note what one turn has published and removed."""
+        newest = self._newest
+        for entry in turn.entries:
+            if isinstance(entry, OutgoingBatch):
+                for sample in entry.samples:
+                    fields = sample._fields
+                    if not fields[5]:
+                        newest[fields[1]] = entry.origin, entry.sequence, sample
+                    elif newest:
+                        newest.pop(fields[1], None)
+            else:
+                newest.pop(entry.frame, None)
+        self.step = turn.step
+
+    def take(self) -> list[Message]:
+        """Messages with the samples that were noted since this was called last, and the claim."""
+        entries = [
+            OutgoingBatch(origin, sequence, (sample,))
+            for origin, sequence, sample in self._newest.values()
+            if can_hold(sample)
+        ]
+        self._newest.clear()
+        if self.step is None:
+            return []
+        # It tells nothing of the state but its number.
+        claim = StateStep(self.step.number, self.step.number, self.step.digest)
+        parts = [entries[start : start + _PER_MESSAGE] for start in range(0, len(entries), _PER_MESSAGE)]
+        return [write_answer(part, claim) for part in parts or [[]]]

@@ -1,0 +1,211 @@
+"""All zenoh sessions of a link: the one that it was opened with, and one for each peer that only another way reaches.
+
+Peers in a mesh hear each other over direct connections only. When one of these breaks, while both ends are well with
+others, zenoh does not dial again. Then a session of its own does, the *patch*, which is connected to nobody else.
+"""
+
+import re
+import threading
+from collections.abc import Callable, Iterable
+from time import monotonic
+from uuid import uuid4
+
+import anyio
+import anyio.to_thread
+import zenoh
+
+from tfbus.links._message import Message
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.zenoh._dialing import Dialing
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._session import ZenohSession
+
+_PROBE_TIME = 1.0
+_MEETING_TIME = 3.0
+_TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
+
+_Way = tuple[ZenohSession | None, str]
+"""A connection between two links: the patch here, or None for the first session, and the name of the session there."""
+
+
+class ZenohSessions:
+    """The sessions of one link; peers are present while one of the sessions says so.
+
+    Parameters
+    ----------
+    config : zenoh.Config
+    patch_config : callable
+        The configuration of a session that connects to one address only.
+    keys : Keys
+    receive : callable
+        Called in any thread with each `Received` item.
+    dialing : Dialing, optional
+        Decides whom to dial when.
+    """
+
+    def __init__(
+        self,
+        config: zenoh.Config,
+        patch_config: Callable[[str], zenoh.Config],
+        keys: Keys,
+        receive: Callable[[Received], object],
+        dialing: Dialing | None = None,
+    ) -> None:
+        self._patch_config = patch_config
+        self._keys = keys
+        self._receive = receive
+        self._lock = threading.Lock()
+        self._main = ZenohSession(config, keys, receive, self._note_directly)
+        self._patches: dict[str, ZenohSession] = {}
+        self._present: dict[str, set[_Way]] = {}
+        self._changes: list[tuple[str, Presence]] = []
+        self._dialing = Dialing(monotonic) if dialing is None else dialing
+        self._closing: list[threading.Thread] = []
+
+    def open(self) -> None:
+        """Open the session; for a worker thread.
+
+        Raises
+        ------
+        OSError
+            If it cannot listen where it should, or as a client reaches nobody.
+        """
+        self._main.open()
+
+    def put(self, message: Message) -> None:
+        """Send a live message, or drop it while the network is congested; raises `zenoh.ZError`."""
+        for session in self._open():
+            session.put(message)
+
+    def put_slowly(self, messages: Iterable[Message]) -> None:
+        """Send messages by the slow key of each session that somebody hears there; raises `zenoh.ZError`."""
+        hearing = [session for session in self._open() if session.is_heard_slowly()]
+        for message in messages:
+            for session in hearing:
+                session.put_slowly(message)
+
+    def is_heard_slowly(self) -> bool:
+        """Whether anybody subscribes to the slow key."""
+        return any(session.is_heard_slowly() for session in self._open())
+
+    def ask(self, peer: str, since: int) -> None:
+        """Ask a peer for the changes of its state behind a number."""
+        patch = self._patches.get(peer)
+        (patch if patch is not None and patch.is_open else self._main).ask(peer, since)
+
+    def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
+        """Answer questions; for a worker thread."""
+        self._main.answer(answers)
+
+    def _open(self) -> list[ZenohSession]:
+        return [self._main, *(patch for patch in tuple(self._patches.values()) if patch.is_open)]
+
+    def close(self) -> list[threading.Thread]:
+        """Begin to close all sessions; returns threads that end when they are closed."""
+        sessions = [self._main, *self._patches.values()]
+        self._patches.clear()
+        return [*self._closing, *(session.close() for session in sessions)]
+
+    async def keep_connected(self, interval: float = 0.5) -> None:
+        """Dial peers that were lost, until cancelled."""
+        async with anyio.create_task_group() as tasks:
+            while True:
+                await anyio.sleep(interval)
+                with self._lock:
+                    changes, self._changes = self._changes, []
+                await self._note(changes)
+                self._closing = [closing for closing in self._closing if closing.is_alive()]
+                for peer, address in self._dialing.take_due():
+                    if peer not in self._patches:
+                        tasks.start_soon(self._patch, peer, address)
+
+    async def _note(self, changes: list[tuple[str, Presence]]) -> None:
+        for peer, presence in changes:
+            if presence is Presence.LEFT:
+                if peer not in self._present:
+                    self._dialing.left(peer)
+                    self._drop_patch(peer)
+            else:
+                self._dialing.joined(peer)
+        joined = {peer for peer, presence in changes if presence is Presence.JOINED}
+        if joined:
+            addresses = await anyio.to_thread.run_sync(self._main.addresses)
+            for peer in joined & addresses.keys():
+                self._dialing.reached(peer, addresses[peer])
+                # They are connected directly again.
+                self._drop_patch(peer)
+
+    async def _patch(self, peer: str, address: str) -> None:
+        if not await _is_reachable(address) or peer in self._patches:
+            return
+        patch = ZenohSession(
+            self._patch_config(address),
+            self._keys,
+            lambda item: self._receive_by_patch(item, peer),
+            lambda link, name, presence: self._note_by_patch(link, name, presence, peer, patch),
+            uuid4().hex,
+        )
+        self._patches[peer] = patch
+        try:
+            await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)
+        except (OSError, zenoh.ZError):
+            # It may also have been lost while it began.
+            self._drop_patch(peer)
+            return
+        with anyio.move_on_after(_MEETING_TIME):
+            while peer not in self._present:  # noqa: ASYNC110 - zenoh's threads wake no event here
+                await anyio.sleep(0.05)
+        if peer not in self._present or (None, FIRST_SESSION) in self._present[peer]:
+            self._drop_patch(peer)
+
+    def _drop_patch(self, peer: str) -> None:
+        patch = self._patches.pop(peer, None)
+        if patch is not None:
+            self._closing.append(patch.close())
+            with self._lock:
+                ways = [way for way in self._present.get(peer, ()) if way[0] is patch]
+            for way in ways:
+                # It will not tell any more.
+                self._note_presence(peer, way, Presence.LEFT)
+
+    def _receive_by_patch(self, item: Received, peer: str) -> None:
+        # Somebody else may be at that address now.
+        if item.sender in ("", peer):
+            self._receive(item)
+
+    def _note_by_patch(self, link: str, name: str, presence: Presence, peer: str, patch: ZenohSession) -> None:
+        if link == peer and (presence is Presence.LEFT or self._patches.get(peer) is patch):
+            self._note_presence(peer, (patch, name), presence)
+
+    def _note_directly(self, link: str, name: str, presence: Presence) -> None:
+        self._note_presence(link, (None, name), presence)
+
+    def _note_presence(self, peer: str, way: _Way, presence: Presence) -> None:
+        with self._lock:
+            ways = self._present.setdefault(peer, set())
+            was_present = bool(ways)
+            if presence is Presence.JOINED:
+                ways.add(way)
+            else:
+                ways.discard(way)
+            is_present = bool(ways)
+            if not is_present:
+                del self._present[peer]
+            if is_present is not was_present:
+                self._receive(Received(peer, presence))
+            if is_present is not was_present or way == (None, FIRST_SESSION):
+                self._changes.append((peer, presence))
+
+
+async def _is_reachable(address: str) -> bool:
+    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try."""
+    found = _TCP.match(address)
+    if found is None:
+        return True
+    try:
+        with anyio.fail_after(_PROBE_TIME):
+            stream = await anyio.connect_tcp(found["six"] or found["four"], int(found["port"]))
+    except OSError:
+        return False
+    await stream.aclose()
+    return True
