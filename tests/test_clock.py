@@ -112,6 +112,47 @@ async def test_each_timed_task_has_run_until_it_blocks_before_the_next_one_wakes
     assert events == ["a0", "a1", "a2", "b0", "b1", "b2"]
 
 
+async def test_what_a_timed_task_sets_off_over_a_hundred_tasks_ends_before_the_next_one_wakes() -> None:
+    clock = SimulatedClock()
+    log: list[str] = []
+
+    async def pass_on(name: str, hop: int, chain: list[anyio.Event]) -> None:
+        await chain[hop].wait()
+        log.append(f"{name}{hop}")
+        chain[hop + 1].set()
+
+    async def begin(chain: list[anyio.Event]) -> None:
+        await clock.sleep(1.0)
+        chain[0].set()
+
+    async with anyio.create_task_group() as tasks:
+        for name in "ab":
+            chain = [anyio.Event() for _ in range(101)]
+            for hop in range(100):
+                tasks.start_soon(pass_on, name, hop, chain)
+            tasks.start_soon(begin, chain)
+            await settle()
+        await clock.advance(1.0)
+    assert log == [f"{name}{hop}" for name in "ab" for hop in range(100)]
+
+
+async def test_two_clocks_may_be_advanced_at_once() -> None:
+    log: list[tuple[int, int]] = []
+
+    async def tick(clock: SimulatedClock, name: int) -> None:
+        async for k in clock.ticks(10):
+            log.append((name, k))  # noqa: PERF401 - it is cancelled
+
+    async with anyio.create_task_group() as tickers:
+        async with anyio.create_task_group() as drivers:
+            for name in range(2):
+                clock = SimulatedClock()
+                tickers.start_soon(tick, clock, name)
+                drivers.start_soon(clock.advance, 1.0)
+        tickers.cancel_scope.cancel()
+    assert sorted(log) == [(name, k) for name in range(2) for k in range(11)]
+
+
 async def _broadcast_and_listen() -> list[str]:
     """A 100 Hz broadcaster and a 1 Hz listener for ten simulated seconds."""
     clock = SimulatedClock()

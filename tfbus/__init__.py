@@ -4,6 +4,8 @@ A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of 
 seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
 """
 
+from tfbus.analysis.diagnose import diagnose
+from tfbus.analysis.finding import Finding
 from tfbus.buffer.buffer import Buffer
 from tfbus.buffer.watch import Watch
 from tfbus.bus.broadcaster import TransformBroadcaster
@@ -111,6 +113,7 @@ __all__ = [
     "ExplainedEdge",
     "Explanation",
     "ExtrapolationError",
+    "Finding",
     "FrameAdded",
     "FrameLive",
     "FrameRemoved",
@@ -174,6 +177,7 @@ __all__ = [
     "Vector3Stamped",
     "Watch",
     "WrenchStamped",
+    "diagnose",
     "do_transform",
     "format_stamp",
     "from_seconds",

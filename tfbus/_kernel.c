@@ -393,16 +393,17 @@ lower_bound(const int64_t *stamps, Py_ssize_t count, int64_t at)
     return low + (count == 1 && stamps[low] < at);
 }
 
-/* Put the samples in the window into a block of its own, at the front, with room for some more. */
+/* Put the samples in the window into a block of its own, at the front, with room for `more`, and some beyond. */
 static int
-history_rehouse(History *self)
+history_rehouse(History *self, Py_ssize_t more)
 {
+    const Py_ssize_t most = PY_SSIZE_T_MAX / (Py_ssize_t)SAMPLE_SIZE / 4;
     const Py_ssize_t count = self->end - self->start;
-    if (count > PY_SSIZE_T_MAX / (Py_ssize_t)SAMPLE_SIZE / 2) {
+    if (count > most || more > most) {
         PyErr_NoMemory();
         return -1;
     }
-    Block *block = (Block *)PyType_GenericAlloc(BlockType, count + count / 8 + 8);
+    Block *block = (Block *)PyType_GenericAlloc(BlockType, count + more + (count + more) / 8 + 7);
     if (block == NULL) {
         return -1;
     }
@@ -418,30 +419,30 @@ history_rehouse(History *self)
     return 0;
 }
 
-/* Make room for one sample behind the last. */
+/* Make room for some samples behind the last. */
 static int
-history_reserve(History *self)
+history_reserve(History *self, Py_ssize_t more)
 {
-    if (self->block != NULL && self->end < block_capacity(self->block)) {
+    if (self->block != NULL && more <= block_capacity(self->block) - self->end) {
         return 0;
     }
     const Py_ssize_t count = self->end - self->start;
     /* In place, if nobody else reads the block and the move pays off. */
     if (self->block != NULL && self->block->readers == 0 && self->start > count / 8
-        && block_capacity(self->block) <= 2 * count + 16) {
+        && more <= block_capacity(self->block) - count && block_capacity(self->block) <= 2 * count + 16) {
         memmove(block_stamps(self->block), block_stamps(self->block) + self->start, count * sizeof(int64_t));
         memmove(block_rows(self->block), block_rows(self->block) + WIDTH * self->start, count * ROW_SIZE);
         self->start = 0;
         self->end = count;
         return 0;
     }
-    return history_rehouse(self);
+    return history_rehouse(self, more);
 }
 
 static int
 history_push(History *self, int64_t stamp, const double *row)
 {
-    if (history_reserve(self) < 0) {
+    if (history_reserve(self, 1) < 0) {
         return -1;
     }
     block_stamps(self->block)[self->end] = stamp;
@@ -555,6 +556,53 @@ history_push_method(History *self, PyObject *const *args, Py_ssize_t count)
     Py_RETURN_NONE;
 }
 
+/* push_many(stamps, rows): int64 of shape (n,) and float64 of shape (n, 7), both contiguous. */
+static PyObject *
+history_push_many(History *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer stamps, rows;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "push_many takes stamps and rows");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &stamps, PyBUF_SIMPLE) < 0) {
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[1], &rows, PyBUF_SIMPLE) < 0) {
+        PyBuffer_Release(&stamps);
+        return NULL;
+    }
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps.len / size;
+    int done = 0;
+    if (stamps.len % size != 0 || rows.len % (Py_ssize_t)ROW_SIZE != 0
+        || rows.len / (Py_ssize_t)ROW_SIZE != count) {
+        PyErr_SetString(PyExc_ValueError, "each stamp needs a row of seven floats");
+    } else if (count == 0) {
+        done = 1;
+    } else if (history_reserve(self, count) == 0) {
+        int64_t *own = block_stamps(self->block) + self->end;
+        Py_ssize_t i = self->end == self->start ? 1 : 0;
+        memcpy(own, stamps.buf, stamps.len);
+        while (i < count && own[i - 1] < own[i]) {
+            i++;
+        }
+        if (i < count) {
+            PyErr_SetString(PyExc_ValueError, "pushed samples must be newer than all others, and in order");
+        } else {
+            memcpy(block_rows(self->block) + WIDTH * self->end, rows.buf, rows.len);
+            self->end += count;
+            history_slide(self);
+            done = 1;
+        }
+    }
+    PyBuffer_Release(&rows);
+    PyBuffer_Release(&stamps);
+    if (!done) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
 static PyObject *
 history_find(History *self, PyObject *number)
 {
@@ -621,10 +669,10 @@ history_put(History *self, PyObject *const *args, Py_ssize_t count)
         return NULL;
     }
     const int replaces = block_stamps(self->block)[self->start + index] == stamp;
-    if (!replaces && history_reserve(self) < 0) {
+    if (!replaces && history_reserve(self, 1) < 0) {
         return NULL;
     }
-    if (self->block->readers > 0 && history_rehouse(self) < 0) {
+    if (self->block->readers > 0 && history_rehouse(self, 1) < 0) {
         return NULL;
     }
     const Py_ssize_t place = self->start + index, behind = self->end - place;
@@ -667,7 +715,7 @@ history_take(History *self, PyObject *other)
     self->block = from->block;
     self->start = from->start;
     self->end = from->end;
-    if (history_rehouse(self) < 0) {
+    if (history_rehouse(self, 1) < 0) {
         Py_XDECREF(OBJECT(self->block));
         self->block = old;
         self->start = start;
@@ -816,15 +864,20 @@ history_dealloc(History *self)
     Py_DECREF(type);
 }
 
+static PyObject *history_row(History *self, PyObject *number);
+
 static PyMethodDef history_methods[] = {
     {"append", FAST(history_append), METH_FASTCALL,
      PyDoc_STR("append(parent, stamp, row, authority): store a sample that continues the history; else do nothing.")},
     {"push", FAST(history_push_method), METH_FASTCALL, PyDoc_STR("push(stamp, row): store the newest sample.")},
+    {"push_many", FAST(history_push_many), METH_FASTCALL,
+     PyDoc_STR("push_many(stamps, rows): store the newest samples, from contiguous arrays of shape (n,) and (n, 7).")},
     {"put", FAST(history_put), METH_FASTCALL,
      PyDoc_STR("put(index, stamp, row): store a sample before another, or in its place if the stamps are equal.")},
     {"find", (PyCFunction)history_find, METH_O, PyDoc_STR("find(stamp): the index of the first sample not before it.")},
     {"stamp", (PyCFunction)history_stamp, METH_O, PyDoc_STR("stamp(index): the stamp of a sample.")},
     {"sample", (PyCFunction)history_sample, METH_O, PyDoc_STR("sample(index): the stamp and the row of a sample.")},
+    {"row", (PyCFunction)history_row, METH_O, PyDoc_STR("row(at): the row at a stamp; None if it is not plain.")},
     {"clear", (PyCFunction)history_clear, METH_NOARGS, PyDoc_STR("Forget all samples.")},
     {"take", (PyCFunction)history_take, METH_O, PyDoc_STR("take(other): hold a copy of the samples of another.")},
     {"columns", FAST(history_columns), METH_FASTCALL,
@@ -954,6 +1007,23 @@ edge_at(const Samples *samples, int64_t at, Segment *segment, double *out)
         out[i] = keep * a[i] + turn * b[i];
     }
     return ANSWERED;
+}
+
+static PyObject *
+history_row(History *self, PyObject *number)
+{
+    int overflow;
+    double row[WIDTH];
+    const long long at = PyLong_AsLongLongAndOverflow(number, &overflow);
+    if (at == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    const Samples samples = samples_of(self);
+    Segment segment = {.before = INT64_MIN, .after = INT64_MIN};
+    if (overflow || self->mixed || edge_at(&samples, at, &segment, row) != ANSWERED) {
+        Py_RETURN_NONE;
+    }
+    return boxed_row(row);
 }
 
 /* Chain: the edges between two frames ------------------------------------------------------------------------------ */

@@ -15,14 +15,13 @@ from typing import Protocol
 import anyio
 import anyio.lowlevel
 
+from tfbus._aio.settling import settling
 from tfbus.errors import ClockResetError
 from tfbus.registration import Registration
 from tfbus.stamps import SECOND, STAMP_MAX, as_duration, as_stamp, from_seconds, is_real
 
 JumpCallback = Callable[[int, int], object]
 """A function that is called with the stamps just before and just after a jump, in ns."""
-
-_SETTLING_CHECKPOINTS = 5
 
 
 class Ticks:
@@ -142,6 +141,10 @@ class SimulatedClock:
     together, or woken by one publish or one `set`, run in the order of the event loop, which trio shuffles on purpose.
     A task that waits for a worker thread or a socket counts as blocked: simulated time is for one process.
 
+    A timer costs the same however many tasks there are. To see that all are blocked, `advance` counts, on an asyncio
+    loop, the calls of the method ``call_soon`` of the loop, and puts its counter in the place of that method until it
+    returns.
+
     Parameters
     ----------
     start : int
@@ -252,12 +255,13 @@ class SimulatedClock:
         self._advancing = True
         try:
             end = self._elapsed + duration
-            await self._settle()
-            while self._timers and self._timers[0].due <= end:
-                timer = self._timers.pop(0)
-                self._move_to(timer.due)
-                timer.fire()
-                await self._settle()
+            with settling() as settle:
+                await settle()
+                while self._timers and self._timers[0].due <= end:
+                    timer = self._timers.pop(0)
+                    self._move_to(timer.due)
+                    timer.fire()
+                    await settle()
             self._move_to(end)
         finally:
             self._advancing = False
@@ -282,12 +286,6 @@ class SimulatedClock:
                 sleeper.timer = self._start_timer(self._elapsed + sleeper.stamp - after, sleeper.event.set)
         for callback in tuple(self._callbacks.values()):
             callback(before, after)
-
-    async def _settle(self) -> None:
-        # On asyncio, `wait_all_tasks_blocked` sleeps 0.1 s while a task can run; after the checkpoints few can.
-        for _ in range(_SETTLING_CHECKPOINTS):
-            await anyio.lowlevel.checkpoint()
-        await anyio.wait_all_tasks_blocked()
 
     def _move_to(self, elapsed: int) -> None:
         if elapsed > self._elapsed:

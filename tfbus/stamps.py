@@ -22,10 +22,10 @@ STAMP_MIN: Final = -(2**63)
 STAMP_MAX: Final = 2**63 - 1
 
 StampLike: TypeAlias = SupportsIndex | np.datetime64 | datetime
-"""What `as_stamp` accepts; a ``pandas.Timestamp`` is a ``datetime``."""
+"""The types that `as_stamp` accepts; a ``pandas.Timestamp`` is a ``datetime``."""
 
 StampsLike: TypeAlias = npt.ArrayLike | Sequence[StampLike]
-"""What `as_stamps` accepts."""
+"""The types that `as_stamps` accepts."""
 
 Stamps = npt.NDArray[np.int64]
 """An array of stamps in ns, shape (n,)."""
@@ -45,7 +45,7 @@ _UNITS = {
 }
 """The units of datetime64 of more than a nanosecond, in ns; years and months at their shortest."""
 _PARTS = {"ps": 1_000, "fs": 1_000_000, "as": SECOND}
-"""How many of the finer units are a nanosecond."""
+"""The number of the finer units in a nanosecond."""
 
 
 class Latest(Enum):

@@ -77,7 +77,8 @@ class BusStatistics:
     samples : int
         Accepted samples.
     rejected : mapping of str to int
-        Rejected samples, by reason.
+        Rejected samples, by reason. ``"displaced"`` are edges that had been accepted, and were removed to make room
+        for a frame that its sender has reserved.
     reparented : int
         Samples that changed the newest parent of a child.
     kind_changes : int

@@ -47,6 +47,8 @@ nitpick_ignore = [
     ("py:class", "anyio.CancelScope"),
     ("py:class", "collections.Counter"),
     ("py:class", "contextlib.AbstractContextManager"),
+    ("py:class", "datetime.datetime"),
+    ("py:class", "matplotlib.figure.Figure"),
     ("py:class", "os.PathLike"),
     ("py:class", "pathlib.Path"),
 ]
@@ -54,6 +56,10 @@ nitpick_ignore_regex = [
     ("py:class", r"(ArrayLike|NDArray|(collections\.abc|numpy)\.\w+)"),
     # What a recording's messages may have as errors, beside those that are public.
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
+    # What the methods of a recording for those who read it in blocks have.
+    ("py:class", r"tfbus\.recording\.(_blocks|formats\._raw_transforms)\.\w+"),
+    # Sphinx splits the parameters of such types.
+    ("py:class", r"[\w.]+\[\w+"),
 ]
 
 html_theme = "furo"
@@ -80,7 +86,7 @@ numpydoc_show_class_members = False
 default_role = "py:obj"
 
 # The import paths of which the reference tells, the preferred one first. Modules may move below them.
-PATHS = ("tfbus", "tfbus.links.zenoh", "tfbus.recording", "tfbus.testing", "tfbus.data")
+PATHS = ("tfbus", "tfbus.links.zenoh", "tfbus.recording", "tfbus.analysis", "tfbus.testing", "tfbus.data")
 
 
 def public_names() -> dict[int, str]:

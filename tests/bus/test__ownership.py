@@ -180,9 +180,9 @@ def test_an_edge_that_was_there_first_is_removed_when_the_owner_publishes(caplog
         found = events_of(events)
     assert buffer.lookup_nowait("map", "base").transform.translation == (2.0, 0.0, 0.0)
     assert [(edge.parent, edge.child) for edge in buffer.tree.edges()] == [("map", "base")]
-    assert bus.statistics().rejected == {"reserved": 1, "cycle": 1}
+    assert bus.statistics().rejected == {"displaced": 1, "cycle": 1}
     assert FrameRemoved(0, "map") in found
-    (refused,) = (event for event in found if isinstance(event, SampleRejected) and event.reason == "reserved")
+    (refused,) = (event for event in found if isinstance(event, SampleRejected) and event.reason == "displaced")
     assert (refused.frame, refused.parent, refused.authority) == ("map", "base", "stranger")
     assert (
         "removed a frame: the edge 'base' -> 'map' from 'stranger' would hang 'map' below 'base', "

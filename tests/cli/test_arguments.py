@@ -6,7 +6,21 @@ from cyclopts import App, CycloptsError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.cli.arguments import Backend, Duration, Flag, Instant, JsonFlag, Rate, Speed, Step, parse_seconds
+from tfbus.cli.arguments import (
+    Backend,
+    Duration,
+    Flag,
+    Instant,
+    JsonFlag,
+    Rate,
+    Speed,
+    Step,
+    Time,
+    TopicOptions,
+    UsageError,
+    parse_seconds,
+    parse_time,
+)
 from tfbus.cli.output import format_seconds
 
 LIMIT = 9_223_372_036 * 1_000_000_000
@@ -72,7 +86,8 @@ def parse(kind: Any, *arguments: str) -> object:
         (Speed, ["--option", "inf"], float("inf")),
         (Duration, ["--option", "0"], 0.0),
         (Duration, ["--option", "inf"], float("inf")),
-        (Instant, ["--option=-1.5"], -1_500_000_000),
+        (Instant, ["--option=1.5"], Time(1_500_000_000, False)),
+        (Instant, ["--option", "2014-03-31T19:24:50"], Time(1_396_293_890_000_000_000, True)),
         (Step, ["--option", "0.000000001"], 1),
         (Backend, ["--option", "trio"], "trio"),
         (Flag, ["--option"], True),
@@ -94,6 +109,7 @@ def test_an_argument_is_converted_to_its_type(kind: Any, arguments: list[str], v
         (Duration, "--option=-1"),
         (Duration, "--option=nan"),
         (Instant, "--option=noon"),
+        (Instant, "--option=-1"),
         (Step, "--option=0"),
         (Step, "--option=-1"),
         (Backend, "--option=curio"),
@@ -104,3 +120,47 @@ def test_an_argument_is_converted_to_its_type(kind: Any, arguments: list[str], v
 def test_an_argument_that_its_type_does_not_allow_is_an_error(kind: Any, argument: str) -> None:
     with pytest.raises(CycloptsError):
         parse(kind, argument)
+
+
+@pytest.mark.parametrize(
+    ("text", "time"),
+    [
+        ("0", Time(0, absolute=False)),
+        ("12.5", Time(12_500_000_000, absolute=False)),
+        ("99999999.999999999", Time(99_999_999_999_999_999, absolute=False)),
+        ("100000000", Time(100_000_000_000_000_000, absolute=True)),
+        ("1396293888.05", Time(1_396_293_888_050_000_000, absolute=True)),
+        ("2014-03-31T19:24:50.123456789", Time(1_396_293_890_123_456_789, absolute=True)),
+        ("2014-03-31T21:24:50+02:00", Time(1_396_293_890_000_000_000, absolute=True)),
+        ("2014-03-31 19:24:50Z", Time(1_396_293_890_000_000_000, absolute=True)),
+        (" 2014-03-31", Time(1_396_224_000_000_000_000, absolute=True)),
+    ],
+)
+def test_a_time_is_an_offset_a_stamp_or_a_date(text: str, time: Time) -> None:
+    assert parse_time(text) == time
+    assert time.stamp(1_000) == time.nanoseconds + (0 if time.absolute else 1_000)
+    assert time.stamp(None) == time.nanoseconds
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("-1", "from the beginning on"),
+        ("2014-13-31", "or a date such as"),
+        ("2014-03-31Tnoon", "or a date such as"),
+        ("2014-03-31T19:24:50.1234567891", "more than nine decimals"),
+        ("9999-01-01", "does not fit"),
+    ],
+)
+def test_a_time_that_is_neither_is_an_error(text: str, why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        parse_time(text)
+
+
+def test_topics_have_prefixes_and_contradictions_are_refused() -> None:
+    options = TopicOptions(("/robot1/tf=robot1/", "/tf"), prefix="x/")
+    assert options.arguments() == {"topics": {"/robot1/tf": "robot1/", "/tf": ""}, "prefix": "x/", "namespaces": False}
+    assert TopicOptions().arguments() == {"topics": None, "prefix": "", "namespaces": False}
+    for wrong in (TopicOptions(("/tf",), namespaces=True), TopicOptions(prefix="/x"), TopicOptions(("/tf=/x",))):
+        with pytest.raises(UsageError):
+            wrong.arguments()

@@ -30,15 +30,21 @@ URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
         ("broadcast", ("--rate FLOAT", *LINK)),
         ("demo", ("--duration", "--rate", "--listen-rate", "--backend", "--simulated", "--no-broadcaster")),
         ("echo", ("TARGET", "SOURCE", "--rate FLOAT", "--max-age FLOAT", "--json", *LINK)),
-        ("info", ("FILE", "--json")),
+        ("check", ("WHAT", "--from TIME", "--max-speed FLOAT", "--json", *LINK)),
+        ("compare", ("REFERENCE", "ESTIMATE", "--pair STR...", "--scale", "--json")),
+        ("convert", ("SOURCE", "FURTHER", "--from TIME", "--rename STR...", "--drop-static", "--overwrite")),
+        ("foxglove", ("--port INT", *LINK)),
+        ("info", ("FILE", "--json", "--wide", "--namespaces")),
         ("listen", ("--rate FLOAT", *LINK)),
-        ("play", ("FILE", "--rate FLOAT", "--loop", "--from SECONDS", "--to SECONDS", *LINK)),
-        ("query", ("FILE", "TARGET", "SOURCE", "--at SECONDS", "--every SECONDS", "--csv", "--json")),
+        ("play", ("FILE", "--rate FLOAT", "--loop", "--from TIME", "--to TIME", "--topic STR...", *LINK)),
+        ("plot", ("FILE", "FRAMES", "--output", "--path", "--3d", "--gaps", "--text", "--compare PATH")),
+        ("query", ("FILE", "TARGET", "SOURCE", "--at TIME", "--every SECONDS", "--tum", "--csv", "--json")),
         ("record", ("FILE", "--duration FLOAT", "--overwrite", *LINK)),
         ("robot", ("FILE", "POSITION", "--tree", "--rate FLOAT", "--prefix STR", *LINK)),
         ("router", ("--listen STR", "--connect STR", "--backend")),
         ("static", ("PARENT", "CHILD", "--xyz", "--rpy", "--quaternion", "--authority STR", *LINK)),
-        ("tree", ("--duration FLOAT", "--watch", "--rate FLOAT", "--dot PATH", "--json", *LINK)),
+        ("tree", ("--duration FLOAT", "--watch", "--rate FLOAT", "--dot PATH", "--svg PATH", "--json", *LINK)),
+        ("view", ("FILE", "--urdf PATH", "--package-path PATH", "--fixed STR", "--trail STR", "--port INT", *LINK)),
     ],
 )
 def test_the_help_of_a_command_has_an_example_and_every_option(
@@ -65,8 +71,10 @@ def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Com
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = "broadcast demo echo info listen play query record robot router static tree"
-    assert re.findall(r"│ ([a-z]+) ", done.stdout) == commands.split()
+    commands = (
+        "broadcast check compare convert demo echo foxglove info listen play plot query record robot router static"
+    )
+    assert re.findall(r"│ ([a-z]+) ", done.stdout) == [*commands.split(), "tree", "view"]
 
 
 @pytest.mark.parametrize(

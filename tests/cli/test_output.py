@@ -1,9 +1,14 @@
+import errno
 import io
+import os
+import re
 import sys
+from pathlib import Path
 
 import pytest
 
 from tfbus import Transform
+from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import (
     format_counts,
     format_numbers,
@@ -14,6 +19,7 @@ from tfbus.cli.output import (
     say,
     track,
     warn,
+    write_file,
 )
 
 
@@ -76,3 +82,42 @@ def test_items_are_tracked_without_a_bar_where_standard_error_is_no_terminal(
 ) -> None:
     assert list(track(iter("abc"), None, "reading")) == ["a", "b", "c"]
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_file_is_replaced_as_a_whole_without_leaving_others(tmp_path: Path) -> None:
+    path = tmp_path / "frames.dot"
+    for content in (b"first", b"second"):
+        write_file(path, content)
+        assert path.read_bytes() == content
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_cannot_be_replaced_leaves_nothing_unfinished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(UsageError, match="Input/output error"):
+        write_file(tmp_path / "frames.dot", b"digraph")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_file(pipe, b"digraph")
+        assert os.read(reader, 100) == b"digraph"
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+
+
+@pytest.mark.parametrize("name", ["nowhere/frames.dot", "."])
+def test_an_error_names_the_file_that_cannot_be_written(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    with pytest.raises(UsageError, match=re.escape(f"cannot write {path}: ")):
+        write_file(path, b"")

@@ -406,3 +406,13 @@ def test_the_web_application_says_404_with_close_matches_for_an_unknown_frame(se
 @pytest.mark.parametrize("question", ["at=5", "at=1.5", "timeout=-1", "timeout=nan", "at=99999999999999999999"])
 def test_the_web_application_says_400_for_a_question_without_an_answer(server: str, question: str) -> None:
     assert get(f"{server}/transforms/map/base_link?{question}").status_code == 400
+
+
+@pytest.mark.thorough
+def test_the_live_view_serves_a_page_until_ctrl_c() -> None:
+    with Program(sys.executable, DEMOS / "live_view.py") as demo:
+        address = demo.output.expect("open http://127.0.0.1:").removeprefix("open ")
+        assert httpx.get(address, trust_env=False).status_code == 200
+        assert demo.end() == 0
+    assert demo.output.text.splitlines()[1:] == ["the end"]
+    assert demo.errors.text == ""

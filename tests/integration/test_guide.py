@@ -18,7 +18,17 @@ ROOT = Path(__file__).parents[2]
 GUIDE = ROOT / "demos" / "guide"
 PAGES = [ROOT / "README.md", *sorted(GUIDE.glob("*.md"))]
 REFERENCE = sorted((GUIDE / "reference").glob("*.rst"))
-PUBLIC = ["tfbus", "tfbus.data", "tfbus.links.zenoh", "tfbus.recording", "tfbus.robot", "tfbus.testing"]
+PUBLIC = [
+    "tfbus",
+    "tfbus.data",
+    "tfbus.links.foxglove",
+    "tfbus.links.zenoh",
+    "tfbus.plot",
+    "tfbus.recording",
+    "tfbus.robot",
+    "tfbus.testing",
+    "tfbus.view",
+]
 CONSOLE = re.compile(r"^```console\n([\s\S]*?)^```|((?:^    \S.*\n)+)", re.MULTILINE)
 
 

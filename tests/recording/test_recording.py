@@ -120,9 +120,9 @@ TEXT = b"Dear diary,\ntoday I have driven a robot.\n"
         (b"\x89MCAP0\r\n", "truncated", "ends before its first message"),
         (b"\x89MCAP0\r\n" + TEXT * 100, "truncated", "ends before its first message"),
         (b"\x89MC", "truncated", "the file ends after 3 bytes"),
-        (b"#ROSBAG V2.0\n", "damaged", "it cannot be read as a bag of ROS 1"),
+        (b"#ROSBAG V2.0\n", "truncated", "ends before its first message"),
         (b"#ROSBAG V2.0\n" + TEXT * 100, "damaged", "it cannot be read as a bag of ROS 1"),
-        (b"#ROSBAG V1.2\n" + TEXT, "damaged", "it cannot be read as a bag of ROS 1"),
+        (b"#ROSBAG V1.2\n" + TEXT, "foreign", "a bag of ROS 1 that begins with '#ROSBAG V1.2'"),
         (b"#ROS", "truncated", "the file ends after 4 bytes"),
         (b"SQLite format 3\0", "damaged", "it cannot be read as a recording of ROS 2"),
         (b"SQLite format 3\0" + TEXT * 100, "damaged", "it cannot be read as a recording of ROS 2"),
@@ -158,12 +158,9 @@ def test_a_file_that_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
     assert raised.value.reason == "unreadable"
 
 
-@pytest.mark.parametrize(
-    "package", ["mcap", *(pytest.param(name, marks=pytest.mark.thorough) for name in ("rosbags", "zstandard"))]
-)
-def test_without_a_package_the_error_names_the_extra(package: str) -> None:
+def test_without_a_package_the_error_names_the_extra() -> None:
     program = (
-        f"import sys; sys.modules[{package!r}] = None\n"
+        "import sys; sys.modules['mcap'] = None\n"
         "from tfbus.recording import RecordingError, open_recording\n"
         "try:\n"
         f"    open_recording({str(SMALL)!r})\n"

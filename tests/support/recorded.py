@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from tfbus import TransformStamped
 from tfbus.recording import Recording, open_recording
-from tfbus.recording.recording import RecordedMessage
+from tfbus.recording.message import RecordedMessage
 from tfbus.tf_message import encode
 
 SMALL = Path(__file__).parents[1] / "recordings" / "small.bag"
@@ -55,13 +55,14 @@ def write_mcap(
     metadata: dict[str, str] | None = None,
     schema: str = TF_MESSAGE,
     encoding: str = "cdr",
+    definition: bytes = b"geometry_msgs/TransformStamped[] transforms",
     **options: Any,
 ) -> Path:
     """A file by the official writer; a channel for each topic."""
     with path.open("wb") as file:
         writer: Any = Writer(file, chunk_size, compression, **options)
         writer.start("ros2", "tests")
-        kind = writer.register_schema(schema, "ros2msg", b"geometry_msgs/TransformStamped[] transforms")
+        kind = writer.register_schema(schema, "ros2msg", definition)
         channels: dict[str, int] = {}
         for received, topic, samples in lines:
             if topic not in channels:

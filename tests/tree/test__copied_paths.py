@@ -8,6 +8,7 @@ from tfbus import TransformStamped, TransformTree, UnknownFrameError
 from tfbus.geometry.rows import Row
 from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Query, copy_paths
+from tfbus.tree._runs import Runs
 from tfbus.tree.history import Samples
 from tfbus.tree.tree import forest_of
 
@@ -146,7 +147,7 @@ def test_changes_of_parents_elsewhere_split_no_permanent_path() -> None:
 
 
 def samples(*stamps: int) -> Samples:
-    return Samples((np.array(stamps, np.int64), 0, np.zeros((len(stamps), 7)), 0, 7, len(stamps)), [])
+    return Samples((np.array(stamps, np.int64), 0, np.zeros((len(stamps), 7)), 0, 7, len(stamps)), Runs(), Runs())
 
 
 STAMPS = np.array([15, 4, 10, 9, 20])

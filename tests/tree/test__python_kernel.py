@@ -135,6 +135,52 @@ def test_a_long_history_slides_its_window_and_takes_another_one(kernel: ModuleTy
 
 
 @on_both
+@pytest.mark.parametrize(("count", "keep"), [(0, 5), (1, 5), (3, None), (40, 5), (200, None)])
+def test_many_samples_are_stored_as_one_after_the_other(kernel: ModuleType, count: int, keep: int | None) -> None:
+    for before in (0, 1, 9):
+        poses = [(10 * k, x(float(k))) for k in range(before + count)]
+        edge, expected = history(kernel, poses[:before], keep), history(kernel, poses, keep)
+        held = edge.columns(0, before)
+        edge.push_many(np.arange(10 * before, 10 * (before + count), 10), np.full((count, 7), IDENTITY))
+        zeros = history(kernel, [(at, row if at < 10 * before else x(0.0)) for at, row in poses], keep)
+        assert contents(edge) == contents(zeros)
+        assert (edge.newest, edge.horizon) == (expected.newest, expected.horizon)
+        assert held[5] == len(poses[:before]) if keep is None else held[5] <= before
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("stamps", "rows"),
+    [
+        ([5], 1),
+        ([4], 1),
+        ([6, 6], 2),
+        ([7, 6], 2),
+        ([6, 2**62, 8], 3),
+        ([STAMP_MAX, STAMP_MIN], 2),
+        ([6, 7], 1),
+        ([6], 2),
+        ([], 1),
+    ],
+)
+def test_many_samples_that_do_not_follow_are_refused_whole(kernel: ModuleType, stamps: list[int], rows: int) -> None:
+    edge = history(kernel, [(4, x(1.0)), (5, x(2.0))])
+    with pytest.raises(ValueError, match=r"newer than all others|row of seven"):
+        edge.push_many(np.array(stamps, np.int64), np.zeros((rows, 7)))
+    assert contents(edge) == [(4, x(1.0)), (5, x(2.0))]
+
+
+@on_both
+def test_the_row_of_a_history_is_that_of_a_chain_of_it_alone(kernel: ModuleType) -> None:
+    edge = history(kernel, [(0, x(1.0)), (10, x(2.0))], keep=100)
+    chain = kernel.Chain((edge,), ())
+    assert [edge.row(at) for at in (-1, 0, 4, 10, 11, 2**70)] == [None, x(1.0), x(1.4), x(2.0), None, None]
+    assert bits(edge.row(3)) == bits(chain.row(3))
+    edge.mixed = True
+    assert edge.row(0) is None
+
+
+@on_both
 def test_the_copy_of_a_history_is_independent(kernel: ModuleType) -> None:
     edge, twin = history(kernel, [(10, x(1.0)), (20, x(2.0)), (90, x(9.0))], keep=75), history(kernel, keep=75)
     twin.take(edge)

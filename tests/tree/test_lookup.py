@@ -612,3 +612,15 @@ def test_a_stamp_beyond_64_bits_is_a_value_error(source: str) -> None:
 def test_a_frame_name_that_is_no_str_is_a_type_error(names: tuple[Any, Any]) -> None:
     with pytest.raises(TypeError, match="must be a str"):
         tree_of(moving("a", "b", 5)).lookup(*names)
+
+
+def test_the_latest_answer_goes_the_way_that_an_answer_at_its_stamp_goes() -> None:
+    tree = tree_of(
+        moving("map", "b", 100, 1.0),
+        moving("b", "c", 103, 2.0),
+        moving("c", "b", 97, 4.0),
+        moving("b", "tool", 97, 8.0),
+    )
+    # The newest way, down to c, has no sample at 97, but that of c's former child has one.
+    assert tree.lookup("c", "tool").stamp == 97
+    assert x_of(tree, "c", "tool") == x_of(tree, "c", "tool", 97) == 12.0

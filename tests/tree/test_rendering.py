@@ -235,3 +235,21 @@ def test_a_tree_draws_its_own_edges() -> None:
 def test_the_rate_of_a_slow_edge_is_not_zero() -> None:
     slow = Edge("map", "dock", static=False, samples=2, oldest=0, newest=50 * SECOND, authority="")
     assert "0.02 Hz" in describe([slow])
+
+
+def test_dot_with_a_stamp_shows_all_facts_in_the_colour_of_the_state() -> None:
+    lines = to_dot(EDGES, 5 * SECOND, {"base_link": 0.012}).split("\n")
+    assert (
+        '    "map" -> "base_link" '
+        r'[label="50.0 Hz\nage 1 s\nspan 2 s\nodometry\ndelay 12 ms", color="#009e73", fontcolor="#009e73"];'
+    ) in lines
+    assert '    "base_link" -> "lidar" [label="static", style=dashed, color="#0072b2", fontcolor="#0072b2"];' in lines
+    assert any('"arm" [label="one sample' in line and "#d55e00" in line for line in lines)
+    assert any('"tool" [label="no samples", color="#767676"' in line for line in lines)
+
+
+def test_the_dot_of_a_tree_takes_a_stamp() -> None:
+    tree = TransformTree()
+    tree.insert(TransformStamped("map", "base", SECOND, Transform()))
+    assert r"age 2 s" in tree.to_dot(3 * SECOND)
+    assert "age" not in tree.to_dot()

@@ -16,6 +16,8 @@ from tfbus.registration import Registration
 from tfbus.stamps import LATEST, Latest
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
+from tfbus.tree.history import Edge
+from tfbus.tree.html import legend, to_html
 from tfbus.tree.lookup import answer
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.question import Question, question_of
@@ -412,10 +414,7 @@ class Buffer:
 
     def describe(self) -> str:
         """The tree as text, with each edge's rate, age, span and authority, and some of the lookups that wait."""
-        edges = self.tree.edges()
-        if self._local_names is not None:
-            edges = sorted(map(self._local_names.edge, edges), key=lambda edge: edge.child)
-        lines = [describe(edges, self._clock.now())]
+        lines = [describe(self._edges(), self._clock.now())]
         pending = self.pending()
         lines += [f"waiting: {lookup}" for lookup in pending[:_DESCRIBED]]
         if len(pending) > _DESCRIBED:
@@ -431,6 +430,17 @@ class Buffer:
         self.bus._detach(self._live)
         self._live.end("the buffer is closed")
         self._live.call_end_callbacks()
+
+    def _repr_html_(self) -> str:
+        """The tree as notebooks show it, with ages counted from the clock's now."""
+        return to_html(self._edges(), self._clock.now()) + legend()
+
+    def _edges(self) -> list[Edge]:
+        """The newest edges, with the names of this buffer."""
+        edges = self.tree.edges()
+        if self._local_names is None:
+            return edges
+        return sorted(map(self._local_names.edge, edges), key=lambda edge: edge.child)
 
     def _on_bus(self, question: Question) -> Question:
         """A question with the names of the bus."""

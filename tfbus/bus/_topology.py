@@ -292,7 +292,8 @@ class Topology:
             _, looped = admit(edges, batch, self._named)
         if invalid == "drop" or not (looped or refused):
             for error in removed:
-                self.reject(error.reason, error)
+                # Its samples were accepted, so they are not counted as the others that are refused.
+                self.reject("displaced", error)
                 self._log.warning(("intruder", error.child, error.authority), "removed a frame: %s", error)
                 self._evict(_child(error))
         # Whoever was told of a removal may have published.

@@ -16,17 +16,23 @@ except ImportError:
 from tfbus import kernel
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.commands.broadcast import broadcast
+from tfbus.cli.commands.check import check
+from tfbus.cli.commands.compare import compare
+from tfbus.cli.commands.convert import convert
 from tfbus.cli.commands.demo import demo
 from tfbus.cli.commands.echo import echo
+from tfbus.cli.commands.foxglove import foxglove
 from tfbus.cli.commands.info import info
 from tfbus.cli.commands.listen import listen
 from tfbus.cli.commands.play import play
+from tfbus.cli.commands.plot import plot
 from tfbus.cli.commands.query import query
 from tfbus.cli.commands.record import record
 from tfbus.cli.commands.robot import robot
 from tfbus.cli.commands.router import router
 from tfbus.cli.commands.static import static
 from tfbus.cli.commands.tree import tree
+from tfbus.cli.commands.view import view
 from tfbus.cli.output import warn
 from tfbus.errors import RecordingError, TransformLookupError
 
@@ -40,7 +46,27 @@ app = App(
     version=lambda: f"{version('tfbus')} ({kernel} kernel)",
     suppress_keyboard_interrupt=False,
 )
-for command in (demo, broadcast, listen, static, robot, echo, tree, record, play, info, query, router):
+COMMANDS = (
+    demo,
+    broadcast,
+    listen,
+    static,
+    robot,
+    echo,
+    tree,
+    record,
+    play,
+    info,
+    query,
+    check,
+    convert,
+    compare,
+    router,
+    view,
+    plot,
+    foxglove,
+)
+for command in COMMANDS:
     app.command(command)
 
 

@@ -1,15 +1,25 @@
 """The argument types of the subcommands."""
 
+import calendar
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from cyclopts import Parameter, Token
 from cyclopts.validators import Number
 
+from tfbus.recording.recording import Recording, open_recording
 from tfbus.stamps import SECOND, STAMP_MAX
 
 _LIMIT = Decimal(STAMP_MAX // SECOND)
+FIRST_ABSOLUTE: Final = 100_000_000 * SECOND
+"""The first stamp, in ns, that cannot be a time from the beginning of a recording: it is in 1973, or after 3 years."""
+_DATE = re.compile(r"\d{4}-\d\d")
+_FRACTION = re.compile(r"(.*?)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
 
 
 class UsageError(Exception):
@@ -42,8 +52,50 @@ def parse_seconds(text: str) -> int:
     return nanoseconds
 
 
-def _convert_instant(_: Any, tokens: Sequence[Token]) -> Seconds:
-    return Seconds(parse_seconds(tokens[0].value))
+class Time(NamedTuple):
+    """An instant of a recording, as a user types it; the help shows the name of this class."""
+
+    nanoseconds: int
+    absolute: bool
+    """Whether it is a stamp; else it is counted from the beginning of the recording."""
+
+    def stamp(self, start: int | None) -> int:
+        """The stamp in ns, of a recording that starts at a log time; without any message, it starts at 0."""
+        return self.nanoseconds if self.absolute else (start or 0) + self.nanoseconds
+
+
+def parse_time(text: str) -> Time:
+    """An instant from seconds or from a date.
+
+    A number below `FIRST_ABSOLUTE` counts from the beginning of the recording, a greater one is a stamp. A date is in
+    ISO 8601, such as ``2014-03-31T19:24:50.25``, and in UTC unless it says otherwise.
+
+    Raises
+    ------
+    ValueError
+        If the text is neither, is negative, has more than nine decimals, or does not fit 64-bit nanoseconds.
+    """
+    if _DATE.match(text.strip()):
+        return Time(_parse_date(text.strip()), absolute=True)
+    nanoseconds = parse_seconds(text)
+    if nanoseconds < 0:
+        raise ValueError(f"expected a time from the beginning on, not {text}")
+    return Time(nanoseconds, nanoseconds >= FIRST_ABSOLUTE)
+
+
+def _parse_date(text: str) -> int:
+    # A `datetime` has microseconds.
+    head, digits, zone = _FRACTION.fullmatch(text).groups()  # type: ignore[union-attr]  # matches every text
+    try:
+        date = datetime.fromisoformat(head + (zone or ""))
+        seconds = calendar.timegm((date if date.tzinfo else date.replace(tzinfo=UTC)).utctimetuple())
+    except (ValueError, OverflowError):
+        raise ValueError(f"expected seconds, or a date such as 2014-03-31T19:24:50, not {text!r}") from None
+    return parse_seconds(f"{seconds}{digits or ''}" if seconds >= 0 else str(seconds))
+
+
+def _convert_time(_: Any, tokens: Sequence[Token]) -> Time:
+    return parse_time(tokens[0].value)
 
 
 def _convert_step(_: Any, tokens: Sequence[Token]) -> Seconds:
@@ -62,11 +114,61 @@ Speed = Annotated[float, Parameter(validator=Number(gt=0))]
 """A speed relative to real time; may be infinite."""
 Duration = Annotated[float, Parameter(validator=Number(gte=0))]
 """A duration in s; may be infinite."""
-Instant = Annotated[Seconds, Parameter(converter=_convert_instant)]
-"""A stamp, or an offset between two, in ns."""
+Instant = Annotated[Time, Parameter(converter=_convert_time, n_tokens=1, accepts_keys=False)]
+"""An instant of a recording."""
 Step = Annotated[Seconds, Parameter(converter=_convert_step)]
 """A period in ns, greater than zero."""
 Flag = Annotated[bool, Parameter(negative="", show_default=False)]
 """An option without a value."""
+Positive = Annotated[float, Parameter(validator=Number(gt=0))]
+"""A number greater than zero; may be infinite."""
 JsonFlag = Annotated[bool, Parameter(name="--json", negative="", show_default=False)]
 """The flag ``--json``."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class TopicOptions:
+    """The options of a command that reads a recording.
+
+    Parameters
+    ----------
+    topic
+        Read this topic in place of /tf and /tf_static; with =PREFIX behind it, such as /robot1/tf=robot1/, put a prefix
+        before the names of its frames. May be given several times.
+    namespaces
+        Read tf and tf_static of all namespaces; the frames of /robot1/tf get the prefix robot1/.
+    prefix
+        Put this before the names of all frames.
+    """
+
+    topic: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    namespaces: Flag = False
+    prefix: Annotated[str, Parameter(show_default=False)] = ""
+
+    def open(self, file: Path) -> Recording:
+        """Open a recording.
+
+        Raises
+        ------
+        UsageError
+            If the options contradict each other.
+        RecordingError
+            As `open_recording`.
+        """
+        return open_recording(file, **self.arguments())
+
+    def arguments(self) -> dict[str, Any]:
+        """The options as arguments of `open_recording`; raises `UsageError` if they contradict each other."""
+        if self.topic and self.namespaces:
+            raise UsageError("--topic and --namespaces are two ways to choose: give one of them")
+        pairs = [topic.partition("=") for topic in self.topic]
+        for prefix in (self.prefix, *(prefix for _, _, prefix in pairs)):
+            if prefix.startswith("/"):
+                raise UsageError(f"a prefix must not start with '/', got {prefix!r}")
+        topics = {name: prefix for name, _, prefix in pairs} or None
+        return {"topics": topics, "prefix": self.prefix, "namespaces": self.namespaces}
+
+
+DEFAULT_TOPICS = TopicOptions()
+"""The options of a command line that gives none."""

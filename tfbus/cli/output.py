@@ -1,9 +1,12 @@
 """The output of the subcommands: results, notices, warnings, and values as text for people."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TypeVar
 
+from tfbus.cli.arguments import UsageError
 from tfbus.geometry.transform import Transform
 from tfbus.stamps import SECOND
 
@@ -27,13 +30,23 @@ def warn(message: str) -> None:
 
 def track(items: Iterable[ItemT], total: int | None, description: str) -> Iterator[ItemT]:
     """Iterate over the items with a progress bar, if standard error is a terminal."""
+    with progress(total, description) as advance:
+        for item in items:
+            yield item
+            advance(1)
+
+
+@contextmanager
+def progress(total: int | None, description: str) -> Iterator[Callable[[int], object]]:
+    """Show a progress bar for the body of a ``with``, if standard error is a terminal; gives what advances it."""
     if not sys.stderr.isatty():
-        yield from items
+        yield lambda _: None
         return
     from tfbus.cli._progress_bar import progress_bar
 
     with progress_bar() as bar:
-        yield from bar.track(items, total=total, description=description)
+        task = bar.add_task(description, total=total)
+        yield lambda count: bar.advance(task, count)
 
 
 def printable(text: str) -> str:
@@ -61,3 +74,23 @@ def format_transform(transform: Transform) -> str:
 def format_counts(counts: Mapping[str, int]) -> str:
     """Counts by reason in one line: ``3 x not finite, 1 x cycle``."""
     return ", ".join(f"{count:,} x {reason}" for reason, count in counts.items())
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file, all of it or nothing; a pipe or a device is written to directly.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be written.
+    """
+    replaceable = path.is_file() or not path.exists()
+    written = path.with_name(f".{path.name}.part") if replaceable else path
+    try:
+        written.write_bytes(content)
+        if replaceable:
+            written.replace(path)
+    except OSError as error:
+        if replaceable:
+            written.unlink(missing_ok=True)
+        raise UsageError(f"cannot write {path}: {error.strerror}") from None

@@ -33,7 +33,7 @@ class TransformArray:
         Unit quaternions (x, y, z, w). A norm within 1 % of one is normalised; the sign stays as given. NaN throughout,
         in a translation and its rotation, means that there is no transform.
     stamps : sequence or array of shape (n,), optional
-        The stamp of each in ns, or dates as `as_stamp` accepts them.
+        The stamp of each in ns, or dates as `TransformTree.lookup_many` accepts them.
 
     Raises
     ------

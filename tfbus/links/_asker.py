@@ -76,7 +76,7 @@ class Asker:
         return due[: max(room, 0)]
 
     def next_due(self) -> float | None:
-        """When to call `take_due` again; None while nobody is to be asked."""
+        """The time of the next call of `take_due`; None while nobody is to be asked."""
         full = sum(question.open for question in self._questions.values()) >= MOST_OPEN
         return min((one.due for one in self._questions.values() if one.open or not full), default=None)
 

@@ -110,7 +110,7 @@ class Endpoint:
             self._claim_period = CLAIM_PERIOD
 
     def next_question(self) -> float | None:
-        """When the next peer is to be asked; None while nothing is missing."""
+        """The time at which the next peer is to be asked; None while nothing is missing."""
         return None if self._reconciler is None else self._reconciler.next_due()
 
     def reconcile(self) -> float:

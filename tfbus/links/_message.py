@@ -186,7 +186,7 @@ def _size(entry: _Entry) -> int:
 
 
 def _refusal(sample: TransformStamped) -> InvalidTransformError | None:
-    """Why a sample cannot be in a message, or None if it can."""
+    """The reason why a sample cannot be in a message; None if it can."""
     try:
         size = len(sample.authority.encode())
     except UnicodeEncodeError:

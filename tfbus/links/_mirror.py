@@ -1,4 +1,4 @@
-"""What a peer has told of its state, and whether that is all of it."""
+"""The state of a peer as far as it has told it, and whether that is all of it."""
 
 from tfbus.links._entries import MovingFrame, RemovedFrame
 from tfbus.links._state import StateStep, digest_moving, digest_static

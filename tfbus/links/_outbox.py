@@ -113,7 +113,7 @@ class Outbox:
         return turn
 
     def step(self) -> StateStep:
-        """What has changed of the state since the last turn."""
+        """The changes of the state since the last turn."""
         # What no entry tells has to be asked for.
         since = self.state.number if self._silent else self._told
         return StateStep(since, self.state.number, self.state.digest)

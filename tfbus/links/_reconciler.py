@@ -82,7 +82,7 @@ class Reconciler:
         self._wake()
 
     def next_due(self) -> float | None:
-        """When to call `run`, by the asker's clock; None if there is nothing to do."""
+        """The time of the next call of `run`, on the asker's clock; None if there is nothing to do."""
         return self._asker.next_due()
 
     def run(self) -> None:

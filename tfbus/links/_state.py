@@ -64,7 +64,7 @@ class LinkState:
         self._forgotten = 0
 
     def entry(self, frame: str) -> StateEntry | None:
-        """What is said of a frame; a `RemovedFrame` if it has gone."""
+        """The entry of a frame; a `RemovedFrame` if it was removed."""
         entry = self._entries.get(frame)
         return None if entry is None else entry[1]
 
@@ -114,19 +114,19 @@ class LinkState:
 
 
 def digest_of(frame: str, entry: OutgoingBatch | MovingFrame) -> int:
-    """What a frame adds to a digest: 64 bits of its name, and of origin and number if it is static."""
+    """The share of a frame in a digest: 64 bits of its name, and of origin and number if it is static."""
     return (
         digest_static(frame, entry.origin, entry.sequence) if isinstance(entry, OutgoingBatch) else digest_moving(frame)
     )
 
 
 def digest_static(frame: str, origin: bytes, sequence: int) -> int:
-    """What a static frame adds to a digest."""
+    """The share of a static frame in a digest."""
     return _digest(b"%b%d %b" % (origin, sequence, frame.encode("utf-8", "surrogatepass")))
 
 
 def digest_moving(frame: str) -> int:
-    """What a moving frame adds to a digest."""
+    """The share of a moving frame in a digest."""
     return _digest(frame.encode("utf-8", "surrogatepass"))
 
 

@@ -6,21 +6,39 @@ A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Play
 """
 
 from tfbus.errors import RecordingError
+from tfbus.recording.convert import Conversion, StaticTransform, convert
+from tfbus.recording.edits import Edits
+from tfbus.recording.examine import examine
+from tfbus.recording.header_stamps import HeaderStamps, header_stamps
+from tfbus.recording.joint_states import load_joint_states
 from tfbus.recording.load import load
+from tfbus.recording.message import RecordedMessage
 from tfbus.recording.player import Player
 from tfbus.recording.recorder import Recorder
-from tfbus.recording.recording import RecordedMessage, Recording, open_recording
-from tfbus.recording.summary import FrameSummary, RecordingSummary, summarise
+from tfbus.recording.recording import RecordedTopic, Recording, open_recording
+from tfbus.recording.spread import Spread
+from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
 
 __all__ = [
+    "Conversion",
+    "Edits",
     "FrameSummary",
+    "HeaderStamps",
     "Player",
     "RecordedMessage",
+    "RecordedTopic",
     "Recorder",
     "Recording",
     "RecordingError",
     "RecordingSummary",
+    "SenderSummary",
+    "Spread",
+    "StaticTransform",
+    "convert",
+    "examine",
+    "header_stamps",
     "load",
+    "load_joint_states",
     "open_recording",
     "summarise",
 ]

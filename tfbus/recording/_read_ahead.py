@@ -11,7 +11,7 @@ import anyio.streams.memory
 import anyio.to_thread
 
 from tfbus._aio.task_groups import close_task_group
-from tfbus.recording.recording import RecordedMessage
+from tfbus.recording.message import RecordedMessage
 
 _BLOCK = 256
 

@@ -3,13 +3,45 @@
 import logging
 import os
 from collections import Counter
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Mapping
 
+import numpy as np
+
+from tfbus.errors import InvalidTransformError
 from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
 from tfbus.geometry.stamped import Batch
-from tfbus.recording.recording import RecordedMessage, open_recording
+from tfbus.recording._blocks import Block, DecodedBlock
+from tfbus.recording._selection import Topics
+from tfbus.recording.formats._columns import Columns
+from tfbus.recording.recording import Recording, open_recording
+from tfbus.recording.speed_limit import SpeedLimit
+from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.cycles import NewestEdge, admit
+from tfbus.tree.forest import Forest
 from tfbus.tree.tree import TransformTree, forest_of
+
+MAX_DETAILS = 20
+
+
+class Problems(Counter[str]):
+    """The number of transforms and messages that were left out, by reason.
+
+    Attributes
+    ----------
+    details : list of str
+        What was lost at the first damaged places; at most `MAX_DETAILS`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.details: list[str] = []
+
+    def note(self, errors: tuple[InvalidTransformError | MalformedMessageError, ...]) -> None:
+        """Count the errors of a message."""
+        for error in errors:
+            self[error.reason] += 1
+            if isinstance(error, MalformedMessageError) and len(self.details) < MAX_DETAILS:
+                self.details.append(error.detail)
 
 
 def load(
@@ -17,6 +49,10 @@ def load(
     since: int | None = None,
     until: int | None = None,
     *,
+    topics: Topics = None,
+    prefix: str = "",
+    namespaces: bool = False,
+    max_speed: float | None = None,
     problems: Counter[str] | None = None,
     max_translation: float = MAX_TRANSLATION,
 ) -> TransformTree:
@@ -31,9 +67,15 @@ def load(
         As `open_recording`.
     since, until : int, optional
         The first and the last log time, in ns. Static transforms from before `since` are in the tree as well.
+    topics, prefix, namespaces
+        As `open_recording`.
+    max_speed : float, optional
+        In m/s. A moving sample that is further from the last one of its frame that was kept, by stamp, than this speed
+        allows, is left out and counted as ``"speed"``. If the first samples of a frame contradict each other, the first
+        one that a later one agrees with is kept.
     problems : Counter, optional
         Gets the number of transforms and messages that were left out, by reason. Without it, they are logged as a
-        warning.
+        warning, as is what was not read although it may hold transforms.
     max_translation : float
         The greatest magnitude of a translation, in m, at most 1e100.
 
@@ -44,29 +86,92 @@ def load(
 
     Raises
     ------
-    TypeError, ValueError
-        If `max_translation` is not greater than zero and at most 1e100.
     RecordingError
-        If the recording cannot be read at all.
+        If the recording cannot be read at all, or as `open_recording`.
+    ValueError, TypeError
+        If `max_speed` or `max_translation` is not greater than zero, or `max_translation` is greater than 1e100; or as
+        `open_recording`.
     """
-    counted: Counter[str] = Counter() if problems is None else problems
+    limit = None if max_speed is None else SpeedLimit(max_speed)
+    found = Problems()
     tree = TransformTree(keep=None, max_translation=max_translation)
-    with open_recording(path) as recording:
-        fill(tree, recording.messages(since, until), counted)
-    if problems is None and counted:
-        reasons = ", ".join(f"{count} x {reason}" for reason, count in counted.most_common())
-        logging.getLogger("tfbus").warning("left out of %s: %s", os.fspath(path), reasons)
+    with open_recording(path, topics=topics, prefix=prefix, namespaces=namespaces) as recording:
+        fill(tree, recording, found, since, until, limit=limit)
+        remarks = recording.remarks
+    if problems is not None:
+        problems.update(found)
+        return tree
+    logger = logging.getLogger("tfbus")
+    if found:
+        reasons = ", ".join(f"{count} x {reason}" for reason, count in found.most_common())
+        logger.warning("left out of %s: %s", os.fspath(path), "; ".join([reasons, *found.details]))
+    for remark in remarks:
+        logger.warning("%s: %s", os.fspath(path), remark)
     return tree
 
 
-def fill(tree: TransformTree, messages: Iterable[RecordedMessage], problems: Counter[str]) -> None:
-    """Insert the samples of some messages into a tree, and count by reason those that are left out."""
+def fill(
+    tree: TransformTree,
+    recording: Recording,
+    problems: Problems,
+    since: int | None = None,
+    until: int | None = None,
+    *,
+    limit: SpeedLimit | None = None,
+    progress: Callable[[int], object] | None = None,
+) -> None:
+    """Insert the samples of a recording into a tree, and count by reason those that are left out.
+
+    Parameters
+    ----------
+    tree : TransformTree
+    recording : Recording
+    problems : Problems
+    since, until : int, optional
+        As `load`.
+    limit : SpeedLimit, optional
+    progress : callable, optional
+        Called with the number of messages in each block that has been inserted.
+    """
     forest = forest_of(tree)
-    for _, batch, errors in messages:
-        if errors:
-            problems.update(error.reason for error in errors)
-        forest.commit(sound_samples(forest.frames, batch, forest.names.parents, problems, tree.max_translation))
+    for block in recording.blocks(since, until):
+        columns = block.columns() if limit is None else None
+        if columns is None or not _append(forest, columns, tree.max_translation):
+            _commit(forest, block, problems, tree.max_translation, limit)
+        if progress is not None:
+            progress(len(block))
+    if limit is not None:
+        forest.commit(
+            sound_samples(forest.frames, limit.undecided(), forest.names.parents, problems, tree.max_translation)
+        )
+        problems.update(limit.dropped)
     forest.forget_changes()
+
+
+def _append(forest: Forest, columns: list[Columns], max_translation: float) -> bool:
+    """Append the samples of a block, if none of them has to be judged; returns whether that was so."""
+    for each in columns:
+        near = np.square(each.rows[:, :3]).sum(axis=1).max() <= max_translation**2
+        if each.static or not near or not forest.can_append(each.parent, each.child, each.authority, each.stamps):
+            return False
+    for each in columns:
+        forest.append(each.child, each.stamps, each.rows)
+    return True
+
+
+def _commit(
+    forest: Forest,
+    block: Block | DecodedBlock,
+    problems: Problems,
+    max_translation: float,
+    limit: SpeedLimit | None,
+) -> None:
+    for _, batch, errors in block.messages():
+        if errors:
+            problems.note(errors)
+        if limit is not None:
+            batch = limit.admit(_near(batch, problems, max_translation))
+        forest.commit(sound_samples(forest.frames, batch, forest.names.parents, problems, max_translation))
 
 
 def sound_samples(
@@ -100,10 +205,15 @@ def sound_samples(
     else:
         # The usual case: no child has got another parent, so there is no new loop.
         return batch
-    near = tuple(sample for sample in batch if is_within(sample, max_translation))
-    if len(near) < len(batch):
-        far = (sample for sample in batch if not is_within(sample, max_translation))
-        problems.update(not_physical(sample, max_translation).reason for sample in far)
-    accepted, refused = admit(edges, near, parents)
+    accepted, refused = admit(edges, _near(batch, problems, max_translation), parents)
     problems.update(error.reason for error in refused)
     return accepted
+
+
+def _near(batch: Batch, problems: Counter[str], max_translation: float) -> Batch:
+    """The batch without the samples that are too far away, which are counted."""
+    far = [sample for sample in batch if not is_within(sample, max_translation)]
+    if not far:
+        return batch
+    problems.update(not_physical(sample, max_translation).reason for sample in far)
+    return tuple(sample for sample in batch if is_within(sample, max_translation))

@@ -4,6 +4,7 @@ import math
 import os
 from collections import Counter
 from contextlib import suppress
+from typing import Any
 
 import anyio
 import anyio.lowlevel
@@ -13,7 +14,9 @@ from tfbus.bus.bus import Bus
 from tfbus.clock import SimulatedClock
 from tfbus.errors import UnknownFrameError
 from tfbus.recording._read_ahead import ReadAhead
-from tfbus.recording.recording import RecordedMessage, Recording, open_recording
+from tfbus.recording._selection import Selection, Topics
+from tfbus.recording.message import RecordedMessage
+from tfbus.recording.recording import Recording, open_recording
 from tfbus.stamps import as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCKS_AHEAD = 2
@@ -48,6 +51,8 @@ class Player:
         Whether to begin again at the end, for ever.
     since, until : int, optional
         The first and the last log time, in ns. The static transforms from before are played first.
+    topics, prefix, namespaces
+        As `open_recording`.
 
     Attributes
     ----------
@@ -68,7 +73,7 @@ class Player:
     Raises
     ------
     TypeError, ValueError
-        If `rate` is not greater than zero, or `until` is before `since`.
+        If `rate` is not greater than zero, `until` is before `since`, or the topics are wrong.
     """
 
     def __init__(
@@ -80,7 +85,13 @@ class Player:
         loop: bool = False,
         since: int | None = None,
         until: int | None = None,
+        topics: Topics = None,
+        prefix: str = "",
+        namespaces: bool = False,
     ) -> None:
+        # Wrong ones raise here, and not in `play`.
+        Selection(topics, prefix, namespaces)
+        self._chosen: dict[str, Any] = {"topics": topics, "prefix": prefix, "namespaces": namespaces}
         if not is_real(rate):
             raise TypeError(f"a rate must be a number, not {rate!r}")
         if not rate > 0:
@@ -142,7 +153,7 @@ class Player:
             self._pause.cancel()
 
     def _open(self) -> Recording:
-        recording = open_recording(self.path)
+        recording = open_recording(self.path, **self._chosen)
         try:
             # In the worker thread: without an index, these read the whole file.
             self.start = recording.start if self._since is None else self._since

@@ -238,7 +238,7 @@ class Recorder:
         if self._registration is not None:
             self._registration.close()
         self._queue.clear()
-        logging.getLogger("tfbus").warning("the recording %s has ended early", self.path, exc_info=error)
+        logging.getLogger("tfbus.recording").warning("the recording %s has ended early: %s", self.path, error)
         self.bus._announce(RecordingFailed(self.bus.clock.now(), self.path, error))
 
 

@@ -2,27 +2,47 @@
 
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
-from tfbus.errors import InvalidTransformError, RecordingError
-from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.errors import RecordingError
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.recording._blocks import SIZE, Block, DecodedBlock
+from tfbus.recording._selection import Selection, Topics, looks_like_transforms
+from tfbus.recording.formats._columns import ColumnDecoder
+from tfbus.recording.formats._decoder import ChannelDecoder
 from tfbus.recording.formats._storage import Channel, Storage, StoredMessage
-from tfbus.tf_message import Decoded, MalformedMessageError
+from tfbus.recording.message import RecordedMessage
+from tfbus.tf_message import MalformedMessageError
 
 _FIRST_BYTES: Final = 16
+_SHOWN: Final = 10
+_JOINT_TYPES: Final = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
 
-class RecordedMessage(NamedTuple):
-    """The transforms of one message of a recording."""
+@dataclass(frozen=True, slots=True)
+class RecordedTopic:
+    """A topic of a recording.
 
-    received: int
-    """The log time in ns: the time of recording, not a stamp."""
-    batch: Batch
-    """The valid transforms."""
-    errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """Why the other transforms were refused; with ``reason="damaged"``, which part of the file is lost here."""
+    Parameters
+    ----------
+    name, type : str
+    count : int or None
+        The number of its messages; None if only reading the whole file would tell.
+    read : bool
+        Whether its messages are read as transforms.
+    ignored : bool
+        Whether its name or its type promises transforms, and it is not read.
+    """
+
+    name: str
+    type: str
+    count: int | None
+    read: bool
+    ignored: bool
 
 
 class Recording:
@@ -32,8 +52,8 @@ class Recording:
     ----------
     path : Path
     storage : Storage
-    decode_payload : callable
-        Gives the samples and errors of a stored message.
+    selection : Selection
+        Decides which topics are read.
 
     Attributes
     ----------
@@ -42,13 +62,14 @@ class Recording:
         Whether the writer finished the file. If not, the last messages may be missing.
     """
 
-    def __init__(
-        self, path: Path, storage: Storage, decode_payload: Callable[[Channel, bytes], Decoded[TransformStamped]]
-    ) -> None:
+    def __init__(self, path: Path, storage: Storage, selection: Selection) -> None:
         self.path = path
         self.finished = storage.finished
         self._storage: Storage | None = storage
-        self._decode = decode_payload
+        self._selection = selection
+        self._decoders: dict[Channel, ChannelDecoder] = {}
+        self._unwanted: set[Channel] = set()
+        self._check_topics(storage)
 
     @property
     def start(self) -> int | None:
@@ -63,13 +84,36 @@ class Recording:
     @property
     def count(self) -> int | None:
         """The number of messages with transforms; None if only reading the whole file would tell."""
-        return self._opened.count
+        if not self._opened.complete:
+            return None
+        return sum(count or 0 for channel, count in self._opened.channels.items() if self._is_wanted(channel))
+
+    @property
+    def topics(self) -> tuple[RecordedTopic, ...]:
+        """All topics that are known, sorted by name; without an index, these are those met so far by reading."""
+        found: dict[tuple[str, str], RecordedTopic] = {}
+        for channel, count in self._opened.channels.items():
+            key = channel.topic, channel.type
+            before = found.get(key)
+            if before is not None:
+                count = None if count is None or before.count is None else before.count + count
+            read = self._is_wanted(channel)
+            found[key] = RecordedTopic(*key, count, read, not read and looks_like_transforms(channel))
+        return tuple(found[key] for key in sorted(found))
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The ignored topics, and ignored files of a folder, that may hold transforms."""
+        ignored = [topic for topic in self.topics if topic.ignored]
+        joints = [] if any(topic.read for topic in self.topics) else [t for t in self.topics if t.type in _JOINT_TYPES]
+        return (*self._opened.remarks, *map(_remark, ignored), *map(_remark_on_joints, joints))
 
     def messages(self, since: int | None = None, until: int | None = None) -> Iterator[RecordedMessage]:
-        """Iterate over the messages on ``/tf`` and ``/tf_static``, in the order of their log times.
+        """Iterate over the messages on the chosen topics, in the order of their log times.
 
-        Damage raises nothing: it is reported in the `errors` of a message, and reading continues behind it. A file that
-        has no index, because its writer was killed, is read in the order of the file.
+        Damage raises nothing: it is reported in the `errors` of a message, and reading continues behind it. An MCAP
+        file without an index, because its writer was killed, is read in the order of the file. At the end of a reading
+        without limits, the number of messages is compared with what the file promises.
 
         Parameters
         ----------
@@ -88,25 +132,67 @@ class Recording:
 
     def _messages(self, storage: Storage, since: int | None, until: int | None) -> Iterator[RecordedMessage]:
         if since is not None:
-            latched: dict[str, TransformStamped] = {}
-            for stored in storage.messages(None, since - 1, only_static=True):
-                for sample in self._message(stored).batch:
-                    # In the order of the samples that stay.
-                    latched.pop(sample.child, None)
-                    latched[sample.child] = sample
-            for sample in latched.values():
-                yield RecordedMessage(since, (sample,), ())
-        yield from map(self._message, storage.messages(since, until))
+            yield from self._latched(storage, since)
+        yield from map(self._message, storage.messages(self._is_wanted, since, until))
+
+    def blocks(self, since: int | None = None, until: int | None = None) -> Iterator[Block | DecodedBlock]:
+        """All messages as `messages` gives them, in blocks that can be decoded at once; for `load` and `summarise`."""
+        storage = self._opened
+        columns = ColumnDecoder(self._decoders)
+        if since is not None:
+            yield DecodedBlock(list(self._latched(storage, since)))
+        messages = storage.messages(self._is_wanted, since, until)
+        while block := list(islice(messages, SIZE)):
+            yield Block(block, columns, self._message)
+
+    def _latched(self, storage: Storage, since: int) -> Iterator[RecordedMessage]:
+        """The newest static transform of each frame from before a log time."""
+        latched: dict[str, TransformStamped] = {}
+        for stored in storage.messages(self._is_static, None, since - 1):
+            for sample in self._message(stored).batch:
+                # In the order of the samples that stay.
+                latched.pop(sample.child, None)
+                latched[sample.child] = sample
+        for sample in latched.values():
+            yield RecordedMessage(since, (sample,), ())
+
+    def _is_wanted(self, channel: Channel) -> bool:
+        if channel in self._decoders:
+            return True
+        if channel in self._unwanted:
+            return False
+        choice = self._selection.choose(channel)
+        if choice is None:
+            self._unwanted.add(channel)
+        else:
+            self._decoders[channel] = ChannelDecoder(channel, choice.static, choice.prefix)
+        return choice is not None
+
+    def _is_static(self, channel: Channel) -> bool:
+        return self._is_wanted(channel) and self._decoders[channel].static
 
     def _message(self, stored: StoredMessage) -> RecordedMessage:
         received, channel, payload = stored
         if isinstance(channel, MalformedMessageError):
             return RecordedMessage(received, (), (channel,))
         try:
-            samples, errors = self._decode(channel, payload)
+            samples, errors = self._decoders[channel].decode(payload)
         except MalformedMessageError as error:
             return RecordedMessage(received, (), (error,))
         return RecordedMessage(received, tuple(filter(None, samples)), tuple(errors))
+
+    def _check_topics(self, storage: Storage) -> None:
+        """Raise `RecordingError` if a topic that was asked for is not there, as far as the file tells."""
+        for topic in self._selection.topics if storage.complete else ():
+            read = any(
+                self._is_wanted(channel) for channel in storage.channels if channel.topic.removeprefix("/") == topic
+            )
+            if not read:
+                kinds = {channel.type for channel in storage.channels if channel.topic.removeprefix("/") == topic}
+                with_transforms = sorted({each.topic for each in storage.channels if looks_like_transforms(each)})
+                why = f"has type {' and '.join(sorted(kinds))}, which holds no transforms" if kinds else "is not there"
+                there = f"; topics with transforms: {', '.join(with_transforms[:_SHOWN])}" if with_transforms else ""
+                raise RecordingError(f"topic {topic!r} {why}{there}", path=str(self.path), reason="no such topic")
 
     def close(self) -> None:
         """Close the file; closing again does nothing."""
@@ -129,26 +215,63 @@ class Recording:
         return self._storage
 
 
-def open_recording(path: str | os.PathLike[str]) -> Recording:
-    """Open a recording of ROS 1 (``.bag``) or ROS 2 (a folder, ``.db3``, ``.mcap``).
+def _remark(topic: RecordedTopic) -> str:
+    count = "" if topic.count is None else f"{topic.count:,} messages on "
+    return f"not read: {count}topic {topic.name} of type {topic.type or 'unknown'}"
 
-    The first bytes of the file decide which format it has, not its name. All formats but bags may be unfinished.
+
+def _remark_on_joints(topic: RecordedTopic) -> str:
+    return f"no transforms, but {topic.name} has the positions of joints: load_joint_states reads them with a URDF"
+
+
+def open_recording(
+    path: str | os.PathLike[str], *, topics: Topics = None, prefix: str = "", namespaces: bool = False
+) -> Recording:
+    """Open a recording of ROS 1 (``.bag``), of ROS 2 (a folder, ``.db3``, ``.mcap``) or of Foxglove (``.mcap``).
+
+    The first bytes of the file decide which format it has, not its name. It may be unfinished, cut off or damaged.
 
     Parameters
     ----------
     path : str or path-like
+    topics : str, iterable of str, or mapping of str to str, optional
+        The topics to read; a mapping gives each a prefix for the names of its frames: ``{"/robot1/tf": "robot1/"}``. A
+        topic is static if its name ends with ``_static``. By default ``/tf``, ``/tf_static``, and all topics of
+        Foxglove's ``FrameTransform`` and ``FrameTransforms`` that are no ``tf`` of a namespace.
+    prefix : str
+        Put before the names of all frames.
+    namespaces : bool
+        Read ``tf`` and ``tf_static`` of all namespaces; the frames of ``/robot1/tf`` get the prefix ``robot1/``.
 
     Raises
     ------
     RecordingError
-        If the file is missing or empty, cannot be read, was cut off before its first message, or is no recording; or if
-        the packages that read it are not installed.
+        If the file is missing or empty, cannot be read, was cut off before its first message, or is no recording; if a
+        topic in `topics` is not there, or has no transforms; or if the packages that read it are not installed.
+    ValueError, TypeError
+        If both `topics` and `namespaces` are given, or a prefix begins with a slash.
+
+    Notes
+    -----
+    The sizes that a file claims or unfolds to are bounded, and what exceeds its bound is left out and reported: 8 MiB
+    for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and for a value in
+    SQLite, 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its size, or 64 MiB
+    if that is more, in a nameless temporary file. An index of more than 64 MiB is not used.
     """
     file = Path(path)
+    selection = Selection(topics, prefix, namespaces)
+    storage = open_storage(file)
     try:
-        from tfbus.recording.formats._payload import decode_payload
+        return Recording(file, storage, selection)
+    except BaseException:
+        storage.close()
+        raise
 
-        return Recording(file, _open_storage(file, folders=True), decode_payload)
+
+def open_storage(file: Path) -> Storage:
+    """Open all channels of a recording; raises `RecordingError` as `open_recording`."""
+    try:
+        return _open_storage(file, folders=True)
     except ImportError as error:
         problem = f'to read it, tfbus needs some packages more: pip install "tfbus[bag]" ({error})'
         raise RecordingError(problem, path=str(file), reason="missing extra") from error

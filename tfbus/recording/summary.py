@@ -1,20 +1,28 @@
-"""`summarise`, which lists the parents, rates, gaps and authorities of all frames in a recording, and its problems.
+"""`summarise`, which lists topics, frames and senders of a recording, with rates, gaps and delays, and its problems.
 
 The recording is read once and not kept: only one stamp, 8 bytes, of each moving transform stays in memory.
 """
 
+import math
 from array import array
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
-from tfbus.geometry.stamped import TransformStamped
-from tfbus.recording.load import sound_samples
-from tfbus.recording.recording import RecordedMessage, Recording
-from tfbus.stamps import SECOND
+from tfbus.geometry.stamped import Batch
+from tfbus.recording._blocks import Block, DecodedBlock
+from tfbus.recording._delays import Delays
+from tfbus.recording.formats._columns import Columns
+from tfbus.recording.load import Problems, sound_samples
+from tfbus.recording.message import RecordedMessage
+from tfbus.recording.recording import RecordedTopic, Recording
+from tfbus.recording.spread import Spread
+from tfbus.stamps import SECOND, to_seconds
+
+_BLOCK = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +44,10 @@ class FrameSummary:
         The longest time between two successive stamps, in s.
     authorities : tuple of str
         The authorities that sent samples of the frame, in the order of their first samples; without the empty one.
+    period : Spread or None
+        The times between successive stamps.
+    delay : Spread or None
+        The times from the stamp of a moving sample to its log time; negative where stamps lie ahead.
     """
 
     frame: str
@@ -47,6 +59,8 @@ class FrameSummary:
     rate: float | None
     longest_gap: float | None
     authorities: tuple[str, ...]
+    period: Spread | None = None
+    delay: Spread | None = None
 
     @property
     def kind(self) -> str:
@@ -57,6 +71,31 @@ class FrameSummary:
     def span(self) -> float | None:
         """The time from the oldest to the newest stamp, in s."""
         return None if self.oldest is None or self.newest is None else (self.newest - self.oldest) / SECOND
+
+
+@dataclass(frozen=True, slots=True)
+class SenderSummary:
+    """The summary of one authority.
+
+    Parameters
+    ----------
+    authority : str
+    frames : tuple of str
+        The frames that it sent, sorted.
+    static, moving : int
+        The number of samples of each kind.
+    period : Spread or None
+        The times between successive stamps of any of its moving samples; None for fewer than two stamps.
+    delay : Spread or None
+        As `FrameSummary.delay`.
+    """
+
+    authority: str
+    frames: tuple[str, ...]
+    static: int
+    moving: int
+    period: Spread | None
+    delay: Spread | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +110,21 @@ class RecordingSummary:
     start, end : int or None
         The log times of the first and the last message on any topic, in ns; None if there is none.
     messages, transforms : int
-        The number of messages on ``/tf`` and ``/tf_static``, and of the valid transforms in them.
+        The number of messages on the topics that were read, and of the valid transforms in them.
     frames : tuple of FrameSummary
         Every frame that has a parent, sorted by name.
     roots : tuple of str
         The frames that have no parent, sorted.
     problems : mapping of str to int
         The number of transforms and messages that were left out, by reason.
+    senders : tuple of SenderSummary
+        Every authority, sorted by name; the empty one for samples without any.
+    topics : tuple of RecordedTopic
+        All topics, with transforms or not, sorted by name.
+    remarks : tuple of str
+        As `Recording.remarks`.
+    details : tuple of str
+        What was lost at the first damaged places.
     """
 
     path: Path
@@ -89,6 +136,10 @@ class RecordingSummary:
     frames: tuple[FrameSummary, ...]
     roots: tuple[str, ...]
     problems: Mapping[str, int]
+    senders: tuple[SenderSummary, ...] = ()
+    topics: tuple[RecordedTopic, ...] = ()
+    remarks: tuple[str, ...] = ()
+    details: tuple[str, ...] = ()
 
     @property
     def duration(self) -> float | None:
@@ -96,42 +147,103 @@ class RecordingSummary:
         return None if self.start is None or self.end is None else (self.end - self.start) / SECOND
 
 
-def summarise(recording: Recording, messages: Iterable[RecordedMessage] | None = None) -> RecordingSummary:
+def summarise(
+    recording: Recording,
+    messages: Iterable[RecordedMessage] | None = None,
+    *,
+    progress: Callable[[int], object] | None = None,
+) -> RecordingSummary:
     """Read a recording and summarise it.
 
     Parameters
     ----------
     recording : Recording
     messages : iterable of RecordedMessage, optional
-        The messages to read, such as an iterator that shows the progress; by default, all messages of the recording.
+        The messages to read; by default, all messages of the recording, which is faster.
+    progress : callable, optional
+        Called with the number of messages in each block that has been read.
     """
-    frames: dict[str, _Frame] = {}
-    named: set[str] = set()
-    problems: Counter[str] = Counter()
-    count = 0
-    for _, batch, errors in recording.messages() if messages is None else messages:
-        count += 1
-        if errors:
-            problems.update(error.reason for error in errors)
-        for sample in sound_samples(frames, batch, named, problems):
-            child = sample.child
-            named.add(sample.parent)
-            frame = frames.get(child)
-            if frame is None:
-                frame = frames[child] = _Frame(child)
-            frame.count(sample)
+    counts = _Counts()
+    blocks: Iterator[Block | DecodedBlock] = recording.blocks() if messages is None else iter([DecodedBlock(messages)])
+    for block in blocks:
+        columns = block.columns()
+        if columns is None or not counts.add_columns(columns):
+            counts.add_messages(block.messages())
+        else:
+            counts.messages += len(block)
+        if progress is not None:
+            progress(len(block))
+    frames = counts.frames
     parents = {parent for frame in frames.values() for parent in frame.parents}
+    summaries = tuple(frames[child].summary() for child in sorted(frames))
     return RecordingSummary(
         recording.path,
         recording.finished,
         recording.start,
         recording.end,
-        count,
-        sum(frame.static_count + len(frame.stamps) for frame in frames.values()),
-        tuple(frames[child].summary() for child in sorted(frames)),
+        counts.messages,
+        sum(frame.static + frame.moving for frame in summaries),
+        summaries,
         tuple(sorted(parents - frames.keys())),
-        dict(problems.most_common()),
+        dict(counts.problems.most_common()),
+        # Last, because it takes the samples of the frames away.
+        tuple(_sender(frames, authority) for authority in sorted(counts.authorities)),
+        recording.topics,
+        recording.remarks,
+        tuple(counts.problems.details),
     )
+
+
+class _Counts:
+    """All that is counted while a recording is read."""
+
+    def __init__(self) -> None:
+        self.frames: dict[str, _Frame] = {}
+        self.named: set[str] = set()
+        self.problems = Problems()
+        self.messages = 0
+
+    @property
+    def authorities(self) -> set[str]:
+        """The authorities that sent anything."""
+        return {authority for frame in self.frames.values() for authority in frame.sent}
+
+    def add_columns(self, columns: list[Columns]) -> bool:
+        """Count the samples of a block, if no edge has to be judged; returns whether that was so."""
+        for each in columns:
+            frame = self.frames.get(each.child)
+            if frame is None or frame.static or each.static or frame.parent != each.parent:
+                return False
+        for each in columns:
+            self.frames[each.child].count_columns(each)
+        return True
+
+    def add_messages(self, messages: Iterable[RecordedMessage]) -> None:
+        """Count messages one by one."""
+        for received, batch, errors in messages:
+            self.messages += 1
+            if errors:
+                self.problems.note(errors)
+            self._add_batch(received, sound_samples(self.frames, batch, self.named, self.problems))
+
+    def _add_batch(self, received: int, batch: Batch) -> None:
+        for sample in batch:
+            parent, child, stamp, _, authority, static = sample._fields
+            self.named.add(parent)
+            frame = self.frames.get(child)
+            if frame is None:
+                frame = self.frames[child] = _Frame(child)
+            frame.count(parent, stamp, received, authority, static)
+
+
+class _Sent:
+    """The samples of one frame that one authority sent."""
+
+    def __init__(self) -> None:
+        self.static = 0
+        self.moving = 0
+        self.stamps = array("q")
+        self.delays = Delays()
 
 
 class _Frame:
@@ -144,40 +256,94 @@ class _Frame:
         self.newest: int | None = None
         self.authority = ""
         self.parents: dict[str, None] = {}
-        self.authorities: dict[str, None] = {}
-        self.static_count = 0
-        self.stamps = array("q")
+        self.sent: dict[str, _Sent] = {}
 
-    def count(self, sample: TransformStamped) -> None:
+    def count(self, parent: str, stamp: int, received: int, authority: str, static: bool) -> None:
         """Count a sample."""
-        parent, _, stamp, _, authority, static = sample._fields
+        sent = self._sent_by(authority)
         if static:
-            self.static_count += 1
+            sent.static += 1
             self.newest = None
         else:
-            self.stamps.append(stamp)
+            sent.moving += 1
+            sent.stamps.append(stamp)
+            sent.delays.add(np.array([received - stamp]))
         if static or self.newest is None or stamp >= self.newest:
             self.parent, self.authority, self.static = parent, authority, static
             self.newest = None if static else stamp
         if parent not in self.parents:
             self.parents[parent] = None
-        if authority and authority not in self.authorities:
-            self.authorities[authority] = None
+
+    def count_columns(self, columns: Columns) -> None:
+        """Count moving samples with the parent of the newest edge."""
+        sent = self._sent_by(columns.authority)
+        stamps = columns.stamps
+        sent.moving += len(stamps)
+        sent.stamps.frombytes(stamps.tobytes())
+        sent.delays.add(columns.received - stamps)
+        newest = int(stamps.max())
+        if self.newest is None or newest >= self.newest:
+            self.newest, self.authority = newest, columns.authority
 
     def summary(self) -> FrameSummary:
         """The summary of all samples so far."""
-        stamps = np.unique(np.array(self.stamps, np.int64))
+        stamps = np.unique(np.concatenate([np.array(sent.stamps, np.int64) for sent in self.sent.values()]))
         several = len(stamps) > 1
         oldest, newest = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
         span = newest - oldest if several and newest is not None and oldest is not None else 0
         return FrameSummary(
             self.frame,
             tuple(self.parents),
-            self.static_count,
-            len(self.stamps),
+            sum(sent.static for sent in self.sent.values()),
+            sum(sent.moving for sent in self.sent.values()),
             oldest,
             newest,
             (len(stamps) - 1) * SECOND / span if several else None,
             int(np.diff(stamps).max()) / SECOND if several else None,
-            tuple(self.authorities),
+            tuple(authority for authority in self.sent if authority),
+            _periods(stamps),
+            Delays.joined(sent.delays for sent in self.sent.values()).spread(),
         )
+
+    def _sent_by(self, authority: str) -> _Sent:
+        sent = self.sent.get(authority)
+        if sent is None:
+            sent = self.sent[authority] = _Sent()
+        return sent
+
+
+def _sender(frames: Mapping[str, _Frame], authority: str) -> SenderSummary:
+    """The summary of an authority; its samples are taken away, so that they are not in memory twice."""
+    own = {child: frame.sent[authority] for child, frame in frames.items() if authority in frame.sent}
+    stamps = np.empty(sum(len(sent.stamps) for sent in own.values()), np.int64)
+    at = 0
+    for sent in own.values():
+        end = at + len(sent.stamps)
+        stamps[at:end] = sent.stamps
+        at = end
+        sent.stamps = array("q")
+    stamps.sort()
+    return SenderSummary(
+        authority,
+        tuple(sorted(own)),
+        sum(sent.static for sent in own.values()),
+        sum(sent.moving for sent in own.values()),
+        _periods(stamps),
+        Delays.joined(sent.delays for sent in own.values()).spread(),
+    )
+
+
+def _periods(stamps: npt.NDArray[np.int64]) -> Spread | None:
+    """The spread of the times between different stamps, which ascend."""
+    # In blocks, because the differences of millions of stamps would need as much memory once more.
+    periods = array("d")
+    for first in range(0, len(stamps), _BLOCK):
+        differences = np.diff(stamps[first : first + _BLOCK + 1])
+        periods.frombytes((differences[differences > 0] / SECOND).tobytes())
+    if not periods:
+        return None
+    values = np.array(periods)
+    rank = math.ceil(0.99 * len(values)) - 1
+    values.partition(rank)
+    mean = to_seconds(int(stamps[-1] - stamps[0])) / len(values)
+    return Spread(mean, float(values[rank]), float(values[rank:].max()))

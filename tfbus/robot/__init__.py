@@ -1,11 +1,24 @@
 """Robots described in URDF, and the transforms of their links for given positions of the joints.
 
 A `RobotModel` is a tree of links and joints, read from a URDF file or built by hand; a `RobotStatePublisher` publishes
-its transforms on a bus.
+its transforms on a bus. `read_visuals` reads the visible shapes of the links, which only pictures need.
 """
 
 from tfbus.robot.joint import Joint, Mimic
 from tfbus.robot.model import LimitViolation, RobotModel
 from tfbus.robot.state_publisher import RobotStatePublisher
+from tfbus.robot.visual import Box, Cylinder, Mesh, Sphere, Visual, read_visuals
 
-__all__ = ["Joint", "LimitViolation", "Mimic", "RobotModel", "RobotStatePublisher"]
+__all__ = [
+    "Box",
+    "Cylinder",
+    "Joint",
+    "LimitViolation",
+    "Mesh",
+    "Mimic",
+    "RobotModel",
+    "RobotStatePublisher",
+    "Sphere",
+    "Visual",
+    "read_visuals",
+]

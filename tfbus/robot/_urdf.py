@@ -65,8 +65,24 @@ class Urdf(NamedTuple):
     joints: tuple[Joint, ...]
 
 
+class Described(NamedTuple):
+    """One element of a robot, as urdf-parser-py interprets it."""
+
+    tag: str
+    label: str
+    """For errors."""
+    value: Any
+
+
 def read_urdf(source: str | os.PathLike[str]) -> Urdf:
-    """Read the links and joints of a URDF.
+    """Read the links and joints of a URDF; the source and the errors are those of `read_elements`."""
+    name, elements = read_elements(source)
+    links = tuple(each.value.name for each in elements if each.tag == "link")
+    return Urdf(name, links, tuple(_joint(each.value, each.label) for each in elements if each.tag == "joint"))
+
+
+def read_elements(source: str | os.PathLike[str]) -> tuple[str, list[Described]]:
+    """Read the name of a robot, and its links, joints and materials in the order of the file.
 
     Parameters
     ----------
@@ -92,16 +108,28 @@ def read_urdf(source: str | os.PathLike[str]) -> Urdf:
         raise InvalidRobotError(f"a URDF is a <robot>, but this is a <{robot.tag}>")
     _check_expanded(robot)
     name = _interpret(urdf, robot, element("robot", robot.get("name"))).name
-    links, joints = [], []
+    elements = []
     for part, label in _parts(robot):
         if part.tag == "material" and part.find("color") is None and part.find("texture") is None:
             raise InvalidRobotError("it has neither a color nor a texture", element=label)
-        found = _interpret(urdf, part, label)
-        if part.tag == "link":
-            links.append(found.name)
-        elif part.tag == "joint":
-            joints.append(_joint(found, label))
-    return Urdf(name, tuple(links), tuple(joints))
+        elements.append(Described(part.tag, label, _interpret(urdf, part, label)))
+    return name, elements
+
+
+def transform_of(origin: Any, label: str) -> Transform:
+    """The transform of an ``<origin>``; identity if there is none.
+
+    Raises
+    ------
+    InvalidRobotError
+        If it is not finite.
+    """
+    if origin is None:
+        return Transform()
+    try:
+        return Transform.from_xyz_rpy(origin.xyz, origin.rpy)
+    except InvalidTransformError as error:
+        raise InvalidRobotError(f"origin: {error}", element=label) from None
 
 
 def _parse(text: str | bytes) -> Element:
@@ -205,12 +233,6 @@ def _reduce(node: Element, label: str) -> Element:
 
 def _joint(found: Any, label: str) -> Joint:
     """Convert a joint of urdf-parser-py to a `Joint`."""
-    origin = Transform()
-    if found.origin is not None:
-        try:
-            origin = Transform.from_xyz_rpy(found.origin.xyz, found.origin.rpy)
-        except InvalidTransformError as error:
-            raise InvalidRobotError(f"origin: {error}", element=label) from None
     mimic = None
     if found.mimic is not None:
         multiplier, offset = found.mimic.multiplier, found.mimic.offset
@@ -221,7 +243,7 @@ def _joint(found: Any, label: str) -> Joint:
         kind=found.type,
         parent=found.parent,
         child=found.child,
-        origin=origin,
+        origin=transform_of(found.origin, label),
         axis=(1.0, 0.0, 0.0) if found.axis is None else tuple(found.axis),
         lower=found.limit.lower if limited else None,
         upper=found.limit.upper if limited else None,

@@ -126,6 +126,29 @@ class History:
         if stamp > self._cut_after:
             self._cut()
 
+    def push_many(self, stamps: Stamps, rows: npt.NDArray[np.float64]) -> None:
+        """Store samples that are newer than all others, from contiguous arrays of shape (n,) and (n, 7).
+
+        Raises
+        ------
+        ValueError
+            If their stamps do not ascend, or there is not one row for each.
+        """
+        if rows.size != 7 * len(stamps):
+            raise ValueError("each stamp needs a row of seven floats")
+        if not len(stamps):
+            return
+        if (self.stamps and self.stamps[-1] >= stamps[0]) or not (stamps[1:] > stamps[:-1]).all():
+            raise ValueError("pushed samples must be newer than all others, and in order")
+        records = np.empty((len(stamps), 8))
+        records[:, 0] = stamps.view(np.float64)
+        records[:, 1:] = rows
+        self.records += records.data.cast("B")
+        self.stamps.frombytes(stamps.tobytes())
+        self.horizon = self.stamps[-1] - self._keep
+        if self.stamps[-1] > self._cut_after:
+            self._cut()
+
     def put(self, index: int, stamp: int, row: Row) -> None:
         """Store a sample before the one at an index, or in its place if it has the same stamp."""
         record = _pack(stamp, *row)
@@ -160,6 +183,10 @@ class History:
             raise IndexError("no sample has this index")
         stamp, x, y, z, qx, qy, qz, qw = _unpack(self.records, at * _SIZE)
         return stamp, (x, y, z, qx, qy, qz, qw)
+
+    def row(self, at: int) -> Row | None:
+        """The row at a stamp; None if it is not plain."""
+        return climb((self,), at)
 
     def clear(self) -> None:
         """Forget all samples."""

@@ -8,6 +8,9 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+import numpy.typing as npt
+
 from tfbus.errors import DisconnectedError, UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import STAMP_MIN, Latest, as_stamp
@@ -161,6 +164,30 @@ class Forest:
                 self._tell_readers([sample.child for sample in batch])
         return plain
 
+    def can_append(self, parent: str, child: str, authority: str, stamps: npt.NDArray[np.int64]) -> bool:
+        """Whether moving samples of a frame are its next ones, so that inserting them changes nothing but stamps.
+
+        Parameters
+        ----------
+        parent, child, authority : str
+        stamps : int64 array of shape (n,)
+            ns; n is at least one.
+        """
+        history = self.frames.get(child)
+        return (
+            history is not None
+            and history.can_append(parent, authority, int(stamps[0]))
+            and bool((stamps[1:] > stamps[:-1]).all())
+        )
+
+    def append(self, child: str, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
+        """Store the samples that `can_append` has approved; the rows have shape (n, 7)."""
+        with self.lock:
+            self.frames[child].append_many(stamps, rows)
+            self.inserted += len(stamps)
+            if self._readers:
+                self._tell_readers([child])
+
     def insert_judged(self, sample: TransformStamped) -> Outcome:
         """Store one sample that closes no loop."""
         parent, child, stamp, row, authority, static = sample._fields
@@ -294,7 +321,7 @@ class Forest:
         return names_below(self.frames, names, above)
 
     def read_all(self, read: Callable[[FrameHistory], T]) -> dict[str, T]:
-        """What `read` gives for each frame, all of one moment.
+        """The result of `read` for each frame, all of one moment.
 
         Some frames are read at a time, so that insertions by another thread need not wait for all. Frames that have
         changed meanwhile are read again.

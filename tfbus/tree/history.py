@@ -2,14 +2,12 @@
 
 The kernel stores the moving samples, and appends those that only continue the others, as nearly all do. Everything else
 is decided here: late samples, changes of the parent, static samples. Every sample may name its own parent, because a
-frame may be reparented; the parents are stored as runs of samples with the same one.
+frame may be reparented; parents and authorities are stored as runs of samples with the same one.
 """
 
-from bisect import bisect_right
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
-from operator import itemgetter
 from typing import final
 
 import numpy as np
@@ -19,8 +17,7 @@ from tfbus.errors import ExtrapolationError, FutureExtrapolationError, PastExtra
 from tfbus.geometry.rows import IDENTITY, Row, interpolate
 from tfbus.stamps import SECOND, Latest, Stamps
 from tfbus.tree._kernel import Columns, History
-
-_stamp_of = itemgetter(0)
+from tfbus.tree._runs import Runs
 
 
 class Outcome(Enum):
@@ -63,13 +60,13 @@ class Samples:
     ----------
     columns : Columns
         The memory of the samples.
-    runs : list of (int, str)
-        The parent from a stamp (ns) on, in order; empty if all have the same.
+    parents, authorities : Runs
     """
 
-    def __init__(self, columns: Columns, runs: list[tuple[int, str]]) -> None:
+    def __init__(self, columns: Columns, parents: Runs, authorities: Runs) -> None:
         self._columns = columns
-        self._runs = runs
+        self._parents = parents
+        self._authorities = authorities
 
     def __len__(self) -> int:
         return self._columns[-1]
@@ -91,11 +88,12 @@ class Samples:
     @cached_property
     def parents(self) -> list[str] | None:
         """The parent of each sample; None if all have the same."""
-        if not self._runs:
-            return None
-        begins = np.array([stamp for stamp, _ in self._runs], np.int64)
-        numbers = np.maximum(begins.searchsorted(self.stamps, "right") - 1, 0)
-        return [self._runs[number][1] for number in numbers]
+        return self._parents.at_all(self.stamps) if self._parents else None
+
+    @cached_property
+    def authorities(self) -> list[str] | None:
+        """The authority of each sample; None if all have the same."""
+        return self._authorities.at_all(self.stamps) if self._authorities else None
 
 
 @final
@@ -124,7 +122,7 @@ class FrameHistory(History):
         clears it.
     """
 
-    __slots__ = ("_runs", "changed", "child", "static", "static_row", "static_stamp")
+    __slots__ = ("_authorities", "_parents", "changed", "child", "static", "static_row", "static_stamp")
 
     def __init__(self, child: str, parent: str, static: bool, keep: int | None) -> None:
         super().__init__(parent, keep)
@@ -133,8 +131,8 @@ class FrameHistory(History):
         self.static_stamp: int | None = None
         self.static_row: Row = IDENTITY
         self.changed = False
-        # The parent from a stamp on, in order; empty unless there are several.
-        self._runs: list[tuple[int, str]] = []
+        self._parents = Runs()
+        self._authorities = Runs()
 
     def __len__(self) -> int:
         return 1 if self.static else self.count
@@ -142,27 +140,41 @@ class FrameHistory(History):
     @property
     def named_parents(self) -> tuple[str, ...]:
         """The parents that samples in the window name."""
-        return tuple(dict.fromkeys(parent for _, parent in self._runs)) if self.mixed else (self.parent,)
+        return self._parents.names() if self.mixed else (self.parent,)
+
+    def can_append(self, parent: str, authority: str, oldest: int) -> bool:
+        """Whether moving samples from a stamp on are newer, and have the parent and the authority of the others."""
+        newest = self.newest
+        return (
+            newest is not None
+            and newest < oldest
+            and (self.parent, self.authority) == (parent, authority)
+            and not self.mixed
+        )
+
+    def append_many(self, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
+        """Store moving samples that `can_append` has approved; their stamps ascend. The rows have shape (n, 7)."""
+        self.push_many(np.ascontiguousarray(stamps), np.ascontiguousarray(rows))
 
     def insert(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
         """Store a moving sample; the window ends at the newest. A static sample is dropped first."""
+        newest = self.newest
+        if newest is not None and stamp <= newest:
+            return self._insert_late(parent, stamp, row, authority)
+        self.push(stamp, row)
         if self.static:
             self.static = False
             self.static_stamp = None
-            self.parent = parent
             self.changed = True
-        oldest, newest = self.oldest, self.newest
-        if newest is not None and stamp <= newest:
-            return self._insert_late(parent, stamp, row, authority)
+        if newest is not None:
+            self._parents.push(stamp, parent, self.parent)
+            self._authorities.push(stamp, authority, self.authority)
         if parent != self.parent:
-            if oldest is not None:
-                self._set_runs([*(self._runs or [(oldest, self.parent)]), (stamp, parent)])
             self.parent = parent
             self.changed = True
         self.authority = authority
-        self.push(stamp, row)
-        if self.mixed:
-            self._forget_old_runs()
+        if self._parents or self._authorities:
+            self._forget_old_names()
         return Outcome.INSERTED
 
     def insert_static(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
@@ -181,15 +193,15 @@ class FrameHistory(History):
     def clear(self) -> None:
         """Drop all moving samples; the newest parent is remembered."""
         super().clear()
+        self._parents.clear()
+        self._authorities.clear()
         if self.mixed:
-            self._set_runs([])
+            self.mixed = False
             self.changed = True
 
     def parent_at(self, stamp: int) -> str:
         """The parent that holds at `stamp`; outside the window, that of the nearest sample."""
-        if not self.mixed:
-            return self.parent
-        return self._runs[max(bisect_right(self._runs, stamp, key=_stamp_of) - 1, 0)][1]
+        return self._parents.at(stamp) if self.mixed else self.parent
 
     def covers(self, stamp: int) -> bool:
         """Whether the samples surround `stamp`, or the edge is static."""
@@ -208,6 +220,9 @@ class FrameHistory(History):
         """
         if self.static:
             return self.static_row
+        plain = self.row(at)
+        if plain is not None:
+            return plain
         i = self.find(at)
         stamp, row = self.sample(i) if i < self.count else (None, IDENTITY)
         if stamp == at:
@@ -234,7 +249,7 @@ class FrameHistory(History):
 
     def parent_changes(self) -> list[int]:
         """The stamps inside the window at which the parent changes."""
-        return [stamp for stamp, _ in self._runs[1:]]
+        return self._parents.changes()
 
     def beginnings(self) -> list[int]:
         """The stamps inside the window at which a parent begins to hold: the oldest, and each change."""
@@ -269,7 +284,8 @@ class FrameHistory(History):
         first = self.find(low)
         if first and (first == self.count or self.stamp(first) != low):
             first -= 1
-        return Samples(self.columns(first, self.find(high) + 1, wanted), self._runs)
+        columns = self.columns(first, self.find(high) + 1, wanted)
+        return Samples(columns, self._parents.copy(), self._authorities.copy())
 
     def edge(self) -> Edge:
         """The newest edge as plain data."""
@@ -282,16 +298,17 @@ class FrameHistory(History):
         twin.static_stamp = self.static_stamp
         twin.static_row = self.static_row
         twin.take(self)
-        twin._set_runs(self._runs.copy())
+        twin._parents = self._parents.copy()
+        twin._authorities = self._authorities.copy()
+        twin.mixed = self.mixed
         return twin
 
     def copy_within(self, keep: int | None) -> "FrameHistory":
         """An independent copy of the samples in the window, with a window of another length from now on."""
         twin = self.copy()
         twin.keep = keep
-        if twin.mixed:
-            twin._forget_old_runs()
-            twin.changed = False
+        twin._forget_old_names()
+        twin.changed = False
         return twin
 
     def _insert_late(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
@@ -303,37 +320,25 @@ class FrameHistory(History):
         if not at and not replaces:
             self.changed = True
         is_newest = replaces and at == self.count - 1
-        if self.mixed or parent != self.parent:
-            self._name_parent(parent, stamp, at, replaces)
-            self.changed = True
+        before = self.stamp(at - 1) if at else None
+        behind = at + replaces
+        after = self.stamp(behind) if behind < self.count else None
         self.put(at, stamp, row)
+        self._authorities.put(stamp, authority, before, after, self.authority)
+        if self.mixed or parent != self.parent:
+            self._parents.put(stamp, parent, before, after, self.parent)
+            self.mixed = bool(self._parents)
+            self.changed = True
         if is_newest:
             self.parent = parent
             self.authority = authority
         return Outcome.REPLACED if replaces else Outcome.INSERTED
 
-    def _name_parent(self, parent: str, stamp: int, at: int, replaces: bool) -> None:
-        """Note the parent of a late sample that will stand before the one at an index, or replace it."""
-        first, behind = self.stamp(0), at + replaces
-        runs = self._runs or [(first, self.parent)]
-        low = bisect_right(runs, self.stamp(at - 1), key=_stamp_of) if at else 0
-        after = self.stamp(behind) if behind < self.count else None
-        high = len(runs) if after is None else bisect_right(runs, after, key=_stamp_of)
-        fresh = [] if low and runs[low - 1][1] == parent else [(stamp, parent)]
-        if after is not None and runs[high - 1][1] != parent:
-            fresh.append((after, runs[high - 1][1]))
-        self._set_runs([*runs[:low], *fresh, *runs[high:]])
-
-    def _forget_old_runs(self) -> None:
-        """Forget the parents that no sample in the window names any longer."""
-        runs, oldest = self._runs, self.oldest
-        old = 0
-        while oldest is not None and old + 1 < len(runs) and runs[old + 1][0] <= oldest:
-            old += 1
-        if old:
-            self._set_runs(runs[old:])
-            self.changed = True
-
-    def _set_runs(self, runs: list[tuple[int, str]]) -> None:
-        self.mixed = len(runs) > 1
-        self._runs = runs if self.mixed else []
+    def _forget_old_names(self) -> None:
+        """Forget the parents and authorities that no sample in the window names any longer."""
+        oldest = self.oldest
+        if oldest is not None:
+            self._authorities.forget_before(oldest)
+            if self._parents.forget_before(oldest):
+                self.changed = True
+        self.mixed = bool(self._parents)

@@ -135,11 +135,17 @@ def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolatio
         raise AheadError(
             child=edge.child, stamp=bounds.not_after, oldest=edge.oldest, newest=edge.newest, authority=edge.authority
         )
+    if extrapolation is None and path.permanent:
+        try:
+            return common, path.row_at(common), False
+        except ExtrapolationError:
+            # Another way may count there. It is found outside, so that an error keeps no traceback of this one alive.
+            pass
     try:
-        path_then = path
-        if not path.permanent:
-            path_then = forest.find_path(path.frames[0], path.frames[-1], common)
-        row = path_then.row_at(common) if extrapolation is None else extrapolation.row(path_then, common)
+        way = path
+        if not path.permanent or path.root in forest.frames:
+            way = forest.find_path(path.frames[0], path.frames[-1], common)
+        row = way.row_at(common) if extrapolation is None else extrapolation.row(way, common)
     except TransformLookupError as error:
         # The lagging edge has to reach what the others still hold, or the far end of their gap. Where a parent has
         # changed, any later stamp of it may be enough.

@@ -2,10 +2,11 @@
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from tfbus.stamps import format_age, format_duration, format_stamp
+from tfbus.stamps import SECOND, format_age, format_duration, format_stamp
+from tfbus.tree.edge_state import state_of
 from tfbus.tree.history import Edge
 
 _NOT_IN_YAML = re.compile(r"[\x7f-\xa0\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
@@ -99,12 +100,35 @@ def _stacked(edges: list[Edge], indent: str) -> list[tuple[Edge, str, str]]:
     return rows[::-1]
 
 
-def to_dot(edges: Sequence[Edge]) -> str:
-    """The edges in Graphviz's language; static ones are dashed."""
+def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, float] | None = None) -> str:
+    """The edges in Graphviz's language; static ones are dashed.
+
+    Parameters
+    ----------
+    edges : sequence of Edge
+    now : int, optional
+        With it, each edge has the colour of its state at this stamp (ns), and its age and span in the label.
+    delays : mapping of str to float, optional
+        By child, the mean time in s from the stamp of a sample to its arrival; shown in the label.
+    """
     lines = ["digraph tf {"]
+    if now is not None:
+        lines += [
+            '    node [shape=box, style=rounded, fontname="Helvetica", fontsize=11, height=0.3];',
+            '    edge [fontname="Helvetica", fontsize=9];',
+        ]
     for edge in edges:
-        label = _rate(edge) + (f"\n{edge.authority}" if edge.authority else "")
+        known = facts(edge, now or 0)
+        known["authority"] = edge.authority
+        if now is None:
+            known = {"rate": known["rate"], "authority": edge.authority}
+        elif delays is not None and edge.child in delays:
+            known["delay"] = f"delay {format_duration(round(delays[edge.child] * SECOND))}"
+        label = "\n".join(filter(None, known.values()))
         style = ", style=dashed" if edge.static else ""
+        if now is not None:
+            colour = state_of(edge, now).value
+            style += f', color="{colour}", fontcolor="{colour}"'
         lines.append(f"    {_quoted(edge.parent)} -> {_quoted(edge.child)} [label={_quoted(label)}{style}];")
     return "\n".join([*lines, "}", ""])
 

@@ -21,6 +21,7 @@ from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome
+from tfbus.tree.html import legend, to_html
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer, bounds_of
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.rendering import describe, to_dot, to_yaml
@@ -464,13 +465,24 @@ class TransformTree:
         """
         return describe(self.edges(), now)
 
-    def to_dot(self) -> str:
-        """The tree in Graphviz's language; static edges are dashed."""
-        return to_dot(self.edges())
+    def to_dot(self, now: int | None = None) -> str:
+        """The tree in Graphviz's language; static edges are dashed.
+
+        Parameters
+        ----------
+        now : int, optional
+            With it, each edge has the colour of its state at this stamp (ns), and its age and span in the label.
+        """
+        return to_dot(self.edges(), now)
 
     def to_yaml(self) -> str:
         """The tree as YAML with tf2's keys; stamps in s."""
         return to_yaml(self.edges())
+
+    def _repr_html_(self) -> str:
+        """The tree as notebooks show it, with ages counted from the newest stamp in it."""
+        edges = self.edges()
+        return to_html(edges, max((edge.newest for edge in edges if edge.newest is not None), default=0)) + legend()
 
     def _check_writable(self, instead: str) -> None:
         if self._filled_by_bus:

@@ -4,18 +4,18 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.recorded import SMALL, WRONG_IN_SMALL, real, write_mcap
+from support.recorded import SMALL, WRONG_IN_SMALL, Line, real, write_mcap
 from support.samples import moving, static
 
 
 def rows_of(output: str) -> dict[str, list[str]]:
-    """The cells of each row of the table by frame; two blanks or more separate them."""
-    _, _, table = output.partition("\n\n")
+    """The cells of each row of the table of frames by frame; two blanks or more separate them."""
+    table = output.split("\n\n")[1]
     return {cells[0]: cells[1:] for line in table.splitlines() if (cells := re.split(r"  +", line.strip()))}
 
 
 def test_the_table_shows_every_frame_and_counts_invalid_transforms(tfbus: Command) -> None:
-    done = tfbus("info", SMALL)
+    done = tfbus("info", SMALL, "--wide")
     assert (done.returncode, done.stderr) == (0, "")
     head, _, _ = done.stdout.partition("\n\n")
     assert head.splitlines() == [
@@ -58,12 +58,14 @@ def test_json_has_all_digits(tfbus: Command) -> None:
         "span": 9.9,
         "longest_gap": 0.1,
         "authorities": ["slam"],
+        "period": {"mean": 0.1, "p99": 0.1, "max": 0.1},
+        "delay": {"mean": pytest.approx(0.002), "p99": 0.002, "max": 0.002},
     }
     assert frames["laser"]["oldest"] is None
 
 
 def test_the_date_and_the_senders_of_a_real_recording_are_shown(tfbus: Command) -> None:
-    done = tfbus("info", real("turtlesim.bag"))
+    done = tfbus("info", real("turtlesim.bag"), "--wide")
     assert "start     1396293887.844783943 s  2014-03-31 19:24:47 UTC" in done.stdout
     assert rows_of(done.stdout)["turtle1"] == [
         "world", "moving", "1,344", "62.5 Hz", "21.5 s", "16.2 ms", "turtle1_tf_broadcaster"
@@ -73,7 +75,7 @@ def test_the_date_and_the_senders_of_a_real_recording_are_shown(tfbus: Command) 
 def test_names_are_no_markup_and_not_cut_where_the_output_is_no_terminal(tmp_path: Path, tfbus: Command) -> None:
     long = "a_link_with_a_very_long_name_" * 10
     samples = [moving("[bold]map[/bold]", ":robot:", 1), moving(":robot:", long, 1)]
-    rows = rows_of(tfbus("info", write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)])).stdout)
+    rows = rows_of(tfbus("info", write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)]), "--wide").stdout)
     assert rows[":robot:"][0] == "[bold]map[/bold]"
     assert rows[long][0] == ":robot:"
 
@@ -81,7 +83,7 @@ def test_names_are_no_markup_and_not_cut_where_the_output_is_no_terminal(tmp_pat
 def test_names_cannot_control_the_terminal(tmp_path: Path, tfbus: Command) -> None:
     samples = [moving("\x1b[2Jroot", "red\x1b[31m\nhot", 1), moving("red\x1b[31m\nhot", "leaf", 1)]
     metadata = {"tfbus.authorities": json.dumps([["\x1b]0;title\x07", 1]])}
-    done = tfbus("info", write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)], metadata=metadata))
+    done = tfbus("info", write_mcap(tmp_path / "run.mcap", [(1, "/tf", samples)], metadata=metadata), "--wide")
     assert "\x1b" not in done.stdout
     assert r"frames    2, below \x1b[2Jroot" in done.stdout
     rows = rows_of(done.stdout)
@@ -91,7 +93,7 @@ def test_names_cannot_control_the_terminal(tmp_path: Path, tfbus: Command) -> No
 
 
 def test_no_line_ends_with_blanks(tfbus: Command) -> None:
-    assert all(line == line.rstrip() for line in tfbus("info", SMALL).stdout.splitlines())
+    assert all(line == line.rstrip() for line in tfbus("info", SMALL, "--wide").stdout.splitlines())
 
 
 def test_a_frame_of_both_kinds_shows_both(tmp_path: Path, tfbus: Command) -> None:
@@ -114,7 +116,9 @@ def test_an_unfinished_file_is_marked_and_read(tmp_path: Path, tfbus: Command) -
 def test_a_recording_without_transforms_has_no_table(tmp_path: Path, tfbus: Command) -> None:
     done = tfbus("info", write_mcap(tmp_path / "run.mcap", [(1, "/camera", b"")]))
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines()[-2:] == ["contents  0 transforms in 0 messages", "frames    0"]
+    head, topics = done.stdout.split("\n\n")
+    assert head.splitlines()[-3:-1] == ["contents  0 transforms in 0 messages", "frames    0"]
+    assert topics.splitlines()[0].split() == ["topic", "type", "messages", "read"]
 
 
 @pytest.mark.parametrize(
@@ -124,7 +128,7 @@ def test_a_recording_without_transforms_has_no_table(tmp_path: Path, tfbus: Comm
         (b"", "the file is empty"),
         (b"\x89MCAP0\r\n\x01", "the file ends before its first message"),
         (b"Dear diary,\n", "it is no recording of ROS 1 (.bag) or ROS 2 (.mcap, .db3)"),
-        (SMALL.read_bytes()[:-1_000], "it cannot be read as a bag of ROS 1: "),
+        (b"#ROSBAG V2.0\n", "the file ends before its first message"),
     ],
     ids=["missing", "empty", "truncated", "foreign", "truncated bag"],
 )
@@ -136,3 +140,34 @@ def test_a_file_that_is_no_recording_is_one_line_and_status_2(
         path.write_bytes(content)
     done = tfbus("info", path)
     check_wrong_call(done, f"recording '{path}': {why}")
+
+
+def test_all_lines_fit_80_columns_and_what_matters_least_is_left_out(
+    tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = tfbus("info", SMALL).stdout.split("\n\n", 1)[1].splitlines()
+    assert max(map(len, lines)) <= 80
+    assert lines[0].split() == ["frame", "parent", "kind", "samples", "rate", "longest", "gap", "authority"]
+    titles = [line for line in lines if line.startswith(("frame ", "sender ", "topic "))]
+    assert "delay p99" in titles[1]
+    assert len(titles) == 4
+
+
+def test_topics_that_are_not_read_are_listed_and_noted(tmp_path: Path, tfbus: Command) -> None:
+    lines: list[Line] = [
+        (1, "/tf", [moving("a", "b", 1)]),
+        (2, "/robot1/tf", [moving("a", "b", 1)]),
+        (3, "/robot1/tf", b""),
+    ]
+    done = tfbus("info", write_mcap(tmp_path / "run.mcap", lines))
+    assert "note      not read: 2 messages on topic /robot1/tf of type tf2_msgs/msg/TFMessage" in done.stdout
+    assert re.search(r"/robot1/tf +tf2_msgs/msg/TFMessage +2  no, it may hold transforms", done.stdout)
+    assert re.search(r"/tf +tf2_msgs/msg/TFMessage +1  yes", done.stdout)
+
+
+def test_what_is_lost_is_told_line_by_line(tmp_path: Path, tfbus: Command) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", b"nonsense"), (2, "/tf", [moving("a", "b", 1)])])
+    lines = tfbus("info", path).stdout.splitlines()
+    at = lines.index("left out  1 x encoding")
+    assert lines[at + 1].startswith("          it is not plain CDR")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call
-from support.recorded import SMALL, real, write_mcap
+from support.recorded import SMALL, Line, real, write_mcap
 from support.samples import moving, static
 
 from tfbus import TransformTree, from_seconds
@@ -171,6 +171,11 @@ def test_edges_that_never_overlap_are_a_failed_lookup(tmp_path: Path, tfbus: Com
     ("options", "why"),
     [
         (("--csv", "--json"), "give one of them"),
+        (("--tum", "--parquet", "x"), "give one of them"),
+        (("map", "arm", "--tum"), "ask for one pair"),
+        (("map",), "has no SOURCE"),
+        (("--topic", "/a", "--namespaces"), "give one of them"),
+        (("--stamps-of", "/nothing"), "nothing is on topic"),
         (("--at", "1", "--every", "1"), "give one of them"),
         (("--at", "noon"), "expected seconds, not 'noon'"),
         (("--at", "1.0000000001"), "more than nine decimals"),
@@ -220,3 +225,76 @@ def test_a_real_recording_has_the_transform_of_a_lookup(tfbus: Command) -> None:
     found = tree.lookup("turtle2", "carrot", stamp).transform
     assert json.loads(line)["translation"] == [*found.translation]
     assert json.loads(line)["rotation"] == [*found.rotation]
+
+
+def test_an_offset_counts_from_the_beginning_and_a_date_is_absolute(tmp_path: Path, tfbus: Command) -> None:
+    start = 1_396_293_890 * SECOND
+    lines = [(start + k * SECOND, "/tf", [moving("map", "base", start + k * SECOND, float(k))]) for k in range(5)]
+    path = write_mcap(tmp_path / "run.mcap", lines)
+    for at in ("2.5", "1396293892.5", "2014-03-31T19:24:52.5"):
+        (line,) = tfbus("query", path, "map", "base", "--at", at, "--json").stdout.splitlines()
+        assert json.loads(line)["translation"] == [2.5, 0.0, 0.0]
+
+
+def test_the_format_of_tum_has_eight_numbers_a_line(recording: Path, tfbus: Command) -> None:
+    done = tfbus("query", recording, "map", "base", "--every", "5", "--tum")
+    assert done.stdout.splitlines() == [
+        f"{1_700_000_000 + 5 * k}.123456789 {5.0 * k} 0.0 0.0 0.0 0.0 0.0 1.0" for k in range(3)
+    ]
+
+
+def test_several_pairs_are_told_apart(recording: Path, tfbus: Command) -> None:
+    done = tfbus("query", recording, "map", "base", "base", "laser", "--csv")
+    assert done.stdout.splitlines() == [
+        "target,source,stamp,x,y,z,qx,qy,qz,qw",
+        "map,base,1700000010.123456789,10.0,0.0,0.0,0.0,0.0,0.0,1.0",
+        "base,laser,0.000000000,100.0,0.0,0.0,0.0,0.0,0.0,1.0",
+    ]
+    table = tfbus("query", recording, "map", "base", "base", "laser").stdout.splitlines()
+    assert [table[at] for at in (0, 3, 4)] == ["base in map", "", "laser in base"]
+
+
+def test_parquet_has_a_row_for_each_transform(recording: Path, tmp_path: Path, tfbus: Command) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "rows.parquet"
+    done = tfbus("query", recording, "map", "base", "base", "laser", "--every", "5", "--parquet", path)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", f"4 rows in {path}\n")
+    rows = parquet.read_table(path).to_pylist()
+    assert [(row["target"], row["source"], row["x"], row["qw"]) for row in rows] == [
+        ("map", "base", 0.0, 1.0),
+        ("map", "base", 5.0, 1.0),
+        ("map", "base", 10.0, 1.0),
+        ("base", "laser", 100.0, 1.0),
+    ]
+    assert rows[1]["stamp"] == EPOCH + 5 * SECOND
+    check_wrong_call(tfbus("query", recording, "map", "base", "--parquet", tmp_path / "no" / "x"), "cannot write")
+    assert not (tmp_path / "no").exists()
+
+
+def test_the_stamps_of_another_topic_are_asked_for(tmp_path: Path, tfbus: Command) -> None:
+    lines: list[Line] = [(k, "/tf", [moving("map", "base", k, float(k))]) for k in range(10)]
+    lines += [(k, "/other", b"") for k in (3, 7, 20)]
+    path = write_mcap(tmp_path / "run.mcap", sorted(lines, key=lambda line: line[0]))
+    done = tfbus("query", path, "map", "base", "--stamps-of", "/other", "--csv")
+    assert [line.split(",")[1] for line in done.stdout.splitlines()[1:]] == ["3.0", "7.0"]
+    assert "the messages on /other have no headers: their log times are used" in done.stderr
+    assert "1 of 3 instants are left out" in done.stderr
+
+
+def test_namespaces_are_read_and_ignored_ones_are_mentioned(tmp_path: Path, tfbus: Command) -> None:
+    lines = [(1, f"{space}/tf", [moving("odom", "base", 1, x)]) for space, x in (("/r1", 1.0), ("/r2", 2.0))]
+    path = write_mcap(tmp_path / "run.mcap", lines)
+    done = tfbus("query", path, "r2/odom", "r2/base", "--namespaces", "--json")
+    assert json.loads(done.stdout)["translation"] == [2.0, 0.0, 0.0]
+    done = tfbus("query", path, "x/odom", "x/base", "--topic", "/r1/tf=x/", "--json")
+    assert json.loads(done.stdout)["translation"] == [1.0, 0.0, 0.0]
+    assert "not read: 1 messages on topic /r2/tf of type tf2_msgs/msg/TFMessage" in done.stderr
+
+
+def test_a_speed_limit_leaves_out_what_cannot_be(tmp_path: Path, tfbus: Command) -> None:
+    lines = [(k, "/tf", [moving("map", "base", k * SECOND, x)]) for k, x in enumerate([0.0, 1.0, 1e9, 3.0])]
+    done = tfbus(
+        "query", write_mcap(tmp_path / "run.mcap", lines), "map", "base", "--at", "2", "--max-speed", "5", "--json"
+    )
+    assert json.loads(done.stdout)["translation"] == [2.0, 0.0, 0.0]
+    assert "1 x speed" in done.stderr

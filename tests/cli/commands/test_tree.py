@@ -3,6 +3,7 @@ import json
 import os
 import pty
 import re
+import shutil
 import signal
 import subprocess
 from collections.abc import Mapping
@@ -16,8 +17,7 @@ from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus, Edge
-from tfbus.cli.arguments import UsageError
-from tfbus.cli.commands.tree import to_document, write_file
+from tfbus.cli.commands.tree import to_document
 
 TREE = r"""base_link
 ├── base_laser  \d+\.\d Hz  age .+  span .+  from 'robot_tf_publisher'
@@ -53,45 +53,6 @@ def test_the_document_has_each_frame_with_its_edge_and_null_for_missing_values()
     }
 
 
-def test_a_file_is_replaced_as_a_whole_without_leaving_others(tmp_path: Path) -> None:
-    path = tmp_path / "frames.dot"
-    for text in ("first", "second"):
-        write_file(path, text)
-        assert path.read_text() == text
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_file_that_cannot_be_replaced_leaves_nothing_unfinished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(errno.EIO, "Input/output error")
-
-    monkeypatch.setattr(Path, "replace", fail)
-    with pytest.raises(UsageError, match="Input/output error"):
-        write_file(tmp_path / "frames.dot", "digraph")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
-    try:
-        write_file(pipe, "digraph")
-        assert os.read(reader, 100) == b"digraph"
-    finally:
-        os.close(reader)
-    assert pipe.is_fifo()
-
-
-@pytest.mark.parametrize("name", ["nowhere/frames.dot", "."])
-def test_an_error_names_the_file_that_cannot_be_written(name: str, tmp_path: Path) -> None:
-    path = tmp_path / name
-    with pytest.raises(UsageError, match=re.escape(f"cannot write {path}: ")):
-        write_file(path, "")
-
-
 async def publish(bus: Bus) -> None:
     """A camera that is static, and after 2 s a laser at 10 Hz; their parent is the base."""
     bus.publish(static("base", "camera", authority="me"))
@@ -116,6 +77,23 @@ def test_the_tree_is_shown_after_the_duration_and_written_for_graphviz(
     first, *edges, last = dot.read_text().splitlines()
     assert (first, last) == ("digraph tf {", "}")
     assert [edge.partition(" [")[0].strip() for edge in edges] == ['"base" -> "camera"', '"base" -> "laser"']
+
+
+@pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")
+def test_the_picture_has_every_fact_of_each_edge(tfbus: Command, tmp_path: Path) -> None:
+    async def publish_late(bus: Bus) -> None:
+        bus.publish(static("base", "camera", authority="me"))
+        async for _ in bus.clock.ticks(10.0):
+            bus.publish(moving("base", "laser", bus.clock.now() - SECOND // 50, authority="driver"))
+
+    svg, pdf = tmp_path / "frames.svg", tmp_path / "frames.pdf"
+    done = tfbus.on_domain(publish_late, "tree", "--duration", "1.05", "--svg", svg, "--pdf", pdf)
+    assert (done.returncode, done.stderr) == (0, "")
+    drawn = svg.read_text(encoding="utf-8")
+    texts = ["base", "camera", "static", "me", "laser", "10.0 Hz", "driver", "delay 20 ms"]
+    assert [text for text in texts if f">{text}<" not in drawn] == []
+    assert "#009e73" in drawn
+    assert pdf.read_bytes().startswith(b"%PDF")
 
 
 def test_by_default_it_listens_for_a_second(tfbus: Command) -> None:

@@ -55,3 +55,12 @@ def test_only_the_newest_peers_are_remembered() -> None:
     assert len(scene.next()[1]) == MOST_PEERS
     scene.dialing.left("0")
     assert "0" not in [peer for peer, _ in scene.next()[1]]
+
+
+def test_all_addresses_of_a_peer_are_tried_in_turn_the_newest_first() -> None:
+    scene = Scene()
+    for address in ("tcp/there:1", "tcp/there:2", "tcp/there:1", "tcp/there:3"):
+        scene.dialing.reached("a", address)
+    scene.dialing.left("a")
+    tried = [address for _ in range(4) for _, address in scene.next()[1]]
+    assert [address[-1] for address in tried] == ["3", "1", "2", "3"]

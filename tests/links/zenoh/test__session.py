@@ -8,7 +8,7 @@ from uuid import uuid4
 
 import pytest
 import zenoh
-from support.processes import PATIENCE, free_ports, new_domain
+from support.processes import PATIENCE
 
 from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._receive_queue import Answer, Presence, Received
@@ -41,16 +41,6 @@ class End:
         while (came[-1].sender, came[-1].content) != (sender, content):
             came.append(self.next())
         return came
-
-
-@pytest.fixture
-def address() -> str:
-    return f"tcp/127.0.0.1:{free_ports(1)[0]}"
-
-
-@pytest.fixture
-def domain() -> str:
-    return new_domain()
 
 
 Join = Callable[[str], End]

@@ -3,6 +3,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zstandard
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in, write_mcap
@@ -108,3 +109,86 @@ def test_any_other_folder_is_no_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="a folder without files") as raised:
         open_recording(tmp_path)
     assert raised.value.reason == "foreign"
+
+
+def metadata(folder: Path, *files: str, topic: str = "/tf", count: int = 0) -> None:
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n"
+        + "".join(f"    - {file}\n" for file in files)
+        + f"  topics_with_message_count:\n    - topic_metadata: {{name: {topic}}}\n      message_count: {count}\n"
+    )
+
+
+def test_a_folder_is_what_its_metadata_name(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    write_mcap(tmp_path / "stray.mcap", LINES)
+    # As old versions wrote it, with the folder before the name.
+    metadata(tmp_path, "run/run_0.mcap", count=30)
+    assert batches_in(tmp_path) == EXPECTED
+    with open_recording(tmp_path) as recording:
+        assert recording.remarks == ("stray.mcap is ignored: metadata.yaml does not name it",)
+
+
+def test_a_file_that_the_metadata_name_and_is_not_there_is_told(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    metadata(tmp_path, "run_0.mcap", "run_1.mcap", count=30)
+    lost, *rest = messages_in(tmp_path)
+    assert "run_1.mcap': there is no such file" in str(lost.errors[0])
+    assert len(rest) == 30
+
+
+def test_a_name_that_leads_out_of_the_folder_does_not(tmp_path: Path) -> None:
+    (tmp_path / "bag").mkdir()
+    write_mcap(tmp_path / "secret.mcap", LINES)
+    metadata(tmp_path / "bag", "../secret.mcap")
+    with pytest.raises(RecordingError, match="there is no such file"):
+        open_recording(tmp_path / "bag")
+
+
+@pytest.mark.parametrize(
+    ("topic", "count", "says"),
+    [("/tf", 31, "promises 31 messages on '/tf', and 30 were found"), ("/gone", 3, "promises 3 messages on '/gone'")],
+)
+def test_what_the_metadata_promise_and_the_files_do_not_have_is_told(
+    tmp_path: Path, topic: str, count: int, says: str
+) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    metadata(tmp_path, "run_0.mcap", topic=topic, count=count)
+    *_, lost = messages_in(tmp_path)
+    assert says in str(lost.errors[0])
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "a: &a [*a]", "\0", "rosbag2_bagfile_information: {}", "- 1"])
+def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, text: str) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    (tmp_path / "metadata.yaml").write_text(text)
+    assert batches_in(tmp_path) == EXPECTED
+    with open_recording(tmp_path) as recording:
+        assert recording.remarks[0].startswith("metadata.yaml is ignored, as it cannot be read: ")
+
+
+def test_without_metadata_an_uncompressed_file_hides_the_compressed_one(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run_0.mcap", LINES)
+    (tmp_path / "run_0.mcap.zstd").write_bytes(zstandard.compress(path.read_bytes()))
+    assert batches_in(tmp_path) == EXPECTED
+    with open_recording(tmp_path) as recording:
+        assert recording.remarks == ("run_0.mcap.zstd is ignored: the uncompressed file of the same name is there",)
+
+
+def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    (folder / "run_0.db3.zstd").write_bytes(zstandard.compress(bytes(65 * 2**20)))
+    with pytest.raises(RecordingError, match="more than 67,108,864 bytes, which is the bound"):
+        open_recording(folder)
+    assert list(temporary.iterdir()) == []
+    whole = as_ros2(SMALL, tmp_path / "whole", StoragePlugin.SQLITE3, mode=CompressionMode.FILE, **ZSTD)
+    with open_recording(whole) as recording:
+        # What reads it has it open, and it has no name.
+        assert list(temporary.iterdir()) == []
+        assert sum(bool(message.batch) for message in recording.messages()) > 700

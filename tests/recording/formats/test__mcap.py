@@ -1,15 +1,18 @@
 import os
+import random
+import tracemalloc
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType
+from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import batches_in, facts, messages_in, write_mcap
 from support.samples import moving, static
@@ -102,7 +105,9 @@ def test_a_message_whose_log_time_is_no_stamp_is_reported_and_the_others_are_rea
         (message.received, len(message.batch), [str(each) for each in message.errors]) for message in messages_in(path)
     ]
     reasons = [f"no message of transforms (damaged): a message has the log time {time} ns" for time, _, _ in late]
-    assert found == [(5, 1, []), *((5, 0, [reason]) for reason in reasons)]
+    assert found[:3] == [(5, 1, []), *((5, 0, [reason]) for reason in reasons)]
+    # A finished file also promises three.
+    assert len(found) == 3 + finish
 
 
 def test_a_finished_file_without_messages_is_an_empty_recording(write: Write) -> None:
@@ -161,14 +166,18 @@ def test_a_damaged_chunk_is_reported_and_the_others_are_read(write: Write, finis
     path = write(LINES, finish=finish)
     damage(path, encode(EXPECTED[15][1]))
     messages = messages_in(path)
-    (lost,) = [message for message in messages if message.errors]
+    lost, *promised = [message for message in messages if message.errors]
     assert [error.reason for error in lost.errors] == ["damaged"]
+    assert "its checksum does not match" in str(lost.errors[0])
     assert lost.batch == ()
     read = [(message.received, message.batch) for message in messages if message.batch]
     missing = [place for place, line in enumerate(EXPECTED) if line not in read]
     assert 15 in missing
     assert missing == list(range(missing[0], missing[-1] + 1))
     assert len(missing) < 12
+    # A finished file promises how many messages there are.
+    expected = f"the file promises {COUNT} messages on '/tf', and {COUNT - len(missing)} were found"
+    assert [error.detail for message in promised for error in message.errors] == [expected] * finish  # type: ignore[union-attr]
     # It comes in the place of what is lost.
     assert messages.index(lost) == missing[0]
 
@@ -228,18 +237,22 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(write: Write) -> Non
     path.write_bytes(data)
     lost, *read = messages_in(path)
     assert [error.reason for error in lost.errors] == ["damaged"]
+    promised = [read.pop() for _ in range(2)]
+    assert ["promises" in str(message.errors) for message in promised] == [True, True]
     assert 0 < len(read) < len(EXPECTED)
     assert [(message.received, message.batch) for message in read] == EXPECTED[-len(read) :]
 
 
-def test_unreadable_records_end_the_reading_and_are_reported(write: Write) -> None:
+def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Write) -> None:
     path = write(LINES, finish=False)
     data = path.read_bytes()
     nonsense = b"\x04" + (100).to_bytes(8, "little") + b"\xff" * 100
     path.write_bytes(data + nonsense + data[8:])
-    *read, lost = messages_in(path)
-    assert [(message.received, message.batch) for message in read] == EXPECTED
+    messages = messages_in(path)
+    lost = messages.pop(len(EXPECTED))
+    assert [(message.received, message.batch) for message in messages] == EXPECTED * 2
     assert [error.reason for error in lost.errors] == ["damaged"]
+    assert f"the channel at byte {len(data)}" in str(lost.errors[0])
 
 
 @pytest.mark.parametrize(
@@ -323,7 +336,8 @@ THREE = [moving("a", name, 1) for name in "bcd"]
         ("3", [""] * 3),
         ('[["odometry", "x"]]', [""] * 3),
         ('[["odometry", 3], ["slam", -1]]', [""] * 3),
-        ('[["odometry", 1000000000000]]', [""] * 3),
+        ('[["odometry", 1000000000000]]', ["odometry"] * 3),
+        ('[["odometry", 1000000000000], ["slam", 1]]', [""] * 3),
     ],
 )
 def test_authorities_are_in_the_metadata_of_the_channel(write: Write, metadata: str, authorities: list[str]) -> None:
@@ -350,3 +364,118 @@ def test_several_iterations_are_independent(write: Write) -> None:
             next(first)
         rest: list[tuple[int, tuple[TransformStamped, ...]]] = [(its.received, its.batch) for its in second]
         assert rest == EXPECTED[1:]
+
+
+def errors_in(path: Path) -> list[str]:
+    return [str(error) for message in messages_in(path) for error in message.errors]
+
+
+def test_many_channels_that_claim_a_million_authorities_cost_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer: Any = Writer(file)
+        writer.start("ros2", "tests")
+        kind = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
+        claim = {AUTHORITIES: '[["a", 999999], ["b", 1]]'}
+        for number in range(1_000):
+            channel = writer.register_channel("/tf", "cdr", kind, claim)
+            writer.add_message(channel, number, encode([moving("a", "b", number)]), number)
+        writer.finish()
+    tracemalloc.start()
+    assert len(batches_in(path)) == 1_000
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 50_000_000
+
+
+def test_a_message_that_inflates_beyond_its_bound_is_refused_and_the_next_is_read(write: Write) -> None:
+    bomb = zstandard.compress(bytes(9 * 2**20))
+    path = write([(1, "/tf", bomb), (2, "/tf", [moving("a", "b", 2)])], chunk_size=100_000)
+    refused, good = messages_in(path)
+    assert [error.reason for error in refused.errors] == ["oversized"]
+    assert "more than 8,388,608 bytes, which is the bound" in str(refused.errors[0])
+    assert good.batch == (moving("a", "b", 2),)
+
+
+@pytest.mark.parametrize("finish", [True, False])
+@pytest.mark.parametrize("claim", [2**40, 200 * 2**20])
+def test_a_chunk_that_claims_another_size_than_it_has_is_not_inflated(write: Write, finish: bool, claim: int) -> None:
+    path = write(LINES, compression=CompressionType.ZSTD, finish=finish)
+    data = bytearray(path.read_bytes())
+    second = [place for place, opcode in records_in(data) if opcode == Opcode.CHUNK][1]
+    # Behind the header of the record and two times.
+    data[second + 25 : second + 33] = claim.to_bytes(8, "little")
+    path.write_bytes(data)
+    tracemalloc.start()
+    lost, *_ = errors_in(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert f"the chunk at byte {second}: it claims {claim:,} bytes" in lost
+    assert peak < 20_000_000
+
+
+def test_the_whole_part_of_a_torn_chunk_is_read(write: Write) -> None:
+    # Incompressible, so that a chunk has several blocks of Zstandard.
+    rng = random.Random(1)
+    lines = [(k, "/tf", [moving("a", "b", k, rng.random())]) for k in range(5_000)]
+    path = write(lines, compression=CompressionType.ZSTD, chunk_size=10_000_000)
+    whole = [(received, tuple(samples)) for received, _, samples in lines]
+    chunk = next(place for place, opcode in records_in(path.read_bytes()) if opcode == Opcode.CHUNK)
+    size = int.from_bytes(path.read_bytes()[chunk + 1 : chunk + 9], "little")
+    counts = []
+    for part in (0.5, 0.7, 0.95):
+        os.truncate(path, chunk + 9 + int(part * size))
+        found = batches_in(path)
+        assert found == whole[: len(found)]
+        counts.append(len(found))
+        path = write(lines, compression=CompressionType.ZSTD, chunk_size=10_000_000)
+    assert 0 < counts[0] < counts[1] < counts[2] < 5_000
+
+
+@pytest.mark.parametrize(
+    ("part", "says"),
+    [
+        (b"/tf_static", "topic /tg_static"),
+        (b"tf2_msgs/msg/TFMessage", "of type tg2_msgs/msg/TFMessage"),
+    ],
+)
+def test_a_name_in_the_index_that_no_longer_is_one_of_transforms_is_mentioned(
+    write: Write, part: bytes, says: str
+) -> None:
+    path = write(LINES, enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    place = data.rindex(part) + part.index(b"f")
+    data[place] ^= 1
+    path.write_bytes(data)
+    with open_recording(path) as recording:
+        assert any(says in remark for remark in recording.remarks)
+
+
+def test_an_index_that_no_longer_leads_to_a_chunk_with_transforms_is_told(write: Write) -> None:
+    path = write(LINES, enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    entry = next(place for place, opcode in records_in(data) if opcode == Opcode.CHUNK_INDEX)
+    # The length of the chunk.
+    data[entry + 33 : entry + 41] = (2**40).to_bytes(8, "little")
+    path.write_bytes(data)
+    assert any("it is behind the end of the file" in text for text in errors_in(path))
+    assert any("promises" in text for text in errors_in(path))
+
+
+@given(data=st.data())
+def test_one_flipped_bit_never_loses_a_message_in_silence(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("recording") / "run.mcap"
+    whole = bytearray(write_mcap(path, LINES[:15], enable_crcs=data.draw(st.booleans())).read_bytes())
+    place = data.draw(st.integers(8, len(whole) - 1))
+    whole[place] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(whole)
+    try:
+        messages = messages_in(path)
+    except RecordingError:
+        return
+    with open_recording(path) as recording:
+        told = recording.remarks or not recording.finished
+    read = sum(bool(message.batch) for message in messages)
+    assert read == 15 or told or any(message.errors for message in messages)

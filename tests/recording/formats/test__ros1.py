@@ -1,13 +1,19 @@
+import re
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import SMALL, facts, messages_in, sender_of
-from support.samples import moving
+from support.samples import moving, static
 
-from tfbus import RecordingError
+from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
+from tfbus.recording.formats._bag_records import find_chunk, read_record
 from tfbus.tf_message import encode
 
 SECOND = 1_000_000_000
@@ -57,39 +63,188 @@ def test_a_range_includes_both_ends() -> None:
     assert statics == {"laser", "camera", "arm", "table"}
 
 
-def test_a_bag_that_was_never_finished_says_what_helps(tmp_path: Path) -> None:
-    path = tmp_path / "run.bag.active"
+Line = tuple[int, str, list[TransformStamped]]
+
+LINES: list[Line] = [
+    (10, "/tf_static", [static("base", "laser", 1.0)]),
+    *((100 + k, "/tf", [moving("odom", "base", k, float(k)), moving("base", "wheel", k)]) for k in range(60)),
+]
+EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
+
+
+def write_bag(
+    path: Path, lines: Iterable[Line] = LINES, compression: Writer.CompressionFormat | None = None, chunk: int = 2_000
+) -> bytes:
+    """A bag by the writer of `rosbags`; returns its bytes."""
     types = get_typestore(Stores.ROS2_HUMBLE)
+    path.unlink(missing_ok=True)
     writer = Writer(path)
-    writer.open()
-    connection = writer.add_connection("/tf", "tf2_msgs/msg/TFMessage", typestore=types)
-    payload = types.cdr_to_ros1(encode([moving("a", "b", 1)]), "tf2_msgs/msg/TFMessage")
-    writer.write(connection, 1, payload)
-    torn = path.read_bytes()
-    writer.close()
-    path.write_bytes(torn)
-    with pytest.raises(RecordingError, match="reindex") as raised:
-        open_recording(path)
-    assert raised.value.reason == "damaged"
+    if compression is not None:
+        writer.set_compression(compression)
+    writer.chunk_threshold = chunk
+    with writer:
+        topics = {}
+        for received, topic, samples in lines:
+            if topic not in topics:
+                topics[topic] = writer.add_connection(topic, "tf2_msgs/msg/TFMessage", typestore=types, callerid="")
+            payload = types.cdr_to_ros1(encode(samples), "tf2_msgs/msg/TFMessage")
+            writer.write(topics[topic], received, bytes(payload))
+    return path.read_bytes()
 
 
-def test_a_bag_that_is_cut_is_refused_or_says_what_is_lost(tmp_path: Path) -> None:
+def read(path: Path) -> tuple[list[tuple[int, tuple[TransformStamped, ...]]], list[str]]:
+    """What is read of a recording, and what is said to be lost."""
+    messages = messages_in(path)
+    batches = [(message.received, message.batch) for message in messages if message.batch]
+    return batches, [str(error) for message in messages for error in message.errors]
+
+
+def chunks_in(data: bytes) -> list[int]:
+    """Where the headers of the chunks begin, in a bag by `rosbags`."""
+    return [
+        found.start()
+        for found in re.finditer(rb"....\x04\0\0\0op=\x05|....\x10\0\0\0compression=none", data, re.DOTALL)
+    ]
+
+
+COMPRESSIONS = [None, *Writer.CompressionFormat]
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_all_messages_are_read_with_an_index_and_without(
+    tmp_path: Path, compression: Writer.CompressionFormat | None
+) -> None:
     path = tmp_path / "run.bag"
-    data = SMALL.read_bytes()
-    for size in range(20, len(data), 997):
+    data = write_bag(path, compression=compression)
+    assert read(path) == (EXPECTED, [])
+    with open_recording(path) as recording:
+        assert facts(recording) == (10, 159, 61, True)
+    index = int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
+    path.write_bytes(data[:index])
+    assert read(path) == (EXPECTED, [])
+    with open_recording(path) as recording:
+        assert facts(recording) == (10, 159, 61, False)
+
+
+@pytest.mark.parametrize(
+    "compression", [None, *(pytest.param(kind, marks=pytest.mark.thorough) for kind in Writer.CompressionFormat)]
+)
+def test_a_bag_cut_at_any_byte_gives_the_messages_before_the_cut(
+    tmp_path: Path, compression: Writer.CompressionFormat | None
+) -> None:
+    path = tmp_path / "run.bag"
+    data = write_bag(path, LINES[:12], compression, chunk=600)
+    counts = []
+    for size in range(20, len(data), 7):
         path.write_bytes(data[:size])
-        with pytest.raises(RecordingError) as raised:
-            open_recording(path)
-        assert raised.value.reason == "damaged"
-        assert "\n" not in str(raised.value)
+        try:
+            found, lost = read(path)
+        except RecordingError as error:
+            assert error.reason == "truncated"
+            found, lost = [], []
+        assert (found, lost) == (EXPECTED[: len(found)], [])
+        counts.append(len(found))
+    assert counts == sorted(counts)
+    assert counts[-1] == 12
+    if compression is None:
+        # Within the chunks, the messages come one by one.
+        assert set(range(13)) <= set(counts)
 
 
-def test_damage_inside_of_a_bag_is_counted(tmp_path: Path) -> None:
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_the_last_chunk_of_a_writer_that_was_killed_is_read(
+    tmp_path: Path, compression: Writer.CompressionFormat | None
+) -> None:
+    path = tmp_path / "run.bag.active"
+    data = bytearray(write_bag(path, compression=compression))
+    # While it writes a chunk, `rosbag` has a size of zero in the header, and no index.
+    with path.open("rb") as file:
+        last = max(
+            (record for record in map(partial(read_record, file), chunks_in(bytes(data))) if record.kind == 5),
+            key=lambda record: record.offset,
+        )
+    data[last.data - 4 : last.data] = bytes(4)
+    size = data.index(b"size=", last.offset) + 5
+    data[size : size + 4] = bytes(4)
+    place = data.index(b"index_pos=") + 10
+    data[place : place + 8] = bytes(8)
+    path.write_bytes(data[: last.end])
+    assert read(path) == (EXPECTED, [])
+
+
+def test_behind_a_damaged_record_reading_goes_on_with_the_next_chunk(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
-    data = bytearray(SMALL.read_bytes())
-    middle = data.index(b"BZh", len(data) // 2)
-    data[middle + 100 : middle + 110] = b"\xff" * 10
+    data = bytearray(write_bag(path))
+    second, third = chunks_in(bytes(data))[1:3]
+    # The length of the header of a message in the second chunk.
+    place = data.index(b"time=", data.index(b"time=", second) + 100) - 4
+    assert second < place < third
+    data[place + 3] ^= 0x80
     path.write_bytes(data)
-    *read, lost = messages_in(path)
-    assert [error.reason for error in lost.errors] == ["damaged"]
-    assert 100 < len(read) < len(messages_in(SMALL))
+    found, (damage, promised) = read(path)
+    missing = [line for line in EXPECTED if line not in found]
+    assert 0 < len(missing) < 25
+    assert found == [line for line in EXPECTED if line not in missing]
+    assert f"the chunk at byte {second}: " in damage
+    assert f"the file promises 60 messages on '/tf', and {60 - len(missing)} were found" in promised
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_damaged_chunk_header_loses_one_chunk(tmp_path: Path, indexed: bool) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(write_bag(path))
+    second, third = chunks_in(bytes(data))[1:3]
+    data[second + 3] ^= 0x40
+    if not indexed:
+        place = data.index(b"index_pos=") + 10
+        data[place : place + 8] = bytes(8)
+    path.write_bytes(data)
+    found, lost = read(path)
+    missing = [line for line in EXPECTED if line not in found]
+    assert 0 < len(missing) < 25
+    assert found == [line for line in EXPECTED if line not in missing]
+    assert (f"the chunk at byte {second}: " if indexed else f"from byte {second} to byte {third}") in lost[0]
+
+
+def test_a_chunk_that_claims_too_much_is_not_unfolded(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(write_bag(path, compression=Writer.CompressionFormat.BZ2))
+    with path.open("rb") as file:
+        first = read_record(file, find_chunk(file, 13) or 0)
+    size = data.index(b"size=", first.offset) + 5
+    data[size : size + 4] = (300 * 2**20).to_bytes(4, "little")
+    path.write_bytes(data)
+    found, lost = read(path)
+    assert len(found) < len(EXPECTED)
+    assert "claims 314,572,800 bytes, and 268,435,456 is the bound" in lost[0]
+
+
+def test_a_type_that_one_flipped_bit_has_made_unknown_is_mentioned(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(write_bag(path))
+    index = int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
+    place = data.index(b"type=tf2_msgs", index) + 5
+    data[place] ^= 1
+    path.write_bytes(data)
+    with open_recording(path) as recording:
+        remarks = recording.remarks
+    assert any("uf2_msgs/TFMessage" in remark for remark in remarks)
+
+
+@given(data=st.data())
+def test_one_flipped_bit_never_loses_a_message_in_silence(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("recording") / "run.bag"
+    whole = bytearray(write_bag(path, LINES[:15], chunk=800))
+    place = data.draw(st.integers(0, len(whole) - 1))
+    whole[place] ^= 1 << data.draw(st.integers(0, 7))
+    path.write_bytes(whole)
+    try:
+        found, lost = read(path)
+    except RecordingError:
+        return
+    with open_recording(path) as recording:
+        remarks = recording.remarks
+        finished = recording.finished
+    assert len(found) == 15 or lost or remarks or not finished

@@ -1,36 +1,28 @@
-import pytest
+from collections import Counter
 
-from tfbus.recording.formats._storage import Channel, channel_of
+from tfbus.recording.formats._storage import Channel, StoredMessage, select, shortfalls
 
-TF = "tf2_msgs/msg/TFMessage"
-
-
-@pytest.mark.parametrize(
-    ("topic", "static"), [("/tf", False), ("tf", False), ("/tf_static", True), ("tf_static", True)]
-)
-@pytest.mark.parametrize("kind", [TF, "tf2_msgs/TFMessage", "tf/tfMessage", "tf/msg/tfMessage"])
-def test_transforms_are_on_two_topics_under_the_names_of_four_types(topic: str, static: bool, kind: str) -> None:
-    assert channel_of(topic, kind, {}) == Channel(static)
+TF, OTHER, STATIC = Channel("/tf", "", "cdr"), Channel("/tf", "", "cdr"), Channel("/tf_static", "", "cdr")
+BLOCKS: list[list[StoredMessage]] = [[(1, TF, b"a"), (2, STATIC, b"b")], [], [(3, TF, b"c"), (4, TF, b"d")]]
 
 
-@pytest.mark.parametrize("topic", ["/robot1/tf", "/TF", "/tf/", "//tf", "", "/", "/tf_stat"])
-def test_other_topics_are_not(topic: str) -> None:
-    assert channel_of(topic, TF, {}) is None
+def test_a_range_includes_both_ends_and_what_is_in_it_is_counted() -> None:
+    read: Counter[Channel] = Counter()
+    assert [stored[0] for stored in select(BLOCKS, 2, 3, read)] == [2, 3]
+    assert (read[TF], read[STATIC]) == (1, 1)
+    assert [stored[0] for stored in select(BLOCKS, None, None, Counter())] == [1, 2, 3, 4]
 
 
-@pytest.mark.parametrize("kind", ["", "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/tfmessage"])
-def test_other_types_are_not(kind: str) -> None:
-    assert channel_of("/tf", kind, {}) is None
+def test_a_log_time_that_is_no_stamp_is_lost_at_the_time_before() -> None:
+    blocks: list[list[StoredMessage]] = [[(7, TF, b"")], [(2**63, TF, b""), (9, TF, b"")]]
+    _, (received, error, _), (last, _, _) = select(blocks, None, None, Counter())
+    assert (received, last) == (7, 9)
+    assert "has the log time 9223372036854775808 ns" in str(error)
 
 
-def test_a_single_authority_goes_for_any_number_of_transforms() -> None:
-    channel = Channel(False, ("slam",))
-    assert [*channel.tags(1)] == [("slam", False)]
-    assert [*channel.tags(3)] == [("slam", False)] * 3
-    assert [*channel.tags(0)] == []
-
-
-def test_several_authorities_go_for_as_many_transforms_or_for_none() -> None:
-    channel = Channel(True, ("slam", "arm"))
-    assert [*channel.tags(2)] == [("slam", True), ("arm", True)]
-    assert [*channel.tags(3)] == [("", True)] * 3
+def test_what_is_promised_is_compared_by_topic() -> None:
+    # A flipped bit may turn the number of one channel into that of another one of the topic.
+    assert list(shortfalls(5, {TF: 2, OTHER: 2, STATIC: 1}, Counter({TF: 1, OTHER: 3, STATIC: 1}))) == []
+    ((received, error, payload),) = shortfalls(5, {TF: 2, OTHER: 2, STATIC: 1}, Counter({TF: 1, OTHER: 2, STATIC: 1}))
+    assert (received, payload) == (5, b"")
+    assert "the file promises 4 messages on '/tf', and 3 were found" in str(error)

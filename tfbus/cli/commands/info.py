@@ -1,22 +1,48 @@
 """``tfbus info``."""
 
 import json
-import sys
+import shutil
 from collections.abc import Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from tfbus.cli.arguments import JsonFlag
-from tfbus.cli.output import format_counts, format_seconds, printable, track
-from tfbus.recording.recording import open_recording
-from tfbus.recording.summary import FrameSummary, RecordingSummary, summarise
+from tfbus.cli._table import Column, table_lines
+from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, JsonFlag, TopicOptions
+from tfbus.cli.output import format_counts, format_seconds, printable, progress
+from tfbus.recording.recording import RecordedTopic
+from tfbus.recording.spread import Spread
+from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
 from tfbus.stamps import SECOND, format_duration, from_seconds
 
+_SPREADS = tuple(
+    Column(f"{what} {value}", right=True) for what in ("period", "delay") for value in ("mean", "p99", "max")
+)
+# The mean is the rate in other words; the least important column has the lowest number.
+_IMPORTANCE = (1, 2, 4, 3, 5, 6)
+_TIMES = tuple(column._replace(importance=importance) for column, importance in zip(_SPREADS, _IMPORTANCE, strict=True))
+_FRAMES = (
+    Column("frame"),
+    Column("parent"),
+    Column("kind", importance=5),
+    Column("samples", right=True, importance=3),
+    Column("rate", right=True, importance=6),
+    Column("span", right=True, importance=1),
+    Column("longest gap", right=True, importance=2),
+    Column("authority", importance=4),
+)
+_SENDERS = (Column("sender"), Column("frames", right=True, importance=7), Column("samples", right=True, importance=8))
+_TOPICS = (Column("topic"), Column("type", importance=1), Column("messages", right=True, importance=2), Column("read"))
 
-def info(file: Path, /, *, as_json: JsonFlag = False) -> None:
-    """Print the contents of a recording: its frames with their parents, rates, gaps, authorities and errors.
+
+def info(
+    file: Path, /, *, as_json: JsonFlag = False, wide: Flag = False, topics: TopicOptions = DEFAULT_TOPICS
+) -> None:
+    """Print the contents of a recording: its topics, its frames with parents, rates, gaps and delays, and its senders.
+
+    A period is the time between two stamps, a delay the time from a stamp to the log time; of each the mean, what 99 %
+    do not exceed, and the greatest are shown. Columns that do not fit the terminal are left out.
 
     Example: tfbus info run.mcap
 
@@ -25,14 +51,33 @@ def info(file: Path, /, *, as_json: JsonFlag = False) -> None:
     file
         A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
     as_json
-        Print a JSON object instead of a table, with times in s and instants as text with all digits.
+        Print a JSON object instead of tables, with times in s and instants as text with all digits.
+    wide
+        Print all columns, however long the lines are.
     """
-    with open_recording(file) as recording:
-        summary = summarise(recording, track(recording.messages(), recording.count, "reading"))
+    with topics.open(file) as recording, progress(recording.count, "reading") as advance:
+        summary = summarise(recording, progress=advance)
     if as_json:
         print(json.dumps(_to_json(summary), indent=2))
-    else:
-        _print_table(summary)
+        return
+    width = None if wide else shutil.get_terminal_size((80, 24)).columns
+    for line in _heading(summary):
+        print(line)
+    frames = [_frame_row(frame) for frame in summary.frames]
+    timed = [frame for frame in summary.frames if frame.moving]
+    times = [(printable(frame.frame), *_times(frame.period, frame.delay)) for frame in timed]
+    senders = [_sender_row(sender) for sender in summary.senders]
+    tables = (
+        (_FRAMES, frames),
+        ((_FRAMES[0], *_TIMES), times),
+        ((*_SENDERS, *_TIMES), senders),
+        (_TOPICS, [_topic_row(topic) for topic in summary.topics]),
+    )
+    for columns, rows in tables:
+        if rows:
+            print()
+            for line in table_lines(columns, rows, width):
+                print(line)
 
 
 def _to_json(summary: RecordingSummary) -> dict[str, Any]:
@@ -59,31 +104,6 @@ def _format_instant(stamp: int | None) -> str | None:
     return None if stamp is None else format_seconds(stamp)
 
 
-def _print_table(summary: RecordingSummary) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    for line in _heading(summary):
-        print(line)
-    if not summary.frames:
-        return
-    print()
-    table = Table(box=None, pad_edge=False, header_style="")
-    numeric = ("samples", "rate", "span", "longest gap")
-    for column in ("frame", "parent", "kind", *numeric, "authority"):
-        table.add_column(column, justify="right" if column in numeric else "left", overflow="fold")
-    for frame in summary.frames:
-        table.add_row(*_row(frame))
-    # Frame names are no markup; and rows are not wrapped where a program reads them.
-    width = None if sys.stdout.isatty() else 10_000
-    console = Console(markup=False, emoji=False, highlight=False, width=width)
-    # Rich would end the program by itself if the reader has closed the pipe.
-    with console.capture() as drawn:
-        console.print(table)
-    for line in drawn.get().splitlines():
-        print(line.rstrip())
-
-
 def _heading(summary: RecordingSummary) -> list[str]:
     lines = [printable(f"{summary.path}") + ("" if summary.finished else ", not finished by its writer")]
     if summary.start is not None and summary.end is not None:
@@ -95,6 +115,8 @@ def _heading(summary: RecordingSummary) -> list[str]:
     lines.append(f"frames    {len(summary.frames):,}{below}")
     if summary.problems:
         lines.append(f"left out  {format_counts(summary.problems)}")
+    lines += [f"          {printable(detail)}" for detail in summary.details]
+    lines += [f"note      {printable(remark)}" for remark in summary.remarks]
     return lines
 
 
@@ -105,17 +127,41 @@ def _format_date(stamp: int) -> str:
         return ""
 
 
-def _row(frame: FrameSummary) -> tuple[str, ...]:
+def _frame_row(frame: FrameSummary) -> tuple[str, ...]:
     return (
         printable(frame.frame),
         _join_names(frame.parents),
         "static, moving" if frame.kind == "both" else frame.kind,
         f"{frame.static + frame.moving:,}",
         "" if frame.rate is None else f"{frame.rate:.1f} Hz",
-        "" if frame.span is None else format_duration(from_seconds(frame.span)),
-        "" if frame.longest_gap is None else format_duration(from_seconds(frame.longest_gap)),
+        _duration(frame.span),
+        _duration(frame.longest_gap),
         _join_names(frame.authorities),
     )
+
+
+def _sender_row(sender: SenderSummary) -> tuple[str, ...]:
+    name = printable(sender.authority) or "(unknown)"
+    count = sender.static + sender.moving
+    return name, f"{len(sender.frames):,}", f"{count:,}", *_times(sender.period, sender.delay)
+
+
+def _topic_row(topic: RecordedTopic) -> tuple[str, ...]:
+    count = "" if topic.count is None else f"{topic.count:,}"
+    read = "yes" if topic.read else "no, it may hold transforms" if topic.ignored else "no"
+    return printable(topic.name), printable(topic.type), count, read
+
+
+def _times(*spreads: Spread | None) -> list[str]:
+    return [
+        _duration(value)
+        for spread in spreads
+        for value in ((None, None, None) if spread is None else (spread.mean, spread.p99, spread.max))
+    ]
+
+
+def _duration(seconds: float | None) -> str:
+    return "" if seconds is None else format_duration(from_seconds(seconds))
 
 
 def _join_names(names: Iterable[str]) -> str:

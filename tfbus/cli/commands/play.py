@@ -9,12 +9,11 @@ import anyio
 from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Flag, Instant, Speed, UsageError
+from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, Instant, Speed, Time, TopicOptions, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_counts, say, warn
 from tfbus.events import PeerJoined
 from tfbus.recording.player import Player
-from tfbus.recording.recording import open_recording
 from tfbus.stamps import to_seconds
 
 _DISCOVERY = 1.0
@@ -30,6 +29,7 @@ def play(
     loop: Flag = False,
     since: Annotated[Instant | None, Parameter(name="--from")] = None,
     until: Annotated[Instant | None, Parameter(name="--to")] = None,
+    topics: TopicOptions = DEFAULT_TOPICS,
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
     """Publish a recording on a domain with its original stamps and timing, static transforms first.
@@ -45,14 +45,14 @@ def play(
     loop
         Start again at the end, until Ctrl-C.
     since
-        Where to start, in seconds from the beginning of the recording.
+        Where to start: seconds from the beginning of the recording, a stamp in seconds, or a date.
     until
-        Where to stop, in seconds from the beginning of the recording.
+        Where to stop, in the same ways.
     """
-    start, end = _log_times(file, since, until)
+    start, end = _log_times(file, topics, since, until)
 
     async def play_to_domain(bus: Bus) -> None:
-        player = Player(bus, file, rate=rate, loop=loop, since=start, until=end)
+        player = Player(bus, file, rate=rate, loop=loop, since=start, until=end, **topics.arguments())
         await _wait_for_peer(bus)
         say(f"playing {file} on domain {link.domain!r}")
         async with anyio.create_task_group() as tasks:
@@ -67,21 +67,25 @@ def play(
     link.run(play_to_domain)
 
 
-def _log_times(file: Path, since: int | None, until: int | None) -> tuple[int | None, int | None]:
-    """The log times, in ns, of two offsets from the beginning of the recording."""
-    if since is not None and since < 0:
-        raise UsageError("--from must not be negative")
-    if until is not None and until < (since or 0):
-        raise UsageError("--to must not be before --from")
-    with open_recording(file) as recording:
+def _log_times(
+    file: Path, topics: TopicOptions, since: Time | None, until: Time | None
+) -> tuple[int | None, int | None]:
+    """The log times, in ns, of the first and the last instant to play."""
+    with topics.open(file) as recording:
         if not recording.finished:
             warn(f"{file} was not finished by its writer: this is what can be read")
         start, end = recording.start, recording.end
+        for remark in recording.remarks:
+            warn(remark)
     if start is None or end is None:
         return None, None
-    if since is not None and start + since > end:
+    first = None if since is None else since.stamp(start)
+    last = None if until is None else until.stamp(start)
+    if last is not None and last < (start if first is None else first):
+        raise UsageError("--to must not be before --from, or before the beginning")
+    if first is not None and first > end:
         raise UsageError(f"--from is behind the end: {file} is {to_seconds(end - start):.3f} s long")
-    return (None if since is None else start + since), (None if until is None else start + until)
+    return first, last
 
 
 async def _wait_for_peer(bus: Bus) -> None:

@@ -1,35 +1,25 @@
 """``tfbus query``."""
 
-import csv
-import json
 import sys
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
+import numpy.typing as npt
 from cyclopts import Parameter
 
-from tfbus.cli.arguments import Instant, JsonFlag, Step, UsageError
-from tfbus.cli.output import format_counts, format_seconds, track, warn
+from tfbus.cli._transform_rows import Format, Row, print_rows, write_parquet
+from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, Instant, JsonFlag, Positive, Step, TopicOptions, UsageError
+from tfbus.cli.output import format_seconds, track, warn
+from tfbus.cli.recorded_tree import load_tree
 from tfbus.errors import DisconnectedError
-from tfbus.recording.load import fill
-from tfbus.recording.recording import open_recording
+from tfbus.recording.header_stamps import header_stamps
 from tfbus.stamps import LATEST, to_seconds
 from tfbus.tree.tree import TransformTree
 
 MAX_ROWS = 10_000_000
 _CHUNK = 4_096
-_FIELDS = ("stamp", "x", "y", "z", "qx", "qy", "qz", "qw")
-
-
-class Row(NamedTuple):
-    """A transform at a stamp in ns."""
-
-    stamp: int
-    translation: list[float]
-    rotation: list[float]
 
 
 def query(
@@ -37,16 +27,21 @@ def query(
     target: str,
     source: str,
     /,
-    *,
+    *further: str,
     at: Instant | None = None,
     every: Step | None = None,
+    stamps_of: Annotated[str | None, Parameter(show_default=False)] = None,
     as_csv: Annotated[bool, Parameter(name="--csv", negative="", show_default=False)] = False,
     as_json: JsonFlag = False,
+    tum: Flag = False,
+    parquet: Annotated[Path | None, Parameter(show_default=False)] = None,
+    max_speed: Positive | None = None,
+    topics: TopicOptions = DEFAULT_TOPICS,
 ) -> None:
-    """Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at regular intervals.
+    """Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.
 
-    Instants are stamps in s, exact to the nanosecond. Translations are in m, rotations are unit quaternions x y z w.
-    With --every, instants at which the two frames are not connected are left out, and standard error says how many.
+    Instants are exact to the nanosecond. Translations are in m, rotations are unit quaternions x y z w. With --every
+    and --stamps-of, instants without an answer are left out, and standard error says how many.
 
     Example: tfbus query run.mcap map base_link --every 0.1 --csv
 
@@ -58,45 +53,73 @@ def query(
         The frame in which the transform is expressed.
     source
         The frame whose position and orientation are printed.
+    further
+        More pairs of TARGET and SOURCE.
     at
-        The instant; by default the newest one for which all frames between the two have data.
+        The instant, by default the newest one for which all frames between the two have data: seconds from the
+        beginning of the recording, such as 12.5; a stamp in seconds, such as 1396293888.05; or a date, such as
+        2014-03-31T19:24:50.
     every
-        The interval; the first and the last instant are those for which all frames between the two have data.
+        The interval in s; the first and the last instant are those for which all frames between the two have data.
+    stamps_of
+        Take the instants from the headers of the messages on this topic.
     as_csv
         Print comma-separated values with a header.
     as_json
         Print one JSON object a line.
+    tum
+        Print lines of stamp x y z qx qy qz qw, the format of TUM's trajectories.
+    parquet
+        Write a Parquet file instead.
+    max_speed
+        Leave out transforms that no frame can have reached at this speed, in m/s.
     """
-    if as_csv and as_json:
-        raise UsageError("--csv and --json are two ways to print the same: give one of them")
-    if at is not None and every is not None:
-        raise UsageError("--at and --every are two questions: give one of them")
-    tree = _load(file)
-    rows = _rows_at_intervals(tree, target, source, every) if every is not None else _one_row(tree, target, source, at)
-    if as_csv:
-        _print_csv(rows)
-    elif as_json:
-        _print_json(rows, target, source)
+    pairs = _pairs(target, source, further)
+    given: dict[Format, bool] = {"csv": as_csv, "json": as_json, "tum": tum}
+    kinds = [kind for kind, wanted in given.items() if wanted]
+    if len(kinds) + (parquet is not None) > 1:
+        raise UsageError("--csv, --json, --tum and --parquet are ways to write the same: give one of them")
+    if sum(each is not None for each in (at, every, stamps_of)) > 1:
+        raise UsageError("--at, --every and --stamps-of are different questions: give one of them")
+    if tum and len(pairs) > 1:
+        raise UsageError("--tum has no names of frames: ask for one pair")
+    tree, start = load_tree(file, topics, max_speed)
+    stamps = None if stamps_of is None else _stamps_of(file, stamps_of)
+
+    def rows() -> Iterator[Row]:
+        for pair in pairs:
+            if every is not None:
+                yield from _rows_at_intervals(tree, *pair, every)
+            elif stamps is not None:
+                yield from _rows_at(tree, *pair, stamps)
+            else:
+                yield from _one_row(tree, *pair, None if at is None else at.stamp(start))
+
+    if parquet is not None:
+        write_parquet(rows(), parquet)
     else:
-        _print_table(rows)
+        print_rows(rows(), kinds[0] if kinds else "table", several=len(pairs) > 1)
 
 
-def _load(file: Path) -> TransformTree:
-    tree = TransformTree(keep=None)
-    problems: Counter[str] = Counter()
-    with open_recording(file) as recording:
-        if not recording.finished:
-            warn(f"{file} was not finished by its writer: this is what can be read")
-        fill(tree, track(recording.messages(), recording.count, "reading"), problems)
-    if problems:
-        warn(f"left out of {file}: {format_counts(problems)}")
-    return tree
+def _pairs(target: str, source: str, further: Sequence[str]) -> list[tuple[str, str]]:
+    if len(further) % 2:
+        raise UsageError(f"frames come in pairs of TARGET and SOURCE, and {further[-1]!r} has no SOURCE")
+    return [(target, source), *zip(further[::2], further[1::2], strict=True)]
+
+
+def _stamps_of(file: Path, topic: str) -> npt.NDArray[np.int64]:
+    found = header_stamps(file, topic)
+    if not found.from_headers:
+        warn(f"the messages on {topic} have no headers: their log times are used")
+    if found.unreadable:
+        warn(f"{found.unreadable:,} messages on {topic} cannot be read")
+    return found.stamps
 
 
 def _one_row(tree: TransformTree, target: str, source: str, at: int | None) -> Iterator[Row]:
     """The transform at a stamp, or the newest one."""
     found = tree.lookup(target, source, LATEST if at is None else at)
-    yield Row(found.stamp, [*found.transform.translation], [*found.transform.rotation])
+    yield Row(target, source, found.stamp, [*found.transform.translation], [*found.transform.rotation])
 
 
 def _rows_at_intervals(tree: TransformTree, target: str, source: str, step: int) -> Iterator[Row]:
@@ -115,44 +138,31 @@ def _rows_at_intervals(tree: TransformTree, target: str, source: str, step: int)
             f"from {format_seconds(start)} s to {format_seconds(end)} s there would be {count:,} lines: "
             f"give --every more than {to_seconds(step):g} s"
         )
+    yield from _rows_at(tree, target, source, start + step * np.arange(count, dtype=np.int64), start)
+
+
+def _rows_at(
+    tree: TransformTree, target: str, source: str, stamps: npt.NDArray[np.int64], fallback: int | None = None
+) -> Iterator[Row]:
+    """The transforms at some stamps; without a single answer, the error at the first of them, or at `fallback`."""
+    count = len(stamps)
     chunks = range(0, count, _CHUNK)
     missing = 0
     # On a terminal, the rows themselves show the progress.
     for first in chunks if sys.stdout.isatty() else track(chunks, len(chunks), "looking up"):
-        stamps = start + step * np.arange(first, min(first + _CHUNK, count), dtype=np.int64)
+        part = stamps[first : first + _CHUNK]
         try:
-            found = tree.lookup_many(target, source, stamps, out_of_range="nan")
+            found = tree.lookup_many(target, source, part, out_of_range="nan")
         except DisconnectedError:
-            missing += len(stamps)
+            missing += len(part)
             continue
         valid = found.valid
         missing += int(np.count_nonzero(~valid))
-        columns = (stamps[valid], found.translations[valid], found.rotations[valid])
-        yield from map(Row, *(column.tolist() for column in columns))
+        columns = (part[valid], found.translations[valid], found.rotations[valid])
+        for stamp, translation, rotation in zip(*(column.tolist() for column in columns), strict=True):
+            yield Row(target, source, stamp, translation, rotation)
     if missing == count:
         # This lookup raises the error that says why.
-        yield from _one_row(tree, target, source, start)
+        yield from _one_row(tree, target, source, int(stamps[0]) if fallback is None else fallback)
     elif missing > 0:
         warn(f"{missing:,} of {count:,} instants are left out, the frames are not connected there")
-
-
-def _print_csv(rows: Iterator[Row]) -> None:
-    out = csv.writer(sys.stdout, lineterminator="\n")
-    # With the first row, because a lookup that fails prints nothing.
-    for number, row in enumerate(rows):
-        if number == 0:
-            out.writerow(_FIELDS)
-        out.writerow((format_seconds(row.stamp), *row.translation, *row.rotation))
-
-
-def _print_json(rows: Iterator[Row], target: str, source: str) -> None:
-    for row in rows:
-        print(json.dumps({"target": target, "source": source, **row._asdict(), "stamp": format_seconds(row.stamp)}))
-
-
-def _print_table(rows: Iterator[Row]) -> None:
-    for number, row in enumerate(rows):
-        if number == 0:
-            print(f"{'stamp [s]':>20}" + "".join(f"{name:>12}" for name in ("x [m]", "y [m]", "z [m]", *_FIELDS[4:])))
-        values = "".join(f"{value:z12.6f}" for value in (*row.translation, *row.rotation))
-        print(f"{format_seconds(row.stamp):>20}{values}")

@@ -1,9 +1,11 @@
 """``tfbus record``."""
 
+import logging
 import math
 import signal
 import sys
-from contextlib import AsyncExitStack
+from collections.abc import AsyncIterator
+from contextlib import AbstractContextManager, AsyncExitStack
 from pathlib import Path
 
 import anyio
@@ -43,9 +45,16 @@ def record(
         Replace FILE if it exists.
     """
 
+    # The lines below say the same.
+    logging.getLogger("tfbus.recording").addHandler(logging.NullHandler())
+
     async def record_domain(bus: Bus) -> int:
         recorder = Recorder(bus, file, overwrite=overwrite)
         async with AsyncExitStack() as stack:
+            # From before the recorder can fail.
+            events = stack.enter_context(bus.events(stale_after=None))
+            # Until the file is finished, so that a second signal does not kill the program meanwhile.
+            signals = None if sys.platform == "win32" else stack.enter_context(_open_signals())
             try:
                 await stack.enter_async_context(recorder)
             except FileExistsError:
@@ -55,7 +64,7 @@ def record(
             except OSError as error:
                 raise UsageError(f"cannot write {file}: {error.strerror or error}") from None
             say(f"recording domain {link.domain!r} to {file}")
-            status = await _wait_for_end(bus, link, duration)
+            status = await _wait_for_end(bus, link, duration, events, signals)
         print_summary(file, recorder.statistics())
         if recorder.error is None:
             return status
@@ -68,16 +77,25 @@ def record(
     sys.exit(status)
 
 
-async def _wait_for_end(bus: Bus, link: LinkOptions, duration: float) -> int:
+def _open_signals() -> AbstractContextManager[AsyncIterator[signal.Signals]]:
+    return anyio.open_signal_receiver(signal.SIGINT, signal.SIGTERM)
+
+
+async def _wait_for_end(
+    bus: Bus,
+    link: LinkOptions,
+    duration: float,
+    events: EventStream,
+    signals: AsyncIterator[signal.Signals] | None,
+) -> int:
     """Wait until a signal comes, the duration is over, or the disk fails; return the exit status for it."""
     status = 0
-    with bus.events(stale_after=None) as events:
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(link.first_transform, bus)
-            tasks.start_soon(_watch_recorder, events, tasks.cancel_scope)
-            with bus.clock.move_on_after(duration):
-                status = _ENDED_BY_SIGNAL + await _wait_for_signal()
-            tasks.cancel_scope.cancel()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(link.first_transform, bus)
+        tasks.start_soon(_watch_recorder, events, tasks.cancel_scope)
+        with bus.clock.move_on_after(duration):
+            status = _ENDED_BY_SIGNAL + await _wait_for_signal(signals)
+        tasks.cancel_scope.cancel()
     return status
 
 
@@ -90,12 +108,12 @@ async def _watch_recorder(events: EventStream, scope: anyio.CancelScope) -> None
             warn(f"the disk is too slow: samples are lost, {event.dropped} so far")
 
 
-async def _wait_for_signal() -> int:
+async def _wait_for_signal(signals: AsyncIterator[signal.Signals] | None) -> int:
     """Wait for Ctrl-C or a termination and return its number, so that the file is finished before the program ends."""
-    if sys.platform == "win32":
-        # There, Ctrl-C raises by itself.
+    if signals is None:
+        # On Windows, Ctrl-C raises by itself.
         await anyio.sleep_forever()
-    with anyio.open_signal_receiver(signal.SIGINT, signal.SIGTERM) as signals:
+    else:
         async for number in signals:
             return number
     return signal.SIGTERM

@@ -71,7 +71,7 @@ def robot(
         where = f"on domain {link.domain!r} at {rate:g} Hz"
         say(f"publishing {len(transforms)} frames of {model.name!r} {where}, until Ctrl-C")
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(publish_static, bus, model.fixed_transforms(bus.clock.now(), AUTHORITY, prefix))
+            await tasks.start(publish_static, bus, model.fixed_transforms(bus.clock.now(), AUTHORITY, prefix))
             async for _ in bus.clock.ticks(rate):
                 bus.publish(model.moving_transforms(positions, bus.clock.now(), AUTHORITY, prefix), invalid="drop")
 

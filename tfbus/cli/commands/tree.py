@@ -5,13 +5,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import anyio.to_thread
+
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
+from tfbus.bus.delays import Delays
+from tfbus.cli._graphviz import draw
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import print_now
+from tfbus.cli.output import print_now, write_file
 from tfbus.stamps import to_seconds
 from tfbus.tree.history import Edge
+from tfbus.tree.rendering import to_dot
 
 
 def tree(
@@ -20,12 +25,15 @@ def tree(
     watch: Flag = False,
     rate: Rate = 1.0,
     dot: Path | None = None,
+    svg: Path | None = None,
+    pdf: Path | None = None,
+    png: Path | None = None,
     as_json: JsonFlag = False,
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
     """Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.
 
-    Example: tfbus tree --dot frames.dot && dot -Tsvg frames.dot -o frames.svg
+    Example: tfbus tree --svg frames.svg
 
     Parameters
     ----------
@@ -37,19 +45,36 @@ def tree(
         Updates per second, with --watch.
     dot
         Also write the tree to this file, for Graphviz.
+    svg
+        Also draw the tree into this file: each edge with its rate, age, span, authority and delay, the time from the
+        stamp of its samples to their arrival, in the colour of its state. Needs Graphviz.
+    pdf
+        The same as a PDF.
+    png
+        The same as a PNG.
     as_json
         Print a JSON document instead, with --watch one a line: for each frame its parent, kind, rate (Hz), age (s),
         span (s) and authority; null for a value that the frame does not have.
     """
     from tfbus.cli._tree_display import TreeDisplay
 
-    async def show_tree(bus: Bus) -> None:
-        with Buffer(bus) as buffer, TreeDisplay(live=watch and not as_json) as display:
+    pictures = {kind: path for kind, path in (("svg", svg), ("pdf", pdf), ("png", png)) if path is not None}
 
-            def show_once() -> None:
+    async def show_tree(bus: Bus) -> None:
+        delays = Delays()
+        with (
+            Buffer(bus) as buffer,
+            bus.subscribe(lambda batch: delays.note(batch, bus.clock.now()), delays.forget),
+            TreeDisplay(live=watch and not as_json) as display,
+        ):
+
+            async def show_once() -> None:
                 edges, now = buffer.tree.edges(), bus.clock.now()
                 if dot is not None:
-                    write_file(dot, buffer.tree.to_dot())
+                    write_file(dot, to_dot(edges).encode())
+                for kind, path in pictures.items():
+                    graph = to_dot(edges, now, delays.by_frame)
+                    await anyio.to_thread.run_sync(draw, graph, kind, path)
                 if as_json:
                     document = to_document(link.domain, buffer.tree.frames(), edges, now)
                     print_now(json.dumps(document, indent=None if watch else 2))
@@ -59,10 +84,10 @@ def tree(
             await link.first_transform(bus)
             if watch:
                 async for _ in bus.clock.ticks(rate):
-                    show_once()
+                    await show_once()
             else:
                 await bus.clock.sleep(duration)
-                show_once()
+                await show_once()
 
     link.run(show_tree)
 
@@ -75,26 +100,6 @@ def to_document(domain: str, frames: Iterable[str], edges: Iterable[Edge], now: 
         "stamp": now,
         "frames": {frame: _describe(edge_above.get(frame), now) for frame in frames},
     }
-
-
-def write_file(path: Path, text: str) -> None:
-    """Write a text to a file, all of it or nothing; a pipe or a device is written to directly.
-
-    Raises
-    ------
-    UsageError
-        If the file cannot be written.
-    """
-    replaceable = path.is_file() or not path.exists()
-    written = path.with_name(f".{path.name}.part") if replaceable else path
-    try:
-        written.write_text(text, encoding="utf-8")
-        if replaceable:
-            written.replace(path)
-    except OSError as error:
-        if replaceable:
-            written.unlink(missing_ok=True)
-        raise UsageError(f"cannot write {path}: {error.strerror}") from None
 
 
 def _describe(edge: Edge | None, now: int) -> dict[str, Any]:

@@ -1,5 +1,10 @@
 """Links over zenoh, peer to peer or through a router: `ZenohLink`, with the extra ``tfbus[zenoh]``."""
 
+try:
+    import zenoh  # noqa: F401 - the inner modules need it
+except ImportError:
+    raise ImportError('a link over zenoh needs a package more: pip install "tfbus[zenoh]"') from None
+
 from tfbus.links.zenoh.router import ZenohRouter
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 

@@ -8,6 +8,7 @@ import anyio
 import anyio.to_thread
 import zenoh
 
+from tfbus._aio.task_groups import close_task_group
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._carrier import SendReport
 from tfbus.links._inbox import ReceivedMessage
@@ -90,10 +91,12 @@ class ZenohCarrier:
 
     async def run(self) -> None:
         """Send answers, and dial peers that were lost."""
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(self._sessions.keep_connected)
-            tasks.start_soon(self._send_slowly)
-            await self._send_answers()
+        tasks = anyio.create_task_group()
+        await tasks.__aenter__()
+        for task in (self._sessions.keep_connected, self._send_slowly, self._send_answers):
+            tasks.start_soon(task)
+        # Ctrl-C comes to one of them, and leaves without a group.
+        await close_task_group(tasks)
 
     async def _send_answers(self) -> None:
         while True:

@@ -11,6 +11,7 @@ SHORT_TIME = 120.0
 """s; so long after the loss the pause is short."""
 MOST_PEERS = 1_000
 """So many lost peers are remembered, the newest."""
+_MOST_ADDRESSES = 4
 
 
 @dataclass(slots=True)
@@ -34,13 +35,14 @@ class Dialing:
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
-        self._addresses: dict[str, str] = {}
+        self._addresses: dict[str, list[str]] = {}
         self._lost: dict[str, _Lost] = {}
 
     def reached(self, peer: str, address: str) -> None:
-        """A peer has been reached at an address."""
-        self._addresses.pop(peer, None)
-        self._addresses[peer] = address
+        """A peer has been reached at an address, or has reached us from there, which leads nowhere later."""
+        known = self._addresses.pop(peer, [])
+        self._addresses[peer] = known = [address, *(other for other in known if other != address)]
+        del known[_MOST_ADDRESSES:]
         if len(self._addresses) > MOST_PEERS:
             oldest = next(iter(self._addresses))
             del self._addresses[oldest]
@@ -57,15 +59,16 @@ class Dialing:
             self._lost[peer] = _Lost(now, now + FIRST_PAUSE)
 
     def next_due(self) -> float | None:
-        """When to call `take_due` again; None while nobody is lost."""
+        """The time of the next call of `take_due`; None while nobody is lost."""
         return min((lost.due for lost in self._lost.values()), default=None)
 
     def take_due(self) -> list[tuple[str, str]]:
-        """The peers to dial now, with their addresses."""
+        """The peers to dial now, each with one of its addresses in turn."""
         now = self._now()
         due = [peer for peer, lost in self._lost.items() if lost.due <= now]
         for peer in due:
             lost = self._lost[peer]
             lost.pause = min(2 * lost.pause, SHORT_PAUSE) if now - lost.since < SHORT_TIME else LONG_PAUSE
             lost.due = now + lost.pause
-        return [(peer, self._addresses[peer]) for peer in due]
+            self._addresses[peer].append(self._addresses[peer].pop(0))
+        return [(peer, self._addresses[peer][-1]) for peer in due]

@@ -132,7 +132,9 @@ class ZenohSessions:
             addresses = await anyio.to_thread.run_sync(self._main.addresses)
             for peer in joined & addresses.keys():
                 self._dialing.reached(peer, addresses[peer])
-                # They are connected directly again.
+        for peer in joined:
+            # A connection is not enough: zenoh may have it, and tell nothing of the other end.
+            if (None, FIRST_SESSION) in self._present.get(peer, ()):
                 self._drop_patch(peer)
 
     async def _patch(self, peer: str, address: str) -> None:

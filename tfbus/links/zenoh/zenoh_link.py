@@ -9,11 +9,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import uuid4
 
-try:
-    import zenoh  # noqa: F401 - the inner modules need it
-except ImportError:
-    raise ImportError('a link over zenoh needs a package more: pip install "tfbus[zenoh]"') from None
-
 from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier

@@ -3,50 +3,59 @@
 A finished file has an index of its chunks at its end, so only the needed chunks are read, by log time. A file whose
 writer was killed, or whose index fails its checksum, is read from its beginning, as far as possible. A chunk that fails
 its checksum is left out and reported, and reading continues behind it.
-
-The package `mcap` parses the records. This module only splits a file into records and a chunk into messages (MCAP's
-specification, sections "Records" and "Message"): to build an object for each message would take ten times as long.
 """
 
 import struct
 import zlib
-from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
-from io import SEEK_CUR, BytesIO
-from operator import itemgetter
+from io import BytesIO
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, NamedTuple
 
 from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.stream_reader import get_chunk_data_stream
-from zstandard import ZstdError
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats._storage import Channel, StoredMessage, channel_of, lost_message
+from tfbus.recording.formats._bounds import MAX_INDEX
+from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks
+from tfbus.recording.formats._mcap_records import (
+    DAMAGE,
+    Chunk,
+    Torn,
+    parse_record,
+    read_records,
+    split_chunk,
+    split_message,
+)
+from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message, select, shortfalls
 from tfbus.stamps import STAMP_MAX
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 
-_DAMAGE = (McapError, struct.error, ValueError, LookupError, OverflowError, MemoryError, RuntimeError, ZstdError)
-"""The errors that `mcap` and its decompressors raise for damaged bytes."""
-
-_RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
 _FOOTER = struct.Struct("<BQQQI8s")
 _FOOTER_LENGTH: Final = 20
-_MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
-_READ: dict[int, Callable[[ReadDataStream], records.McapRecord]] = {
-    Opcode.SCHEMA: records.Schema.read,
-    Opcode.CHANNEL: records.Channel.read,
-    Opcode.CHUNK: records.Chunk.read,
-    Opcode.CHUNK_INDEX: records.ChunkIndex.read,
-    Opcode.STATISTICS: records.Statistics.read,
+_KINDS: Final[dict[int, str]] = {
+    Opcode.CHUNK: "chunk",
+    Opcode.MESSAGE: "message",
+    Opcode.SCHEMA: "schema",
+    Opcode.CHANNEL: "channel",
+    Opcode.CHUNK_INDEX: "chunk index",
+    Opcode.STATISTICS: "statistics",
 }
+"""The names of the records that are read."""
+_ANY: Final = Channel("", "", "")
+
+
+class _IndexedChunk(NamedTuple):
+    """An entry of the index: the place of a chunk, its length in bytes, and the numbers of the channels in it."""
+
+    place: ChunkPlace
+    length: int
+    channels: tuple[int, ...]
 
 
 class McapStorage:
@@ -55,6 +64,13 @@ class McapStorage:
     Parameters
     ----------
     path : Path
+    file : file, optional
+        The open file to read; by default that of the path.
+
+    Attributes
+    ----------
+    size : int
+        The length of the file in bytes.
 
     Raises
     ------
@@ -63,19 +79,28 @@ class McapStorage:
     OSError
     """
 
-    def __init__(self, path: Path) -> None:
+    remarks: Final = ()
+
+    def __init__(self, path: Path, file: IO[bytes] | None = None) -> None:
         self._path = path
-        self._size = path.stat().st_size
-        self._schemas: dict[int, str] = {}
-        self._channels: dict[int, Channel | None] = {}
-        self._chunks: list[records.ChunkIndex] = []
-        self._statistics: records.Statistics | None = None
-        self.finished = self._read_index()
-        if not self.finished and next(self._log_times(), None) is None:
-            raise RecordingError("the file ends before its first message", path=str(path), reason="truncated")
+        self._file = path.open("rb") if file is None else file
+        try:
+            self.size = self._file.seek(0, 2)
+            self._schemas: dict[int, records.Schema] = {}
+            self._numbered: dict[int, Channel] = {}
+            self._chunks: list[_IndexedChunk] = []
+            self._statistics: records.Statistics | None = None
+            self._counted: Counter[int] | None = None
+            self.finished = self._read_index()
+            if not self.finished and next(self._log_times(), None) is None:
+                raise RecordingError("the file ends before its first message", path=str(path), reason="truncated")
+        except BaseException:
+            self._file.close()
+            raise
 
     def close(self) -> None:
-        """Do nothing: the file is open only while messages are read."""
+        """Close the file."""
+        self._file.close()
 
     @property
     def start(self) -> int | None:
@@ -88,66 +113,109 @@ class McapStorage:
         return None if self._span is None else self._span[1]
 
     @property
-    def count(self) -> int | None:
-        """The number of messages with transforms, if there is an index."""
-        if self._statistics is None:
-            return None
-        counts = self._statistics.channel_message_counts
-        return sum(counts.get(number, 0) for number, channel in self._channels.items() if channel is not None)
+    def complete(self) -> bool:
+        """Whether there are statistics, or the whole file has been read."""
+        return self._statistics is not None or self._counted is not None
 
-    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[StoredMessage]:
+    @property
+    def channels(self) -> Mapping[Channel, int | None]:
+        """All channels known so far; their counts are those of the statistics, or of a whole reading."""
+        counts = self._counted if self._statistics is None else self._statistics.channel_message_counts
+        return {
+            channel: None if counts is None else counts.get(number, 0) for number, channel in self._numbered.items()
+        }
+
+    def messages(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[StoredMessage]:
         """Iterate over messages, as `Storage.messages`; without an index, in the order of the file."""
         low = 0 if since is None else since
         high = STAMP_MAX if until is None else until
+        reading = _Reading(self, wanted)
+        read: Counter[Channel] = Counter()
         now = low
-        for stored in self._by_index(low, high, only_static) if self._chunks else self._in_sequence(low):
-            received, channel, _ = stored
-            if received > STAMP_MAX:
-                received, channel, _ = stored = lost_message(now, f"a message has the log time {received} ns")
-            now = max(now, received)
-            if low <= received <= high and (not only_static or (isinstance(channel, Channel) and channel.static)):
-                yield stored
+        for stored in select(
+            reading.by_index(low, high) if self._chunks else reading.in_sequence(low), since, until, read
+        ):
+            now = stored[0]
+            yield stored
+        if reading.unknown:
+            yield lost_message(now, f"{reading.unknown:,} messages are on channels that the file does not describe")
+        if reading.contradictions:
+            numbers = ", ".join(map(str, sorted(reading.contradictions)))
+            yield lost_message(now, f"the descriptions of channel {numbers} contradict each other")
+        if since is None and until is None and self._statistics is not None:
+            promised = {channel: count or 0 for channel, count in self.channels.items() if wanted(channel)}
+            yield from shortfalls(now, promised, read)
 
     def _read_index(self) -> bool:
         """Read the index behind the messages, and return whether the file was finished."""
-        with self._path.open("rb") as file:
-            if self._size < len(MAGIC) + _FOOTER.size:
-                return False
-            file.seek(self._size - _FOOTER.size)
-            footer = file.read()
-            opcode, length, start, _, checksum, magic = _FOOTER.unpack(footer)
-            if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC):
-                return False
-            file.seek(min(start, self._size))
-            index = file.read()
-        # The checksum covers the index up to the checksum itself.
-        if start and checksum in (0, zlib.crc32(index[: -len(MAGIC) - 4])):
-            with suppress(*_DAMAGE):
-                self._use_index(list(_records(BytesIO(index), len(index))))
+        if self.size < len(MAGIC) + _FOOTER.size:
+            return False
+        self._file.seek(self.size - _FOOTER.size)
+        footer = self._file.read()
+        opcode, length, start, _, checksum, magic = _FOOTER.unpack(footer)
+        if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC):
+            return False
+        if start and start <= self.size and self.size - start <= MAX_INDEX:
+            self._file.seek(start)
+            index = self._file.read()
+            # The checksum covers the index up to the checksum itself.
+            if checksum in (0, zlib.crc32(index[: -len(MAGIC) - 4])):
+                with suppress(*DAMAGE, EndOfFile):
+                    self._use_index(index)
+        if self._statistics is None:
+            # They would contradict what the chunks say.
+            self._schemas.clear()
+            self._numbered.clear()
         return True
 
-    def _use_index(self, index: list[records.McapRecord]) -> None:
-        for record in index:
-            self._register(record)
-        statistics = next((record for record in index if isinstance(record, records.Statistics)), None)
-        kinds = {record.schema_id for record in index if isinstance(record, records.Channel)} - {0}
+    def _use_index(self, data: bytes) -> None:
+        chunks: list[_IndexedChunk] = []
+        statistics: records.Statistics | None = None
+        # Nearly all chunks have the same channels: one tuple for all of them saves most of the memory.
+        shared: dict[tuple[int, ...], tuple[int, ...]] = {}
+        kinds = {0}
+        for _, opcode, content in read_records(BytesIO(data), len(data)):
+            record = None if content is None else parse_record(opcode, content)
+            if isinstance(record, records.ChunkIndex):
+                numbers = tuple(record.message_index_offsets)
+                place = ChunkPlace(record.message_start_time, record.message_end_time, record.chunk_start_offset)
+                chunks.append(_IndexedChunk(place, record.chunk_length, shared.setdefault(numbers, numbers)))
+            elif isinstance(record, records.Statistics):
+                statistics = record
+            elif record is not None:
+                self.register(record)
+                if isinstance(record, records.Channel):
+                    kinds.add(record.schema_id)
         # A writer may leave schemas and channels out of its index; then the index is of no use.
         if (
             statistics is not None
-            and statistics.channel_message_counts.keys() <= self._channels.keys()
-            and kinds <= self._schemas.keys()
+            and statistics.channel_message_counts.keys() <= self._numbered.keys()
+            and kinds <= {0, *self._schemas}
         ):
             self._statistics = statistics
-            chunks = [record for record in index if isinstance(record, records.ChunkIndex)]
-            self._chunks = sorted(chunks, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
+            self._chunks = sorted(chunks)
 
-    def _register(self, record: records.McapRecord) -> None:
+    def register(self, record: records.McapRecord) -> bool:
+        """Note a schema or a channel; returns whether it agrees with what is known already."""
         if isinstance(record, records.Schema):
-            self._schemas[record.id] = record.name
-        elif isinstance(record, records.Channel):
-            ros1 = record.message_encoding == "ros1"
-            kind = self._schemas.get(record.schema_id, "") if ros1 or record.message_encoding == "cdr" else ""
-            self._channels[record.id] = channel_of(record.topic, kind, record.metadata, ros1)
+            return self._schemas.setdefault(record.id, record) == record
+        if not isinstance(record, records.Channel):
+            return True
+        schema = self._schemas.get(record.schema_id)
+        channel = Channel(
+            record.topic,
+            "" if schema is None else schema.name,
+            record.message_encoding,
+            "" if schema is None else schema.encoding,
+            b"" if schema is None else schema.data,
+            record.metadata,
+        )
+        known = self._numbered.setdefault(record.id, channel)
+        return all(getattr(known, name) == getattr(channel, name) for name in ("topic", "type", "encoding", "metadata"))
+
+    def channel(self, number: int) -> Channel | None:
+        """The channel with a number."""
+        return self._numbered.get(number)
 
     @cached_property
     def _span(self) -> tuple[int, int] | None:
@@ -160,120 +228,165 @@ class McapStorage:
 
     def _log_times(self) -> Iterator[tuple[int, int]]:
         """First and last log time of each chunk and of each message outside of chunks, as far as the file is good."""
-        with self._path.open("rb") as file, suppress(*_DAMAGE):
-            file.seek(len(MAGIC))
-            for record in _records(file, self._size):
-                if isinstance(record, records.Message):
-                    yield record.log_time, record.log_time
-                elif isinstance(record, records.Chunk) and (record.message_end_time or self._in_chunk(record)):
-                    yield record.message_start_time, record.message_end_time
+        try:
+            self._file.seek(len(MAGIC))
+            for _, opcode, content in read_records(self._file, self.size):
+                after = self._file.tell()
+                if content is not None and opcode == Opcode.MESSAGE:
+                    received, _, _ = split_message(content)
+                    yield received, received
+                elif content is not None and opcode == Opcode.CHUNK:
+                    with suppress(*DAMAGE):
+                        chunk = Chunk.parse(content)
+                        if chunk.end or self._times_in(chunk.unfold()):
+                            yield chunk.start, chunk.end
+                self._file.seek(after)
+        except EndOfFile as end:
+            for torn in end.args:
+                with suppress(*DAMAGE):
+                    if torn.opcode == Opcode.CHUNK:
+                        times = self._times_in(Chunk.parse(torn.data, torn=True).unfold(torn=True))
+                        if times:
+                            yield min(times), max(times)
+        except DAMAGE:
+            return
 
-    def _by_index(self, low: int, high: int, only_static: bool) -> Iterator[StoredMessage]:
-        """Messages of all chunks that overlap the range, in the order of their log times even if the chunks overlap."""
-        wanted = {
-            number
-            for number, channel in self._channels.items()
-            if channel is not None and (channel.static or not only_static)
-        }
-        chunks = [
-            chunk
-            for chunk in self._chunks
-            if chunk.message_start_time <= high
-            and chunk.message_end_time >= low
-            and not (chunk.message_index_offsets and wanted.isdisjoint(chunk.message_index_offsets))
-        ]
-        starts = [*(chunk.message_start_time for chunk in chunks), 2**64]
-        waiting: list[tuple[int, int, StoredMessage]] = []
-        with self._path.open("rb") as file:
-            for chunk, following in zip(chunks, starts[1:], strict=True):
-                waiting += [
-                    (stored[0], chunk.chunk_start_offset, stored) for stored in self._read_chunk(file, chunk, low)
-                ]
-                # Messages of the same log time stay in the order of the file.
-                waiting.sort(key=itemgetter(0, 1))
-                ready = bisect_left(waiting, following, key=itemgetter(0))
-                yield from map(itemgetter(2), waiting[:ready])
-                del waiting[:ready]
+    def _times_in(self, content: bytes) -> list[int]:
+        found, _ = split_chunk(content, lambda _: _ANY, lambda _: None, torn=True)
+        return [received for received, _, _ in found]
 
-    def _read_chunk(self, file: IO[bytes], index: records.ChunkIndex, low: int) -> list[StoredMessage]:
-        """The messages of a chunk in the index."""
-        if index.chunk_start_offset + index.chunk_length <= self._size:
-            file.seek(index.chunk_start_offset)
-            with suppress(*_DAMAGE):
-                for chunk in _records(BytesIO(file.read(index.chunk_length)), index.chunk_length):
-                    if isinstance(chunk, records.Chunk):
-                        return self._in_chunk(chunk)
-        return [
-            lost_message(max(index.message_start_time, low), f"the chunk at byte {index.chunk_start_offset} is damaged")
-        ]
+    def read_chunk(self, offset: int) -> Chunk:
+        """The chunk at an offset; raises one of `DAMAGE`."""
+        self._file.seek(offset)
+        for _, opcode, content in read_records(self._file, self.size):
+            if opcode == Opcode.CHUNK and content is not None:
+                return Chunk.parse(content)
+            break
+        raise ValueError("there is no chunk, or it is too large")
 
-    def _in_sequence(self, low: int) -> Iterator[StoredMessage]:
-        """All messages in the order of the file, up to its end or damage; damage before `low` is reported at `low`."""
-        now = low
-        with self._path.open("rb") as file:
-            file.seek(len(MAGIC))
+    @property
+    def index(self) -> "list[_IndexedChunk]":
+        """The entries of the index, in the order of their first log times."""
+        return self._chunks
+
+    def records(self, at: int) -> Iterator[tuple[int, int, bytes | None]]:
+        """The records from an offset on, as `read_records`; other readers of the file may come between."""
+        while True:
+            self._file.seek(at)
             try:
-                for record in _records(file, self._size):
-                    found: list[StoredMessage] = []
-                    if isinstance(record, records.Chunk):
-                        try:
-                            found = self._in_chunk(record)
-                        except _DAMAGE:
-                            found = [lost_message(now, f"the chunk before byte {file.tell()} is damaged")]
-                    elif isinstance(record, records.Message):
-                        channel = self._channels.get(record.channel_id)
-                        found = [] if channel is None else [(record.log_time, channel, record.data)]
-                    else:
-                        self._register(record)
-                    for stored in found:
-                        now = max(now, stored[0])
-                        yield stored
-            except EndOfFile:
-                if self.finished:
-                    yield lost_message(now, "a record goes on behind the end of the file")
-            except _DAMAGE:
-                yield lost_message(now, f"nothing can be read from byte {file.tell()} on")
+                record = next(read_records(self._file, self.size))
+            except StopIteration:
+                return
+            at = self._file.tell()
+            yield record
 
-    def _in_chunk(self, chunk: records.Chunk) -> list[StoredMessage]:
-        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-        data = stream.read(length)
-        channels = self._channels
-        found: list[StoredMessage] = []
-        at = 0
-        while at < length:
-            opcode, size = _RECORD.unpack_from(data, at)
-            start = at + _RECORD.size
-            at = start + size
-            if opcode == _MESSAGE_OPCODE:
-                number, _, received, _ = _MESSAGE.unpack_from(data, start)
-                channel = channels.get(number)
-                if channel is not None:
-                    found.append((received, channel, data[start + _MESSAGE.size : at]))
-            elif opcode in _READ:
-                self._register(_READ[opcode](ReadDataStream(BytesIO(data[start:at]))))
+    def set_counts(self, counts: Counter[int]) -> None:
+        """Note the number of messages of each channel, counted by a reading of the whole file."""
+        self._counted = counts
+
+
+class _Reading:
+    """One iteration over the messages of a file.
+
+    Attributes
+    ----------
+    unknown : int
+        Messages on channels that the file does not describe.
+    contradictions : set of int
+        Numbers of channels and schemas that are described in two ways.
+    """
+
+    def __init__(self, storage: McapStorage, wanted: Wanted) -> None:
+        self._storage = storage
+        self._wanted = wanted
+        self._counts: Counter[int] = Counter()
+        self.unknown = 0
+        self.contradictions: set[int] = set()
+
+    def by_index(self, low: int, high: int) -> Iterator[list[StoredMessage]]:
+        """The messages of all chunks that overlap the range, in the order of their log times."""
+        size = self._storage.size
+        places, too_long = [], set()
+        for place, length, numbers in self._storage.index:
+            # Without numbers, or with unknown ones, only reading the chunk tells what is in it.
+            if place.start <= high and place.end >= low and (not numbers or any(map(self._may_be_wanted, numbers))):
+                places.append(place)
+                if place.offset + length > size:
+                    too_long.add(place.offset)
+
+        def read(place: ChunkPlace) -> list[StoredMessage]:
+            try:
+                if place.offset in too_long:
+                    raise ValueError("it is behind the end of the file")
+                return self._in_chunk(self._storage.read_chunk(place.offset))
+            except (*DAMAGE, EndOfFile) as error:
+                reason = str(error) if not isinstance(error, EndOfFile) else "it is cut off"
+                return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {reason}")]
+
+        return merge_chunks(places, read)
+
+    def in_sequence(self, low: int) -> Iterator[list[StoredMessage]]:
+        """All messages in the order of the file, up to its end; damage before `low` is reported at `low`."""
+        now = low
+        summary = False
+        try:
+            for offset, opcode, content in self._storage.records(len(MAGIC)):
+                # Behind the data, schemas and channels come again, and these copies may be the damaged part.
+                summary = summary or opcode == Opcode.DATA_END
+                if summary and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
+                    continue
+                try:
+                    found = self._in_record(opcode, content)
+                except DAMAGE as error:
+                    found = [lost_message(now, f"the {_KINDS.get(opcode, 'record')} at byte {offset}: {error}")]
+                if found:
+                    now = max(now, found[-1][0])
+                    yield found
+        except EndOfFile as end:
+            for torn in end.args:
+                yield self._in_torn(torn)
+            if self._storage.finished:
+                yield [lost_message(now, "a record goes on behind the end of the file")]
+        self._storage.set_counts(self._counts)
+
+    def _in_record(self, opcode: int, content: bytes | None) -> list[StoredMessage]:
+        if content is None:
+            raise ValueError("it exceeds its bound" if opcode in _KINDS else f"its kind, {opcode}, is unknown")
+        if opcode == Opcode.CHUNK:
+            return self._in_chunk(Chunk.parse(content))
+        if opcode == Opcode.MESSAGE:
+            received, number, payload = split_message(content)
+            self._count({number: 1})
+            channel = self._wanted_channel(number)
+            return [] if channel is None else [(received, channel, payload)]
+        if record := parse_record(opcode, content):
+            self._register(record)
+        return []
+
+    def _in_chunk(self, chunk: Chunk, torn: bool = False) -> list[StoredMessage]:
+        found, counts = split_chunk(chunk.unfold(torn), self._wanted_channel, self._register, torn)
+        self._count(counts)
         return found
 
+    def _count(self, counts: Mapping[int, int]) -> None:
+        self._counts.update(counts)
+        self.unknown += sum(count for number, count in counts.items() if self._storage.channel(number) is None)
 
-def _records(file: IO[bytes], size: int) -> Iterator[records.McapRecord]:
-    """The records from the current position to the footer, without the kinds that are not needed here.
+    def _in_torn(self, torn: Torn) -> list[StoredMessage]:
+        """The readable part of the record in which the file ends."""
+        with suppress(*DAMAGE):
+            if torn.opcode == Opcode.CHUNK:
+                return self._in_chunk(Chunk.parse(torn.data, torn=True), torn=True)
+        return []
 
-    Raises
-    ------
-    EndOfFile
-        If the file of `size` bytes ends before the footer.
-    """
-    while True:
-        head = file.read(_RECORD.size)
-        if len(head) < _RECORD.size:
-            raise EndOfFile
-        opcode, length = _RECORD.unpack(head)
-        if file.tell() + length > size:
-            raise EndOfFile
-        if opcode == Opcode.FOOTER:
-            return
-        if opcode == Opcode.MESSAGE:
-            yield records.Message.read(ReadDataStream(BytesIO(file.read(length))), length)
-        elif opcode in _READ:
-            yield _READ[opcode](ReadDataStream(BytesIO(file.read(length))))
-        else:
-            file.seek(length, SEEK_CUR)
+    def _wanted_channel(self, number: int) -> Channel | None:
+        channel = self._storage.channel(number)
+        return channel if channel is not None and self._wanted(channel) else None
+
+    def _may_be_wanted(self, number: int) -> bool:
+        channel = self._storage.channel(number)
+        return channel is None or self._wanted(channel)
+
+    def _register(self, record: records.McapRecord) -> None:
+        if not self._storage.register(record) and isinstance(record, (records.Channel, records.Schema)):
+            self.contradictions.add(record.id)

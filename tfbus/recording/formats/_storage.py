@@ -1,61 +1,108 @@
 """`Storage`, the interface of all formats: channels, and messages in the order of their log times."""
 
-import json
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import repeat
-from typing import Final, Protocol
+from operator import itemgetter
+from typing import Protocol
 
-from tfbus.tf_message import MalformedMessageError, Tag
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tf_message import MalformedMessageError
 
-MOVING_TOPIC: Final = "tf"
-STATIC_TOPIC: Final = "tf_static"
-TYPES: Final = ("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/msg/tfMessage", "tf/tfMessage")
-AUTHORITIES: Final = "tfbus.authorities"
+AUTHORITIES = "tfbus.authorities"
 """The key in a channel's metadata for the authorities: JSON pairs of an authority and a count.
 
 They describe the transforms of every message on the channel, in order: ``[["odometry", 1]]``.
 """
 
-_MAX_TRANSFORMS: Final = 1_000_000
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Channel:
-    """A channel of messages with transforms.
+    """A stream of messages of one topic and type. Channels are equal only to themselves.
 
     Parameters
     ----------
-    static : bool
-        Whether its transforms are static.
-    authorities : tuple of str
-        The authority of each transform of a message; a single one stands for all transforms.
-    ros1 : bool
-        Whether its messages are encoded as in ROS 1, not in CDR.
+    topic, type : str
+    encoding : str
+        Of the messages: ``"cdr"``, ``"ros1"``, ``"json"``, ``"protobuf"``.
+    schema_encoding : str
+        Of the definition: ``"ros2msg"``, ``"ros1msg"``, ``"jsonschema"``, ``"protobuf"``; empty without a definition.
+    schema : bytes
+        The definition of the type; empty if the file has none.
+    metadata : mapping of str to str
     """
 
-    static: bool
-    authorities: tuple[str, ...] = ("",)
-    ros1: bool = False
-    _tags: tuple[Tag, ...] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_tags", tuple((authority, self.static) for authority in self.authorities))
-
-    def tags(self, count: int) -> "tuple[Tag, ...] | repeat[Tag]":
-        """Authority and static flag of each of `count` transforms; no authority if their number does not fit."""
-        if len(self._tags) == count:
-            return self._tags
-        return repeat(self._tags[0] if len(self._tags) == 1 else ("", self.static), count)
+    topic: str
+    type: str
+    encoding: str
+    schema_encoding: str = ""
+    schema: bytes = field(default=b"", repr=False)
+    metadata: Mapping[str, str] = field(default_factory=dict, repr=False)
 
 
 StoredMessage = tuple[int, Channel | MalformedMessageError, bytes]
 """Log time in ns, channel and payload of a message; an error in place of the channel says what was lost there."""
+Wanted = Callable[[Channel], bool]
+"""Whether the messages of a channel are read."""
 
 
 def lost_message(received: int, detail: str) -> StoredMessage:
     """A message in place of those that cannot be read."""
     return received, MalformedMessageError("damaged", detail), b""
+
+
+_log_time = itemgetter(0)
+_channel = itemgetter(1)
+
+
+def select(
+    blocks: Iterable[list[StoredMessage]], since: int | None, until: int | None, read: Counter[Channel]
+) -> Iterator[StoredMessage]:
+    """Iterate over the messages from one log time to another, inclusive, and count them by channel.
+
+    A message whose log time is no stamp becomes a lost one.
+    """
+    low = STAMP_MIN if since is None else since
+    high = STAMP_MAX if until is None else until
+    now = 0 if since is None else since
+    for block in filter(None, blocks):
+        times = list(map(_log_time, block))
+        if max(times) > STAMP_MAX:
+            for at, time in enumerate(times):
+                if time > STAMP_MAX:
+                    block[at] = lost_message(now, f"a message has the log time {time} ns")
+                now = max(now, block[at][0])
+        if min(times) < low or max(times) > high:
+            block = [stored for stored in block if low <= stored[0] <= high]
+            if not block:
+                continue
+        now = max(now, block[-1][0])
+        # Lost ones are counted as well, and not asked for.
+        read.update(map(_channel, block))
+        yield from block
+
+
+def shortfalls(received: int, promised: Mapping[Channel, int], read: Counter[Channel]) -> Iterator[StoredMessage]:
+    """A lost message for each topic with fewer or more messages than the file promises.
+
+    Parameters
+    ----------
+    received : int
+        The log time of the reports, in ns.
+    promised : mapping of Channel to int
+        The number of messages of each channel, as an index or the metadata have it.
+    read : Counter of Channel
+    """
+    # By topic, because a damaged number may turn a message into one of another channel.
+    expected: Counter[str] = Counter()
+    found: Counter[str] = Counter()
+    for channel, count in promised.items():
+        expected[channel.topic] += count
+        found[channel.topic] += read[channel]
+    for topic, count in expected.items():
+        if found[topic] != count:
+            detail = f"the file promises {count:,} messages on {topic!r}, and {found[topic]:,} were found"
+            yield lost_message(received, detail)
 
 
 class Storage(Protocol):
@@ -67,8 +114,12 @@ class Storage(Protocol):
         Whether the writer finished the file; if not, the last messages may be missing.
     start, end : int or None
         The log times of the first and the last message on any channel, in ns; None if there is none.
-    count : int or None
-        The number of messages with transforms; None if only reading the whole file would tell.
+    channels : mapping of Channel to int or None
+        All channels that are known so far, with the number of their messages, as far as it is known.
+    complete : bool
+        Whether `channels` has all channels and all counts; if not, only reading the whole file would tell.
+    remarks : sequence of str
+        What a user should know about the choice of files, such as those that were ignored.
     """
 
     @property
@@ -81,33 +132,21 @@ class Storage(Protocol):
     def end(self) -> int | None: ...
 
     @property
-    def count(self) -> int | None: ...
+    def channels(self) -> Mapping[Channel, int | None]: ...
 
-    def messages(self, since: int | None, until: int | None, only_static: bool = False) -> Iterator[StoredMessage]:
-        """Iterate over the messages with transforms from one log time to another, inclusive, in their order."""
+    @property
+    def complete(self) -> bool: ...
+
+    @property
+    def remarks(self) -> Sequence[str]: ...
+
+    def messages(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[StoredMessage]:
+        """Iterate over the messages of some channels from one log time to another, inclusive, in their order.
+
+        An iteration without limits ends with a report of what the file promises and does not have.
+        """
         ...
 
     def close(self) -> None:
         """Release files and memory."""
         ...
-
-
-def channel_of(topic: str, kind: str, metadata: dict[str, str], ros1: bool = False) -> Channel | None:
-    """The channel of a topic; None unless it is ``tf`` or ``tf_static``, with or without a slash, and its type fits."""
-    name = topic.removeprefix("/")
-    if name not in (MOVING_TOPIC, STATIC_TOPIC) or kind not in TYPES:
-        return None
-    sender = metadata.get("callerid", "").removeprefix("/")
-    authorities = _authorities(metadata[AUTHORITIES]) if AUTHORITIES in metadata else (sender,)
-    return Channel(name == STATIC_TOPIC, authorities, ros1)
-
-
-def _authorities(text: str) -> tuple[str, ...]:
-    """Decode the authorities in metadata; the empty authority if another program wrote something else there."""
-    try:
-        runs = [(str(authority), int(count)) for authority, count in json.loads(text)]
-    except (ValueError, TypeError, RecursionError):
-        return ("",)
-    if not 0 < sum(count for _, count in runs) <= _MAX_TRANSFORMS or any(count < 0 for _, count in runs):
-        return ("",)
-    return tuple(authority for authority, count in runs for _ in range(count))

@@ -7,11 +7,13 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from support.samples import moving
 
-from tfbus.recording.formats._payload import decode_payload
+from tfbus.recording.formats._decoder import ChannelDecoder
 from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import MalformedMessageError, encode
 
-CDR, ROS1 = Channel(False, ("odometry",)), Channel(False, ("odometry",), ros1=True)
+METADATA = {"tfbus.authorities": '[["odometry", 1]]'}
+CDR = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata=METADATA)
+ROS1 = Channel("/tf", "tf2_msgs/TFMessage", "ros1", metadata={"callerid": "/odometry"})
 SAMPLES = [moving("odom", "base", 3, 1.5, "odometry"), moving("base", "wheel", 4, 2.5, "odometry")]
 PAYLOAD = encode(SAMPLES)
 BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msgs/msg/TFMessage"))
@@ -21,7 +23,7 @@ BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msg
     ("channel", "payload"), [(CDR, PAYLOAD), (CDR, zstandard.compress(PAYLOAD)), (ROS1, BY_ROS_1)], ids=str
 )
 def test_the_samples_are_those_that_were_sent_in_whatever_they_are_wrapped(channel: Channel, payload: bytes) -> None:
-    found = decode_payload(channel, payload)
+    found = ChannelDecoder(channel, static=False).decode(payload)
     assert (found.samples, found.errors) == (SAMPLES, [])
 
 
@@ -31,7 +33,7 @@ def test_in_the_other_byte_order_every_transform_has_its_authority_too() -> None
     numbers = struct.pack(">7d", 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     one = struct.pack(">iI", 1, 2) + b"".join(name)
     payload = b"\0\0\0\0" + struct.pack(">I", 2) + one + b"\0" * 4 + numbers + one + numbers
-    found = decode_payload(CDR, payload)
+    found = ChannelDecoder(CDR, static=False).decode(payload)
     assert found.samples == [moving("abc", "xyz", 1_000_000_002, 1.0, "odometry")] * 2
 
 
@@ -39,7 +41,7 @@ def test_in_the_other_byte_order_every_transform_has_its_authority_too() -> None
 @given(payload=st.binary(max_size=300))
 def test_any_bytes_are_samples_or_malformed(channel: Channel, payload: bytes) -> None:
     try:
-        decode_payload(channel, payload)
+        ChannelDecoder(channel, static=False).decode(payload)
     except MalformedMessageError as error:
         assert error.reason
 
@@ -51,12 +53,12 @@ def test_a_message_that_is_cut_or_turned_over_is_samples_or_malformed(channel: C
     payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
     end = data.draw(st.integers(0, len(payload)))
     try:
-        decode_payload(channel, bytes(payload[:end]))
+        ChannelDecoder(channel, static=False).decode(bytes(payload[:end]))
     except MalformedMessageError as error:
         assert error.reason
 
 
 def test_what_only_looks_compressed_is_malformed() -> None:
     with pytest.raises(MalformedMessageError) as raised:
-        decode_payload(CDR, b"\x28\xb5\x2f\xfd" + b"\xff" * 30)
+        ChannelDecoder(CDR, static=False).decode(b"\x28\xb5\x2f\xfd" + b"\xff" * 30)
     assert raised.value.reason == "encoding"

@@ -1,0 +1,21 @@
+import numpy as np
+
+from tfbus.analysis._motion import MovingSamples
+from tfbus.analysis.limits import Limits
+
+ROW = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_a_single_sample_has_nothing_wrong() -> None:
+    none = np.zeros(1, np.int64)
+    samples = MovingSamples("base", none, np.array([ROW]), none, none, none)
+    assert list(samples.findings(Limits())) == []
+
+
+def test_without_arrivals_the_order_is_not_judged() -> None:
+    stamps, none = np.array([3, 2, 1]) * 10**9, np.zeros(3, np.int64)
+    samples = MovingSamples("base", stamps, np.array([ROW] * 3), none, none, None)
+    assert list(samples.findings(Limits())) == []
+    received = stamps + 5 * 10**9
+    late = MovingSamples("base", stamps, np.array([ROW] * 3), none, none, received)
+    assert [(finding.kind, finding.count) for finding in late.findings(Limits())] == [("stamps go back", 2)]

@@ -1,0 +1,190 @@
+import math
+import random
+from typing import Any
+
+import pytest
+from support.samples import moving, static
+
+from tfbus import SECOND, Finding, Transform, TransformStamped
+from tfbus.analysis import Examiner, Limits
+
+MS = SECOND // 1_000
+
+
+def drive(count: int = 100, period: int = 100 * MS, speed: float = 1.0) -> list[TransformStamped]:
+    """A base that moves at a constant speed."""
+    return [moving("odom", "base", k * period, speed * k * period / SECOND, "odometry") for k in range(count)]
+
+
+def examine(samples: list[TransformStamped], delay: int = MS, **limits: float) -> dict[tuple[str, str | None], Finding]:
+    examiner = Examiner(Limits(**limits))
+    for sample in samples:
+        examiner.add([sample], sample.stamp + delay)
+    findings = examiner.findings()
+    found = {(finding.kind, finding.frame): finding for finding in findings}
+    assert len(found) == len(findings)
+    return found
+
+
+def test_nothing_is_wrong_with_a_robot_that_drives() -> None:
+    assert examine([static("base", "laser", 0.5), *drive()]) == {}
+
+
+def facts(finding: Finding) -> tuple[int, int | None, float | None, int | None]:
+    return finding.count, finding.first, None if finding.worst is None else round(finding.worst, 6), finding.at
+
+
+def test_a_translation_that_cannot_be_is_found_and_is_no_jump() -> None:
+    samples = drive()
+    samples[40] = moving("odom", "base", samples[40].stamp, 1e32)
+    samples[50] = moving("odom", "base", samples[50].stamp, 1e9)
+    found = examine([sample.replace(authority="") for sample in samples])
+    assert facts(found.pop(("translation", "base"))) == (2, 4 * SECOND, 1e32, 4 * SECOND)
+    assert found == {}
+
+
+def test_a_static_translation_that_cannot_be_is_found() -> None:
+    found = examine([static("base", "laser", 1e9), static("base", "laser", 1e9)])
+    assert facts(found.pop(("translation", "laser"))) == (2, None, 1e9, None)
+    assert found == {}
+
+
+def test_a_jump_is_beyond_the_bound_or_far_beyond_what_the_frame_usually_does() -> None:
+    samples = drive(speed=0.1)
+    # From 0.1 m/s to 3 m/s and back: far below the bound.
+    samples[40] = moving("odom", "base", samples[40].stamp, 0.7, "odometry")
+    found = examine(samples)
+    assert facts(found.pop(("jump", "base"))) == (2, 4 * SECOND, 3.1, 4 * SECOND)
+    assert found == {}
+    # Without a usual speed, only the bound counts.
+    few = [moving("odom", "base", 0), moving("odom", "base", SECOND, 9.0), moving("odom", "base", 2 * SECOND, 9.0)]
+    assert examine(few) == {}
+    assert facts(examine(few, speed=8.0)["jump", "base"]) == (1, SECOND, 9.0, SECOND)
+
+
+def turned(stamp: int, angle: float) -> TransformStamped:
+    return TransformStamped("odom", "base", stamp, Transform.from_axis_angle((0, 0, 1), angle))
+
+
+@pytest.mark.parametrize("angle", [1e-3, 0.5, 3.0])
+def test_a_turn_rate_is_exact_for_small_angles_and_large_ones(angle: float) -> None:
+    samples = [turned(0, 0.0), turned(SECOND, angle), turned(2 * SECOND, 2 * angle)]
+    assert examine(samples, turn_rate=angle * 1.001) == {}
+    finding = examine(samples, turn_rate=angle * 0.999)["turn", "base"]
+    assert (finding.count, finding.first) == (2, SECOND)
+    assert finding.worst == pytest.approx(angle)
+
+
+def test_a_change_of_sign_of_the_quaternion_is_no_turn() -> None:
+    one, other = Transform(), Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, -1.0))
+    samples = [TransformStamped("odom", "base", k * SECOND, (one, other)[k % 2]) for k in range(10)]
+    assert examine(samples, turn_rate=1e-6) == {}
+
+
+def test_another_parent_is_no_jump_but_is_told() -> None:
+    samples = [moving("a", "box", k * 100 * MS, 0.0) for k in range(30)]
+    samples += [moving("b", "box", k * 100 * MS, 500.0) for k in range(30, 60)]
+    found = examine([*samples, static("a", "b", 1.0)])
+    assert facts(found.pop(("two parents", "box"))) == (1, 3 * SECOND, None, None)
+    assert found == {}
+
+
+def test_stamps_that_go_back_are_found_with_the_longest_way() -> None:
+    samples = drive(10)
+    samples[3], samples[5] = samples[5], samples[3]
+    found = examine(samples)
+    assert facts(found.pop(("stamps go back", "base"))) == (2, 4 * 100 * MS, 0.2, 300 * MS)
+    assert found == {}
+
+
+def test_stamps_ahead_of_their_arrival_are_found() -> None:
+    found = examine(drive(10), delay=-80 * MS)
+    assert facts(found.pop(("ahead", "base"))) == (10, 0, 0.08, 0)
+    assert found == {}
+    assert examine(drive(10), delay=-50 * MS) == {}
+
+
+def test_duplicate_stamps_are_found() -> None:
+    samples = drive(10)
+    found = examine([*samples, samples[4], samples[4], samples[7]])
+    assert facts(found.pop(("duplicate stamps", "base")))[:2] == (3, 400 * MS)
+    assert facts(found.pop(("stamps go back", "base")))[0] == 3
+    assert found == {}
+
+
+def test_a_gap_is_long_and_unusual() -> None:
+    samples = drive()
+    found = examine(samples[:50] + samples[70:])
+    assert facts(found.pop(("gap", "base"))) == (1, 4_900 * MS, 2.1, 4_900 * MS)
+    assert found == {}
+    # A frame that is always slow has no gap, nor has a short pause of a fast one.
+    assert examine(drive(20, period=2 * SECOND)) == {}
+    fast = drive(2_000, period=MS)
+    assert examine(fast[:500] + fast[900:], gap=0.41) == {}
+
+
+def test_a_rate_that_breaks_down_is_found() -> None:
+    samples = drive(1_000, period=10 * MS)
+    # In the third tenth, only every fifth comes.
+    kept = [sample for at, sample in enumerate(samples) if not 200 <= at < 300 or at % 5 == 0]
+    found = examine(kept)
+    finding = found.pop(("rate", "base"))
+    assert (finding.count, finding.unit) == (1, "Hz")
+    assert finding.worst == pytest.approx(20.0, rel=0.1)
+    assert finding.first == pytest.approx(2 * SECOND, rel=0.01)
+    assert "from 100" in finding.detail
+    assert found == {}
+
+
+def test_two_authorities_are_found_with_their_changes() -> None:
+    samples = [sample.replace(authority=("slam", "odometry")[at // 10 % 2]) for at, sample in enumerate(drive(30))]
+    found = examine(samples)
+    assert facts(found["two authorities", "base"]) == (2, SECOND, None, None)
+    assert found["two authorities", "base"].detail == "2 senders: 'slam', 'odometry'"
+
+
+def test_a_static_frame_that_changes_is_found_and_one_that_repeats_is_not() -> None:
+    samples = [static("base", "arm", float(x), stamp=at) for at, x in enumerate([1, 1, 2, 2, 3])]
+    found = examine(samples)
+    assert facts(found.pop(("static changes", "arm"))) == (2, 2, None, None)
+    assert found == {}
+
+
+def test_a_frame_of_both_kinds_is_found() -> None:
+    found = examine([static("odom", "base"), *drive(5)])
+    assert facts(found.pop(("two kinds", "base")))[:2] == (5, 0)
+    found.pop(("two authorities", "base"))
+    assert found == {}
+
+
+def test_trees_that_are_not_connected_are_found_by_the_newest_parents() -> None:
+    assert examine([static("a", "b"), static("b", "c")]) == {}
+    found = examine([static("a", "b"), static("x", "y")])
+    assert found["disconnected", None].count == 2
+    assert found["disconnected", None].detail == "separate trees, below 'a', 'x'"
+
+
+def test_norms_and_refusals_are_told() -> None:
+    examiner = Examiner()
+    examiner.add([static("a", "b")])
+    for stamp, norm in ((1, 1.00005), (2, 1.002), (3, 0.99)):
+        examiner.add_norm("b", stamp, norm)
+    examiner.add_refused(["not finite", "cycle", "not finite"])
+    assert [(each.kind, each.frame, each.count, each.first) for each in examiner.findings()] == [
+        ("refused", None, 1, None),
+        ("refused", None, 2, None),
+        ("rotation", "b", 2, 2),
+    ]
+    assert examiner.findings()[-1].worst == pytest.approx(0.01)
+
+
+def test_any_numbers_are_examined_without_an_error() -> None:
+    rng = random.Random(3)
+    numbers: list[Any] = [0.0, 1e300, -1e-300, 1.0, math.pi]
+    samples = [
+        TransformStamped(
+            "a", rng.choice("bcd"), rng.choice([0, 1, -(2**63), 2**62]), Transform(rng.choices(numbers, k=3))
+        )
+        for _ in range(200)
+    ]
+    assert ("translation", "b") in examine(samples, delay=0)

@@ -1,0 +1,69 @@
+import csv
+import json
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from support.commands import Command, check_wrong_call
+from support.recorded import write_mcap
+from support.samples import moving
+
+from tfbus import Transform, TransformStamped
+
+SECOND = 1_000_000_000
+
+
+def write(path: Path, offset: float) -> Path:
+    """A base on a parabola."""
+    places = [(k, k * SECOND, (k + offset, 0.1 * k * k, 0.0)) for k in range(10)]
+    lines = [(k, "/tf", [TransformStamped("map", "base", stamp, Transform(place))]) for k, stamp, place in places]
+    return write_mcap(path, lines)
+
+
+@pytest.fixture
+def both(tmp_path: Path) -> tuple[Path, Path]:
+    return write(tmp_path / "truth.mcap", 0.0), write(tmp_path / "slam.mcap", 2.0)
+
+
+def test_errors_are_printed_with_and_without_alignment(both: tuple[Path, Path], tfbus: Command) -> None:
+    done = tfbus("compare", *both, "--pair", "map:base")
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert lines[0] == "map:base, not aligned: 10 poses of 10 and 10"
+    assert lines[2].split() == ["absolute", "translation", "m", "2", "2", "2", "0", "2", "2"]
+    assert lines[7] == "map:base, aligned: 10 poses of 10 and 10"
+    plain, aligned = json.loads(tfbus("compare", *both, "--pair", "map:base", "--json").stdout)
+    assert (plain["absolute_translation"]["rmse"], plain["alignment"]) == (2.0, None)
+    assert aligned["absolute_translation"]["max"] == pytest.approx(0.0, abs=1e-9)
+    assert aligned["alignment"]["translation"] == pytest.approx([-2.0, 0.0, 0.0])
+
+
+def test_errors_over_time_are_a_table(both: tuple[Path, Path], tfbus: Command) -> None:
+    done = tfbus("compare", *both, "--pair", "map:base", "--delta", "3", "--csv")
+    rows = list(csv.DictReader(StringIO(done.stdout)))
+    assert [row["stamp"] for row in rows] == [f"{k}.000000000" for k in range(10)]
+    assert [float(row["absolute_translation"]) for row in rows] == [2.0] * 10
+    assert [bool(row["relative_translation"]) for row in rows] == [k in (3, 6, 9) for k in range(10)]
+
+
+def test_what_cannot_be_aligned_is_warned_of(tmp_path: Path, tfbus: Command) -> None:
+    lines = [(k, "/tf", [moving("map", "base", k * SECOND, float(k))]) for k in range(5)]
+    path = write_mcap(tmp_path / "line.mcap", lines)
+    done = tfbus("compare", path, path, "--pair", "map:base")
+    assert done.returncode == 0
+    assert "their points lie on a line" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (("--pair", "base"), "a pair is TARGET:SOURCE"),
+        (("--pair", "map:base", "--csv", "--json"), "give one of them"),
+        (("--pair", "map:base", "--delta", "0"), "delta must be at least 1"),
+        ((), "--pair"),
+    ],
+)
+def test_a_wrong_call_is_one_line_and_status_2(
+    both: tuple[Path, Path], options: tuple[str, ...], why: str, tfbus: Command
+) -> None:
+    check_wrong_call(tfbus("compare", *both, *options), why)

@@ -1,0 +1,61 @@
+from pathlib import Path
+
+import pytest
+from support.commands import Command, check_wrong_call
+from support.recorded import SMALL, batches_in, write_mcap
+from support.samples import moving, static
+
+LINES = [
+    (0, "/tf_static", [static("base", "laser", 1.5)]),
+    *((k * 10**9, "/tf", [moving("odom", "base", k)]) for k in range(1, 10)),
+]
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return write_mcap(tmp_path / "run.mcap", LINES)
+
+
+def test_a_part_is_renamed_and_its_statics_go_to_a_file(source: Path, tmp_path: Path, tfbus: Command) -> None:
+    out, statics = tmp_path / "out.bag", tmp_path / "statics.yaml"
+    options = ("--from", "3", "--to", "5", "--rename", "base=body", "--prefix", "r/", "--static-to-yaml", statics)
+    done = tfbus("convert", source, out, "--drop-static", *options)
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr == f"3 messages with 3 transforms in {out}\n"
+    assert [(received, [(each.parent, each.child) for each in batch]) for received, batch in batches_in(out)] == [
+        (k * 10**9, [("r/odom", "body")]) for k in (3, 4, 5)
+    ]
+    assert statics.read_text() == (
+        '- parent: "body"\n  child: "r/laser"\n  translation: [1.5, 0.0, 0.0]\n  rotation: [0.0, 0.0, 0.0, 1.0]\n'
+    )
+
+
+def test_inputs_are_merged_and_frames_and_topics_are_chosen(source: Path, tmp_path: Path, tfbus: Command) -> None:
+    other = write_mcap(tmp_path / "other.mcap", [(2_500_000_000, "/tf", [moving("map", "odom", 2)])])
+    out = tmp_path / "out.db3"
+    assert tfbus("convert", source, other, out, "--topics", "/tf", "--frames", "odom").returncode == 0
+    assert [batch[0].child for _, batch in batches_in(out)] == ["odom"]
+    check_wrong_call(tfbus("convert", source, other, out), "give --overwrite")
+    assert tfbus("convert", source, other, out, "--overwrite").returncode == 0
+    assert [received for received, _ in batches_in(out)][:5] == [0, 10**9, 2 * 10**9, 2_500_000_000, 3 * 10**9]
+
+
+def test_without_statics_the_file_is_an_empty_list(tmp_path: Path, tfbus: Command) -> None:
+    path, statics = write_mcap(tmp_path / "run.mcap", LINES[1:]), tmp_path / "statics.yaml"
+    tfbus("convert", path, tmp_path / "out.mcap", "--static-to-yaml", statics)
+    assert statics.read_text() == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("out.mcap",), "at last the new file"),
+        ((SMALL, "out.csv"), "must end in .mcap, .bag, .db3"),
+        ((SMALL, "out.mcap", "--rename", "base"), "--rename is OLD=NEW"),
+        ((SMALL, "out.mcap", "--rename", "base=/x"), "must not start with '/'"),
+        ((SMALL, "missing/out.mcap"), "cannot write missing/out.mcap"),
+        (("missing.bag", "out.mcap"), "there is no such file"),
+    ],
+)
+def test_a_wrong_call_is_one_line_and_status_2(arguments: tuple[object, ...], why: str, tfbus: Command) -> None:
+    check_wrong_call(tfbus("convert", *arguments), why)

@@ -1,0 +1,52 @@
+import signal
+from pathlib import Path
+
+import httpx
+import pytest
+
+pytest.importorskip("viser", reason="the live page needs viser")
+
+from support.commands import Command, check_wrong_call
+from support.processes import new_domain
+from support.programs import free_address, start_tfbus
+from support.recorded import SMALL, write_mcap
+from support.samples import moving
+
+ROBOT = Path(__file__).parents[3] / "demos" / "robot_arm.urdf"
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("backend", ["asyncio", "trio"])
+def test_the_page_of_a_recording_is_served_until_ctrl_c(backend: str) -> None:
+    with start_tfbus("view", str(SMALL), "--urdf", str(ROBOT), "--port", "0", "--backend", backend) as view:
+        address = view.output.expect("http://127.0.0.1:")
+        assert httpx.get(address, trust_env=False).status_code == 200
+        assert view.end(signal.SIGINT) == 130
+    assert view.output.text == f"{address}\n"
+    assert view.errors.text.endswith("\nopen this address in a browser; Ctrl-C ends it\n")
+
+
+@pytest.mark.thorough
+def test_the_page_of_a_domain_is_served_until_ctrl_c() -> None:
+    with start_tfbus("view", "--port", "0", "--domain", new_domain(), "--listen", free_address()) as view:
+        address = view.output.expect("http://127.0.0.1:")
+        assert httpx.get(address, trust_env=False).status_code == 200
+        assert view.end(signal.SIGINT) == 130
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (("nowhere.bag",), "there is no such file"),
+        (("RUN", "--fixed", "/map"), "/map"),
+        (("RUN", "--trail", ""), "empty"),
+        (("RUN", "--port", "70000"), "--port"),
+        (("RUN", "--urdf", "nowhere.urdf"), "cannot use nowhere.urdf: No such file"),
+        (("RUN", "--urdf", "RUN"), "not well-formed"),
+    ],
+)
+def test_what_cannot_be_shown_is_a_usage_error(
+    tmp_path: Path, tfbus: Command, arguments: tuple[str, ...], why: str
+) -> None:
+    recording = write_mcap(tmp_path / "run.mcap", [(0, "/tf", [moving("map", "base", 5)])])
+    check_wrong_call(tfbus("view", *(recording if each == "RUN" else each for each in arguments)), why)

@@ -1,0 +1,196 @@
+import json
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+import anyio.to_thread
+import pytest
+
+pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
+
+from support.samples import moving, static
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from tfbus import SECOND, Bus, BusClosedError, SimulatedClock, Transform, TransformStamped
+from tfbus.links.foxglove import FoxgloveServer
+
+pytestmark = pytest.mark.anyio
+
+START = 1_000 * SECOND
+
+
+class Application:
+    """What the Foxglove application does: it subscribes to the one channel, and reads messages."""
+
+    def __init__(self, address: str) -> None:
+        self._socket: ClientConnection = connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None)
+        self.channel: dict[str, Any] = {}
+        while not self.channel:
+            message = self._socket.recv(timeout=30.0)
+            if isinstance(message, str) and json.loads(message)["op"] == "advertise":
+                [self.channel] = json.loads(message)["channels"]
+
+    def subscribe(self) -> None:
+        wanted = {"op": "subscribe", "subscriptions": [{"id": 1, "channelId": self.channel["id"]}]}
+        self._socket.send(json.dumps(wanted))
+
+    def transforms(self) -> list[tuple[Any, ...]]:
+        """The next message: for each transform its stamp, frames, translation and rotation."""
+        while True:
+            message = self._socket.recv(timeout=30.0)
+            if isinstance(message, bytes) and message[0] == 1:
+                return [decoded(each) for each in decode_fields(message[13:]).get(1, [])]
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def decode_fields(data: bytes) -> dict[int, list[Any]]:
+    """The fields of a protobuf message by their number (protobuf.dev, "Encoding")."""
+    fields: dict[int, list[Any]] = {}
+    place = 0
+
+    def varint() -> int:
+        nonlocal place
+        value = shift = 0
+        while True:
+            byte = data[place]
+            place += 1
+            value |= (byte & 0x7F) << shift
+            shift += 7
+            if byte < 0x80:
+                return value
+
+    while place < len(data):
+        number, kind = divmod(varint(), 8)
+        value: Any
+        if kind == 0:
+            value = varint()
+        elif kind == 1:
+            value = data[place : place + 8]
+            place += 8
+        else:
+            length = varint()
+            value = data[place : place + length]
+            place += length
+        fields.setdefault(number, []).append(value)
+    return fields
+
+
+def decoded(data: bytes) -> tuple[Any, ...]:
+
+    fields = decode_fields(data)
+
+    def floats(number: int, count: int) -> tuple[float, ...]:
+        parts = decode_fields(fields[number][0])
+        return tuple(struct.unpack("<d", parts[i][0])[0] if i in parts else 0.0 for i in range(1, count + 1))
+
+    stamp = decode_fields(fields[1][0])
+    nanoseconds = stamp.get(1, [0])[0] * SECOND + stamp.get(2, [0])[0]
+    return nanoseconds, fields[2][0].decode(), fields[3][0].decode(), floats(4, 3), floats(5, 4)
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Wait for what the threads of the library bring about."""
+    with anyio.fail_after(30.0):
+        while not holds():  # noqa: ASYNC110 - there is no event to wait for
+            await anyio.sleep(0.01)
+
+
+@asynccontextmanager
+async def application(server: FoxgloveServer) -> AsyncIterator[Application]:
+    found = await anyio.to_thread.run_sync(Application, server.address)
+    try:
+        yield found
+    finally:
+        await anyio.to_thread.run_sync(found.close)
+
+
+@pytest.fixture
+def bus() -> Bus:
+    return Bus(SimulatedClock(START))
+
+
+@pytest.mark.every_loop
+async def test_an_application_gets_the_static_frames_and_then_what_is_published(bus: Bus) -> None:
+    bus.publish([static("base", "lidar", 2.0, stamp=START), moving("map", "old", START, 9.0)])
+    turned = Transform.from_xyz_rpy((1.0, -2.0, 0.5), (0.1, 0.2, 0.3))
+    async with FoxgloveServer(bus, 0) as server, application(server) as app:
+        assert (app.channel["topic"], app.channel["schemaName"]) == ("/tf", "foxglove.FrameTransforms")
+        app.subscribe()
+        assert await anyio.to_thread.run_sync(app.transforms) == [
+            (START, "base", "lidar", (2.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        ]
+        bus.publish([TransformStamped("map", "base", START + 5, turned), moving("map", "arm", START + 7, 3.0)])
+        base, arm = await anyio.to_thread.run_sync(app.transforms)
+        assert base == (START + 5, "map", "base", turned.translation, turned.rotation)
+        assert arm == (START + 7, "map", "arm", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+        assert (server.sent, server.not_sent) == (3, 0)
+
+
+async def test_a_second_application_gets_the_static_frames_of_now(bus: Bus) -> None:
+    bus.publish(
+        [static("base", "lidar", 2.0, START), static("base", "gone", 1.0, START), static("base", "b", 1.0, START)]
+    )
+    async with FoxgloveServer(bus, 0) as server, application(server) as first:
+        first.subscribe()
+        assert len(await anyio.to_thread.run_sync(first.transforms)) == 3
+        bus.remove_frame("gone")
+        bus.publish([static("base", "lidar", 3.0, START), moving("base", "b", START)])
+        async with application(server) as second:
+            second.subscribe()
+            [lidar] = await anyio.to_thread.run_sync(second.transforms)
+            assert lidar[2:4] == ("lidar", (3.0, 0.0, 0.0))
+
+
+async def test_while_nobody_has_subscribed_the_bus_is_not_listened_to(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0) as server:
+        bus.publish(moving("map", "base", START))
+        assert not bus._subscribers.callbacks
+        async with application(server) as app:
+            app.subscribe()
+            await until(lambda: bool(bus._subscribers.callbacks))
+        await until(lambda: not bus._subscribers.callbacks)
+        assert server.sent == 0
+    assert server.address == ""
+
+
+async def test_stamps_that_foxglove_cannot_hold_are_counted(bus: Bus) -> None:
+    bus.publish(
+        [static("map", "early", stamp=-1), static("map", "late", stamp=2**32 * SECOND), static("map", "ok", 1.0)]
+    )
+    async with FoxgloveServer(bus, 0) as server, application(server) as app:
+        app.subscribe()
+        assert [each[2] for each in await anyio.to_thread.run_sync(app.transforms)] == ["ok"]
+        assert (server.sent, server.not_sent) == (1, 2)
+
+
+async def test_a_port_that_is_taken_is_an_error(bus: Bus) -> None:
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        pytest.raises(OSError, match=r"cannot listen at 127\.0\.0\.1"),
+    ):
+        async with FoxgloveServer(bus, taken.getsockname()[1]):
+            pytest.fail("entered")
+
+
+async def test_a_server_is_entered_once_and_not_on_a_closed_bus(bus: Bus) -> None:
+    server = FoxgloveServer(bus, 0)
+    async with server:
+        bus.close()
+    with pytest.raises(RuntimeError, match="once"):
+        await server.__aenter__()
+    with pytest.raises(BusClosedError):
+        await FoxgloveServer(bus, 0).__aenter__()
+
+
+@pytest.mark.parametrize(
+    ("port", "error"), [(-1, ValueError), (65_536, ValueError), (1.0, TypeError), (True, TypeError)]
+)
+def test_an_invalid_port_is_refused_at_once(bus: Bus, port: Any, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        FoxgloveServer(bus, port)

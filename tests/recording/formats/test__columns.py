@@ -1,0 +1,154 @@
+import struct
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+from support.samples import moving, static
+
+from tfbus import TransformStamped
+from tfbus.recording.formats._columns import ColumnDecoder, Columns
+from tfbus.recording.formats._decoder import ChannelDecoder
+from tfbus.recording.formats._storage import Channel, StoredMessage, lost_message
+from tfbus.tf_message import encode
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+TF = "tf2_msgs/msg/TFMessage"
+METADATA = {"tfbus.authorities": '[["odometry", 1], ["slam", 1]]'}
+CDR = Channel("/tf", TF, "cdr", metadata=METADATA)
+ROS1 = Channel("/tf", "tf2_msgs/TFMessage", "ros1", metadata={"callerid": "/odometry"})
+OTHER = Channel("/tf", TF, "cdr", metadata={"tfbus.authorities": '[["other", 1]]'})
+
+
+def payload_of(channel: Channel, samples: Sequence[TransformStamped]) -> bytes:
+    data = encode(samples)
+    return bytes(TYPES.cdr_to_ros1(data, TF)) if channel is ROS1 else data
+
+
+def both(
+    stored: list[StoredMessage], prefix: str = ""
+) -> tuple[list[Columns] | None, dict[str, list[TransformStamped]]]:
+    """What is decoded at once, and one by one."""
+    decoders = {channel: ChannelDecoder(channel, static=False, prefix=prefix) for channel in (CDR, ROS1, OTHER)}
+    one_by_one: dict[str, list[TransformStamped]] = {}
+    for _, channel, payload in stored:
+        if isinstance(channel, Channel):
+            for sample in decoders[channel].decode(payload).samples:
+                if sample is not None:
+                    one_by_one.setdefault(sample.child, []).append(sample)
+    return ColumnDecoder(decoders).decode(stored), one_by_one
+
+
+def samples_in(columns: Columns) -> list[TransformStamped]:
+    found = []
+    for stamp, row in zip(columns.stamps.tolist(), columns.rows.tolist(), strict=True):
+        sample = TransformStamped.__new__(TransformStamped)
+        sample._fields = columns.parent, columns.child, stamp, tuple(row), columns.authority, columns.static
+        found.append(sample)
+    return found
+
+
+numbers = st.floats(-1e8, 1e8, allow_nan=False)
+quaternions = st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: sum(x * x for x in q) > 0.1)
+
+
+@st.composite
+def unnormalised(draw: st.DrawFn) -> tuple[float, ...]:
+    """Seven numbers whose quaternion is normalised only nearly."""
+    quaternion = np.array(draw(quaternions))
+    quaternion *= draw(st.sampled_from([1.0, 1.0 + 1e-15, 1.0 + 1e-9, 0.992, 1.009])) / np.linalg.norm(quaternion)
+    return (*draw(st.tuples(numbers, numbers, numbers)), *quaternion.tolist())
+
+
+def raw(names: Sequence[tuple[str, str]], stamp: int, rows: Sequence[tuple[float, ...]]) -> bytes:
+    """A message in CDR whose numbers are as they are given."""
+    data = bytearray(encode([moving(parent, child, stamp) for parent, child in names]))
+    at = 0
+    for row in rows:
+        at = data.index(struct.pack("<7d", 0, 0, 0, 0, 0, 0, 1), at)
+        data[at : at + 56] = struct.pack("<7d", *row)
+    return bytes(data)
+
+
+NAMES = ([("map", "odom"), ("odom", "base")], [("map", "odom")], [("a", "b"), ("b", "c")])
+
+
+@given(
+    lines=st.lists(
+        st.tuples(st.sampled_from([CDR, ROS1]), st.sampled_from(NAMES), st.integers(0, 10**18), unnormalised()),
+        max_size=12,
+    ),
+    prefix=st.sampled_from(["", "r1/"]),
+)
+def test_the_bits_are_those_of_decoding_one_by_one(
+    lines: list[tuple[Channel, list[tuple[str, str]], int, tuple[float, ...]]], prefix: str
+) -> None:
+    stored: list[StoredMessage] = []
+    for at, (channel, names, stamp, row) in enumerate(lines):
+        data = raw(names, stamp, [row] * len(names))
+        stored.append((at, channel, bytes(TYPES.cdr_to_ros1(data, TF)) if channel is ROS1 else data))
+    columns, one_by_one = both(stored, prefix)
+    if columns is None:
+        # A frame has several authorities.
+        assert any(len({sample.authority for sample in samples}) > 1 for samples in one_by_one.values())
+        return
+    assert {each.child: samples_in(each) for each in columns} == one_by_one
+    for each in columns:
+        assert each.received.tolist() == [stored[at][0] for at in each.order.tolist()]
+        assert each.order.tolist() == sorted(each.order.tolist())
+
+
+GOOD = (1, CDR, encode([moving("map", "odom", 1), moving("odom", "base", 1)]))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        (2, CDR, raw([("map", "odom")], 1, [(float("nan"), 0, 0, 0, 0, 0, 1)])),
+        (2, CDR, raw([("map", "odom")], 1, [(1e10, 0, 0, 0, 0, 0, 1)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, 0, 0, 0, 1.02)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, 0, 0, 0, 0)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, 1e300, 0, 0, 0)])),
+        (2, CDR, raw([("map", "odom")], 1, [(0, 0, 0, float("inf"), 0, 0, 0)])),
+        (2, CDR, encode([moving("map", "odom", 1)])[:-8]),
+        (2, CDR, encode([moving("map", "odom", 1)]) + b"\0"),
+        (2, CDR, b"\0\0\0\0" + encode([])[4:]),
+        (2, CDR, b""),
+        (2, CDR, encode([moving("abc", "abd", 1)]).replace(b"abd", b"abc")),
+        (2, CDR, encode([moving("map", "odom", 1)]).replace(b"odom\0", b"odom!")),
+        (2, CDR, encode([moving("map", "odom", 1)]).replace(b"odom\0", b"od\xffm\0")),
+        (2, CDR, encode([moving("map", "odom", 999_999_999)]).replace(struct.pack("<I", 999_999_999), b"\xff" * 4)),
+        (
+            2,
+            ROS1,
+            payload_of(ROS1, [moving("map", "odom", 0)]).replace(b"\0" * 12, b"\0" * 4 + b"\xff" * 4 + b"\0" * 4),
+        ),
+        (2, OTHER, encode([moving("map", "odom", 2)])),
+        (2, CDR, encode([moving("earth", "odom", 2), moving("x", "y", 2)])),
+        (2, Channel("/tf", "foxglove.FrameTransform", "json"), b"{}"),
+        lost_message(2, "lost"),
+    ],
+)
+def test_what_may_be_invalid_or_needs_a_judgement_is_left_to_the_slow_path(other: StoredMessage) -> None:
+    columns, _ = both([GOOD, (3, CDR, GOOD[2])])
+    assert columns is not None
+    decoders = {channel: ChannelDecoder(channel, static=False) for channel in (CDR, ROS1, OTHER)}
+    assert ColumnDecoder(decoders).decode([GOOD, other]) is None
+
+
+def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
+    payload = encode([moving("mmap", "bbase", 5)]).replace(b"mmap", b"/map").replace(b"bbase", b"/base")
+    decoder = ColumnDecoder({CDR: ChannelDecoder(CDR, static=True)})
+    columns = decoder.decode([(1, CDR, payload)])
+    assert columns is not None
+    (found,) = columns
+    assert found[:4] == ("map", "base", "", True)
+    assert samples_in(found) == [static("map", "base", stamp=5)]
+
+
+def test_a_message_with_more_layouts_than_are_kept_is_left_to_the_slow_path() -> None:
+    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k:03}", k)])) for k in range(65)]
+    assert both(stored[:64])[0] is not None
+    assert both(stored)[0] is None

@@ -1,0 +1,133 @@
+import json
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfbus.recording.formats._raw_transforms import RawTransform, bounded, holds_transforms, parser_of, write_cdr
+from tfbus.recording.formats._storage import Channel
+from tfbus.tf_message import MalformedMessageError
+
+NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
+ONE = RawTransform(5, 6, b"map", b"base", NUMBERS)
+AS_JSON = {
+    "timestamp": {"sec": 5, "nsec": 6},
+    "parent_frame_id": "map",
+    "child_frame_id": "base",
+    "translation": {"x": 1, "y": 2.0, "z": 3},
+    "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
+}
+
+
+def foxglove(encoding: str, name: str = "foxglove.FrameTransforms", schema: bytes = b"") -> Channel:
+    return Channel("/tf", name, encoding, encoding, schema)
+
+
+def test_json_of_one_transform_and_of_many_is_read() -> None:
+    assert parser_of(foxglove("json"))(json.dumps({"transforms": [AS_JSON, AS_JSON]}).encode()) == [ONE, ONE]
+    assert parser_of(foxglove("json", "foxglove.FrameTransform"))(json.dumps(AS_JSON).encode()) == [ONE]
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"[", b"[" * 100_000, b"3", b'{"transforms": 3}', b'{"transforms": [{}]}', b"\xff", b"null"]
+)
+def test_other_json_is_malformed(text: bytes) -> None:
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("json"))(text)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"), [(("timestamp", "sec"), 1.5), (("translation", "x"), "1"), (("rotation",), 3)]
+)
+def test_json_with_wrong_values_is_malformed(path: tuple[str, ...], value: object) -> None:
+    content = json.loads(json.dumps(AS_JSON))
+    inner = content
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("json", "foxglove.FrameTransform"))(json.dumps(content).encode())
+
+
+def test_foxglove_messages_of_ros_have_the_layout_of_ros() -> None:
+    many = foxglove("cdr", "foxglove_msgs/msg/FrameTransforms")
+    assert parser_of(many)(write_cdr([ONE])) == [ONE]
+    # A single one begins at the stamp, so its numbers are aligned otherwise.
+    names = b"\4\0\0\0map\0" + b"\5\0\0\0base\0"
+    single = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + names
+    single += bytes(-(len(single) - 4) % 8) + NUMBERS
+    assert parser_of(foxglove("cdr", "foxglove_msgs/msg/FrameTransform"))(single) == [ONE]
+    ros1 = struct.pack("<II", 5, 6) + b"\3\0\0\0map\4\0\0\0base" + NUMBERS
+    assert parser_of(foxglove("ros1", "foxglove_msgs/FrameTransform"))(ros1) == [ONE]
+
+
+def protobuf_schema() -> tuple[bytes, bytes]:
+    """The definition of ``foxglove.FrameTransforms``, and a message of it."""
+    pb2 = pytest.importorskip("google.protobuf.descriptor_pb2")
+    from google.protobuf import descriptor_pool, message_factory, timestamp_pb2
+
+    file = pb2.FileDescriptorProto(name="frames.proto", package="foxglove", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    kind = pb2.FieldDescriptorProto
+    fields: dict[str, list[tuple[str, int, str]]] = {
+        "Vector3": [(axis, kind.TYPE_DOUBLE, "") for axis in "xyz"],
+        "Quaternion": [(axis, kind.TYPE_DOUBLE, "") for axis in "xyzw"],
+        "FrameTransform": [
+            ("timestamp", kind.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
+            ("parent_frame_id", kind.TYPE_STRING, ""),
+            ("child_frame_id", kind.TYPE_STRING, ""),
+            ("translation", kind.TYPE_MESSAGE, ".foxglove.Vector3"),
+            ("rotation", kind.TYPE_MESSAGE, ".foxglove.Quaternion"),
+        ],
+        "FrameTransforms": [("transforms", kind.TYPE_MESSAGE, ".foxglove.FrameTransform")],
+    }
+    for name, parts in fields.items():
+        message = file.message_type.add(name=name)
+        for number, (part, type_, type_name) in enumerate(parts, 1):
+            label = kind.LABEL_REPEATED if part == "transforms" else kind.LABEL_OPTIONAL
+            message.field.add(name=part, number=number, type=type_, type_name=type_name or None, label=label)
+    pool = descriptor_pool.DescriptorPool()
+    timestamp = pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+    pool.Add(timestamp)
+    pool.Add(file)
+    content = message_factory.GetMessageClass(pool.FindMessageTypeByName("foxglove.FrameTransforms"))()
+    each = content.transforms.add(parent_frame_id="map", child_frame_id="base")
+    each.timestamp.seconds, each.timestamp.nanos = 5, 6
+    each.translation.x, each.translation.y, each.translation.z, each.rotation.w = 1, 2, 3, 1
+    return pb2.FileDescriptorSet(file=[timestamp, file]).SerializeToString(), content.SerializeToString()
+
+
+def test_protobuf_is_read_by_the_schema_in_the_file() -> None:
+    schema, payload = protobuf_schema()
+    assert parser_of(foxglove("protobuf", schema=schema))(payload) == [ONE]
+    for wrong in (foxglove("protobuf"), foxglove("protobuf", schema=b"\xff" * 9)):
+        with pytest.raises(MalformedMessageError):
+            parser_of(wrong)(payload)
+    with pytest.raises(MalformedMessageError):
+        parser_of(foxglove("protobuf", schema=schema))(b"\xff" * 20)
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+@given(payload=st.binary(max_size=200))
+def test_any_bytes_are_transforms_or_malformed(encoding: str, payload: bytes) -> None:
+    try:
+        parser_of(Channel("/tf", "tf2_msgs/msg/TFMessage", encoding))(payload)
+    except MalformedMessageError as error:
+        assert error.reason
+
+
+def test_a_message_is_bounded_compressed_or_not() -> None:
+    assert bounded(b"abc") == b"abc"
+    with pytest.raises(MalformedMessageError) as raised:
+        bounded(bytes(8 * 2**20 + 1))
+    assert raised.value.reason == "oversized"
+
+
+def test_only_known_types_in_known_encodings_hold_transforms() -> None:
+    assert holds_transforms(Channel("/x", "tf2_msgs/msg/TFMessage", "cdr"))
+    assert not holds_transforms(Channel("/x", "tf2_msgs/msg/TFMessage", "json"))
+    assert holds_transforms(foxglove("json"))
+    assert not holds_transforms(foxglove("cbor"))
+    assert not holds_transforms(Channel("/tf", "std_msgs/msg/String", "cdr"))

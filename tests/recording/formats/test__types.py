@@ -1,0 +1,38 @@
+import pytest
+
+from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats._types import MessageTypes, types_with_header
+
+
+@pytest.mark.parametrize(("kind", "name"), [("a/B", "a/msg/B"), ("a/msg/B", "a/msg/B")])
+def test_types_have_the_names_of_ros_2(kind: str, name: str) -> None:
+    assert MessageTypes.name(kind) == name
+    with pytest.raises(ValueError, match="no name of a type"):
+        MessageTypes.name("B")
+
+
+def test_a_type_that_the_file_defines_is_converted() -> None:
+    cdr = Channel("/a", "my_msgs/msg/Pair", "cdr", "ros2msg", b"uint8 a\nuint32 b\n")
+    ros1 = Channel("/a", "my_msgs/Pair", "ros1", "ros1msg", b"uint8 a\nuint32 b\n")
+    payload = b"\0\1\0\0\7\0\0\0\5\0\0\0"
+    assert MessageTypes().convert(cdr, payload) == b"\7\5\0\0\0"
+    assert MessageTypes().convert(ros1, b"\7\5\0\0\0") == payload
+    definition, digest = MessageTypes().ros1_definition(cdr)
+    assert "uint32 b" in definition
+    assert len(digest) == 32
+
+
+def test_what_is_not_known_or_damaged_is_an_error() -> None:
+    unknown = Channel("/a", "my_msgs/msg/Pair", "cdr")
+    types = MessageTypes()
+    with pytest.raises(ValueError, match="cannot be converted"):
+        types.convert(unknown, b"\0\1\0\0")
+    with pytest.raises(ValueError, match="has no definition"):
+        types.ros1_definition(unknown)
+    with pytest.raises(ValueError, match="cannot be read"):
+        types.convert(Channel("/a", "my_msgs/msg/Pair", "cdr", "ros2msg", b"\xff{{"), b"")
+
+
+def test_types_with_a_header_are_known() -> None:
+    assert "sensor_msgs/msg/LaserScan" in types_with_header()
+    assert "geometry_msgs/msg/Twist" not in types_with_header()

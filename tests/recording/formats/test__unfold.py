@@ -1,0 +1,61 @@
+import bz2
+import io
+from collections.abc import Callable
+
+import lz4.frame
+import pytest
+import zstandard
+
+from tfbus.recording.formats._unfold import UnfoldError, unfold, unfold_file
+
+DATA = bytes(range(256)) * 4_096
+FOLD: dict[str, Callable[[bytes], bytes]] = {
+    "zstd": zstandard.compress,
+    "lz4": lz4.frame.compress,
+    "bz2": bz2.compress,
+    "": bytes,
+    "none": bytes,
+}
+COMPRESSED = ("zstd", "lz4", "bz2")
+
+
+@pytest.mark.parametrize("kind", FOLD)
+def test_what_was_folded_unfolds_to_the_same_up_to_the_bound(kind: str) -> None:
+    folded = FOLD[kind](DATA)
+    assert unfold(folded, kind, len(DATA)) == DATA
+    with pytest.raises(UnfoldError, match=f"more than {len(DATA) - 1:,} bytes"):
+        unfold(folded, kind, len(DATA) - 1)
+
+
+@pytest.mark.parametrize("kind", COMPRESSED)
+def test_a_torn_part_gives_what_it_unfolds_to(kind: str) -> None:
+    # Pseudo-random bytes, so that there are several blocks.
+    data = b"".join((k * 2_654_435_761 % 2**32).to_bytes(4, "little") for k in range(500_000))
+    folded = FOLD[kind](data)
+    part = unfold(folded[: len(folded) * 3 // 4], kind, len(data), torn=True)
+    assert len(data) // 4 < len(part) < len(data)
+    assert data.startswith(part)
+
+
+@pytest.mark.parametrize("kind", ["lz4", "bz2"])
+def test_data_that_end_too_early_are_damage(kind: str) -> None:
+    with pytest.raises(UnfoldError, match="end too early"):
+        unfold(FOLD[kind](DATA)[:-10], kind, len(DATA))
+
+
+@pytest.mark.parametrize("kind", COMPRESSED)
+def test_nonsense_and_unknown_compressions_are_damage(kind: str) -> None:
+    with pytest.raises(UnfoldError, match="cannot be decompressed"):
+        unfold(b"\xff" * 100, kind, 1_000)
+    with pytest.raises(UnfoldError, match="the compression 'rar' is unknown"):
+        unfold(DATA, "rar", len(DATA))
+
+
+def test_a_file_unfolds_into_another_up_to_the_bound() -> None:
+    folded, unfolded = zstandard.compress(DATA), io.BytesIO()
+    unfold_file(io.BytesIO(folded), unfolded, len(DATA))
+    assert unfolded.getvalue() == DATA
+    with pytest.raises(UnfoldError, match="which is the bound"):
+        unfold_file(io.BytesIO(folded), io.BytesIO(), len(DATA) - 1)
+    with pytest.raises(UnfoldError, match="cannot be decompressed"):
+        unfold_file(io.BytesIO(b"\xff" * 100), io.BytesIO(), len(DATA))

@@ -1,0 +1,35 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfbus import SECOND
+from tfbus.recording._delays import Delays
+
+delays = st.lists(st.integers(-(10**15), 10**15), min_size=1, max_size=300)
+
+
+@given(parts=st.lists(delays, min_size=1, max_size=3))
+def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(parts: list[list[int]]) -> None:
+    counted = []
+    for part in parts:
+        each = Delays()
+        each.add(np.array(part))
+        counted.append(each)
+    spread = Delays.joined(counted).spread()
+    assert spread is not None
+    whole = sorted(delay for part in parts for delay in part)
+    assert spread.mean == pytest.approx(sum(whole) / len(whole) / SECOND, rel=1e-9, abs=1e-9)
+    assert spread.max == whole[-1] / SECOND
+    exact = whole[-(-99 * len(whole) // 100) - 1] / SECOND
+    assert spread.p99 == pytest.approx(exact, rel=0.0101, abs=1e-12)
+    assert spread.p99 <= spread.max
+
+
+def test_zero_is_exact_and_nothing_has_no_spread() -> None:
+    zero = Delays()
+    zero.add(np.zeros(3, np.int64))
+    spread = zero.spread()
+    assert spread is not None
+    assert (spread.mean, spread.p99, spread.max) == (0.0, 0.0, 0.0)
+    assert Delays().spread() is None

@@ -1,0 +1,230 @@
+import sqlite3
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
+from support.recorded import SMALL, Line, batches_in, messages_in, write_mcap
+from support.samples import moving, static
+
+from tfbus import RecordingError
+from tfbus.recording import Conversion, Edits, convert, load, open_recording
+from tfbus.recording.formats._raw_transforms import RawTransform, parser_of, write_cdr, write_ros1
+from tfbus.recording.formats._storage import Channel
+from tfbus.recording.recording import open_storage
+from tfbus.tf_message import encode
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+TF = "tf2_msgs/msg/TFMessage"
+ENDINGS = (".mcap", ".bag", ".db3")
+CDR, ROS1 = Channel("/tf", TF, "cdr"), Channel("/tf", "tf2_msgs/TFMessage", "ros1")
+
+LINES: list[Line] = [
+    (10, "/tf_static", [static("base", "laser", 1.0), static("base", "camera", 2.0)]),
+    *((100 + k, "/tf", [moving("odom", "base", k, float(k)), moving("base", "wheel", k)]) for k in range(20)),
+]
+EXPECTED = [(received, tuple(samples)) for received, _, samples in LINES]
+
+
+def raw(path: Path) -> list[tuple[int, str, list[RawTransform]]]:
+    """Log time, topic and the transforms of all messages, bit by bit."""
+    storage = open_storage(path)
+    try:
+        return [
+            (received, channel.topic, parser_of(channel)(payload))
+            for received, channel, payload in storage.messages(lambda channel: channel.topic in ("/tf", "/tf_static"))
+            if isinstance(channel, Channel)
+        ]
+    finally:
+        storage.close()
+
+
+@pytest.mark.parametrize("first", ENDINGS)
+@pytest.mark.parametrize("second", ENDINGS)
+def test_transforms_keep_every_bit_from_any_format_to_any_other(tmp_path: Path, first: str, second: str) -> None:
+    one, two = tmp_path / f"one{first}", tmp_path / f"two{second}"
+    # The small bag has numbers that are not finite, and quaternions that are not normalised.
+    done = convert([SMALL], one)
+    assert (done.messages, done.problems) == (len(messages_in(SMALL)), {})
+    convert([one], two)
+    assert raw(one) == raw(two) == raw(SMALL)
+    assert sorted(tmp_path.iterdir()) == [one, two]
+
+
+bits = st.binary(min_size=56, max_size=56)
+names = st.text("ab/é\0", max_size=9).map(str.encode)
+transforms = st.builds(RawTransform, st.integers(0, 2**31 - 1), st.integers(0, 2**32 - 1), names, names, bits)
+
+
+@given(transforms=st.lists(transforms, max_size=5))
+def test_what_is_written_is_what_rosbags_and_the_parser_read(transforms: list[RawTransform]) -> None:
+    cdr, ros1 = write_cdr(transforms), write_ros1(transforms)
+    assert parser_of(CDR)(cdr) == parser_of(ROS1)(ros1) == transforms
+    assert bytes(TYPES.ros1_to_cdr(ros1, TF)) == cdr
+
+
+def lines_of_others(path: Path) -> list[tuple[str, int, bytes]]:
+    """Topic, log time and payload of all messages, by the official reader or by rosbags."""
+    if path.suffix == ".mcap":
+        with path.open("rb") as file:
+            return [(channel.topic, each.log_time, each.data) for _, channel, each in make_reader(file).iter_messages()]
+    if path.suffix == ".bag":
+        with rosbag1.Reader(path) as reader:
+            return [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
+    folder = path.with_suffix("")
+    folder.mkdir()
+    database = sqlite3.connect(path)
+    ((metadata,),) = database.execute("SELECT metadata FROM metadata")
+    database.close()
+    (folder / "metadata.yaml").write_text(metadata)
+    path.rename(folder / path.name)
+    with rosbag2.Reader(folder) as bag:
+        return [(connection.topic, time, bytes(data)) for connection, time, data in bag.messages()]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_readers_of_others_find_the_same_messages(tmp_path: Path, ending: str) -> None:
+    source = write_mcap(tmp_path / "source.mcap", LINES)
+    path = tmp_path / f"run{ending}"
+    convert([source], path)
+    payloads = [
+        (topic, received, encode(samples)) for received, topic, samples in LINES if not isinstance(samples, bytes)
+    ]
+    if ending == ".bag":
+        payloads = [(topic, time, bytes(TYPES.cdr_to_ros1(payload, TF))) for topic, time, payload in payloads]
+    assert lines_of_others(path) == payloads
+
+
+def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(tmp_path: Path) -> None:
+    text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
+    source = write_mcap(tmp_path / "run.mcap", [(5, "/said", text)], schema="std_msgs/msg/String")
+    bag, back = tmp_path / "run.bag", tmp_path / "back.db3"
+    convert([source], tmp_path / "same.mcap")
+    assert lines_of_others(tmp_path / "same.mcap") == [("/said", 5, text)]
+    convert([source], bag)
+    assert lines_of_others(bag) == [("/said", 5, b"\5\0\0\0hello")]
+    convert([bag], back)
+    assert lines_of_others(back) == [("/said", 5, text)]
+
+
+def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path) -> None:
+    lines: list[Line] = [(1, "/a", b"{}"), (2, "/a", b"{}")]
+    source = write_mcap(tmp_path / "run.mcap", lines, schema="my.Thing", encoding="json")
+    for ending in (".bag", ".db3"):
+        done = convert([source], tmp_path / f"run{ending}")
+        assert (done.messages, done.problems) == (0, {"format": 2})
+        assert "cannot hold the encoding 'json'" in done.details[0]
+    unknown = write_mcap(tmp_path / "unknown.mcap", [(1, "/a", b"\0\1\0\0")], schema="my_msgs/msg/Thing")
+    done = convert([unknown], tmp_path / "unknown.bag")
+    assert (done.messages, done.problems) == (0, {"type": 1})
+
+
+def edited(tmp_path: Path, *inputs: Path, **arguments: Any) -> tuple[Conversion, list[Any]]:
+    path = tmp_path / "edited.mcap"
+    since, until = arguments.pop("since", None), arguments.pop("until", None)
+    topics = arguments.pop("topics", None)
+    done = convert(inputs, path, since, until, topics=topics, edits=Edits(**arguments), overwrite=True)
+    return done, batches_in(path)
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    return write_mcap(tmp_path / "source.mcap", LINES, metadata={"tfbus.authorities": '[["a", 1], ["b", 1]]'})
+
+
+def test_frames_are_renamed_and_get_a_prefix(tmp_path: Path, source: Path) -> None:
+    _, found = edited(tmp_path, source, rename={"base": "body"}, prefix="r1/")
+    assert {(each.parent, each.child) for _, batch in found for each in batch} == {
+        ("body", "r1/laser"),
+        ("body", "r1/camera"),
+        ("r1/odom", "body"),
+        ("body", "r1/wheel"),
+    }
+    assert {each.child: each.authority for _, batch in found for each in batch}["r1/wheel"] == "b"
+
+
+def test_only_some_frames_stay_with_their_authorities_and_empty_messages_go(tmp_path: Path, source: Path) -> None:
+    done, found = edited(tmp_path, source, frames=["wheel"])
+    assert [(received, [(each.child, each.authority) for each in batch]) for received, batch in found] == [
+        (100 + k, [("wheel", "b")]) for k in range(20)
+    ]
+    assert (done.messages, done.transforms) == (20, 20)
+
+
+def test_static_transforms_are_left_out_and_told(tmp_path: Path, source: Path) -> None:
+    done, found = edited(tmp_path, source, drop_static=True, rename={"laser": "lidar"})
+    assert not any(each.static for _, batch in found for each in batch)
+    assert {name: (each.parent, each.translation) for name, each in done.statics.items()} == {
+        "lidar": ("base", (1.0, 0.0, 0.0)),
+        "camera": ("base", (2.0, 0.0, 0.0)),
+    }
+
+
+def test_a_part_begins_with_the_static_transforms_from_before(tmp_path: Path, source: Path) -> None:
+    _, found = edited(tmp_path, source, since=105, until=107)
+    assert [received for received, _ in found] == [105, 105, 106, 107]
+    assert [each.child for each in found[0][1]] == ["laser", "camera"]
+    _, found = edited(tmp_path, source, topics=["tf"])
+    assert [received for received, _ in found] == [100 + k for k in range(20)]
+
+
+def test_several_recordings_are_merged_by_their_log_times(tmp_path: Path) -> None:
+    even = write_mcap(tmp_path / "even.mcap", LINES[::2])
+    odd = write_mcap(tmp_path / "odd.mcap", LINES[1::2])
+    _, found = edited(tmp_path, odd, even)
+    assert found == EXPECTED
+
+
+def test_what_is_lost_of_an_input_is_told(tmp_path: Path) -> None:
+    lines = [*LINES, (200, "/tf", b"nonsense")]
+    source = write_mcap(tmp_path / "source.mcap", lines)
+    done = convert([source], tmp_path / "same.mcap")
+    # It is passed through as it is.
+    assert (done.messages, done.problems) == (len(lines), {})
+    done = convert([source], tmp_path / "other.mcap", edits=Edits(prefix="r/"))
+    assert (done.messages, done.problems) == (len(LINES), {"encoding": 1})
+
+
+def test_a_wrong_output_is_refused_and_nothing_is_left_behind(tmp_path: Path, source: Path) -> None:
+    with pytest.raises(ValueError, match=r"must end in \.mcap, \.bag, \.db3, not 'run\.csv'"):
+        convert([source], tmp_path / "run.csv")
+    with pytest.raises(ValueError, match="is an input as well"):
+        convert([source], source, overwrite=True)
+    there = tmp_path / "there.mcap"
+    there.write_text("precious")
+    with pytest.raises(FileExistsError):
+        convert([source], there)
+    with pytest.raises(RecordingError, match="no such file"):
+        convert([source, tmp_path / "missing.bag"], there, overwrite=True)
+    with pytest.raises(OSError, match="No such file"):
+        convert([source], tmp_path / "missing" / "run.mcap")
+    assert there.read_text() == "precious"
+    assert sorted(tmp_path.iterdir()) == [source, there]
+    convert([source], there, overwrite=True)
+    assert len(load(there).frames()) == 5
+
+
+def test_foxglove_transforms_become_those_of_ros(tmp_path: Path) -> None:
+    text = (
+        b'{"transforms": [{"timestamp": {"sec": 1, "nsec": 2}, "parent_frame_id": "a", "child_frame_id": "b", '
+        b'"translation": {"x": 1, "y": 2, "z": 0.1}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}]}'
+    )
+    source = write_mcap(tmp_path / "run.mcap", [(5, "/tf", text)], schema="foxglove.FrameTransforms", encoding="json")
+    convert([source], tmp_path / "run.bag")
+    ((received, topic, (found,)),) = raw(tmp_path / "run.bag")
+    assert (received, topic, found[:4]) == (5, "/tf", (1, 2, b"a", b"b"))
+    assert struct.unpack("<7d", found.numbers) == (1.0, 2.0, 0.1, 0.0, 0.0, 0.0, 1.0)
+    convert([source], tmp_path / "same.mcap")
+    with open_recording(tmp_path / "same.mcap") as recording:
+        assert [topic.type for topic in recording.topics] == ["foxglove.FrameTransforms"]
+
+
+def test_new_names_are_checked() -> None:
+    for arguments in ({"rename": {"a": "/b"}}, {"rename": {"a": ""}}, {"prefix": "/r"}):
+        with pytest.raises(ValueError, match="a frame name"):
+            Edits(**arguments)

@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import pytest
+from rosbags.typesys import Stores, get_typestore
+from support.recorded import Line, real, write_mcap
+
+from tfbus import RecordingError
+from tfbus.recording import header_stamps
+from tfbus.recording.formats._storage import Channel
+from tfbus.recording.header_stamps import begins_with_header
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+POINT = "geometry_msgs/msg/PointStamped"
+
+
+def point(stamp: int) -> bytes:
+    kinds = TYPES.types
+    header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9), "map")
+    return bytes(TYPES.serialize_cdr(kinds[POINT](header, kinds["geometry_msgs/msg/Point"](0.0, 0.0, 0.0)), POINT))
+
+
+LINES: list[Line] = [(k, "/points", point(1_500_000_000 * k)) for k in range(3)]
+
+
+def write(path: Path, schema: str, text: bytes, lines: list[Line] = LINES, encoding: str = "cdr") -> Path:
+    return write_mcap(path, lines, schema=schema, encoding=encoding, definition=text)
+
+
+@pytest.mark.parametrize("text", [b"# a point\nstd_msgs/Header header\ngeometry_msgs/Point point\n", b""])
+def test_the_stamps_are_those_of_the_headers(tmp_path: Path, text: bytes) -> None:
+    found = header_stamps(write(tmp_path / "run.mcap", POINT, text, [*LINES, (9, "/points", b"\0\1")]), "points")
+    assert (found.stamps.tolist(), found.from_headers, found.unreadable) == ([0, 1_500_000_000, 3_000_000_000], True, 1)
+
+
+def test_without_headers_the_log_times_are_taken(tmp_path: Path) -> None:
+    found = header_stamps(write(tmp_path / "run.mcap", "std_msgs/msg/String", b"string data\n"), "/points")
+    assert (found.stamps.tolist(), found.from_headers) == ([0, 1, 2], False)
+
+
+def test_a_topic_without_messages_is_an_error_that_names_the_others(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="nothing is on topic '/point'; there are /points"):
+        header_stamps(write(tmp_path / "run.mcap", POINT, b""), "/point")
+
+
+@pytest.mark.parametrize(
+    ("channel", "expected"),
+    [
+        (Channel("/a", "my/msg/A", "cdr", "ros2msg", b"int8 X=1\nstd_msgs/msg/Header header"), True),
+        (Channel("/a", "my/A", "ros1", "ros1msg", b"Header header"), True),
+        (Channel("/a", "my/A", "ros1", "ros1msg", b"int32 x\nHeader header"), False),
+        (Channel("/a", "my/A", "ros1", "ros1msg", b"\n=====\nMSG: my/B\nHeader header"), False),
+        (Channel("/a", "sensor_msgs/LaserScan", "ros1"), True),
+        (Channel("/a", "sensor_msgs/msg/LaserScan", "cdr"), True),
+        (Channel("/a", "geometry_msgs/msg/Twist", "cdr"), False),
+        (Channel("/a", "nonsense", "cdr"), False),
+        (Channel("/a", "sensor_msgs/msg/LaserScan", "json"), False),
+    ],
+)
+def test_a_header_is_known_from_the_definition_or_the_type(channel: Channel, expected: bool) -> None:
+    assert begins_with_header(channel) is expected
+
+
+def test_the_stamps_of_a_real_recording_are_those_of_its_transforms() -> None:
+    found = header_stamps(real("pr2_tf.bag"), "/joint_states")
+    assert found.from_headers
+    assert len(found.stamps) > 100

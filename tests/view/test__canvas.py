@@ -1,0 +1,87 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the live page needs viser")
+
+from support.samples import moving, static, tree_of
+from support.viser_pages import viser_page
+
+from tfbus import LATEST, PointCloud
+from tfbus.view._canvas import Canvas
+from tfbus.view._page import Page
+
+
+def test_axes_dots_and_lines_are_where_the_scene_has_them() -> None:
+    tree = tree_of(moving("map", "base", 0, 1.0), static("base", "lidar", 2.0))
+    page = Page(tree)
+    page.select("lidar")
+    clicked: list[str] = []
+    with viser_page() as server:
+        canvas = Canvas(server, clicked.append)
+        # The same number of frames is updated in place; another one is drawn anew.
+        for sample in (None, moving("map", "base", 1, 5.0), static("base", "arm", 1.0)):
+            if sample is not None:
+                tree.insert(sample)
+            picture = page.picture(0)
+            canvas.draw(picture, 0.2)
+            axes, dots = canvas._axes, canvas._dots
+            assert axes is not None
+            assert dots is not None
+            assert np.array_equal(axes.batched_positions, picture.scene.positions)
+            assert np.array_equal(axes.batched_wxyzs, picture.scene.wxyzs)
+            assert np.array_equal(dots.batched_positions, picture.scene.positions)
+            assert np.array_equal(dots.batched_colors, picture.scene.colours)
+            assert np.array_equal(canvas._lines.points, picture.scene.lines)
+            assert np.array_equal(canvas._lines.colors, picture.scene.line_colours)
+            assert np.array_equal(canvas._chain.points, picture.scene.chain_lines)
+            assert axes.axes_length == pytest.approx(0.2)
+        canvas.draw(picture, 0.4)
+        assert canvas._axes is not axes
+        for place in (3, None, 99, 0):
+            canvas._on_click(SimpleNamespace(instance_index=place))
+    assert clicked == [picture.scene.frames[3], "map"]
+
+
+def test_labels_follow_their_frames_and_hide_when_they_are_not_wanted() -> None:
+    tree = tree_of(moving("map", "base", 0, 1.0))
+    page = Page(tree)
+    page.labels = "all"
+    with viser_page() as server:
+        canvas = Canvas(server, print)
+        canvas.draw(page.picture(0), 0.2)
+        tree.insert(moving("map", "base", 1, 4.0))
+        canvas.draw(page.picture(0), 0.2)
+        assert [(label.text, label.position[0], label.visible) for label in canvas._labels] == [
+            ("map", 0.0, True),
+            ("base", 4.0, True),
+        ]
+        page.labels = "selection"
+        page.select("map")
+        canvas.draw(page.picture(0), 0.2)
+        assert [label.visible for label in canvas._labels] == [True, False]
+
+
+def test_points_are_moved_hidden_replaced_and_removed() -> None:
+    cloud = PointCloud("map", LATEST, np.array([[0.0, 1.0, 2.0], [np.nan, 0.0, 0.0], [3.0, 4.0, 5.0]]))
+    colours = np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3]], np.uint8)
+    with viser_page() as server:
+        canvas = Canvas(server, print)
+        canvas.add_points("scan", cloud, 0.05, colours)
+        canvas.add_points("other", cloud, 0.05, (9, 9, 9))
+        first = canvas._clouds["scan"]
+        assert first.points.tolist() == [[0, 1, 2], [3, 4, 5]]
+        assert first.colors.tolist() == [[1, 1, 1], [3, 3, 3]]
+        assert not first.visible
+        canvas.place_points("scan", (1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.9))
+        assert first.visible
+        assert (first.position.tolist(), first.wxyz.tolist()) == ([1, 2, 3], [0.9, 0.1, 0.2, 0.3])
+        canvas.place_points("scan", None)
+        assert not first.visible
+        canvas.remove_points("scan")
+        canvas.add_points("third", cloud, 0.05, (9, 9, 9))
+        names = [cloud.name for cloud in canvas._clouds.values()]
+        assert len(set(names)) == 2
+        canvas.add_points("other", cloud, 0.1, (9, 9, 9))
+        assert canvas._clouds["other"].name == names[0]

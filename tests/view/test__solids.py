@@ -1,0 +1,65 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("viser", reason="the live page needs viser")
+
+from support.samples import static, tree_of
+from support.viser_pages import viser_page
+
+from tfbus import Transform, TransformStamped
+from tfbus.robot import Box, Sphere, Visual
+from tfbus.view._meshes import MeshFiles, solids_of
+from tfbus.view._page import Page
+from tfbus.view._solids import Solids
+
+VISUALS = [
+    Visual("base", Box((1.0, 2.0, 3.0)), Transform((0.0, 0.0, 0.5)), (1.0, 0.0, 0.0, 1.0)),
+    Visual("tool", Sphere(0.5)),
+    Visual("tool", Box((0.1, 0.1, 0.1)), Transform((1.0, 0.0, 0.0))),
+]
+
+
+def test_shapes_are_drawn_at_their_links_one_object_for_equal_triangles() -> None:
+    tree = tree_of(static("map", "base", 2.0))
+    quarter = Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2))
+    tree.insert(TransformStamped("base", "tool", 0, quarter, static=True))
+    page = Page(tree)
+    with viser_page() as server:
+        solids = Solids(server, solids_of(VISUALS, MeshFiles((), Path())))
+        solids.draw(page.picture(0).scene)
+        boxes, spheres = solids._handles
+        assert boxes is not None
+        assert spheres is not None
+        # The box of the tool is 1 m along x of the tool, which is y of the map.
+        assert boxes.batched_positions == pytest.approx(np.array([[2.0, 0.0, 0.5], [2.0, 1.0, 0.0]]), abs=1e-6)
+        assert boxes.batched_wxyzs[1] == pytest.approx([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])
+        assert boxes.batched_scales == pytest.approx(np.array([[1.0, 2.0, 3.0], [0.1, 0.1, 0.1]]))
+        assert boxes.batched_colors.tolist()[0] == [255, 0, 0]
+        assert spheres.batched_positions.tolist() == [[2.0, 0.0, 0.0]]
+        tree.insert(static("map", "base", 3.0))
+        solids.draw(page.picture(0).scene)
+        assert spheres.batched_positions.tolist() == [[3.0, 0.0, 0.0]]
+
+
+def test_shapes_of_links_without_a_pose_and_of_a_hidden_robot_are_left_out() -> None:
+    tree = tree_of(static("map", "base", 2.0), static("base", "tool", 1.0))
+    page = Page(tree)
+    with viser_page() as server:
+        solids = Solids(server, solids_of(VISUALS, MeshFiles((), Path())))
+        solids.draw(page.picture(0).scene)
+        tree.remove_frame("tool")
+        solids.draw(page.picture(0).scene)
+        boxes, spheres = solids._handles
+        assert boxes is not None
+        assert len(boxes.batched_positions) == 1
+        assert spheres is None
+        solids.opacity = 0.0
+        solids.draw(page.picture(0).scene)
+        assert solids._handles == [None, None]
+        solids.opacity = 0.25
+        solids.draw(page.picture(0).scene)
+        assert solids._handles[0] is not None
+        assert solids._handles[0].opacity == 0.25

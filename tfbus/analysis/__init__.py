@@ -1,0 +1,26 @@
+"""The analysis of trees that are complete: a doctor, and the comparison of trajectories.
+
+`diagnose` tells what in a tree cannot be right; an `Examiner` is fed with samples as they arrive, and so also sees what
+a tree does not keep, such as duplicates and stamps that go back. `compare` gives the absolute and the relative pose
+error of a frame between two trees, as the benchmarks for SLAM define them.
+"""
+
+from tfbus.analysis.alignment import Alignment
+from tfbus.analysis.compare import Comparison, compare
+from tfbus.analysis.diagnose import diagnose
+from tfbus.analysis.examiner import Examiner
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
+from tfbus.analysis.pose_errors import PoseErrors, Statistics
+
+__all__ = [
+    "Alignment",
+    "Comparison",
+    "Examiner",
+    "Finding",
+    "Limits",
+    "PoseErrors",
+    "Statistics",
+    "compare",
+    "diagnose",
+]

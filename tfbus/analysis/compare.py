@@ -1,0 +1,177 @@
+"""`compare`, which compares the trajectory of a frame in one tree with that in another."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.analysis.alignment import Alignment
+from tfbus.analysis.pose_errors import PoseErrors
+from tfbus.geometry.rows import Columns, compose, invert
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds
+from tfbus.tree.tree import TransformTree, forest_of
+
+_Rows = npt.NDArray[np.float64]
+_Stamps = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """The errors of a trajectory.
+
+    Parameters
+    ----------
+    poses : int
+        The number of poses that were compared.
+    of : tuple of int
+        The number of poses in the reference and in the estimate.
+    alignment : Alignment or None
+        The motion that was applied to the estimate; None without alignment.
+    absolute : PoseErrors
+        The errors of the poses (ATE, APE).
+    relative : PoseErrors
+        The errors of the steps from one pose to a later one (RPE).
+    """
+
+    poses: int
+    of: tuple[int, int]
+    alignment: Alignment | None
+    absolute: PoseErrors
+    relative: PoseErrors
+
+
+def compare(
+    reference: TransformTree,
+    estimate: TransformTree,
+    target: str,
+    source: str,
+    *,
+    align: bool = False,
+    scale: bool = False,
+    max_difference: float = 0.01,
+    delta: int = 1,
+) -> Comparison:
+    """Compare where `source` was in `target`, in two trees.
+
+    A trajectory has the stamps of the moving edge between the two frames that has the most samples. Each pose of the
+    shorter one is compared with the pose of the other one that is nearest in time.
+
+    Parameters
+    ----------
+    reference, estimate : TransformTree
+    target, source : str
+    align : bool
+        Move the estimate as near as possible to the reference first, by Umeyama's method.
+    scale : bool
+        With `align`, scale it as well.
+    max_difference : float
+        The greatest difference of two stamps, in s.
+    delta : int
+        The number of poses from the beginning to the end of a step; each step begins where the one before ends.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    UnknownFrameError, DisconnectedError
+        If there is no path in one of the trees.
+    ValueError
+        If there are no two poses at about the same stamp, the trajectories cannot be aligned, or `delta` is less than
+        one, or `max_difference` negative.
+    """
+    if delta < 1:
+        raise ValueError(f"delta must be at least 1, got {delta}")
+    limit = from_seconds(as_duration(max_difference, "max_difference"))
+    ours, theirs = _trajectory(reference, target, source), _trajectory(estimate, target, source)
+    first, second = _match(ours[0], theirs[0], limit)
+    if not len(first):
+        raise ValueError(
+            f"no pose of {source!r} in {target!r} is at the same stamp within {max_difference:g} s: "
+            f"{_span(ours[0])} in the reference, {_span(theirs[0])} in the estimate"
+        )
+    stamps, wanted, found = ours[0][first], ours[1][first], theirs[1][second]
+    alignment = None
+    if align:
+        alignment = Alignment.between(found[:, :3], wanted[:, :3], scale)
+        found = found.copy()
+        found[:, :3] *= alignment.scale
+        found = _stack(compose(_columns_of(alignment.transform._row, len(found)), _columns(found)))
+    absolute = _stack(compose(invert(_columns(wanted)), _columns(found)))
+    # The difference of positions, and not the length of the relative transform, which rounds once more.
+    distances = np.linalg.norm(found[:, :3] - wanted[:, :3], axis=1)
+    starts = np.arange(0, len(stamps) - delta, delta)
+    ends = starts + delta
+    steps = [compose(invert(_columns(rows[starts])), _columns(rows[ends])) for rows in (wanted, found)]
+    relative = _stack(compose(invert(steps[0]), steps[1]))
+    return Comparison(
+        len(stamps),
+        (len(ours[0]), len(theirs[0])),
+        alignment,
+        PoseErrors(stamps, distances, _angles(absolute)),
+        PoseErrors(stamps[ends], np.linalg.norm(relative[:, :3], axis=1), _angles(relative)),
+    )
+
+
+def _trajectory(tree: TransformTree, target: str, source: str) -> tuple[_Stamps, _Rows]:
+    """The stamps and the poses of a trajectory; stamps without an answer are left out."""
+    frames = set(tree.chain(target, source))
+    edges = [edge for edge in tree.edges() if not edge.static and {edge.parent, edge.child} <= frames]
+    if not edges:
+        raise ValueError(f"{source!r} does not move in {target!r}")
+    densest = max(edges, key=lambda edge: edge.samples)
+    forest = forest_of(tree)
+    with forest.lock:
+        stamps = np.array(forest.frames[densest.child].samples_between(STAMP_MIN, STAMP_MAX).stamps, np.int64)
+    found = tree.lookup_many(target, source, stamps, out_of_range="nan")
+    valid = found.valid
+    rows = np.hstack([found.translations[valid], found.rotations[valid]])
+    return stamps[valid], rows
+
+
+def _match(first: _Stamps, second: _Stamps, limit: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """The places of the stamps that belong together: of each in the shorter array, the nearest in the other."""
+    if len(second) > len(first):
+        return _nearest(first, second, limit)
+    places, others = _nearest(second, first, limit)
+    return others, places
+
+
+def _nearest(short: _Stamps, long: _Stamps, limit: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    if not len(short):
+        return np.array([], np.intp), np.array([], np.intp)
+    after = np.clip(np.searchsorted(long, short, side="right"), 1, len(long) - 1) if len(long) > 1 else None
+    if after is None:
+        best = np.zeros(len(short), np.intp)
+    else:
+        # Of two that are equally near, the earlier one.
+        best = np.where(long[after] - short < short - long[after - 1], after, after - 1)
+    near = np.flatnonzero(np.abs(long[best] - short) <= limit)
+    return near, best[near]
+
+
+def _columns(rows: _Rows) -> Columns:
+    x, y, z, i, j, k, w = rows.T
+    return x, y, z, i, j, k, w
+
+
+def _columns_of(row: Sequence[float], count: int) -> Columns:
+    return _columns(np.tile(np.array(row), (count, 1)))
+
+
+def _stack(columns: Columns) -> _Rows:
+    return np.stack(columns, axis=1)
+
+
+def _angles(rows: _Rows) -> _Rows:
+    """The angle of each rotation; exact for small ones as well."""
+    angles: _Rows = 2.0 * np.arctan2(np.linalg.norm(rows[:, 3:6], axis=1), np.abs(rows[:, 6]))
+    return angles
+
+
+def _span(stamps: _Stamps) -> str:
+    if not len(stamps):
+        return "none"
+    return f"{len(stamps):,} from {stamps[0] / 1e9:.3f} s to {stamps[-1] / 1e9:.3f} s"

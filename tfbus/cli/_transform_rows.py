@@ -1,0 +1,111 @@
+"""The rows of transforms that ``tfbus query`` prints or writes."""
+
+import csv
+import json
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from tfbus.cli.arguments import UsageError
+from tfbus.cli.output import format_seconds, printable, say
+
+Format = Literal["table", "csv", "json", "tum"]
+_BLOCK = 65_536
+_NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+class Row(NamedTuple):
+    """A transform at a stamp in ns."""
+
+    target: str
+    source: str
+    stamp: int
+    translation: list[float]
+    rotation: list[float]
+
+
+def print_rows(rows: Iterable[Row], kind: Format, several: bool) -> None:
+    """Print rows; with `several`, they are of several pairs of frames, and each line begins with its pair."""
+    # With the first row, because a lookup that fails prints nothing.
+    rows = iter(rows)
+    for first in islice(rows, 1):
+        _PRINTERS[kind](chain((first,), rows), several)
+
+
+def write_parquet(rows: Iterator[Row], path: Path) -> None:
+    """Write rows to a Parquet file with the columns target, source, stamp (int64, ns), x, y, z, qx, qy, qz and qw.
+
+    Raises
+    ------
+    UsageError
+        If the file cannot be written, or the extra is missing.
+    """
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise UsageError('--parquet needs a package more: pip install "tfbus[parquet]"') from None
+    names = pa.dictionary(pa.int32(), pa.string())
+    fields = [("target", names), ("source", names), ("stamp", pa.int64())]
+    schema = pa.schema(fields + [(name, pa.float64()) for name in _NUMBERS])
+    # A lookup that fails writes nothing.
+    rows = iter(rows)
+    first = list(islice(rows, _BLOCK))
+    count = 0
+    try:
+        with parquet.ParquetWriter(path, schema) as writer:
+            block = first
+            while block:
+                columns: list[Any] = [
+                    pa.array([row.target for row in block]).dictionary_encode(),
+                    pa.array([row.source for row in block]).dictionary_encode(),
+                    pa.array([row.stamp for row in block], pa.int64()),
+                    *(pa.array([row.translation[at] for row in block]) for at in range(3)),
+                    *(pa.array([row.rotation[at] for row in block]) for at in range(4)),
+                ]
+                writer.write_table(pa.Table.from_arrays(columns, schema=schema))
+                count += len(block)
+                block = list(islice(rows, _BLOCK))
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror or error}") from None
+    say(f"{count:,} rows in {path}")
+
+
+def _print_csv(rows: Iterator[Row], several: bool) -> None:
+    out = csv.writer(sys.stdout, lineterminator="\n")
+    out.writerow((*(("target", "source") if several else ()), "stamp", *_NUMBERS))
+    for row in rows:
+        pair = (row.target, row.source) if several else ()
+        out.writerow((*pair, format_seconds(row.stamp), *row.translation, *row.rotation))
+
+
+def _print_json(rows: Iterator[Row], _: bool) -> None:
+    for row in rows:
+        print(json.dumps({**row._asdict(), "stamp": format_seconds(row.stamp)}))
+
+
+def _print_tum(rows: Iterator[Row], _: bool) -> None:
+    for row in rows:
+        print(format_seconds(row.stamp), *row.translation, *row.rotation)
+
+
+def _print_table(rows: Iterator[Row], several: bool) -> None:
+    pair = None
+    for row in rows:
+        if pair != row[:2]:
+            if several:
+                print(f"{'' if pair is None else chr(10)}{printable(row.source)} in {printable(row.target)}")
+            print(f"{'stamp [s]':>20}" + "".join(f"{name:>12}" for name in ("x [m]", "y [m]", "z [m]", *_NUMBERS[3:])))
+            pair = row[:2]
+        values = "".join(f"{value:z12.6f}" for value in (*row.translation, *row.rotation))
+        print(f"{format_seconds(row.stamp):>20}{values}")
+
+
+_PRINTERS: dict[Format, Callable[[Iterator[Row], bool], None]] = {
+    "table": _print_table,
+    "csv": _print_csv,
+    "json": _print_json,
+    "tum": _print_tum,
+}

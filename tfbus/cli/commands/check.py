@@ -1,0 +1,125 @@
+"""``tfbus check``."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from tfbus.analysis.examiner import Examiner
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
+from tfbus.bus.bus import Bus
+from tfbus.cli.arguments import (
+    DEFAULT_TOPICS,
+    Duration,
+    Instant,
+    JsonFlag,
+    Positive,
+    TopicOptions,
+    UsageError,
+)
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import printable, progress, say, warn
+from tfbus.geometry.stamped import Batch
+from tfbus.recording.examine import examine
+
+_WRONG = 1
+_DEFAULT = Limits()
+_SUFFIXES = (".mcap", ".bag", ".db3", ".active")
+
+
+def check(
+    what: str,
+    /,
+    *,
+    since: Annotated[Instant | None, Parameter(name="--from")] = None,
+    until: Annotated[Instant | None, Parameter(name="--to")] = None,
+    duration: Duration = 10.0,
+    max_translation: Positive = _DEFAULT.translation,
+    max_speed: Positive = _DEFAULT.speed,
+    max_turn_rate: Positive = _DEFAULT.turn_rate,
+    as_json: JsonFlag = False,
+    topics: TopicOptions = DEFAULT_TOPICS,
+    link: LinkOptions = DEFAULT_LINK,
+) -> None:
+    """Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.
+
+    The exit status is 0 if nothing is wrong and 1 if something is.
+
+    Example: tfbus check run.mcap
+
+    Parameters
+    ----------
+    what
+        A recording, or the name of a domain.
+    since
+        For a recording, where to start: seconds from the beginning, a stamp in seconds, or a date.
+    until
+        For a recording, where to stop, in the same ways.
+    duration
+        For a domain, how many seconds to listen.
+    max_translation
+        The longest possible translation, in m.
+    max_speed
+        The highest possible speed of a frame in its parent, in m/s.
+    max_turn_rate
+        The highest possible angular speed of a frame in its parent, in rad/s.
+    as_json
+        Print a JSON list of findings instead.
+    """
+    limits = Limits(translation=max_translation, speed=max_speed, turn_rate=max_turn_rate)
+    file = Path(what)
+    if file.exists() or file.suffix in _SUFFIXES:
+        findings = _check_file(file, topics, limits, since, until)
+    elif since is not None or until is not None:
+        raise UsageError(f"--from and --to are for recordings, and there is no file {what!r}")
+    else:
+        findings = _check_domain(replace(link, domain=what), limits, duration)
+    if as_json:
+        print(json.dumps([{**asdict(finding), "advice": finding.advice} for finding in findings], indent=2))
+    else:
+        _print(findings)
+    sys.exit(_WRONG if findings else 0)
+
+
+def _check_file(
+    file: Path, topics: TopicOptions, limits: Limits, since: Instant | None, until: Instant | None
+) -> list[Finding]:
+    with topics.open(file) as recording, progress(recording.count, "reading") as advance:
+        if not recording.finished:
+            warn(f"{file} was not finished by its writer: this is what can be read")
+        start = recording.start
+        first = None if since is None else since.stamp(start)
+        last = None if until is None else until.stamp(start)
+        findings = examine(recording, limits, first, last, progress=advance)
+        for remark in recording.remarks:
+            warn(remark)
+    return findings
+
+
+def _check_domain(link: LinkOptions, limits: Limits, duration: float) -> list[Finding]:
+    async def listen(bus: Bus) -> list[Finding]:
+        examiner = Examiner(limits)
+
+        def note(batch: Batch) -> None:
+            examiner.add(batch, bus.clock.now())
+
+        with bus.subscribe(note):
+            await link.first_transform(bus)
+            say(f"listening to domain {link.domain!r} for {duration:g} s")
+            await bus.clock.sleep(duration)
+        return examiner.findings()
+
+    return link.run(listen)
+
+
+def _print(findings: Sequence[Finding]) -> None:
+    if not findings:
+        print("nothing is wrong")
+    for finding in findings:
+        print(printable(f"{finding.kind:<16}  {finding}"))
+        print(f"{'':16}  -> {finding.advice}")

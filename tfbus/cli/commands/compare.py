@@ -1,0 +1,165 @@
+"""``tfbus compare``."""
+
+import csv
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from tfbus.analysis import Comparison
+from tfbus.analysis.compare import compare as compare_trees
+from tfbus.cli._table import Column, table_lines
+from tfbus.cli.arguments import DEFAULT_TOPICS, Duration, Flag, JsonFlag, TopicOptions, UsageError
+from tfbus.cli.output import format_counts, format_seconds, printable, progress, warn
+from tfbus.recording.load import Problems, fill
+from tfbus.tree.tree import TransformTree
+
+_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+_COLUMNS = (Column("error"), Column("unit"), *(Column(name, right=True) for name in _STATISTICS))
+
+
+def compare(
+    reference: Path,
+    estimate: Path,
+    /,
+    *,
+    pair: Annotated[tuple[str, ...], Parameter(negative="")],
+    scale: Flag = False,
+    max_difference: Duration = 0.01,
+    delta: int = 1,
+    as_csv: Annotated[bool, Parameter(name="--csv", negative="", show_default=False)] = False,
+    as_json: JsonFlag = False,
+    topics: TopicOptions = DEFAULT_TOPICS,
+) -> None:
+    """Compare the trajectory of a frame in two recordings: absolute and relative pose error, aligned and not.
+
+    Example: tfbus compare truth.bag slam.mcap --pair map:base_link
+
+    Parameters
+    ----------
+    reference
+        The recording that counts as true.
+    estimate
+        The recording to judge.
+    pair
+        As TARGET:SOURCE, the frames whose transform is compared; may be given several times.
+    scale
+        Scale the estimate as well where it is aligned.
+    max_difference
+        The greatest difference of two stamps that are compared, in s.
+    delta
+        The number of poses of each step for the relative error.
+    as_csv
+        Print the errors over time: m and rad, without alignment; the relative ones are empty where no step ends.
+    as_json
+        Print a JSON object instead.
+    """
+    if as_csv and as_json:
+        raise UsageError("--csv and --json are two ways to print the same: give one of them")
+    wanted, judged = (_load(file, topics) for file in (reference, estimate))
+    found = {}
+    for text in pair:
+        target, colon, source = text.partition(":")
+        if not (target and colon and source):
+            raise UsageError(f"a pair is TARGET:SOURCE, such as map:base_link, not {text!r}")
+        for aligned in (False,) if as_csv else (False, True):
+            try:
+                found[text, aligned] = compare_trees(
+                    wanted,
+                    judged,
+                    target,
+                    source,
+                    align=aligned,
+                    scale=scale,
+                    max_difference=max_difference,
+                    delta=delta,
+                )
+            except ValueError as error:
+                if not aligned:
+                    raise UsageError(str(error)) from None
+                warn(f"{text}: {error}")
+    if as_csv:
+        _print_csv(found)
+    elif as_json:
+        print(json.dumps([_to_json(text, each) for (text, _), each in found.items()], indent=2))
+    else:
+        _print_tables(found)
+
+
+def _load(file: Path, topics: TopicOptions) -> TransformTree:
+    tree = TransformTree(keep=None)
+    problems = Problems()
+    with topics.open(file) as recording, progress(recording.count, "reading") as advance:
+        fill(tree, recording, problems, progress=advance)
+        remarks = recording.remarks
+    if problems:
+        warn(f"left out of {file}: {format_counts(problems)}")
+    for remark in remarks:
+        warn(f"{file}: {remark}")
+    return tree
+
+
+def _rows(found: Comparison) -> Iterator[tuple[str, str, Any]]:
+    """Name, unit and statistics of each kind of error."""
+    for kind, errors in (("absolute", found.absolute), ("relative", found.relative)):
+        if len(errors.stamps):
+            translation, rotation = errors.statistics()
+            yield f"{kind} translation", "m", translation
+            yield f"{kind} rotation", "rad", rotation
+
+
+def _to_json(text: str, found: Comparison) -> dict[str, Any]:
+    alignment = found.alignment
+    return {
+        "pair": text,
+        "poses": found.poses,
+        "of": found.of,
+        "alignment": None
+        if alignment is None
+        else {
+            "translation": alignment.transform.translation,
+            "rotation": alignment.transform.rotation,
+            "scale": alignment.scale,
+        },
+        **{name.replace(" ", "_"): asdict(statistics) for name, _, statistics in _rows(found)},
+    }
+
+
+def _print_tables(found: dict[tuple[str, bool], Comparison]) -> None:
+    for number, ((text, aligned), each) in enumerate(found.items()):
+        how = "aligned" if aligned else "not aligned"
+        if each.alignment is not None and each.alignment.scale != 1.0:
+            how += f" and scaled by {each.alignment.scale:.6g}"
+        before = "\n" if number else ""
+        print(f"{before}{printable(text)}, {how}: {each.poses:,} poses of {each.of[0]:,} and {each.of[1]:,}")
+        rows = [
+            (name, unit, *(f"{getattr(statistics, key):.6g}" for key in _STATISTICS))
+            for name, unit, statistics in _rows(each)
+        ]
+        for line in table_lines(_COLUMNS, rows, None):
+            print(line)
+
+
+def _print_csv(found: dict[tuple[str, bool], Comparison]) -> None:
+    out = csv.writer(sys.stdout, lineterminator="\n")
+    out.writerow(
+        ("pair", "stamp", "absolute_translation", "absolute_rotation", "relative_translation", "relative_rotation")
+    )
+    for (text, _), each in found.items():
+        relative = each.relative
+        steps = dict(
+            zip(
+                relative.stamps.tolist(),
+                zip(relative.translation.tolist(), relative.rotation.tolist(), strict=True),
+                strict=True,
+            )
+        )
+        absolute = each.absolute
+        for stamp, distance, angle in zip(
+            absolute.stamps.tolist(), absolute.translation.tolist(), absolute.rotation.tolist(), strict=True
+        ):
+            out.writerow((text, format_seconds(stamp), distance, angle, *steps.get(stamp, ("", ""))))

@@ -1,0 +1,106 @@
+"""``tfbus plot``."""
+
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from tfbus.cli.arguments import Flag, UsageError
+from tfbus.cli.output import track, write_file
+from tfbus.cli.recorded_tree import load_tree
+from tfbus.errors import UnknownFrameError
+from tfbus.recording.recording import open_recording
+
+_KINDS = ("png", "svg", "pdf")
+
+
+def plot(
+    file: Path,
+    /,
+    *frames: str,
+    output: Annotated[Path | None, Parameter(name=("--output", "-o"))] = None,
+    path: Flag = False,
+    three_d: Annotated[bool, Parameter(name="--3d", negative="", show_default=False)] = False,
+    gaps: Flag = False,
+    text: Flag = False,
+    compare: Path | None = None,
+) -> None:
+    """Plot the transforms of some frames from a recording over time: FILE TARGET SOURCE...
+
+    The first of FRAMES is the target, in which the others are drawn: x, y and z in m, roll, pitch and yaw in degrees.
+
+    Example: tfbus plot run.mcap map base_link lidar -o run.png
+
+    Parameters
+    ----------
+    file
+        A recording: .mcap, .db3 or .bag, or a folder of ROS 2.
+    frames
+        The target, then the sources. With --gaps, the frames to show; by default all.
+    output
+        Write a picture to this file: .png, .svg or .pdf; without it, a window opens.
+    path
+        Draw the path of each frame from above instead.
+    three_d
+        Draw the path of each frame in three dimensions.
+    gaps
+        Draw when each frame was heard instead, with histograms of the periods and delays.
+    text
+        Print the curves as lines of letters instead.
+    compare
+        Draw this recording over the first one.
+    """
+    if gaps and (path or three_d or text or compare is not None):
+        raise UsageError("--gaps is a picture of its own: give no --path, --3d, --text or --compare with it")
+    if text and (path or three_d or output is not None):
+        raise UsageError("--text prints the curves over time: give no --path, --3d or --output with it")
+    if not gaps and len(frames) < 2:
+        raise UsageError("give the target and at least one source, such as: tfbus plot run.mcap map base_link")
+    kind = None if output is None else output.suffix.removeprefix(".").lower()
+    if kind is not None and kind not in _KINDS:
+        raise UsageError(f"cannot draw {output}: its name must end in .png, .svg or .pdf")
+    try:
+        from tfbus import plot as plots
+    except ImportError as error:
+        raise UsageError(str(error)) from None
+    if gaps:
+        with open_recording(file) as recording:
+            reception = plots.read_reception(track(recording.messages(), recording.count, "reading"))
+        for frame in frames:
+            if frame not in reception:
+                raise UnknownFrameError(frame=frame, known=tuple(reception))
+        if not reception:
+            raise UsageError(f"there are no transforms in {file}")
+        chosen = {frame: reception[frame] for frame in frames} if frames else reception
+        _finish(lambda figure: plots.plot_gaps(chosen, figure), output, kind)
+        return
+    target, *sources = frames
+    trees = [("", load_tree(file)[0])]
+    if compare is not None:
+        names = (file.stem, compare.stem) if file.stem != compare.stem else (str(file), str(compare))
+        trees = [(names[0], trees[0][1]), (names[1], load_tree(compare)[0])]
+    if text:
+        for name, tree in trees:
+            for source in sources:
+                print(*[name] * bool(name), plots.sparklines(plots.read_series(tree, target, source)), sep="\n")
+    elif path or three_d:
+        _finish(lambda figure: plots.plot_path(trees, target, *sources, three_d=three_d, figure=figure), output, kind)
+    else:
+        _finish(lambda figure: plots.plot_transforms(trees, target, *sources, figure=figure), output, kind)
+
+
+def _finish(draw: Callable[[Any], Any], output: Path | None, kind: str | None) -> None:
+    """Write a figure to a file, or show it in a window until that is closed."""
+    if output is not None:
+        picture = BytesIO()
+        draw(None).savefig(picture, format=kind, dpi=150)
+        write_file(output, picture.getvalue())
+        return
+    from tfbus.plot import show_in_window
+
+    try:
+        show_in_window(draw)
+    except RuntimeError as error:
+        raise UsageError(f"{error}: write a picture with -o, or print the curves with --text") from None

@@ -1,0 +1,106 @@
+"""``tfbus view``."""
+
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Annotated
+
+import anyio
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from tfbus.buffer.buffer import Buffer
+from tfbus.bus.bus import Bus
+from tfbus.cli._event_loop import run
+from tfbus.cli.arguments import Rate, UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import print_now, say
+from tfbus.cli.recorded_tree import load_tree
+from tfbus.errors import InvalidRobotError, InvalidTransformError
+from tfbus.frames import check_frame
+
+Port = Annotated[int, Parameter(validator=Number(gte=0, lte=65_535))]
+
+
+def view(
+    file: Path | None = None,
+    /,
+    *,
+    urdf: Path | None = None,
+    package_path: Annotated[tuple[Path, ...], Parameter(negative="", show_default=False)] = (),
+    fixed: str | None = None,
+    trail: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
+    port: Port = 8080,
+    rate: Rate = 30.0,
+    link: LinkOptions = DEFAULT_LINK,
+) -> None:
+    """Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.
+
+    The address of the page is printed; only programs on this machine can open it.
+
+    Example: tfbus view run.mcap --urdf robot.urdf --trail base_link
+
+    Parameters
+    ----------
+    file
+        A recording to look at instead of a domain: .mcap, .db3 or .bag, or a folder of ROS 2.
+    urdf
+        Draw the visible shapes of this robot at its frames.
+    package_path
+        Look for the meshes of package://NAME in this folder; may be given several times.
+    fixed
+        The frame that stands still; by default the root of the largest tree.
+    trail
+        Draw where this frame was in the last ten seconds; may be given several times.
+    port
+        Serve the page at this port, or the next one that is free; 0 for any.
+    rate
+        Draw at most so many times per second.
+    """
+    try:
+        from tfbus.view import View
+    except ImportError as error:
+        raise UsageError(str(error)) from None
+    try:
+        for frame in trail if fixed is None else (*trail, fixed):
+            check_frame(frame)
+    except InvalidTransformError as error:
+        raise UsageError(str(error)) from None
+
+    async def show(bus: Bus, buffer: Buffer, live: bool) -> None:
+        page = View(
+            bus,
+            buffer,
+            port,
+            fixed=fixed,
+            trails=trail,
+            urdf=urdf,
+            package_paths=package_path,
+            rate=rate,
+            live=live,
+        )
+        async with AsyncExitStack() as stack:
+            try:
+                await stack.enter_async_context(page)
+            except (InvalidRobotError, ImportError) as error:
+                raise UsageError(str(error)) from None
+            except OSError as error:
+                what = error.filename or f"port {port}"
+                raise UsageError(f"cannot use {what}: {error.strerror or error}") from None
+            print_now(page.address)
+            say("open this address in a browser; Ctrl-C ends it")
+            await anyio.sleep_forever()
+
+    async def show_domain(bus: Bus) -> None:
+        with Buffer(bus) as buffer:
+            await show(bus, buffer, live=True)
+
+    if file is None:
+        link.run(show_domain)
+        return
+    recorded, _ = load_tree(file)
+
+    async def show_recording() -> None:
+        with Bus() as bus, Buffer(bus, keep=None, prefill=recorded) as buffer:
+            await show(bus, buffer, live=False)
+
+    run(show_recording, link.backend)

@@ -1,0 +1,41 @@
+"""Reading a whole recording for a command, with its progress and its losses on standard error."""
+
+from pathlib import Path
+
+from tfbus.cli.arguments import DEFAULT_TOPICS, TopicOptions
+from tfbus.cli.output import format_counts, progress, warn
+from tfbus.recording.load import Problems, fill
+from tfbus.recording.speed_limit import SpeedLimit
+from tfbus.tree.tree import TransformTree
+
+
+def load_tree(
+    file: Path, topics: TopicOptions = DEFAULT_TOPICS, max_speed: float | None = None
+) -> tuple[TransformTree, int | None]:
+    """The tree of a recording, and the log time of its first message in ns; warns of everything that is not in it.
+
+    Parameters
+    ----------
+    file : Path
+    topics : TopicOptions
+    max_speed : float, optional
+        In m/s; faster transforms are left out.
+
+    Raises
+    ------
+    RecordingError, UsageError
+        As `TopicOptions.open`.
+    """
+    tree = TransformTree(keep=None)
+    problems = Problems()
+    limit = None if max_speed is None else SpeedLimit(max_speed)
+    with topics.open(file) as recording, progress(recording.count, "reading") as advance:
+        if not recording.finished:
+            warn(f"{file} was not finished by its writer: this is what can be read")
+        fill(tree, recording, problems, limit=limit, progress=advance)
+        remarks, start = recording.remarks, recording.start
+    if problems:
+        warn(f"left out of {file}: {format_counts(problems)}")
+    for line in (*problems.details, *remarks):
+        warn(line)
+    return tree, start

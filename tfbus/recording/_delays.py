@@ -1,0 +1,58 @@
+"""The delays of many messages in little memory: a histogram with buckets of 1 %."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.recording.spread import Spread
+from tfbus.stamps import SECOND, to_seconds
+
+_GROWTH: Final = math.log(1.01)
+
+
+class Delays:
+    """Counts delays by their size; mean and maximum are exact."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._total = 0.0
+        self._max = -math.inf
+        self._buckets: Counter[int] = Counter()
+
+    @classmethod
+    def joined(cls, parts: Iterable["Delays"]) -> "Delays":
+        """The delays of all parts."""
+        whole = cls()
+        for part in parts:
+            whole._count += part._count
+            whole._total += part._total
+            whole._max = max(whole._max, part._max)
+            whole._buckets.update(part._buckets)
+        return whole
+
+    def add(self, delays: npt.NDArray[np.int64]) -> None:
+        """Count delays in ns; there is at least one."""
+        self._count += len(delays)
+        self._total += float(delays.sum(dtype=np.float64)) / SECOND
+        self._max = max(self._max, to_seconds(int(delays.max())))
+        # The number of a bucket is the logarithm of its upper end, with the sign of the delays; 0 ns has its own.
+        sizes = np.ceil(np.log(np.maximum(np.abs(delays.astype(np.float64)), 1.0)) / _GROWTH).astype(np.int64) + 1
+        buckets, counts = np.unique(np.sign(delays) * sizes, return_counts=True)
+        for bucket, count in zip(buckets.tolist(), counts.tolist(), strict=True):
+            self._buckets[bucket] += count
+
+    def spread(self) -> Spread | None:
+        """Their spread; None if there are none."""
+        if not self._count:
+            return None
+        rank = math.ceil(0.99 * self._count)
+        for bucket in sorted(self._buckets):
+            rank -= self._buckets[bucket]
+            if rank <= 0:
+                break
+        size = math.exp((abs(bucket) - 1) * _GROWTH) / SECOND if bucket else 0.0
+        return Spread(self._total / self._count, min(math.copysign(size, bucket), self._max), self._max)

@@ -1,0 +1,265 @@
+"""`convert`, which writes recordings to a new one, in another format, in part, or together."""
+
+import heapq
+import os
+import struct
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from itertools import groupby
+from json import dumps
+from operator import itemgetter
+from pathlib import Path
+
+from tfbus.errors import RecordingError
+from tfbus.recording.edits import Edits
+from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
+from tfbus.recording.formats._copies import BagCopy, CannotWriteError, Copy, McapCopy, SqliteCopy, transform_channel
+from tfbus.recording.formats._decoder import ChannelDecoder
+from tfbus.recording.formats._raw_transforms import (
+    COMPRESSED,
+    RawTransform,
+    bounded,
+    holds_transforms,
+    parser_of,
+    write_cdr,
+    write_ros1,
+)
+from tfbus.recording.formats._storage import AUTHORITIES, Channel, Storage, StoredMessage, Wanted
+from tfbus.recording.formats._unfold import UnfoldError, unfold
+from tfbus.recording.load import MAX_DETAILS
+from tfbus.recording.recording import open_storage
+from tfbus.tf_message import MalformedMessageError
+
+_COPIES: dict[str, Callable[[Path, str], Copy]] = {".mcap": McapCopy, ".bag": BagCopy, ".db3": SqliteCopy}
+_NUMBERS = struct.Struct("<7d")
+
+
+@dataclass(frozen=True, slots=True)
+class StaticTransform:
+    """A static transform of a recording, with its numbers as they are there."""
+
+    parent: str
+    child: str
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+    """(x, y, z, w)."""
+
+
+@dataclass(slots=True)
+class Conversion:
+    """The result of `convert`.
+
+    Parameters
+    ----------
+    messages, transforms : int
+        The number of messages on all topics, and of transforms in them, that were written.
+    problems : Counter of str
+        The number of messages that were left out, by reason.
+    details : list of str
+        What was lost or left out at the first places.
+    statics : dict of str to StaticTransform
+        The last static transform of each child frame, with its new names.
+    """
+
+    messages: int = 0
+    transforms: int = 0
+    problems: Counter[str] = field(default_factory=Counter)
+    details: list[str] = field(default_factory=list)
+    statics: dict[str, StaticTransform] = field(default_factory=dict)
+
+    def note(self, reason: str, detail: str) -> None:
+        """Count a problem."""
+        self.problems[reason] += 1
+        if len(self.details) < MAX_DETAILS and detail not in self.details:
+            self.details.append(detail)
+
+
+def convert(
+    inputs: Sequence[str | os.PathLike[str]],
+    output: str | os.PathLike[str],
+    since: int | None = None,
+    until: int | None = None,
+    *,
+    topics: Collection[str] | None = None,
+    edits: Edits | None = None,
+    overwrite: bool = False,
+    progress: Callable[[int], object] | None = None,
+) -> Conversion:
+    """Write recordings to a new one, all messages in the order of their log times.
+
+    Transforms keep every bit of their stamps and numbers, also those that nothing would accept. Other messages, and
+    messages with transforms that nothing changes, are passed through as they are. Where the new format cannot hold
+    their encoding, they are converted between CDR and ROS 1; what cannot be converted is left out and counted.
+
+    Parameters
+    ----------
+    inputs : sequence of str or path-like
+        As `open_recording`.
+    output : str or path-like
+        A file that ends in ``.mcap``, ``.bag`` (ROS 1) or ``.db3`` (ROS 2).
+    since, until : int, optional
+        The first and the last log time, in ns. With `since`, the static transforms from before come first.
+    topics : collection of str, optional
+        The topics to write; by default all.
+    edits : Edits, optional
+        What is changed in the transforms.
+    overwrite : bool
+        Whether to replace an existing file.
+    progress : callable, optional
+        Called with 1 for each message that is read.
+
+    Returns
+    -------
+    Conversion
+
+    Raises
+    ------
+    RecordingError
+        If an input cannot be read, or the packages are missing.
+    ValueError
+        If the output has another ending, or is one of the inputs.
+    FileExistsError
+        If the output is there already.
+    OSError
+        If it cannot be written; then there is no output, and an existing file stays as it was.
+    """
+    target = Path(output)
+    make = _COPIES.get(target.suffix)
+    if make is None:
+        raise ValueError(f"the output must end in {', '.join(_COPIES)}, not {target.name!r}")
+    if any(target.exists() and Path(path).exists() and target.samefile(path) for path in inputs):
+        raise ValueError(f"{target} is an input as well")
+    if target.exists() and not overwrite:
+        raise FileExistsError(17, "it is there already", str(target))
+    part = target.with_name(f".{target.stem}.part{target.suffix}")
+    with ExitStack() as stack:
+        storages = []
+        for path in inputs:
+            storages.append(open_storage(Path(path)))
+            stack.callback(storages[-1].close)
+        try:
+            copy = make(part, target.name)
+        except ImportError as error:
+            problem = f'to write it, tfbus needs some packages more: pip install "tfbus[bag]" ({error})'
+            raise RecordingError(problem, path=str(target), reason="missing extra") from error
+        stack.callback(part.unlink, missing_ok=True)
+        stack.callback(copy.close)
+        run = _Run(copy, Edits() if edits is None else edits, topics)
+        for received, channel, payload in run.merged(storages, since, until):
+            run.write(received, channel, payload)
+            if progress is not None:
+                progress(1)
+        copy.finish()
+        part.replace(target)
+    return run.result
+
+
+class _Run:
+    """One conversion: what is wanted, and what has been done."""
+
+    def __init__(self, copy: Copy, edits: Edits, topics: Collection[str] | None) -> None:
+        self.result = Conversion()
+        self._copy = copy
+        self._edits = edits
+        self._topics = None if topics is None else {topic.removeprefix("/") for topic in topics}
+        self._decoders: dict[Channel, ChannelDecoder] = {}
+        self._outputs: dict[tuple[Channel, tuple[tuple[str, int], ...]], Channel] = {}
+
+    def merged(self, storages: Sequence[Storage], since: int | None, until: int | None) -> Iterator[StoredMessage]:
+        """The wanted messages of all recordings in the order of their log times, with the statics from before."""
+        if since is not None:
+            for storage in storages:
+                latched: dict[tuple[Channel, bytes], None] = {}
+                for _, channel, payload in storage.messages(self._is_static, None, since - 1):
+                    if isinstance(channel, Channel):
+                        # In the order of those that stay.
+                        latched.pop((channel, payload), None)
+                        latched[channel, payload] = None
+                yield from ((since, channel, payload) for channel, payload in latched)
+        wanted: Wanted = self._is_wanted
+        yield from heapq.merge(*(each.messages(wanted, since, until) for each in storages), key=itemgetter(0))
+
+    def write(self, received: int, channel: Channel | MalformedMessageError, payload: bytes) -> None:
+        """Write one message, or count why it is left out."""
+        if isinstance(channel, MalformedMessageError):
+            self.result.note(channel.reason, channel.detail)
+            return
+        try:
+            if holds_transforms(channel):
+                self._write_transforms(received, channel, payload)
+            else:
+                if channel.encoding == "cdr" and payload[:4] == COMPRESSED:
+                    payload = unfold(payload, "zstd", MAX_OTHER_MESSAGE)
+                self._copy.write(channel, received, payload)
+                self.result.messages += 1
+        except MalformedMessageError as error:
+            self.result.note(error.reason, error.detail)
+        except UnfoldError as error:
+            self.result.note("damaged", str(error))
+        except CannotWriteError as error:
+            self.result.note("format", str(error))
+        except ValueError as error:
+            self.result.note("type", str(error))
+
+    def _write_transforms(self, received: int, channel: Channel, payload: bytes) -> None:
+        decoder = self._decoder(channel)
+        payload = bounded(payload)
+        plain = self._copy.holds(channel) and not self._edits.changes_messages
+        try:
+            transforms = parser_of(channel)(payload)
+        except MalformedMessageError:
+            if not plain:
+                raise
+            # It is passed through as it is.
+            transforms = []
+        kept = [
+            (self._edits.apply(each), decoder.authority_of(place, len(transforms)))
+            for place, each in enumerate(transforms)
+            if self._edits.keeps(each)
+        ]
+        if decoder.static:
+            self._note_statics([each for each, _ in kept])
+            if self._edits.drop_static:
+                return
+        if plain:
+            self._copy.write(channel, received, payload)
+        elif kept or not transforms:
+            runs = tuple((name, len(list(run))) for name, run in groupby(authority for _, authority in kept))
+            encode = write_cdr if self._copy.encoding == "cdr" else write_ros1
+            self._copy.write(self._output(channel, runs), received, encode([each for each, _ in kept]))
+        else:
+            return
+        self.result.messages += 1
+        self.result.transforms += len(kept)
+
+    def _output(self, channel: Channel, runs: tuple[tuple[str, int], ...]) -> Channel:
+        """The channel for the transforms of another one, from the given authorities."""
+        runs = runs if len(runs) > 1 else tuple((name, 1) for name, _ in runs)
+        key = channel, runs
+        if key not in self._outputs:
+            metadata = {name: value for name, value in channel.metadata.items() if name == "offered_qos_profiles"}
+            if self._copy.encoding == "ros1" and len(runs) == 1 and runs[0][0]:
+                metadata["callerid"] = "/" + runs[0][0]
+            elif any(name for name, _ in runs):
+                metadata[AUTHORITIES] = dumps(runs)
+            self._outputs[key] = transform_channel(channel, self._copy.encoding, metadata)
+        return self._outputs[key]
+
+    def _note_statics(self, transforms: Sequence[RawTransform]) -> None:
+        for each in transforms:
+            parent, child = (name.decode(errors="replace").lstrip("/") for name in (each.parent, each.child))
+            x, y, z, i, j, k, w = _NUMBERS.unpack(each.numbers)
+            self.result.statics[child] = StaticTransform(parent, child, (x, y, z), (i, j, k, w))
+
+    def _decoder(self, channel: Channel) -> ChannelDecoder:
+        if channel not in self._decoders:
+            self._decoders[channel] = ChannelDecoder(channel, self._is_static(channel))
+        return self._decoders[channel]
+
+    def _is_wanted(self, channel: Channel) -> bool:
+        return self._topics is None or channel.topic.removeprefix("/") in self._topics
+
+    def _is_static(self, channel: Channel) -> bool:
+        return self._is_wanted(channel) and holds_transforms(channel) and channel.topic.endswith("_static")

@@ -1,0 +1,68 @@
+"""`examine`, which tells what is wrong with a recording."""
+
+import math
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+
+from tfbus.analysis.examiner import Examiner
+from tfbus.analysis.finding import Finding
+from tfbus.analysis.limits import Limits
+from tfbus.recording._blocks import Block
+from tfbus.recording.formats._raw_transforms import RawTransform, bounded, parser_of
+from tfbus.recording.formats._storage import Channel
+from tfbus.recording.recording import Recording
+from tfbus.stamps import SECOND
+from tfbus.tf_message import MalformedMessageError
+
+_ROTATION = struct.Struct("<4d")
+
+
+def examine(
+    recording: Recording,
+    limits: Limits | None = None,
+    since: int | None = None,
+    until: int | None = None,
+    *,
+    progress: Callable[[int], object] | None = None,
+) -> list[Finding]:
+    """Examine all transforms of a recording in the order of their arrival.
+
+    Parameters
+    ----------
+    recording : Recording
+    limits : Limits, optional
+    since, until : int, optional
+        The first and the last log time, in ns.
+    progress : callable, optional
+        Called with the number of messages in each block that has been read.
+
+    Returns
+    -------
+    list of Finding
+        Empty if nothing is wrong.
+    """
+    examiner = Examiner(limits)
+    parsers: dict[Channel, Callable[[bytes], list[RawTransform]]] = {}
+    for block in recording.blocks(since, until):
+        if isinstance(block, Block):
+            for _, channel, payload in block.stored:
+                if isinstance(channel, Channel):
+                    parse = parsers.setdefault(channel, parser_of(channel))
+                    with suppress(MalformedMessageError):
+                        _note_norms(examiner, parse(bounded(payload)))
+        for received, batch, errors in block.messages():
+            examiner.add(batch, received)
+            examiner.add_refused(error.reason for error in errors)
+        if progress is not None:
+            progress(len(block))
+    return examiner.findings()
+
+
+def _note_norms(examiner: Examiner, transforms: list[RawTransform]) -> None:
+    for seconds, nanoseconds, _, child, numbers in transforms:
+        norm = math.hypot(*_ROTATION.unpack_from(numbers, 24))
+        # What is not finite is refused anyway.
+        if math.isfinite(norm):
+            name = child.decode(errors="replace").lstrip("/")
+            examiner.add_norm(name, seconds * SECOND + nanoseconds, norm)

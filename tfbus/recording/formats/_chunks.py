@@ -1,0 +1,57 @@
+"""Messages of chunks in the order of their log times, for the formats that store messages in chunks."""
+
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from operator import itemgetter
+from typing import NamedTuple
+
+from tfbus.recording.formats._storage import StoredMessage
+
+_log_time = itemgetter(0)
+_END = 2**64
+
+
+class ChunkPlace(NamedTuple):
+    """A chunk in an index: its log times in ns, and where it begins in the file."""
+
+    start: int
+    end: int
+    offset: int
+
+
+def merge_chunks(
+    places: Sequence[ChunkPlace], read: Callable[[ChunkPlace], list[StoredMessage]]
+) -> Iterator[list[StoredMessage]]:
+    """Iterate over the messages of all chunks, many at once, in the order of their log times even if chunks overlap.
+
+    Messages of the same log time stay in the order of the file. Only the messages of chunks that overlap are in memory.
+
+    Parameters
+    ----------
+    places : sequence of ChunkPlace
+        In the order of their starts.
+    read : callable
+        Gives the messages of a chunk in the order of the file.
+    """
+    waiting: list[StoredMessage] = []
+    origins: list[int] = []
+    for number, place in enumerate(places, 1):
+        following = places[number].start if number < len(places) else _END
+        found = read(place)
+        if not waiting and found and _in_order(found) and found[-1][0] < following:
+            # The usual case: nothing overlaps.
+            yield found
+            continue
+        waiting += found
+        origins += [place.offset] * len(found)
+        order = sorted(range(len(waiting)), key=lambda at: (waiting[at][0], origins[at]))
+        waiting = [waiting[at] for at in order]
+        origins = [origins[at] for at in order]
+        ready = bisect_left(waiting, following, key=_log_time)
+        yield waiting[:ready]
+        del waiting[:ready], origins[:ready]
+
+
+def _in_order(messages: list[StoredMessage]) -> bool:
+    times = list(map(_log_time, messages))
+    return times == sorted(times)

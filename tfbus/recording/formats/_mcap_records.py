@@ -1,0 +1,219 @@
+"""The records of an MCAP file, and the messages in its chunks (MCAP's specification, sections "Records" and "Chunk").
+
+The package `mcap` parses the records that are rare. This module only splits a file into records and a chunk into
+messages: to build an object for each message would take ten times as long.
+"""
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from typing import IO, Final, NamedTuple
+
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+
+from tfbus.recording.formats._bounds import MAX_CHUNK, MAX_CHUNK_MESSAGES, MAX_INDEX, MAX_OTHER_MESSAGE
+from tfbus.recording.formats._storage import Channel, StoredMessage
+from tfbus.recording.formats._unfold import UnfoldError, unfold
+
+DAMAGE: Final = (
+    McapError,
+    struct.error,
+    ValueError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+    RuntimeError,
+    AssertionError,
+)
+"""The errors that `mcap` raises for damaged bytes."""
+
+RECORD: Final = struct.Struct("<BQ")
+_MESSAGE: Final = struct.Struct("<HIQQ")
+_MESSAGE_RECORD: Final = struct.Struct("<BQHIQQ")
+_CHUNK: Final = struct.Struct("<QQQII")
+_LENGTH: Final = struct.Struct("<Q")
+_MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
+_SKIPPED: Final = frozenset(
+    (Opcode.HEADER, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.ATTACHMENT_INDEX, Opcode.METADATA)
+) | {Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET}
+_BOUND: Final = {Opcode.CHUNK: MAX_CHUNK, Opcode.MESSAGE: MAX_OTHER_MESSAGE}
+_PRIVATE: Final = 0x80
+
+_READ: Final[dict[int, Callable[[ReadDataStream], records.McapRecord]]] = {
+    Opcode.SCHEMA: records.Schema.read,
+    Opcode.CHANNEL: records.Channel.read,
+    Opcode.CHUNK_INDEX: records.ChunkIndex.read,
+    Opcode.STATISTICS: records.Statistics.read,
+}
+
+
+class Torn(NamedTuple):
+    """The part of a record that there is of one that goes on behind the end of the file."""
+
+    opcode: int
+    data: bytes
+
+
+class Chunk(NamedTuple):
+    """A chunk record."""
+
+    start: int
+    end: int
+    size: int
+    crc: int
+    compression: str
+    data: bytes
+
+    @classmethod
+    def parse(cls, data: bytes, torn: bool = False) -> "Chunk":
+        """Parse the content of a chunk record; with `torn`, one that may end too early.
+
+        Raises
+        ------
+        struct.error, ValueError
+        """
+        start, end, size, crc, length = _CHUNK.unpack_from(data)
+        if length > 32:
+            raise ValueError(f"the name of the compression has {length} bytes")
+        at = _CHUNK.size + length
+        compression = data[_CHUNK.size : at].decode("ascii")
+        (stored,) = _LENGTH.unpack_from(data, at)
+        at += _LENGTH.size
+        if not torn and stored != len(data) - at:
+            raise ValueError(f"{stored} bytes are announced, and there are {len(data) - at}")
+        return cls(start, end, size, crc, compression, data[at : at + stored])
+
+    def unfold(self, torn: bool = False) -> bytes:
+        """The records in the chunk; with `torn`, as far as they can be decompressed.
+
+        Raises
+        ------
+        UnfoldError
+            If the data are damaged, or larger than `MAX_CHUNK`.
+        """
+        if self.size > MAX_CHUNK:
+            raise UnfoldError(f"it claims {self.size:,} bytes, and {MAX_CHUNK:,} is the bound")
+        content = unfold(self.data, self.compression, self.size, torn)
+        if len(content) < self.size and not torn:
+            raise UnfoldError(f"it claims {self.size:,} bytes, and holds {len(content):,}")
+        if len(content) == self.size and self.crc and zlib.crc32(content) != self.crc:
+            raise UnfoldError("its checksum does not match")
+        return content
+
+
+def parse_record(opcode: int, data: bytes) -> records.McapRecord | None:
+    """The schema, channel, chunk index or statistics in a record; None for the other kinds.
+
+    Raises
+    ------
+    One of `DAMAGE`.
+    """
+    read = _READ.get(opcode)
+    return None if read is None else read(ReadDataStream(BytesIO(data)))
+
+
+def read_records(file: IO[bytes], size: int) -> Iterator[tuple[int, int, bytes | None]]:
+    """Offset, opcode and content of each record from the current position to the footer, without the kinds not needed.
+
+    The content is None if it exceeds its bound, or the opcode is unknown.
+
+    Raises
+    ------
+    EndOfFile
+        If the file of `size` bytes ends before the footer. Its argument is the `Torn` record there, if there is one.
+    """
+    while True:
+        offset = file.tell()
+        head = file.read(RECORD.size)
+        if len(head) < RECORD.size:
+            raise EndOfFile
+        opcode, length = RECORD.unpack(head)
+        if offset + RECORD.size + length > size:
+            raise EndOfFile(Torn(opcode, file.read(min(MAX_CHUNK, size - offset - RECORD.size))))
+        if opcode == Opcode.FOOTER:
+            return
+        known = opcode in _READ or opcode in _BOUND or opcode == Opcode.DATA_END
+        if known and length <= _BOUND.get(opcode, MAX_INDEX):
+            yield offset, opcode, file.read(length)
+        else:
+            file.seek(offset + RECORD.size + length)
+            if known or not (opcode in _SKIPPED or opcode >= _PRIVATE):
+                yield offset, opcode, None
+
+
+def split_message(data: bytes) -> tuple[int, int, bytes]:
+    """Log time in ns, channel and payload of a message outside of a chunk; `struct.error` if it is too short."""
+    number, _, received, _ = _MESSAGE.unpack_from(data)
+    return received, number, data[_MESSAGE.size :]
+
+
+def split_chunk(
+    data: bytes,
+    wanted: Callable[[int], Channel | None],
+    register: Callable[[records.McapRecord], object],
+    torn: bool = False,
+) -> tuple[list[StoredMessage], dict[int, int]]:
+    """Split the records of a chunk.
+
+    Parameters
+    ----------
+    data : bytes
+    wanted : callable
+        Gives a channel by its number, None if its messages are not returned; asked again after each other record.
+    register : callable
+        Gets each schema and channel before the messages that follow it.
+    torn : bool
+        Whether the data may end inside of a record.
+
+    Returns
+    -------
+    The wanted messages in the order of the chunk, and the number of all messages by channel.
+
+    Raises
+    ------
+    One of `DAMAGE`.
+    """
+    length = len(data)
+    found: list[StoredMessage] = []
+    counts: dict[int, int] = {}
+    channels: dict[int, Channel | None] = {}
+    at = 0
+    # A message has at least so many bytes; what follows the last one is read with care below.
+    last = length - _MESSAGE_RECORD.size
+    unpack = _MESSAGE_RECORD.unpack_from
+    while at < length:
+        if at > last:
+            if torn and length - at < RECORD.size:
+                break
+            opcode, size = RECORD.unpack_from(data, at)
+            number = received = 0
+        else:
+            opcode, size, number, _, received, _ = unpack(data, at)
+        start = at + RECORD.size
+        at = start + size
+        if at > length:
+            if torn:
+                break
+            raise ValueError("a record goes on behind the end of the chunk")
+        if opcode == _MESSAGE_OPCODE:
+            if size < _MESSAGE.size:
+                raise ValueError("a message is too short")
+            if number in counts:
+                counts[number] += 1
+            else:
+                counts[number] = 1
+            if number not in channels:
+                channels[number] = wanted(number)
+            channel = channels[number]
+            if channel is not None:
+                found.append((received, channel, data[start + _MESSAGE.size : at]))
+                if len(found) > MAX_CHUNK_MESSAGES:
+                    raise ValueError(f"it has more than {MAX_CHUNK_MESSAGES:,} messages, which is the bound")
+        elif record := parse_record(opcode, data[start:at]):
+            register(record)
+            channels.clear()
+    return found, counts

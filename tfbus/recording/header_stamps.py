@@ -1,0 +1,101 @@
+"""`header_stamps`, the stamps of the messages on any topic of a recording."""
+
+import os
+import struct
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.errors import RecordingError
+from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
+from tfbus.recording.formats._raw_transforms import COMPRESSED
+from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats._types import MessageTypes, types_with_header
+from tfbus.recording.formats._unfold import UnfoldError, unfold
+from tfbus.recording.recording import open_storage
+from tfbus.stamps import SECOND
+
+_HEADER_TYPES = ("Header", "std_msgs/Header", "std_msgs/msg/Header")
+
+
+class HeaderStamps(NamedTuple):
+    """The stamps of the messages on a topic."""
+
+    stamps: npt.NDArray[np.int64]
+    """ns, in the order of the log times."""
+    from_headers: bool
+    """Whether they are those of the headers; else the messages have no header, and these are their log times."""
+    unreadable: int
+    """The number of messages that are damaged or too short, and left out."""
+
+
+def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
+    """Read the stamps of all messages on a topic, whatever they hold.
+
+    Parameters
+    ----------
+    path : str or path-like
+        As `open_recording`.
+    topic : str
+
+    Raises
+    ------
+    RecordingError
+        If the recording cannot be read, or nothing is on the topic.
+    """
+    name = topic.removeprefix("/")
+    stamps: list[int] = []
+    unreadable = 0
+    from_headers = True
+    storage = open_storage(Path(path))
+    try:
+        for received, channel, payload in storage.messages(lambda each: each.topic.removeprefix("/") == name):
+            if not isinstance(channel, Channel):
+                unreadable += 1
+            elif not begins_with_header(channel):
+                from_headers = False
+                stamps.append(received)
+            else:
+                try:
+                    stamps.append(_stamp(channel, payload))
+                except (struct.error, UnfoldError):
+                    unreadable += 1
+        known = sorted({channel.topic for channel in storage.channels})
+    finally:
+        storage.close()
+    if not stamps:
+        raise RecordingError(
+            f"nothing is on topic {topic!r}; there are {', '.join(known) or 'no topics'}",
+            path=os.fspath(path),
+            reason="no such topic",
+        )
+    return HeaderStamps(np.array(stamps, np.int64), from_headers, unreadable)
+
+
+def begins_with_header(channel: Channel) -> bool:
+    """Whether the messages of a channel of ROS begin with a header, by the definition in the file or that of ROS 2."""
+    if channel.encoding not in ("cdr", "ros1"):
+        return False
+    if channel.schema and channel.schema_encoding in ("ros1msg", "ros2msg"):
+        for line in channel.schema.decode(errors="replace").splitlines():
+            field = line.partition("#")[0].split()
+            if line.startswith("==="):
+                return False
+            # A constant is no field.
+            if field and "=" not in line.partition("#")[0]:
+                return field[0] in _HEADER_TYPES
+        return False
+    return MessageTypes.name(channel.type) in types_with_header() if "/" in channel.type else False
+
+
+def _stamp(channel: Channel, payload: bytes) -> int:
+    if payload[:4] == COMPRESSED and channel.encoding == "cdr":
+        payload = unfold(payload, "zstd", MAX_OTHER_MESSAGE)
+    if channel.encoding == "ros1":
+        # Behind the number that counts the messages.
+        seconds, nanoseconds = struct.unpack_from("<II", payload, 4)
+    else:
+        seconds, nanoseconds = struct.unpack_from("<iI" if payload[1:2] == b"\1" else ">iI", payload, 4)
+    return int(seconds * SECOND + nanoseconds)

@@ -1,0 +1,18 @@
+"""`RecordedMessage`, one message of a recording."""
+
+from typing import NamedTuple
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.stamped import Batch
+from tfbus.tf_message import MalformedMessageError
+
+
+class RecordedMessage(NamedTuple):
+    """The transforms of one message of a recording."""
+
+    received: int
+    """The log time in ns: the time of recording, not a stamp."""
+    batch: Batch
+    """The valid transforms."""
+    errors: tuple[InvalidTransformError | MalformedMessageError, ...]
+    """Why the other transforms were refused; with ``reason="damaged"``, which part of the file is lost here."""

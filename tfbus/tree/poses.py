@@ -1,0 +1,257 @@
+"""The poses of all frames in one of them: what a picture of the tree needs, and faster than a lookup for each frame.
+
+The tree is walked from the fixed frame outwards, edges above it upside down, so each edge is read once for each stamp
+at which it is needed, which is usually one. The samples are read under the lock; numpy composes them after that, one
+level of the tree at a time.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+from struct import Struct
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.errors import TransformLookupError
+from tfbus.geometry.rows import IDENTITY, Row, compose, invert
+from tfbus.stamps import LATEST, STAMP_MIN, Latest
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.lookup import find
+
+_WIDTH = 7
+_pack = Struct(f"{_WIDTH}d").pack
+_IDENTITY = _pack(*IDENTITY)
+_NO_ROW = _pack(*(np.nan,) * _WIDTH)
+
+
+class Poses(NamedTuple):
+    """The poses of the frames that are connected with a fixed frame, which comes first."""
+
+    frames: tuple[str, ...]
+    columns: npt.NDArray[np.float64]
+    """Translation (m) and quaternion (x, y, z, w) of each frame in the fixed frame, shape (7, n)."""
+    parents: npt.NDArray[np.intp]
+    """The place of each frame's parent in `frames`, shape (n,); -1 for a root."""
+    answered: npt.NDArray[np.bool_]
+    """Whether a lookup has this answer, shape (n,). Otherwise edges without a sample at the stamp keep their nearest
+    one; the columns are NaN where an edge has no sample at all."""
+    static: npt.NDArray[np.bool_]
+    """Whether the edge between each frame and its parent is static, shape (n,); False for a root."""
+    heard: npt.NDArray[np.int64]
+    """The stamp (ns) of the newest sample of each frame, not after the stamp asked for, shape (n,); `STAMP_MIN` for a
+    static frame, a root, and where there is none."""
+
+
+class _Plan(NamedTuple):
+    """The order in which the frames are reached from the fixed frame."""
+
+    topology: tuple[list[str], list[str]]
+    """All children, and the parent of each."""
+    frames: list[str]
+    origins: list[int]
+    """The place of the frame from which each one is reached."""
+    edges: list[str]
+    """The child of the edge between the two."""
+    inverted: list[bool]
+    levels: list[int]
+    parents: npt.NDArray[np.intp]
+
+
+class PoseReader:
+    """Reads the poses of all frames of a forest again and again; it keeps the order of the frames while that holds.
+
+    Parameters
+    ----------
+    forest : Forest
+    """
+
+    def __init__(self, forest: Forest) -> None:
+        self._forest = forest
+        self._plans: dict[str, _Plan] = {}
+
+    def read(self, fixed: str, at: int | Latest = LATEST) -> Poses:
+        """The poses in the frame `fixed` at a stamp, or for each frame at the one that `LATEST` means.
+
+        Raises
+        ------
+        UnknownFrameError
+            If no sample names `fixed`.
+        """
+        forest = self._forest
+        with forest.lock:
+            forest.check_known(fixed)
+            plan = self._plan(fixed, at)
+            histories = [None if child == "" else forest.frames[child] for child in plan.edges]
+            gathered = _gather(plan, histories, at)
+            moved = _moved_to_another_parent(plan, histories) if at is LATEST else []
+            corrections = [(place, _find(forest, fixed, plan.frames[place])) for place in moved]
+            own = [forest.frames.get(frame) for frame in plan.frames]
+            static = np.array([history is not None and history.static for history in own])
+            if isinstance(at, Latest):
+                newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
+            else:
+                newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
+            heard = np.array(newest, np.int64)
+        columns, answered = gathered.compose()
+        for place, row in corrections:
+            answered[place] = row is not None
+            if row is not None:
+                columns[:, place] = row
+        return Poses(tuple(plan.frames), columns, plan.parents, answered, static, heard)
+
+    def _plan(self, fixed: str, at: int | Latest) -> _Plan:
+        frames = self._forest.frames
+        if isinstance(at, Latest):
+            parents = [history.parent for history in frames.values()]
+        else:
+            parents = [history.parent_at(at) for history in frames.values()]
+        # Not pairs: a thousand new tuples for each picture keep the garbage collector busy.
+        topology = list(frames), parents
+        plan = self._plans.get(fixed)
+        if plan is None or plan.topology != topology:
+            # Only one: a picture seldom changes its fixed frame.
+            self._plans = {fixed: (plan := _make_plan(fixed, topology))}
+        return plan
+
+
+def _make_plan(fixed: str, topology: tuple[list[str], list[str]]) -> _Plan:
+    above = dict(zip(*topology, strict=True))
+    below: dict[str, list[str]] = {}
+    for child, parent in above.items():
+        below.setdefault(parent, []).append(child)
+    places = {fixed: 0}
+    plan = _Plan(topology, [fixed], [-1], [""], [False], [0], np.empty(0, np.intp))
+    for place, frame in enumerate(plan.frames):
+        reached = [(child, child, False) for child in below.get(frame, ())]
+        if frame in above:
+            reached.append((above[frame], frame, True))
+        for other, child, inverted in reached:
+            if other not in places:
+                places[other] = len(plan.frames)
+                plan.frames.append(other)
+                plan.origins.append(place)
+                plan.edges.append(child)
+                plan.inverted.append(inverted)
+                plan.levels.append(plan.levels[place] + 1)
+    parents = [places.get(above.get(frame, ""), -1) for frame in plan.frames]
+    return plan._replace(parents=np.array(parents, np.intp))
+
+
+class _Gathered(NamedTuple):
+    """The edges of a plan, each as it is at the stamps at which the frames behind it need it."""
+
+    plan: _Plan
+    rows: bytearray
+    """The row of each edge, seven floats."""
+    places: list[int]
+    """The place of the frame behind each edge."""
+    origins: list[int]
+    """For each edge, the index of the one before it on the way from the fixed frame."""
+    answered: list[bool]
+    own: list[int]
+    """For each frame, the index of its edge at its own stamp."""
+
+    def compose(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        """The poses of the frames as columns of shape (7, n), and whether each is answered."""
+        places = np.array(self.places, np.intp)
+        levels = np.array(self.plan.levels, np.intp)[places]
+        order = levels.argsort(kind="stable")
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        columns = np.frombuffer(self.rows, np.float64).reshape(-1, _WIDTH).T[:, order]
+        origins = rank[np.array(self.origins, np.intp)[order]]
+        upside_down = np.flatnonzero(np.array(self.plan.inverted, np.bool_)[places][order])
+        columns[:, upside_down] = invert((*columns[:, upside_down],))
+        ends = levels[order].searchsorted(np.arange(1, levels.max() + 2))
+        for start, end in pairwise(ends.tolist()):
+            columns[:, start:end] = compose((*columns[:, origins[start:end]],), (*columns[:, start:end],))
+        own = rank[self.own]
+        return columns[:, own], np.array(self.answered, np.bool_)[self.own]
+
+
+def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Latest) -> _Gathered:
+    """Read every edge; the caller holds the lock of the forest.
+
+    The inner functions share local lists, because attributes would cost half as much again.
+    """
+    gathered = _Gathered(plan, bytearray(), [], [], [], [])
+    _, rows, places, origins, answered, own = gathered
+    before_each = plan.origins
+    # The stamp of each frame; None while the path from the fixed frame is static, and holds at every stamp.
+    stamps: list[int | None] = []
+    others: dict[tuple[int, int], int] = {}
+
+    def add(place: int, stamp: int | None, above: int) -> int:
+        """Read one edge at one stamp; where it has no sample, its nearest stands in."""
+        nonlocal rows
+        history = histories[place]
+        is_answered = True
+        if history is None:
+            row = _IDENTITY
+        elif history.static:
+            row = _pack(*history.static_row)
+        elif (newest := history.newest) is None or stamp is None:
+            row, is_answered = _NO_ROW, False
+        elif stamp >= newest:
+            row, is_answered = _pack(*history.sample(history.count - 1)[1]), stamp == newest
+        else:
+            oldest = history.stamp(0)
+            row, is_answered = _pack(*history.row_at(max(stamp, oldest))), stamp >= oldest
+        index = len(places)
+        rows += row
+        places.append(place)
+        origins.append(above)
+        answered.append(is_answered and (index == 0 or answered[above]))
+        return index
+
+    def add_at_another_stamp(place: int, stamp: int) -> int:
+        """The index of a frame at a stamp that is not its own, with all before it on the path."""
+        ahead = []
+        while stamps[place] is not None and stamps[place] != stamp and (place, stamp) not in others:
+            ahead.append(place)
+            place = before_each[place]
+        index = others.get((place, stamp), own[place])
+        for here in reversed(ahead):
+            index = others[here, stamp] = add(here, stamp, index)
+        return index
+
+    for place, history in enumerate(histories):
+        origin = before_each[place]
+        before = stamp = stamps[origin] if place else None
+        if history is not None and not history.static:
+            if isinstance(at, int):
+                stamp = at
+            elif (newest := history.newest) is None:
+                stamp = before or 0
+            elif before is None or newest < before:
+                stamp = newest
+        stamps.append(stamp)
+        if place == 0 or before is None or before == stamp:
+            above = own[origin] if place else 0
+        else:
+            assert stamp is not None
+            above = add_at_another_stamp(origin, stamp)
+        own.append(add(place, stamp, above))
+    return gathered
+
+
+def _heard(stamp: int | None) -> int:
+    return STAMP_MIN if stamp is None else stamp
+
+
+def _moved_to_another_parent(plan: _Plan, histories: Sequence[FrameHistory | None]) -> list[int]:
+    """The places of the frames that had another parent on the way to them inside the window."""
+    moved = [False] * len(histories)
+    for place, history in enumerate(histories):
+        if history is not None:
+            moved[place] = history.mixed or moved[plan.origins[place]]
+    return [place for place, has in enumerate(moved) if has]
+
+
+def _find(forest: Forest, fixed: str, frame: str) -> Row | None:
+    try:
+        return find(forest, fixed, frame, LATEST, None)[1]
+    except TransformLookupError:
+        return None

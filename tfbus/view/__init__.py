@@ -1,0 +1,16 @@
+"""The live 3D page: a `View` serves a page on which people see the frames of a buffer and move through its history.
+
+What a picture shows is decided without a browser and without an event loop (page, scene, timeline); the canvas and the
+panel draw it with viser. Needs ``pip install "tfbus[view]"``.
+"""
+
+try:
+    from tfbus.view.view import View
+except ImportError as error:
+    if error.name is None or error.name.startswith("tfbus"):
+        raise
+    raise ImportError(
+        f'for the live page, tfbus needs some packages more: pip install "tfbus[view]" ({error})'
+    ) from error
+
+__all__ = ["View"]

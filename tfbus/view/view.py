@@ -1,0 +1,351 @@
+"""`View`, the live 3D page of a bus."""
+
+import logging
+import os
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import anyio
+import anyio.abc
+import anyio.lowlevel
+import anyio.to_thread
+import numpy as np
+
+from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.task_groups import close_task_group
+from tfbus._log import OnceLogger
+from tfbus.buffer.buffer import Buffer
+from tfbus.bus.bus import Bus
+from tfbus.bus.delays import Delays
+from tfbus.data import PointCloud
+from tfbus.errors import BusClosedError
+from tfbus.events import FrameAdded
+from tfbus.frames import check_frame
+from tfbus.geometry.stamped import Batch
+from tfbus.robot.visual import read_visuals
+from tfbus.stamps import as_duration, is_real
+from tfbus.statistics import QueueStatistics
+from tfbus.tree.edge_state import STALE_AFTER
+from tfbus.view._controls import Controls
+from tfbus.view._meshes import MeshFiles, Solid, solids_of
+from tfbus.view._page import Page
+from tfbus.view._screen import Points, Screen, Sight
+from tfbus.view._server import Server, start_server, stop_server
+
+_AT_LEAST_EVERY = 0.5
+"""s; ages and stale frames change without any sample."""
+
+
+class View:
+    """A page in the browser that shows the frames of a buffer: ``async with View(bus, buffer) as view``.
+
+    It shows the axes of every frame that is connected with the fixed frame, a line to its parent in the colour of its
+    state, and in a panel what is known of the selected frame, the tree, and what happens. Time can be stopped, moved
+    and played. All browsers show the same page. While no browser shows it, it draws nothing and listens to nothing.
+
+    Parameters
+    ----------
+    bus : Bus
+    buffer : Buffer
+        Its history is what the page can go back to. The frames have the names of the bus.
+    port : int
+        Where to serve the page: this port, or the next one that is free; 0 for any.
+    host : str
+        The address to listen at. By default, only programs on this machine can connect; whoever can connect sees and
+        controls the page.
+    fixed : str, optional
+        The frame that stands still; by default the root of the largest tree. It can be changed on the page.
+    trails : iterable of str
+        Frames that draw where they were in the last ten seconds.
+    urdf : str or path, optional
+        A robot whose visible shapes are drawn at the frames of its links, as `tfbus.robot.read_visuals` takes it.
+    package_paths : iterable of path
+        Folders in which the ``package://`` of its meshes are looked for.
+    rate : float
+        The page is drawn at most so many times per s.
+    live : bool
+        Whether the page starts with the newest samples. Otherwise it is for a recording: it starts at the oldest.
+    stale_after : float
+        A moving frame is shown as stale when its newest stamp is more than this many s behind the clock.
+
+    Attributes
+    ----------
+    address : str
+        The address of the page, ``http://127.0.0.1:8080``; empty outside of the ``async with``.
+
+    Raises
+    ------
+    ValueError
+        If the port, the rate or `stale_after` is out of range.
+    InvalidTransformError
+        If a frame has a name that no frame can have.
+    OSError, InvalidRobotError, ImportError
+        On entering, if the address cannot be listened at, or the URDF cannot be read.
+    BusClosedError, RuntimeError
+        On entering, if the bus is closed; if it belongs to another thread, or the view was entered before.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        buffer: Buffer,
+        port: int = 8080,
+        *,
+        host: str = "127.0.0.1",
+        fixed: str | None = None,
+        trails: Iterable[str] = (),
+        urdf: str | os.PathLike[str] | None = None,
+        package_paths: Iterable[str | os.PathLike[str]] = (),
+        rate: float = 30.0,
+        live: bool = True,
+        stale_after: float = STALE_AFTER,
+    ) -> None:
+        if isinstance(trails, str):
+            raise TypeError(f"trails must be several names, not {trails!r}")
+        if isinstance(port, bool) or not isinstance(port, int):
+            raise TypeError(f"a port must be an int, not {port!r}")
+        if not 0 <= port <= 65_535:
+            raise ValueError(f"a port must be from 0 to 65535, got {port}")
+        if not is_real(rate):
+            raise TypeError(f"a rate must be a number in Hz, not {rate!r}")
+        if not 0.0 < rate < float("inf"):
+            raise ValueError(f"a rate must be greater than zero and finite, got {rate!r} Hz")
+        trails = tuple(trails)
+        for frame in trails if fixed is None else (*trails, fixed):
+            check_frame(frame)
+        self.bus = bus
+        self.address = ""
+        self._buffer = buffer
+        self._host, self._port = host, port
+        self._urdf = urdf
+        self._package_paths = tuple(Path(path) for path in package_paths)
+        self._period = 1.0 / rate
+        self._page_options = (fixed, trails, live, as_duration(stale_after, "stale_after"))
+        self._stale_after = self._page_options[3]
+        self._points: dict[str, Points] = {}
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self._controls = Controls(self._control_used)
+        self._changed = anyio.Event()
+        self._drawn = anyio.Event()
+        self._drawn_waker = LoopWaker(lambda: self._drawn.set())
+        self._texts_wanted = True
+        self._entered = False
+        self._page: Page
+        self._screen: Screen
+        self._server: Server | None = None
+        self._tasks: anyio.abc.TaskGroup
+
+    def add_points(
+        self,
+        cloud: PointCloud,
+        name: str = "points",
+        *,
+        size: float = 0.02,
+        colour: Any = (86, 180, 233),
+    ) -> None:
+        """Show points in their frame, instead of those that had the same name.
+
+        Points with a stamp are where their frame was then, seen from the fixed frame; those with the stamp `LATEST`
+        move with their frame. They are hidden until there is a transform.
+
+        Parameters
+        ----------
+        cloud : PointCloud
+        name : str
+        size : float
+            Of each point, in m.
+        colour : (int, int, int) or integer array of shape (n, 3)
+            Red, green and blue from 0 to 255, of all points or of each.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the cloud is none, the size is not greater than zero, or the colour has another shape.
+        """
+        if not isinstance(cloud, PointCloud):
+            raise TypeError(f"expected a PointCloud, not {cloud!r}")
+        if not is_real(size):
+            raise TypeError(f"a size must be a number of m, not {size!r}")
+        if not 0.0 < size < float("inf"):
+            raise ValueError(f"a size must be greater than zero and finite, got {size!r}")
+        self._points[name] = Points(cloud, float(size), _as_colours(colour, len(cloud)))
+        self._changed.set()
+
+    def remove_points(self, name: str = "points") -> None:
+        """Remove points.
+
+        Raises
+        ------
+        KeyError
+            If there are none of this name.
+        """
+        del self._points[name]
+        self._changed.set()
+
+    @property
+    def viewers(self) -> int:
+        """The number of browsers that show the page."""
+        return 0 if self._server is None else len(self._server.get_clients())
+
+    def statistics(self) -> QueueStatistics:
+        """The counters of the queue of what people do on the page."""
+        return self._controls.statistics()
+
+    async def __aenter__(self) -> Self:
+        if self._entered:
+            raise RuntimeError("a view is entered once: make another one")
+        self.bus._check_thread()
+        if self.bus.closed:
+            raise BusClosedError
+        self._entered = True
+        self._controls.bind()
+        self._drawn_waker.bind()
+        fixed, trails, live, stale_after = self._page_options
+        self._page = Page(self._buffer.tree, fixed, trails, live, stale_after)
+        # What a thread has started must not be lost to a cancellation.
+        with anyio.CancelScope(shield=True):
+            solids = await anyio.to_thread.run_sync(self._read_solids)
+            server = self._server = await anyio.to_thread.run_sync(start_server, self._host, self._port)
+        try:
+            self._screen = Screen(server, self._page, solids, self._controls.put)
+            self._screen.set_points(self._points)
+            server.on_client_connect(self._client_changed)
+            server.on_client_disconnect(self._client_changed)
+            self.address = f"http://{f'[{self._host}]' if ':' in self._host else self._host}:{server.get_port()}"
+            self._tasks = await anyio.create_task_group().__aenter__()
+            self._tasks.start_soon(self._run)
+        except BaseException:
+            await self._stop()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._tasks.cancel_scope.cancel()
+        try:
+            await close_task_group(self._tasks)
+        finally:
+            await self._stop()
+
+    async def _stop(self) -> None:
+        self.address = ""
+        self._controls.end()
+        server, self._server = self._server, None
+        if server is not None:
+            with anyio.CancelScope(shield=True):
+                await anyio.to_thread.run_sync(stop_server, server)
+
+    def _read_solids(self) -> list[Solid]:
+        if self._urdf is None:
+            return []
+        text = isinstance(self._urdf, str) and "<" in self._urdf
+        files = MeshFiles(self._package_paths, Path() if text else Path(self._urdf).parent)
+        return solids_of(read_visuals(self._urdf), files)
+
+    async def _run(self) -> None:
+        while True:
+            self._changed = anyio.Event()
+            if self.viewers:
+                await self._show()
+            else:
+                await self._changed.wait()
+
+    async def _show(self) -> None:
+        """Draw until nobody looks any more."""
+        async with anyio.create_task_group() as tasks:
+            with self._listening():
+                tasks.start_soon(self._note_events)
+                before = time.monotonic_ns()
+                while self.viewers:
+                    self._changed = anyio.Event()
+                    elapsed = time.monotonic_ns()
+                    self._page.timeline.advance((elapsed - before) / 1e9)
+                    before = elapsed
+                    await self._draw(elapsed)
+                    await anyio.sleep(self._period)
+                    if not self._page.timeline.playing:
+                        with anyio.move_on_after(_AT_LEAST_EVERY):
+                            await self._changed.wait()
+            tasks.cancel_scope.cancel()
+
+    async def _draw(self, elapsed: int) -> None:
+        """Read the page here, have viser's thread show it, and wait until it has."""
+        texts, self._texts_wanted = self._texts_wanted, False
+        drawn = self._drawn = anyio.Event()
+        try:
+            assert self._server is not None
+            sight = self._screen.read(self.bus.clock.now(), elapsed, texts)
+            self._server.get_event_loop().call_soon_threadsafe(self._show_sight, sight)
+        except Exception as error:  # noqa: BLE001 - a picture that fails must not end the program that it is of
+            self._warn(error)
+        else:
+            await drawn.wait()
+
+    def _show_sight(self, sight: Sight) -> None:
+        """Show what was read; called in viser's thread."""
+        try:
+            self._screen.show(sight)
+        except Exception as error:  # noqa: BLE001 - as above
+            self._warn(error)
+        # The event loop may have ended before the server.
+        with suppress(RuntimeError):
+            self._drawn_waker.wake()
+
+    def _warn(self, error: Exception) -> None:
+        self._log.warning((type(error), str(error)), "the page could not be drawn: %r", error)
+
+    @contextmanager
+    def _listening(self) -> Iterator[None]:
+        """Redraw when samples arrive or frames go, for the body of a ``with``; a closed bus has nothing new."""
+        delays = Delays()
+        self._page.delays = delays.by_frame
+
+        def arrived(batch: Batch) -> None:
+            delays.note(batch, self.bus.clock.now())
+            self._changed.set()
+
+        def removed(frame: str) -> None:
+            delays.forget(frame)
+            self._changed.set()
+
+        with ExitStack() as stack:
+            if not self.bus.closed:
+                stack.enter_context(self.bus.subscribe(arrived, removed))
+                # Those that are latched arrived at another time.
+                delays.by_frame.clear()
+            yield
+
+    async def _note_events(self) -> None:
+        if self.bus.closed:
+            return
+        known = self.bus.statistics().frames
+        with self.bus.events(stale_after=self._stale_after) as events:
+            async for event in events:
+                if known and isinstance(event, FrameAdded):
+                    # It begins with the frames that are there already.
+                    known -= 1
+                    continue
+                self._page.note_event(event)
+                self._texts_wanted = True
+                self._changed.set()
+
+    def _client_changed(self, _: object) -> None:
+        self._controls.put(lambda: None)
+
+    def _control_used(self) -> None:
+        self._texts_wanted = True
+        self._changed.set()
+
+
+def _as_colours(colour: Any, count: int) -> Any:
+    colours = np.asarray(colour)
+    if colours.shape not in ((3,), (count, 3)):
+        raise ValueError(f"a colour must have shape (3,) or ({count}, 3), got {colours.shape}")
+    if colours.dtype.kind not in "iu":
+        raise TypeError(f"a colour must be integers from 0 to 255, not {colours.dtype}")
+    return np.clip(colours, 0, 255).astype(np.uint8)
