@@ -76,6 +76,7 @@ _NAMES_IN = {
     "geometry.stamped": ("TransformStamped",),
     "geometry.transform": ("Transform",),
     "geometry.transform_array": ("TransformArray",),
+    "geometry.which_kernel": ("kernel",),
     "message_filter.message_filter": ("MessageFilter",),
     "registration": ("Registration",),
     "robot.joint": (

@@ -66,6 +66,7 @@ from tfbus.events import SubscriberFailed as SubscriberFailed
 from tfbus.geometry.stamped import TransformStamped as TransformStamped
 from tfbus.geometry.transform import Transform as Transform
 from tfbus.geometry.transform_array import TransformArray as TransformArray
+from tfbus.geometry.which_kernel import kernel as kernel
 from tfbus.message_filter.message_filter import MessageFilter as MessageFilter
 from tfbus.registration import Registration as Registration
 from tfbus.robot.joint import Joint as Joint
