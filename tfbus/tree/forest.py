@@ -75,6 +75,8 @@ class Forest:
         Number of samples that had each `Outcome`.
     looped : int
         Number of samples that have been in `looping`.
+    version : int
+        Another number after each change.
     """
 
     __slots__ = (
@@ -93,6 +95,7 @@ class Forest:
         "new_parents",
         "paths",
         "replaced",
+        "version",
         "window",
     )
 
@@ -113,6 +116,7 @@ class Forest:
         self.replaced = 0
         self.expired = 0
         self.looped = 0
+        self.version = 0
 
     # Changes
 
@@ -125,6 +129,7 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         with self.lock:
+            self.version += 1
             if len(batch) == 1 and commit(self.frames, batch, 0):
                 # Nearly always so: a sample that only continues its history closes no loop and changes no path.
                 self.inserted += 1
@@ -150,6 +155,7 @@ class Forest:
         """
         count = len(batch)
         with self.lock:
+            self.version += 1
             stored = commit(self.frames, batch, 0)
             self.inserted += stored
             plain = stored == count
@@ -183,6 +189,7 @@ class Forest:
     def append(self, child: str, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
         """Store the samples that `can_append` has approved; the rows have shape (n, 7)."""
         with self.lock:
+            self.version += 1
             self.frames[child].append_many(stamps, rows)
             self.inserted += len(stamps)
             if self._readers:
@@ -224,12 +231,14 @@ class Forest:
             If no sample names the frame.
         """
         with self.lock:
+            self.version += 1
             self.check_known(frame)
             self._remove(frame)
 
     def clear(self) -> None:
         """Drop all moving samples. Static ones and names stay."""
         with self.lock:
+            self.version += 1
             for history in self.frames.values():
                 history.clear()
                 history.changed = False
