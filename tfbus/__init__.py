@@ -41,6 +41,7 @@ from tfbus.errors import (
     LookupTimeoutError,
     PastExtrapolationError,
     RecordingError,
+    RemoteLookupError,
     TransformError,
     TransformLookupError,
     UnknownFrameError,
@@ -75,6 +76,7 @@ from tfbus.robot.model import LimitViolation, RobotModel
 from tfbus.robot.state_publisher import RobotStatePublisher
 from tfbus.stamps import LATEST, SECOND, Latest, format_stamp, from_seconds, to_seconds
 from tfbus.statistics import (
+    BufferServerStatistics,
     BufferStatistics,
     BusStatistics,
     LinkStatistics,
@@ -95,6 +97,7 @@ __all__ = [
     "AheadError",
     "AuthorityConflict",
     "Buffer",
+    "BufferServerStatistics",
     "BufferStatistics",
     "Bus",
     "BusClosedError",
@@ -148,6 +151,7 @@ __all__ = [
     "RecordingError",
     "RecordingFailed",
     "Registration",
+    "RemoteLookupError",
     "Reparented",
     "RobotModel",
     "RobotStatePublisher",
