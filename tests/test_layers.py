@@ -25,7 +25,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "buffer": ("bus",),
     "message_filter": ("buffer",),
     "robot": ("bus",),
-    "links": ("bus", "tf_message"),
+    "links": ("buffer", "tf_message"),
     "analysis": ("tree",),
     "recording": ("analysis", "robot", "tf_message"),
     "view": ("buffer", "recording", "robot"),

@@ -49,6 +49,7 @@ _NAMES_IN = {
         "LookupTimeoutError",
         "PastExtrapolationError",
         "RecordingError",
+        "RemoteLookupError",
         "TransformError",
         "TransformLookupError",
         "UnknownFrameError",
@@ -97,6 +98,7 @@ _NAMES_IN = {
         "to_seconds",
     ),
     "statistics": (
+        "BufferServerStatistics",
         "BufferStatistics",
         "BusStatistics",
         "LinkStatistics",
