@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
-from io import BytesIO
 from itertools import accumulate, chain
 from operator import itemgetter
 from pathlib import Path
@@ -54,8 +53,9 @@ _KINDS: Final[dict[int, str]] = {
 }
 """The names of the records that are read."""
 _ANY: Final = Channel("", "", "")
+_PIECE: Final = 2**16
 _FIRST_BLOCK: Final = 2**16
-_BLOCK: Final = 2**22
+_BLOCK: Final = 2**20
 """Bytes that are decoded at once: few at first, for the first message of each frame has to be judged by itself."""
 _MOST_OVERLAPPING: Final = 16
 """Chunks; if more have to be in memory at once, their messages are merged one by one."""
@@ -200,26 +200,34 @@ class McapStorage:
         opcode, length, start, _, checksum, magic = _FOOTER.unpack(footer)
         if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC):
             return False
-        if start and start <= self.size and self.size - start <= MAX_INDEX:
-            self._file.seek(start)
-            index = self._file.read()
-            # The checksum covers the index up to the checksum itself.
-            if checksum in (0, zlib.crc32(index[: -len(MAGIC) - 4])):
-                with suppress(*DAMAGE, EndOfFile):
-                    self._use_index(index)
+        there_is_one = start and start <= self.size and self.size - start <= MAX_INDEX
+        # The checksum covers the index up to the checksum itself.
+        if there_is_one and checksum in (0, self._checksum(start, self.size - len(MAGIC) - 4)):
+            with suppress(*DAMAGE, EndOfFile):
+                self._use_index(start)
         if self._statistics is None:
             # They would contradict what the chunks say.
             self._schemas.clear()
             self._numbered.clear()
         return True
 
-    def _use_index(self, data: bytes) -> None:
+    def _checksum(self, start: int, end: int) -> int:
+        # In pieces: a large one in memory would, once it is freed, keep `malloc` from giving large ones back.
+        self._file.seek(start)
+        checksum = 0
+        while start < end and (piece := self._file.read(min(_PIECE, end - start))):
+            checksum = zlib.crc32(piece, checksum)
+            start += len(piece)
+        return checksum
+
+    def _use_index(self, start: int) -> None:
         chunks: list[_IndexedChunk] = []
         statistics: records.Statistics | None = None
         # Nearly all chunks have the same channels: one tuple for all of them saves most of the memory.
         shared: dict[tuple[int, ...], tuple[int, ...]] = {}
         kinds = {0}
-        for _, opcode, content in read_records(BytesIO(data), len(data)):
+        self._file.seek(start)
+        for _, opcode, content in read_records(self._file, self.size):
             record = None if content is None else parse_record(opcode, content)
             if isinstance(record, records.ChunkIndex):
                 numbers = tuple(record.message_index_offsets)
