@@ -127,7 +127,8 @@ class UnknownFrameError(TransformLookupError):
     frame : str
         The unknown frame.
     close_matches : tuple of str
-        Known frames with a similar name, the most similar first; computed when first read.
+        Known frames with a similar name, the most similar first; computed when first read, from the frames that are
+        known then.
     """
 
     frame: str

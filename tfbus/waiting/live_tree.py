@@ -64,15 +64,15 @@ class LiveTree:
             limit = self.waiting.limit
             passed = None
             for sample in batch:
-                fields = sample._fields
-                if fields[1] in waiters:
-                    _wake(self.waiting.pop_unblocked(fields[1], fields[2]))
-                if fields[2] > limit:
-                    passed = limit = fields[2]
+                child, stamp = sample.child, sample.stamp
+                if child in waiters:
+                    _wake(self.waiting.pop_unblocked(child, stamp))
+                if stamp > limit:
+                    passed = limit = stamp
             if passed is not None:
                 self._wake_hopeless(passed)
         if self._watches:
-            _wake(self.watching.mark([sample._fields[1] for sample in batch]))
+            _wake(self.watching.mark([sample.child for sample in batch]))
         if not plain:
             for frame in self.forest.expired_frames:
                 history = self.forest.frames.get(frame)
