@@ -18,6 +18,7 @@ from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
 from tfbus.tree._kernel import commit
 from tfbus.tree._known_frames import KnownFrames
 from tfbus.tree._path_cache import PathCache
+from tfbus.tree._saved_frames import SavedFrame, load_frame
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
 from tfbus.tree.path import Path, find_path, path_at
@@ -375,6 +376,21 @@ class Forest:
     def copy_within(self, window: int | None) -> "Forest":
         """An independent copy of the samples in the windows, with windows of another length (ns) from now on."""
         return self._copy_of(window, lambda history: history.copy_within(window))
+
+    def add_saved(self, saved: SavedFrame) -> None:
+        """Take in a frame that `save_frame` has made of another forest without loops; none of that name is here."""
+        with self.lock:
+            history = self.frames[saved.child] = load_frame(saved, self.window)
+            self.names.update(saved.child, history.named_parents)
+
+    def rebuild(self, save: Callable[[FrameHistory], SavedFrame]) -> None:
+        """Replace the history of each frame by what is saved of it."""
+        with self.lock:
+            for child, history in self.frames.items():
+                self.frames[child] = load_frame(save(history), self.window)
+                self.names.update(child, self.frames[child].named_parents)
+            self.forget_paths()
+            self._tell_readers(self.frames)
 
     def _copy_of(self, window: int | None, copied: Callable[[FrameHistory], FrameHistory]) -> "Forest":
         twin = Forest(window)
