@@ -4,6 +4,7 @@ Buffers join late, with and without prefill and prefix, and leave; samples come 
 in the past, turn static, or would close a loop; frames are removed, the clock jumps, lookups wait and are cancelled.
 """
 
+import logging
 import os
 from collections.abc import Awaitable, Callable
 
@@ -15,10 +16,16 @@ from support.oracle.schedule import Burst, schedules
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 
 SCHEDULES = int(os.environ.get("ORACLE_SCHEDULES", "2000"))
-"""On each loop, in the thorough suite. Ten thousand take a quarter of an hour on two cores."""
+"""On each loop, in the thorough suite. Ten thousand take about four minutes a loop on two cores."""
 
 PARTS = 20
 """Tests that share them, so that they can run in several processes."""
+
+
+@pytest.fixture(autouse=True)
+def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Log nothing, because formatting the lines takes a good part of the time."""
+    monkeypatch.setattr(logging.getLogger("tfbus"), "disabled", True)
 
 
 def play(run: Run, bursts: list[Burst]) -> None:

@@ -84,6 +84,7 @@ async def test_a_patch_ends_with_its_peer_and_is_made_again() -> None:
         assert await here.next() == Received(there.id, Presence.LEFT)
 
 
+@pytest.mark.thorough
 async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
     async with ends(3) as (here, there, gone):
         here.dialing.reached(gone.id, there.address)

@@ -96,27 +96,30 @@ CHAINS = [
     *(Publish(tuple(Edge(*ends, stamp) for ends in CHAIN)) for stamp in OFFSETS),
     Publish(tuple(Edge(*ends, None) for ends in CHAIN[2:])),
 ]
-QUESTIONS = [(target, source, at) for target, source in permutations(FRAMES, 2) for at in (*OFFSETS, *[None] * 4)]
+BUFFERS = range(4)
+PAIRS = tuple(permutations(FRAMES, 2))
+# Lists of all that can be asked, because a single draw is quick.
+ASKS = [
+    Ask(buffer, *pair, at, timeout)
+    for buffer, pair, at, timeout in product(
+        BUFFERS, PAIRS, (*OFFSETS, None, None, None), (None, None, None, 0.0, 0.5, 5.0)
+    )
+]
+ASKS_FOR_NO_OLD_ANSWER = [
+    Ask(buffer, *pair, None, timeout, max_age)
+    for buffer, pair, timeout, max_age in product(BUFFERS, PAIRS, (None, 2.0, 8.0), range(6))
+]
+ASKS_IN_TIME_TRAVEL = [
+    Ask(buffer, *pair, at, timeout, None, fixed, source_at)
+    for buffer, pair, at, timeout, fixed, source_at in product(
+        BUFFERS, PAIRS, (-1, 1, None), (None, 5.0), FRAMES, (-2, 0, None)
+    )
+]
 
-places = st.sampled_from([(), (), (), (), (), (0,), (1,), (2, 0)])
 publishes = st.lists(st.sampled_from(EDGES), min_size=1, max_size=4).map(tuple).map(Publish)
 chains = st.sampled_from(CHAINS)
-questions = st.sampled_from(QUESTIONS)
-timeouts = st.sampled_from([None, None, None, 0.0, 0.5, 2.0, 5.0, 8.0])
-kinds = st.sampled_from(["plain", "plain", "plain", "travel", "fresh"])
-
-
-@st.composite
-def asks(draw: st.DrawFn) -> Ask:
-    buffer, (target, source, at), timeout, kind = draw(st.integers(0, 3)), draw(questions), draw(timeouts), draw(kinds)
-    if kind == "travel":
-        fixed, _, source_at = draw(questions)
-        return Ask(buffer, target, source, at, timeout, None, fixed, source_at)
-    if kind == "fresh" and at is None:
-        return Ask(buffer, target, source, at, timeout, draw(st.integers(0, 5)))
-    return Ask(buffer, target, source, at, timeout)
-
-
+asks = st.sampled_from(ASKS)
+other_asks = st.sampled_from(ASKS_FOR_NO_OLD_ANSWER) | st.sampled_from(ASKS_IN_TIME_TRAVEL)
 rare: list[Happening] = [
     *(Remove(frame) for frame in FRAMES * 2),
     *(Jump(by) for by in (-9, -5, -1, 1, 4, 9)),
@@ -124,14 +127,15 @@ rare: list[Happening] = [
     *(Join(keep, False, prefill) for keep, prefill in product((None, 2), (0, 1, 2))),
     *(Leave(0), Leave(1), CloseBus()),
 ]
+rarely = st.sampled_from(rare)
 happenings: st.SearchStrategy[Happening] = st.one_of(
-    publishes, publishes, chains, chains, asks(), asks(), st.sampled_from(rare)
+    *[publishes] * 3, *[chains] * 3, *[asks] * 3, other_asks, *[rarely] * 2
 )
+PLACES: list[tuple[int, ...]] = [(), (), (), (), (), (0,), (1,), (2, 0)]
+AROUND = list(product(PLACES, PLACES, (0.0, 0.5, 1.5, 5.0)))
 bursts = st.builds(
-    Burst,
-    places,
-    st.lists(happenings, min_size=2, max_size=6).map(tuple),
-    places,
-    st.sampled_from([0.0, 0.5, 1.5, 5.0]),
+    lambda around, happenings: Burst(around[0], happenings, around[1], around[2]),
+    st.sampled_from(AROUND),
+    st.lists(happenings, min_size=2, max_size=5).map(tuple),
 )
-schedules = st.lists(bursts, min_size=3, max_size=10)
+schedules = st.lists(bursts, min_size=3, max_size=7)
