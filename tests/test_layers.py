@@ -43,6 +43,7 @@ ALLOWED_EFFECTS = {"tree.forest": {"threading"}}
 CORE = {"anyio", "numpy", "transforms3d"}
 # The module, or the room, that each extra is for.
 EXTRAS = {
+    "cyclonedds": ("links.dds",),
     "cyclopts": ("cli",),
     "foxglove": ("links.foxglove",),
     "lz4": ("recording.formats",),
