@@ -43,9 +43,9 @@ class LinkOptions:
         The event loop to run on.
     """
 
-    domain: str = "tf"
+    domain: Annotated[str, Parameter(env_var="TFBUS_DOMAIN")] = "tf"
     listen: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False, env_var="TFBUS_CONNECT")] = ()
     robot: Annotated[str | None, Parameter(show_default=False)] = None
     robots: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     backend: Backend = "asyncio"

@@ -93,13 +93,18 @@ class Endpoint:
         ------
         BusClosedError
         """
-        self._relay.attach(self.outbox)
+        # Peers that cannot be asked are of a world that knows no buses.
+        self._relay.attach(self.outbox, foreign=self._askable is None)
 
     def detach(self) -> None:
         """Leave the bus; its peers are forgotten, and their frames stay."""
         for peer in self.peers.forget_all():
             self._relay.lose(peer, self.outbox, drop=False)
         self._relay.detach(self.outbox)
+
+    def clock_jumped_back(self) -> None:
+        """Take samples with the stamps of earlier ones for news."""
+        self._relay.clock_jumped_back()
 
     def send(self) -> None:
         """Hand to the carrier all that has gathered in the outbox, if there is anything."""

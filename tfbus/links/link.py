@@ -211,3 +211,4 @@ class Link:
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
             self._receive_queue.discard_moving()
+            self._endpoint.clock_jumped_back()

@@ -45,9 +45,6 @@ def record(
         Replace FILE if it exists.
     """
 
-    # The lines below say the same.
-    logging.getLogger("tfbus.recording").addHandler(logging.NullHandler())
-
     async def record_domain(bus: Bus) -> int:
         recorder = Recorder(bus, file, overwrite=overwrite)
         async with AsyncExitStack() as stack:
@@ -71,7 +68,13 @@ def record(
         warn(f"the recording has ended early: {recorder.error}")
         return _RECORDING_FAILED
 
-    status = link.run(record_domain)
+    recorder_log = logging.getLogger("tfbus.recording")
+    # The lines of this command say the same.
+    recorder_log.propagate = False
+    try:
+        status = link.run(record_domain)
+    finally:
+        recorder_log.propagate = True
     if status == _ENDED_BY_SIGNAL + signal.SIGINT:
         raise KeyboardInterrupt
     sys.exit(status)
