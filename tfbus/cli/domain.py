@@ -13,6 +13,7 @@ from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.errors import pip_install
 
 T = TypeVar("T")
 
@@ -84,7 +85,7 @@ class LinkOptions:
         try:
             from tfbus.links.zenoh import ZenohLink
         except ImportError:
-            raise UsageError('joining a domain needs a package more: pip install "tfbus[cli,zenoh]"') from None
+            raise UsageError(f"joining a domain needs a package more: {pip_install('cli,zenoh')}") from None
         async with AsyncExitStack() as stack:
             try:
                 link = ZenohLink(
