@@ -13,13 +13,14 @@ from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.errors import pip_install
 from tfbus.geometry.stamped import TransformStamped
 
 T = TypeVar("T")
 
 _SILENCE_BEFORE_NOTICE = 1.0
 """s."""
-_NO_ZENOH = 'joining a domain needs a package more: pip install "tfbus[cli,zenoh]"'
+_NO_ZENOH = f"joining a domain needs a package more: {pip_install('cli,zenoh')}"
 
 
 class RemoteLookups(Protocol):
