@@ -24,6 +24,7 @@ from tfbus import (
     LookupTimeoutError,
     PastExtrapolationError,
     RecordingError,
+    RemoteLookupError,
     TransformError,
     TransformLookupError,
     UnknownFrameError,
@@ -104,6 +105,14 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         LookupTimeoutError(target="map", source="base_link", timeout=0.25, missing=SHORT),
         "no transform from 'base_link' to 'map' within 0.25 s: "
         "frame 'base_link': asked for 12.500 s, newest sample is 12.090 s (410 ms short), from 'odometry'",
+    ),
+    (
+        RemoteLookupError(domain="tf", robot="r1", reason="absent", detail="nobody offers it"),
+        "no answer from the buffer of robot 'r1' in domain 'tf': nobody offers it",
+    ),
+    (
+        RemoteLookupError(domain="tf", robot=None, reason="lost", detail="it has gone"),
+        "no answer from a buffer without a robot in domain 'tf': it has gone",
     ),
     (
         InvalidTransformError(

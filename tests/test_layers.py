@@ -25,7 +25,7 @@ ROOMS: dict[str, tuple[str, ...]] = {
     "buffer": ("bus",),
     "message_filter": ("buffer",),
     "robot": ("bus",),
-    "links": ("bus", "tf_message"),
+    "links": ("buffer", "tf_message"),
     "analysis": ("tree",),
     "recording": ("analysis", "robot", "tf_message"),
     "view": ("buffer", "recording", "robot"),
@@ -71,7 +71,8 @@ def module_name(path: Path) -> str:
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix(".__init__")
 
 
-SOURCES = {module_name(path): path for path in PACKAGE.rglob("*.py")}
+# The build hook is no module of the package: nothing imports it, and no wheel has it.
+SOURCES = {module_name(path): path for path in PACKAGE.rglob("*.py") if path.name != "_build.py"}
 # The door of the package loads what it exports when it is used; its imports are those of the stub beside it.
 SOURCES["__init__"] = PACKAGE / "__init__.pyi"
 MODULES = sorted(SOURCES)
@@ -118,7 +119,8 @@ def own_imports(module: str) -> frozenset[str]:
     found: set[str] = set()
     for name in imports(module):
         top, _, rest = name.partition(".")
-        if top == "tfbus":
+        # The compiled kernel belongs to the ground, and imports nothing of tfbus.
+        if top == "tfbus" and rest.partition(".")[0] != "_kernel":
             while rest and rest not in SOURCES:
                 rest = rest.rpartition(".")[0]
             found.add(rest or "__init__")

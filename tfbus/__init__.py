@@ -49,6 +49,7 @@ _NAMES_IN = {
         "LookupTimeoutError",
         "PastExtrapolationError",
         "RecordingError",
+        "RemoteLookupError",
         "TransformError",
         "TransformLookupError",
         "UnknownFrameError",
@@ -76,6 +77,7 @@ _NAMES_IN = {
     "geometry.stamped": ("TransformStamped",),
     "geometry.transform": ("Transform",),
     "geometry.transform_array": ("TransformArray",),
+    "geometry.which_kernel": ("kernel",),
     "message_filter.message_filter": ("MessageFilter",),
     "registration": ("Registration",),
     "robot.joint": (
@@ -96,6 +98,7 @@ _NAMES_IN = {
         "to_seconds",
     ),
     "statistics": (
+        "BufferServerStatistics",
         "BufferStatistics",
         "BusStatistics",
         "LinkStatistics",

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, SupportsIndex, TypeVar
 
 from tfbus.buffer._local_names import LocalNames
 from tfbus.buffer._waiting_lookup import Lookups
@@ -139,11 +139,16 @@ class Buffer:
             As `TransformTree.lookup`.
         """
         bounds = None if max_age is None else self._lookups.bounds(max_age, at, source_at)
-        policy = None
-        if tolerance != 0.0 or max_gap is not None or extrapolate is not None:
-            # Not called for nothing, which would cost a twentieth of a lookup.
-            policy = policy_of(tolerance, max_gap, extrapolate)
         names = self._local_names
+        policy = None
+        if tolerance == 0.0 and max_gap is None and extrapolate is None:
+            if names is None and source_at is None and fixed is None and bounds is None:
+                # Nearly all questions are plain, and a call on the way costs a fifth of the answer.
+                plain = self._forest.paths.answer(target, source, at)
+                if plain is not None:
+                    return plain
+        else:
+            policy = policy_of(tolerance, max_gap, extrapolate)
         try:
             if names is None:
                 return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
@@ -425,6 +430,9 @@ class Buffer:
         self.bus._detach(self._live)
         self._live.end("the buffer is closed")
         self._live.call_end_callbacks()
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
+        raise TypeError("a buffer belongs to its bus and cannot be copied or pickled: use buffer.tree.copy()")
 
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the clock's now."""

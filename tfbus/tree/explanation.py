@@ -15,7 +15,6 @@ from tfbus.tree.extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import AT_A_TIME, Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, Bounds, find
-from tfbus.tree.path import Path
 from tfbus.tree.policy import Policy
 from tfbus.tree.rendering import format_rate
 
@@ -184,7 +183,7 @@ def explain(
         if isinstance(found.raised, UnknownFrameError):
             return Explanation(target, source, at, None, now, errors=_unknown(forest, target, source))
         if now is None:
-            reached = (edge.stamps[-1] for edge in forest.frames.values() if edge.stamps)
+            reached = (edge.newest for edge in forest.frames.values() if edge.newest is not None)
             now = max(reached, default=None)
     raised = found.raised
     edges: list[ExplainedEdge] = []
@@ -225,7 +224,7 @@ def _find(forest: Forest, target: str, source: str, at: At, bounds: Bounds | Non
     links = (*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:])))
     instant = stamp
     if raised is not None:
-        instant = _reached(path) if isinstance(at, Latest) else at
+        instant = path.latest() if isinstance(at, Latest) else at
     return _Finding(stamp, raised, instant, chain, links=links)
 
 
@@ -249,11 +248,6 @@ def _up_to_root(forest: Forest, frame: str, instant: int | None) -> tuple[str, .
             return (*walk, here)
         walk[here] = None
     return tuple(walk)
-
-
-def _reached(path: Path) -> int | None:
-    """The newest common stamp of all moving edges; None if one has no samples."""
-    return path.newest_common()[0] if all(edge.stamps for edge in path.moving) else None
 
 
 def _explained(
@@ -304,7 +298,7 @@ def _block(edge: FrameHistory, at: At, raised: ExtrapolationError, policy: Polic
         return None
     # `LATEST` waits until the lagging edges reach what the others still hold.
     if isinstance(raised.stamp, Latest):
-        return None if edge.stamps else edge.extrapolation_error(LATEST)
-    if edge.stamps and edge.stamps[-1] >= raised.stamp - raised.slack:
+        return None if len(edge) else edge.extrapolation_error(LATEST)
+    if edge.newest is not None and edge.newest >= raised.stamp - raised.slack:
         return None
     return edge.extrapolation_error(raised.stamp, raised.slack)

@@ -15,17 +15,20 @@ from tfbus.errors import DisconnectedError, UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import STAMP_MIN, Latest, as_stamp
 from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
+from tfbus.tree._kernel import commit
 from tfbus.tree._known_frames import KnownFrames
+from tfbus.tree._path_cache import PathCache
+from tfbus.tree._saved_frames import SavedFrame, load_frame
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
 from tfbus.tree.path import Path, find_path, path_at
-
-_PATHS_KEPT = 10_000
 
 AT_A_TIME = 100
 """The number of frames that are read before the lock is released, for questions about all of them."""
 
 _ROUNDS = 3
+
+_CHANGING_PATHS_KEPT = 5_000
 
 T = TypeVar("T")
 
@@ -56,7 +59,7 @@ class Forest:
     frames : dict of str to FrameHistory
         By child.
     names : KnownFrames
-    paths : dict of (target, source) to Path
+    paths : PathCache
         The newest paths that have been found and are permanent. A change that could make one wrong empties it.
     changing_paths : dict of (target, source) to Path
         The same of newest paths that are not permanent.
@@ -73,6 +76,8 @@ class Forest:
         Number of samples that had each `Outcome`.
     looped : int
         Number of samples that have been in `looping`.
+    version : int
+        Another number after each change.
     """
 
     __slots__ = (
@@ -91,6 +96,7 @@ class Forest:
         "new_parents",
         "paths",
         "replaced",
+        "version",
         "window",
     )
 
@@ -99,7 +105,7 @@ class Forest:
         self.window = window
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
-        self.paths: dict[tuple[str, str], Path] = {}
+        self.paths = PathCache(self.lock)
         self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
@@ -111,6 +117,7 @@ class Forest:
         self.replaced = 0
         self.expired = 0
         self.looped = 0
+        self.version = 0
 
     # Changes
 
@@ -123,6 +130,13 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         with self.lock:
+            self.version += 1
+            if len(batch) == 1 and commit(self.frames, batch, 0):
+                # Nearly always so: a sample that only continues its history closes no loop and changes no path.
+                self.inserted += 1
+                if self._readers:
+                    self._tell_readers([batch[0].child])
+                return [Outcome.INSERTED]
             _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
@@ -140,17 +154,17 @@ class Forest:
         bool
             Whether every sample was the next one of its frame, so that nothing but stamps has changed.
         """
-        frames = self.frames
-        plain = True
+        count = len(batch)
         with self.lock:
-            for sample in batch:
-                parent, child, stamp, row, authority, static = sample._fields
-                history = frames.get(child)
-                if history is not None and not static and history.append(parent, stamp, row, authority):
-                    self.inserted += 1
-                else:
-                    plain = False
-                    self.insert_judged(sample)
+            self.version += 1
+            stored = commit(self.frames, batch, 0)
+            self.inserted += stored
+            plain = stored == count
+            while stored < count:
+                self.insert_judged(batch[stored])
+                end = commit(self.frames, batch, stored + 1)
+                self.inserted += end - stored - 1
+                stored = end
             if self._suspects:
                 self.find_past_loops()
             if self._readers:
@@ -176,6 +190,7 @@ class Forest:
     def append(self, child: str, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
         """Store the samples that `can_append` has approved; the rows have shape (n, 7)."""
         with self.lock:
+            self.version += 1
             self.frames[child].append_many(stamps, rows)
             self.inserted += len(stamps)
             if self._readers:
@@ -190,7 +205,7 @@ class Forest:
             if child in self.changed:
                 self._suspects.append(sample)
         if static:
-            if row != history.row:
+            if row != history.static_row:
                 # The paths hold the rows of static edges.
                 self.forget_paths()
             outcome = history.insert_static(parent, stamp, row, authority)
@@ -217,12 +232,14 @@ class Forest:
             If no sample names the frame.
         """
         with self.lock:
+            self.version += 1
             self.check_known(frame)
             self._remove(frame)
 
     def clear(self) -> None:
         """Drop all moving samples. Static ones and names stay."""
         with self.lock:
+            self.version += 1
             for history in self.frames.values():
                 history.clear()
                 history.changed = False
@@ -279,16 +296,18 @@ class Forest:
 
     def _newest_path(self, target: str, source: str) -> Path:
         """The path by the newest parents; it is kept until a change may make it wrong."""
-        path = self.paths.get((target, source)) or self.changing_paths.get((target, source))
+        path = self.paths.find(target, source) or self.changing_paths.get((target, source))
         if path is not None:
             return path
         self.check_known(target)
         self.check_known(source)
         path = find_path(self.frames, target, source, None)
-        if len(self.paths) + len(self.changing_paths) >= _PATHS_KEPT:
-            self.forget_paths()
-        kept = self.paths if path.permanent else self.changing_paths
-        kept[target, source] = path
+        if path.permanent:
+            self.paths.keep(target, source, path)
+        else:
+            if len(self.changing_paths) >= _CHANGING_PATHS_KEPT:
+                self.changing_paths.clear()
+            self.changing_paths[target, source] = path
         return path
 
     def known_frames(self) -> tuple[str, ...]:
@@ -301,7 +320,7 @@ class Forest:
         if frame not in self.names:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
-            raise UnknownFrameError(frame=frame, known=self.names.sorted())
+            raise UnknownFrameError(frame=frame, known=self.names)
 
     def edges_above(self, *names: str) -> list[FrameHistory]:
         """The edges of some frames and of all above them, by any parent that a sample in the window names."""
@@ -357,6 +376,21 @@ class Forest:
     def copy_within(self, window: int | None) -> "Forest":
         """An independent copy of the samples in the windows, with windows of another length (ns) from now on."""
         return self._copy_of(window, lambda history: history.copy_within(window))
+
+    def add_saved(self, saved: SavedFrame) -> None:
+        """Take in a frame that `save_frame` has made of another forest without loops; none of that name is here."""
+        with self.lock:
+            history = self.frames[saved.child] = load_frame(saved, self.window)
+            self.names.update(saved.child, history.named_parents)
+
+    def rebuild(self, save: Callable[[FrameHistory], SavedFrame]) -> None:
+        """Replace the history of each frame by what is saved of it."""
+        with self.lock:
+            for child, history in self.frames.items():
+                self.frames[child] = load_frame(save(history), self.window)
+                self.names.update(child, self.frames[child].named_parents)
+            self.forget_paths()
+            self._tell_readers(self.frames)
 
     def _copy_of(self, window: int | None, copied: Callable[[FrameHistory], FrameHistory]) -> "Forest":
         twin = Forest(window)

@@ -152,3 +152,21 @@ def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
     arguments: Sequence[str], why: str, tfbus: Command
 ) -> None:
     check_wrong_call(tfbus("echo", *arguments), why)
+
+
+def test_numbers_and_frames_are_on_lines_of_their_own_where_they_do_not_fit() -> None:
+    assert describe(MOVING, MOVING.stamp + SECOND // 4, 60).split("\n") == [
+        "At 1700000000.000000001 s, age 250 ms: 'base_link' in 'map'",
+        "- Translation: [1.000000, -2.000000, 0.500000] m",
+        "- Rotation: in quaternion (xyzw)",
+        "  [0.000000, 0.000000, -0.247404, 0.968912]",
+        "            in rpy (rad)",
+        "  [0.000000, 0.000000, -0.500000]",
+        "            in rpy (deg)",
+        "  [0.000000, 0.000000, -28.647890]",
+    ]
+    long = MOVING.replace(child="a_frame_with_a_very_long_name_of_a_part_of_a_part_of_a_robot")
+    assert describe(long, MOVING.stamp, 50).split("\n")[1:3] == [
+        "  'a_frame_with_a_very_lo…rt_of_a_part_of_a_robot'",
+        "  in 'map'",
+    ]

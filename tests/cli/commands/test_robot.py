@@ -10,7 +10,8 @@ from support.commands import START, Command, check_wrong_call
 from support.processes import new_domain
 from support.programs import free_address, start_tfbus
 
-from tfbus import SECOND, Buffer, Bus, TransformStamped
+from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
+from tfbus.cli.commands.robot import tree_lines
 
 CRANE = """<?xml version="1.0"?>
 <robot name="crane">
@@ -214,3 +215,15 @@ def test_other_programs_receive_the_frames_of_the_robot(crane: str) -> None:
         assert robot.end() == 130
     assert robot.output.text == ""
     assert len(robot.errors.text.splitlines()) == 1
+
+
+def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortened(crane: str) -> None:
+    model = RobotModel.from_urdf(crane)
+    whole = list(tree_lines(model, model.zeros()))
+    widest = max(map(len, whole))
+    assert list(tree_lines(model, model.zeros(), width=widest)) == whole
+    for width in range(24, widest):
+        lines = list(tree_lines(model, model.zeros(), width=width))
+        assert max(map(len, lines)) <= width
+        assert len(lines) == len(whole)
+        assert all("revolute" not in line for line in lines)

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
+from tfbus.cli._width import cells, terminal_width, wrapped
 from tfbus.cli.arguments import Duration, JsonFlag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_seconds, print_now, say
@@ -73,7 +74,8 @@ def echo(
                         reported = cause
                 else:
                     reported = None
-                    print_now((to_json if as_json else describe)(transform, bus.clock.now()))
+                    now = bus.clock.now()
+                    print_now(to_json(transform, now) if as_json else describe(transform, now, terminal_width()))
 
     link.run(print_transforms)
 
@@ -93,21 +95,28 @@ def to_json(sample: TransformStamped, now: int) -> str:
     )
 
 
-def describe(sample: TransformStamped, now: int) -> str:
-    """The sample in the format of ``tf2_echo``, with both frames and the age at `now`, in ns."""
+def describe(sample: TransformStamped, now: int, width: int | None = None) -> str:
+    """The sample in the format of ``tf2_echo``, with both frames and the age at `now`, in ns; lines fit the width."""
     when = (
         "any time" if sample.static else f"{format_seconds(sample.stamp)} s, age {format_duration(now - sample.stamp)}"
     )
     angles = sample.transform.as_rpy()
-    return "\n".join(
-        (
-            f"At {when}: {sample.child!r} in {sample.parent!r}",
-            f"- Translation: [{_join(sample.transform.translation)}] m",
-            f"- Rotation: in quaternion (xyzw) [{_join(sample.transform.rotation)}]",
-            f"            in rpy (rad)          [{_join(angles)}]",
-            f"            in rpy (deg)          [{_join(map(math.degrees, angles))}]",
-        )
+    facts = (
+        (f"At {when}:", f"{sample.child!r} in {sample.parent!r}"),
+        ("- Translation:", f"[{_join(sample.transform.translation)}] m"),
+        ("- Rotation: in quaternion (xyzw)", f"[{_join(sample.transform.rotation)}]"),
+        ("            in rpy (rad)         ", f"[{_join(angles)}]"),
+        ("            in rpy (deg)         ", f"[{_join(map(math.degrees, angles))}]"),
     )
+    return "\n".join(line for what, values in facts for line in _fitted(what, values, width))
+
+
+def _fitted(what: str, values: str, width: int | None) -> list[str]:
+    """A fact in one line, or with its values in a line of their own."""
+    line = f"{what} {values}"
+    if width is None or cells(line) <= width:
+        return [line]
+    return [what.rstrip(), *("  " + part for part in wrapped(values, width - 2, 0))]
 
 
 def _join(numbers: Iterable[float]) -> str:

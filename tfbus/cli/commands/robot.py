@@ -8,6 +8,8 @@ import anyio
 
 from tfbus.bus.bus import Bus
 from tfbus.cli._static_frames import publish_static
+from tfbus.cli._table import Column, table_lines
+from tfbus.cli._width import cells, narrow_guides, shorten, terminal_width
 from tfbus.cli.arguments import Flag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_numbers, format_transform, printable, say, warn
@@ -20,6 +22,9 @@ from tfbus.tree.history import Edge
 from tfbus.tree.rendering import Branch, branches
 
 AUTHORITY = "robot"
+_LEAST_POSITION = 16
+"""The shortest that a position is made for the frames to have room, in columns."""
+_COLUMNS = (Column("frame"), Column("joint", importance=2), Column("type", importance=1), Column("position"))
 
 
 def robot(
@@ -64,7 +69,7 @@ def robot(
     for violation in violations:
         warn(str(violation))
     if tree:
-        print("\n".join(tree_lines(model, positions, prefix)))
+        print("\n".join(tree_lines(model, positions, prefix, terminal_width())))
         return
 
     async def publish(bus: Bus) -> None:
@@ -78,8 +83,13 @@ def robot(
     link.run(publish)
 
 
-def tree_lines(model: RobotModel, positions: Mapping[str, Position], prefix: str = "") -> Iterator[str]:
-    """The tree of frames, one a line, with the name, the type and the position of the joint above each."""
+def tree_lines(
+    model: RobotModel, positions: Mapping[str, Position], prefix: str = "", width: int | None = None
+) -> Iterator[str]:
+    """The tree of frames, one a line, with the name, the type and the position of the joint above each.
+
+    Where they do not fit the width, types are left out first, then the names of joints.
+    """
     joint_above = {joint.child: joint for joint in model.joints}
     resolved = {joint.name: position for joint, position in model.resolve(positions)}
     edges = [Edge(joint.parent, joint.child, joint.kind == "fixed", 0, None, None, "") for joint in model.joints]
@@ -93,10 +103,27 @@ def tree_lines(model: RobotModel, positions: Mapping[str, Position], prefix: str
                 position = _format_position(joint, resolved[joint.name])
                 if joint.mimic is not None and joint.name not in positions:
                     position += f", mimics {printable(joint.mimic.joint)}"
-        rows.append((guides + printable(prefix + frame), name, kind, position))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        rows.append((guides, printable(prefix + frame), name, kind, position))
+    step, room = _layout(rows, width)
+    return table_lines(
+        _COLUMNS,
+        [(narrow_guides(row[0], step) + row[1], *row[2:4], shorten(row[4], room)) for row in rows],
+        width,
+        titles=False,
+    )
+
+
+def _layout(rows: Sequence[tuple[str, str, str, str, str]], width: int | None) -> tuple[int, int]:
+    """The width of a level, and that of the positions, which are shortened first where the frames would not fit."""
+    positions = max(cells(row[4]) for row in rows)
+    least = min(_LEAST_POSITION, positions)
+    for step in (4, 2, 1):
+        room = (
+            positions if width is None else width - 2 - max(cells(narrow_guides(row[0], step) + row[1]) for row in rows)
+        )
+        if room >= least:
+            break
+    return step, max(room, least)
 
 
 def _format_position(joint: Joint, position: Position) -> str:

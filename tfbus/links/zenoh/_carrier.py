@@ -52,6 +52,11 @@ class ZenohCarrier:
         self._answers: deque[tuple[zenoh.Query, Message]] = deque()
         self._woken = anyio.Event()
 
+    @property
+    def session(self) -> zenoh.Session:
+        """The session of zenoh, while the carrier is open."""
+        return self._sessions.session
+
     async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
         """Open the session; raises `OSError` if it cannot listen where it should, or as a client reaches nobody."""
         self._report = report

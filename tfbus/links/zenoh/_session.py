@@ -22,6 +22,8 @@ from tfbus.tf_message import MalformedMessageError
 
 _LONGEST_SHOWN_KEY = 200
 MOST_QUESTIONS = 1_000
+MOST_NAMES = 1_000
+"""Bytes; so much is read of an answer with names of sessions."""
 _ANSWER_TIME = 2.0
 _TOGETHER = 0.02
 _EARLY = 0.9
@@ -41,6 +43,8 @@ class ZenohSession:
         attachment.
     note_presence : callable
         Called in zenoh's threads with a link, the name of a session of it, and its `Presence`.
+    note_asked : callable, optional
+        Called in zenoh's threads with each query of a link that asks whether it is heard; without it, none is answered.
     name : str
         The name of this session among those of the link.
 
@@ -56,9 +60,11 @@ class ZenohSession:
         receive: Callable[[Received], object],
         note_presence: Callable[[str, str, Presence], object],
         name: str = FIRST_SESSION,
+        note_asked: Callable[[zenoh.Query], object] | None = None,
     ) -> None:
         self._config = config
         self._note_presence = note_presence
+        self._note_asked = note_asked
         self._name = name
         self._keys = keys
         self._receive = receive
@@ -111,21 +117,28 @@ class ZenohSession:
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
         self._declared = [
             *(
-                session.declare_subscriber(key, _directly(self._receive_live), allowed_origin=remote)
+                session.declare_subscriber(key, directly(self._receive_live), allowed_origin=remote)
                 for key in keys.heard("live")
             ),
             *(
-                session.declare_subscriber(key, _directly(self._receive_slow(rate)), allowed_origin=remote)
+                session.declare_subscriber(key, directly(self._receive_slow(rate)), allowed_origin=remote)
                 for key, rate in keys.slow()
             ),
             *(
-                session.liveliness().declare_subscriber(key, _directly(self._receive_presence), history=True)
+                session.liveliness().declare_subscriber(key, directly(self._receive_presence), history=True)
                 for key in keys.heard("@alive")
             ),
-            session.declare_queryable(keys.own("state"), _directly(self._receive_question)),
+            session.declare_queryable(keys.own("state"), directly(self._receive_question)),
+            *([session.declare_queryable(keys.own("hears"), directly(self._note_asked))] if self._note_asked else []),
             session.liveliness().declare_token(keys.token(self._name)),
         ]
         self.is_open = True
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session of zenoh, once it is open."""
+        assert self._session is not None
+        return self._session
 
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested."""
@@ -142,8 +155,7 @@ class ZenohSession:
     def addresses(self) -> dict[str, str]:
         """The address at which each directly connected session is reached, by the id of the session; may block."""
         try:
-            assert self._session is not None
-            return {str(link.zid): link.dst for link in self._session.info.links()}
+            return {str(link.zid): link.dst for link in self.session.info.links()}
         except zenoh.ZError:
             return {}
 
@@ -162,8 +174,7 @@ class ZenohSession:
                 self._receive(Received(peer, Answer(None)))
 
         try:
-            assert self._session is not None
-            self._session.get(
+            self.session.get(
                 self._keys.of("state", peer),
                 zenoh.handlers.Callback(take, end, indirect=False),
                 payload=_SINCE.pack(since),
@@ -173,6 +184,31 @@ class ZenohSession:
             )
         except zenoh.ZError:
             self._receive(Received(peer, Answer(None)))
+
+    def ask_hearing(self, peer: str, take: Callable[[list[str]], object]) -> None:
+        """Ask a peer which sessions of this link it hears; `take` is called in a thread of zenoh, if it answers."""
+
+        def take_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                names = reply.ok.payload.to_bytes()[:MOST_NAMES].decode("ascii", "replace")
+                take(names.split(",") if names else [])
+
+        # What cannot be asked is asked again.
+        with suppress(zenoh.ZError):
+            self.session.get(
+                self._keys.of("hears", peer),
+                zenoh.handlers.Callback(take_reply, indirect=False),
+                payload=self._keys.token(FIRST_SESSION),
+                timeout=_ANSWER_TIME,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+
+    def answer_hearing(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
+        """Answer links that ask whether they are heard; for a worker thread, as `answer`."""
+        for query, names in answers:
+            with suppress(zenoh.ZError):
+                query.reply(self._keys.own("hears"), ",".join(names)[:MOST_NAMES])
+            query.drop()
 
     def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
         """Answer questions; for a worker thread, because zenoh waits for a peer whose queue is full."""
@@ -282,7 +318,7 @@ def close_session(session: zenoh.Session | None) -> None:
             session.close()
 
 
-def _directly(callback: Callable[[Any], object]) -> Any:
+def directly(callback: Callable[[Any], object]) -> Any:
     # Otherwise each subscriber has a thread of its own, and one overtakes the other.
     return zenoh.handlers.Callback(callback, indirect=False)
 

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import uuid4
 
+import zenoh
+
 from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
@@ -136,3 +138,10 @@ class ZenohLink(Link):
         super().__init__(
             bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
         )
+        self._zenoh = carrier
+
+    def _zenoh_session(self) -> zenoh.Session:
+        """The session of zenoh; raises `RuntimeError` unless the link is entered."""
+        if not self._attached:
+            raise RuntimeError("the link is not entered")
+        return self._zenoh.session
