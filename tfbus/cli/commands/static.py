@@ -56,7 +56,7 @@ def static(
 
     async def publish(bus: Bus) -> None:
         numbers = format_transform(sample.transform)
-        say(f"publishing {child!r} in {parent!r} on domain {link.domain!r}, until Ctrl-C: {numbers}")
+        say(f"publishing {child!r} in {parent!r} on {link.place}, until Ctrl-C: {numbers}")
         await publish_static(bus, [sample.replace(stamp=bus.clock.now())])
         await anyio.sleep_forever()
 
