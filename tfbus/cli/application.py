@@ -19,6 +19,7 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 
 COMMANDS = {
+    "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
     "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
     "receives it.",
     "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
