@@ -43,6 +43,7 @@ ALLOWED_EFFECTS = {"tree.forest": {"threading"}}
 CORE = {"anyio", "numpy", "transforms3d"}
 # The module, or the room, that each extra is for.
 EXTRAS = {
+    "cbor2": ("links.rosbridge",),
     "cyclonedds": ("links.dds",),
     "cyclopts": ("cli",),
     "foxglove": ("links.foxglove",),
@@ -58,6 +59,7 @@ EXTRAS = {
     "trimesh": ("view",),
     "urdf_parser_py": ("robot",),
     "viser": ("view",),
+    "wsproto": ("links.rosbridge",),
     "zenoh": ("links.zenoh",),
     "zstandard": ("recording.formats",),
 }

@@ -25,6 +25,7 @@ MOST_QUESTIONS = 1_000
 MOST_NAMES = 1_000
 """Bytes; so much is read of an answer with names of sessions."""
 _ANSWER_TIME = 2.0
+_HEARING_TIME = 1.5
 _TOGETHER = 0.02
 _EARLY = 0.9
 """s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
@@ -45,6 +46,8 @@ class ZenohSession:
         Called in zenoh's threads with a link, the name of a session of it, and its `Presence`.
     note_asked : callable, optional
         Called in zenoh's threads with each query of a link that asks whether it is heard; without it, none is answered.
+    note_connection : callable, optional
+        Called in zenoh's threads with the id of a session to which a connection was made or has broken.
     name : str
         The name of this session among those of the link.
 
@@ -61,10 +64,12 @@ class ZenohSession:
         note_presence: Callable[[str, str, Presence], object],
         name: str = FIRST_SESSION,
         note_asked: Callable[[zenoh.Query], object] | None = None,
+        note_connection: Callable[[str], object] | None = None,
     ) -> None:
         self._config = config
         self._note_presence = note_presence
         self._note_asked = note_asked
+        self._note_connection = note_connection
         self._name = name
         self._keys = keys
         self._receive = receive
@@ -132,6 +137,8 @@ class ZenohSession:
             *([session.declare_queryable(keys.own("hears"), directly(self._note_asked))] if self._note_asked else []),
             session.liveliness().declare_token(keys.token(self._name)),
         ]
+        if self._note_connection is not None:
+            self._declared.append(session.info.declare_link_events_listener(directly(self._receive_connection)))
         self.is_open = True
 
     @property
@@ -185,21 +192,28 @@ class ZenohSession:
         except zenoh.ZError:
             self._receive(Received(peer, Answer(None)))
 
-    def ask_hearing(self, peer: str, take: Callable[[list[str]], object]) -> None:
-        """Ask a peer which sessions of this link it hears; `take` is called in a thread of zenoh, if it answers."""
+    def ask_hearing(self, peer: str, take: Callable[[list[str] | None], object]) -> None:
+        """Ask a peer which sessions of this link it hears; `take` is called in zenoh's threads, None for no answer."""
+        answered = False
 
         def take_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
+            nonlocal answered
+            if reply.ok is not None and not answered:
+                answered = True
                 names = reply.ok.payload.to_bytes()[:MOST_NAMES].decode("ascii", "replace")
                 take(names.split(",") if names else [])
+
+        def end() -> None:
+            if not answered:
+                take(None)
 
         # What cannot be asked is asked again.
         with suppress(zenoh.ZError):
             self.session.get(
                 self._keys.of("hears", peer),
-                zenoh.handlers.Callback(take_reply, indirect=False),
+                zenoh.handlers.Callback(take_reply, end, indirect=False),
                 payload=self._keys.token(FIRST_SESSION),
-                timeout=_ANSWER_TIME,
+                timeout=_HEARING_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
 
@@ -283,6 +297,10 @@ class ZenohSession:
         elif found[0] != self._keys.link:
             present = sample.kind == zenoh.SampleKind.PUT
             self._note_presence(*found, Presence.JOINED if present else Presence.LEFT)
+
+    def _receive_connection(self, event: zenoh.LinkEvent) -> None:
+        if self._note_connection is not None:
+            self._note_connection(str(event.link.zid))
 
     def _receive_question(self, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()

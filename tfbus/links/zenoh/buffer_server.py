@@ -263,5 +263,5 @@ def _send(batch: list[tuple[zenoh.Query, bytes]]) -> None:
     for query, answer in batch:
         # An asker that has gone needs no answer.
         with suppress(zenoh.ZError):
-            query.reply(query.key_expr, answer)
+            query.reply(query.key_expr, answer, express=True)
         query.drop()
