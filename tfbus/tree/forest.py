@@ -82,27 +82,6 @@ class Forest:
         Another number after each change that may make a path wrong.
     """
 
-    __slots__ = (
-        "_readers",
-        "_suspects",
-        "changed",
-        "changing_paths",
-        "expired",
-        "expired_frames",
-        "frames",
-        "inserted",
-        "lock",
-        "looped",
-        "looping",
-        "names",
-        "new_parents",
-        "paths",
-        "replaced",
-        "structure",
-        "version",
-        "window",
-    )
-
     def __init__(self, window: int | None) -> None:
         self.lock = threading.Lock()
         self.window = window
