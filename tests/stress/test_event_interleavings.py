@@ -545,7 +545,7 @@ RESERVED = Reserve("a", "slam")
 # What is rare: a stranger's edge goes to make room, from the bus or from a batch.
 MAKING_ROOM = [
     Burst((), (Publish((STRANGERS,), False), RESERVED, Publish((OWNERS,), False)), 0.0),
-    Burst((), (Publish((STRANGERS, STRANGERS, OWNERS), True), Remove("a")), 0.0),
+    Burst((), (Remove("a"), Publish((STRANGERS, STRANGERS, OWNERS), True), Remove("a")), 0.0),
     Burst((), (Publish((STRANGERS,), False), Publish((OWNERS, STRANGERS), False), Publish((OWNERS,), True)), 1.5),
 ]
 
