@@ -111,8 +111,15 @@ class ZenohSessions:
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
+        self._to(peer).ask(peer, since)
+
+    def ask_history(self, peer: str, seconds: float, after: str) -> None:
+        """Ask a peer for the last seconds of its moving frames."""
+        self._to(peer).ask_history(peer, seconds, after)
+
+    def _to(self, peer: str) -> ZenohSession:
         patch = self._patches.get(peer)
-        (patch if patch is not None and patch.is_open else self._main).ask(peer, since)
+        return patch if patch is not None and patch.is_open else self._main
 
     def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
         """Answer questions; for a worker thread."""
