@@ -11,8 +11,10 @@ from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.clock import Clock, SimulatedClock
 
 T = TypeVar("T")
 
@@ -50,8 +52,15 @@ class LinkOptions:
     robots: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     backend: Backend = "asyncio"
 
-    def run(self, program: Callable[[Bus], Awaitable[T]]) -> T:
+    def run(self, program: Callable[[Bus], Awaitable[T]], *, clock: Clock | None = None) -> T:
         """Run a program on a bus that has joined the domain, until its end or Ctrl-C.
+
+        Parameters
+        ----------
+        program : async callable
+        clock : Clock, optional
+            The clock of the bus. The time of a `SimulatedClock` is told to the domain; a `ReplayClock` follows the time
+            that is told there.
 
         Returns
         -------
@@ -66,7 +75,7 @@ class LinkOptions:
         """
 
         async def join_and_run() -> T:
-            with Bus() as bus:
+            with Bus(clock) as bus:
                 async with self.join(bus):
                     return await program(bus)
 
@@ -94,6 +103,8 @@ class LinkOptions:
                     connect=self.connect or None,
                     robot=self.robot,
                     robots=self.robots or None,
+                    clock=bus.clock if isinstance(bus.clock, ReplayClock) else None,
+                    tell_clock=isinstance(bus.clock, SimulatedClock),
                 )
                 await stack.enter_async_context(link)
             except ValueError as error:

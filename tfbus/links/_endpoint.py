@@ -8,6 +8,7 @@ from time import monotonic
 
 from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
+from tfbus.clock_follower import HearsTime
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import Asker
 from tfbus.links._carrier import AskableCarrier, Carrier
@@ -46,6 +47,8 @@ class Endpoint:
         Returns a monotonic time in s.
     wake : callable
         Called when `reconcile` has to be called earlier than it said before.
+    follower : HearsTime, optional
+        Hears the time of the first peer that tells one, until that peer is lost.
 
     Attributes
     ----------
@@ -66,6 +69,7 @@ class Endpoint:
         max_frames: int = 10_000,
         now: Callable[[], float] = monotonic,
         wake: Callable[[], object] = lambda: None,
+        follower: HearsTime | None = None,
     ) -> None:
         self._bus = bus
         self._name = name
@@ -74,6 +78,8 @@ class Endpoint:
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._relay = relay_of(bus)
         self._askable = carrier if isinstance(carrier, AskableCarrier) else None
+        self._follower = follower
+        self._followed: str | None = None
         self._now = now
         self._claimed_at = -CLAIM_PERIOD
         self._claim_period = CLAIM_PERIOD
@@ -104,10 +110,17 @@ class Endpoint:
     def send(self) -> None:
         """Hand to the carrier all that has gathered in the outbox, if there is anything."""
         turn = self.outbox.flush()
-        if turn.entries or turn.statics:
+        if turn.entries or turn.statics or turn.time is not None:
             self._carrier.send(turn)
             self._claimed_at = self._now()
             self._claim_period = CLAIM_PERIOD
+
+    def tell_time(self, stamp: int) -> None:
+        """Tell peers the time of this bus's clock, in ns, with all that is published from now on."""
+        if self.outbox.time is not None and stamp < self.outbox.time:
+            # What was published before the jump is of the time before it.
+            self.send()
+        self.outbox.tell_time(stamp)
 
     def next_question(self) -> float | None:
         """The time at which the next peer is to be asked; None while nothing is missing."""
@@ -144,13 +157,27 @@ class Endpoint:
             elif isinstance(content, Answer):
                 self._take_answer(item.sender, content)
             else:
-                self.inbox.receive(item.sender, self._carrier.read(content))
+                message = self._carrier.read(content)
+                if message.time is not None:
+                    self._hear_time(item.sender, message.time)
+                self.inbox.receive(item.sender, message)
                 if self._reconciler is not None:
                     self._reconciler.heard(item.sender)
         except MalformedMessageError as error:
             self.peers.reject(item.sender, error.reason, error)
         except Exception as error:  # noqa: BLE001 - no peer, and no subscriber, may end the event loop
             self.peers.reject(item.sender, "not published", error)
+
+    def _hear_time(self, sender: str, stamp: int) -> None:
+        if self._follower is None or self.peers.find(sender) is None:
+            return
+        if self._followed is None:
+            self._followed = sender
+        if sender == self._followed:
+            self._follower.hear(stamp)
+        else:
+            error = ValueError(f"this bus follows the clock of peer {self._followed}")
+            self.peers.reject(sender, "second clock", error)
 
     def _answer(self, question: Question) -> None:
         if self._askable is None:
@@ -186,9 +213,13 @@ class Endpoint:
             peer.present = True
             if self._reconciler is not None:
                 self._reconciler.joined(peer)
+            if self.outbox.time is not None:
+                self.outbox.tell_time(self.outbox.time)
             self._bus._announce(PeerJoined(self._bus.clock.now(), self._name, sender))
 
     def _peer_left(self, sender: str) -> None:
+        if sender == self._followed:
+            self._followed = None
         peer = self.peers.forget(sender)
         if peer is not None:
             if self._reconciler is not None:

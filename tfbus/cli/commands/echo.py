@@ -6,10 +6,11 @@ from collections.abc import Iterable
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Duration, JsonFlag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_seconds, print_now, say
-from tfbus.errors import MAY_COME, InvalidTransformError, TransformLookupError
+from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import format_duration, to_seconds
@@ -71,11 +72,14 @@ def echo(
                     if cause != reported:
                         say(f"waiting for {source!r} in {target!r}: {missing}")
                         reported = cause
+                except ClockResetError:
+                    # A replay has begun, or has begun again.
+                    continue
                 else:
                     reported = None
                     print_now((to_json if as_json else describe)(transform, bus.clock.now()))
 
-    link.run(print_transforms)
+    link.run(print_transforms, clock=ReplayClock())
 
 
 def to_json(sample: TransformStamped, now: int) -> str:

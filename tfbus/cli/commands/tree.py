@@ -11,6 +11,7 @@ from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.bus.delays import Delays
 from tfbus.cli._graphviz import draw
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import print_now, write_file
@@ -89,7 +90,7 @@ def tree(
                 await bus.clock.sleep(duration)
                 await show_once()
 
-    link.run(show_tree)
+    link.run(show_tree, clock=ReplayClock())
 
 
 def to_document(domain: str, frames: Iterable[str], edges: Iterable[Edge], now: int) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from typing import Any
 from uuid import uuid4
 
 from tfbus.bus.bus import Bus
+from tfbus.clock import SimulatedClock
+from tfbus.clock_follower import HearsTime
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
@@ -57,6 +59,11 @@ class ZenohLink(Link):
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
         How many live messages may wait for the event loop; then the oldest are dropped and counted.
+    clock : SimulatedClock, optional
+        Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
+        time is followed until it is lost; the time of others is refused and counted.
+    tell_clock : bool
+        Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
 
     Attributes
     ----------
@@ -105,6 +112,8 @@ class ZenohLink(Link):
         lease: float = 2.0,
         max_frames: int = 10_000,
         capacity: int = 10_000,
+        clock: SimulatedClock | HearsTime | None = None,
+        tell_clock: bool = False,
     ) -> None:
         if isinstance(robots, str):
             raise TypeError(f"robots must be several names, not {robots!r}")
@@ -134,5 +143,13 @@ class ZenohLink(Link):
             slow_rate,
         )
         super().__init__(
-            bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
+            bus,
+            domain,
+            carrier,
+            frames=frames,
+            drop_lost=drop_lost,
+            max_frames=max_frames,
+            capacity=capacity,
+            clock=clock,
+            tell_clock=tell_clock,
         )
