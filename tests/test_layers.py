@@ -44,7 +44,7 @@ CORE = {"anyio", "numpy", "transforms3d"}
 # The module, or the room, that each extra is for.
 EXTRAS = {
     "cyclopts": ("cli",),
-    "foxglove": ("links.foxglove",),
+    "foxglove": ("links.foxglove", "recording.formats"),
     "lz4": ("recording.formats",),
     "matplotlib": ("plot",),
     "mcap": ("recording.formats",),
