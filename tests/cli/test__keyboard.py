@@ -150,6 +150,7 @@ def test_the_terminal_is_as_before_after_every_end(hour: Path, end: str, backend
     with session(hour, "--domain", new_domain(), "--backend", backend) as play:
         play.expect("space pauses")
         play.until_raw(True)
+        play.expect(" 0%")
         if end == "ctrl-c":
             play.press(b"\x03")
         else:
@@ -164,6 +165,7 @@ def test_the_terminal_is_as_before_while_the_program_is_stopped(hour: Path) -> N
     with session(hour, "--domain", new_domain()) as play:
         play.expect("space pauses")
         play.until_raw(True)
+        play.expect(" 0%")
         for _ in range(2):
             play.press(b"\x1a")
             assert os.WIFSTOPPED(play.wait(os.WUNTRACED))

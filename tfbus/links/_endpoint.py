@@ -8,10 +8,10 @@ from time import monotonic
 
 from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
-from tfbus.clock_follower import HearsTime
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import Asker
 from tfbus.links._carrier import AskableCarrier, Carrier
+from tfbus.links._clock_follower import HearsTime
 from tfbus.links._inbox import Inbox
 from tfbus.links._outbox import Outbox
 from tfbus.links._peers import Peers

@@ -15,9 +15,9 @@ from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
 from tfbus.bus.sample_queue import check_capacity
 from tfbus.clock import SimulatedClock
-from tfbus.clock_follower import ClockFollower, HearsTime
 from tfbus.errors import BusClosedError
 from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._clock_follower import ClockFollower, HearsTime
 from tfbus.links._endpoint import Endpoint
 from tfbus.links._receive_queue import Received, ReceiveQueue
 from tfbus.registration import Registration

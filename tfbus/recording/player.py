@@ -297,17 +297,20 @@ class Player:
                 return
 
     async def _sleep_until_due(self, stamp: int) -> None:
+        await anyio.lowlevel.checkpoint()
+        # Only the state counts: a pause may come when the time is over, but this task has not gone on yet.
         while self._seek_target is None:
-            due = math.inf
-            if self._paused and self._steps:
-                due = -math.inf
-            elif not self._paused:
+            if self._paused:
+                if self._steps:
+                    return
+                due = math.inf
+            else:
                 due = self._origin_time + to_seconds(stamp - self._origin) / self.rate
+                if due <= anyio.current_time():
+                    return
             with anyio.CancelScope() as self._waiting:
                 await anyio.sleep_until(due)
-            stirred, self._waiting = self._waiting.cancelled_caught, None
-            if not stirred:
-                return
+            self._waiting = None
 
     def _publish(self, message: RecordedMessage) -> None:
         self.position = message.received

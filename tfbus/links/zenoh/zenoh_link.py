@@ -11,7 +11,7 @@ from uuid import uuid4
 
 from tfbus.bus.bus import Bus
 from tfbus.clock import SimulatedClock
-from tfbus.clock_follower import HearsTime
+from tfbus.links._clock_follower import HearsTime
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
