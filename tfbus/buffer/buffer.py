@@ -13,7 +13,7 @@ from tfbus.errors import ExtrapolationError, TransformLookupError
 from tfbus.frames import as_prefix
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
-from tfbus.stamps import LATEST, Latest
+from tfbus.stamps import LATEST, AtLike, as_at
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
@@ -111,10 +111,10 @@ class Buffer:
         self,
         target: str,
         source: str,
-        at: int | Latest = LATEST,
+        at: AtLike = LATEST,
         *,
         max_age: float | None = None,
-        source_at: int | Latest | None = None,
+        source_at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -138,7 +138,7 @@ class Buffer:
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
         """
-        bounds = None if max_age is None else self._lookups.bounds(max_age, at, source_at)
+        bounds = None if max_age is None else self._lookups.bounds(max_age, as_at(at), as_at(source_at))
         policy = None
         if tolerance != 0.0 or max_gap is not None or extrapolate is not None:
             # Not called for nothing, which would cost a twentieth of a lookup.
@@ -159,11 +159,11 @@ class Buffer:
         self,
         target: str,
         source: str,
-        at: int | Latest = LATEST,
+        at: AtLike = LATEST,
         *,
         timeout: float | None = None,
         max_age: float | None = None,
-        source_at: int | Latest | None = None,
+        source_at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -217,7 +217,7 @@ class Buffer:
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
-        question = Question(target, source, at, source_at, fixed, max_age, policy)
+        question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
         return await self._lookups.lookup(self._on_bus(question), timeout)
 
     async def _lookup_among(self, questions: Sequence[Question]) -> None:
@@ -236,7 +236,7 @@ class Buffer:
         *,
         timeout: float | None = None,
         max_age: float | None = None,
-        at: int | Latest | None = None,
+        at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -271,7 +271,7 @@ class Buffer:
         TransformError
             As `lookup`.
         """
-        question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
         return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
 
     def transform_nowait(
@@ -280,7 +280,7 @@ class Buffer:
         target: str,
         *,
         max_age: float | None = None,
-        at: int | Latest | None = None,
+        at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -295,10 +295,10 @@ class Buffer:
         TypeError
             As `transform`.
         """
-        question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
         return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
 
-    def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
+    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
         """Whether `lookup_nowait` with the same arguments has an answer now."""
         try:
             self.lookup_nowait(target, source, at, **question)
@@ -373,7 +373,7 @@ class Buffer:
         self,
         target: str,
         source: str,
-        at: int | Latest = LATEST,
+        at: AtLike = LATEST,
         *,
         max_age: float | None = None,
         tolerance: float = 0.0,
@@ -384,8 +384,9 @@ class Buffer:
 
         See `TransformTree.explain`; ages are counted from the clock's now.
         """
-        asked = self._on_bus(Question(target, source, at))
-        bounds = None if max_age is None else self._lookups.bounds(max_age, at, None)
+        instant = as_at(at)
+        asked = self._on_bus(Question(target, source, instant))
+        bounds = None if max_age is None else self._lookups.bounds(max_age, instant, None)
         found = self.tree.explain(
             asked.target,
             asked.source,

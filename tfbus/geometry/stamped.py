@@ -8,7 +8,7 @@ from tfbus.frames import check_frame
 from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.plain import from_fields
-from tfbus.stamps import as_stamp, format_duration, format_stamp
+from tfbus.stamps import StampLike, as_stamp, format_duration, format_stamp
 
 Fields = tuple[str, str, int, Row, str, bool]
 
@@ -46,7 +46,7 @@ class TransformStamped:
         self,
         parent: str,
         child: str,
-        stamp: int,
+        stamp: StampLike,
         transform: Transform,
         authority: str = "",
         static: bool = False,

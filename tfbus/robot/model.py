@@ -11,6 +11,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import from_row
 from tfbus.robot._urdf import read_urdf
 from tfbus.robot.joint import Joint, Position, element
+from tfbus.stamps import StampLike
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ class RobotModel:
         return cls(name, links, joints)
 
     def transforms(
-        self, positions: Mapping[str, Position], stamp: int, authority: str = "", prefix: str = ""
+        self, positions: Mapping[str, Position], stamp: StampLike, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
         """The transforms of all links, each in its parent.
 
@@ -150,7 +151,7 @@ class RobotModel:
             *self.moving_transforms(positions, stamp, authority, prefix),
         ]
 
-    def fixed_transforms(self, stamp: int, authority: str = "", prefix: str = "") -> list[TransformStamped]:
+    def fixed_transforms(self, stamp: StampLike, authority: str = "", prefix: str = "") -> list[TransformStamped]:
         """The static ones of `transforms`."""
         return [
             TransformStamped(prefix + joint.parent, prefix + joint.child, stamp, joint.origin, authority, static=True)
@@ -158,7 +159,7 @@ class RobotModel:
         ]
 
     def moving_transforms(
-        self, positions: Mapping[str, Position], stamp: int, authority: str = "", prefix: str = ""
+        self, positions: Mapping[str, Position], stamp: StampLike, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
         """The moving ones of `transforms`."""
         return [
