@@ -4,13 +4,15 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
+import anyio.lowlevel
+
 from tfbus.buffer._local_names import LocalNames
 from tfbus.buffer._waiting_lookup import Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
 from tfbus.data import Stamped, do_transform
 from tfbus.errors import ExtrapolationError, TransformLookupError
-from tfbus.frames import as_prefix
+from tfbus.frames import as_prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
 from tfbus.stamps import LATEST, AtLike, as_at
@@ -21,7 +23,7 @@ from tfbus.tree.html import legend, to_html
 from tfbus.tree.lookup import answer
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.question import Question, question_of
-from tfbus.tree.rendering import describe
+from tfbus.tree.rendering import counted, describe
 from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import PendingLookup
@@ -249,6 +251,7 @@ class Buffer:
         data : any type of `tfbus.data` but LaserScan, or a type registered with `do_transform`
             With `frame` and `stamp`; the stamp may be `LATEST`.
         target : str
+            Data that are in it already, while the buffer does not know it, stay as they are.
         timeout, max_age : float, optional
             As `lookup`.
         at : int or LATEST, optional
@@ -272,6 +275,9 @@ class Buffer:
             As `lookup`.
         """
         question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        if self._is_in_place(question):
+            await anyio.lowlevel.checkpoint()
+            return data
         return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
 
     def transform_nowait(
@@ -296,7 +302,37 @@ class Buffer:
             As `transform`.
         """
         question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        if self._is_in_place(question):
+            return data
         return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
+
+    async def can_transform_within(
+        self, target: str, source: str, timeout: float | None, at: AtLike = LATEST, **question: Any
+    ) -> bool:
+        """Whether `lookup` with the same arguments has an answer within a time; tf2's ``can_transform`` with a timeout.
+
+        Parameters
+        ----------
+        target, source, at, question
+            As `lookup`.
+        timeout : float or None
+            In s, on the bus's clock; None to wait as long as it takes.
+
+        Returns
+        -------
+        bool
+            False once the time is up, or at once if waiting cannot help.
+
+        Raises
+        ------
+        BusClosedError, ClockResetError, TypeError
+            As `lookup`.
+        """
+        try:
+            await self.lookup(target, source, at, timeout=timeout, **question)
+        except TransformLookupError:
+            return False
+        return True
 
     def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
         """Whether `lookup_nowait` with the same arguments has an answer now."""
@@ -427,6 +463,11 @@ class Buffer:
         self._live.end("the buffer is closed")
         self._live.call_end_callbacks()
 
+    def __repr__(self) -> str:
+        keep = "everything" if self.tree.keep is None else f"{self.tree.keep:g} s"
+        state = "closed" if self._live.end_reason is not None else f"{counted(len(self.pending()), 'lookup')} waiting"
+        return f"<Buffer of {counted(len(self.tree.frames()), 'frame')}, keeps {keep}, {state}>"
+
     def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
         raise TypeError("a buffer belongs to its bus and cannot be copied or pickled: use buffer.tree.copy()")
 
@@ -440,6 +481,13 @@ class Buffer:
         if self._local_names is None:
             return edges
         return sorted(map(self._local_names.edge, edges), key=lambda edge: edge.child)
+
+    def _is_in_place(self, question: Question) -> bool:
+        """Whether data are in the target frame already, and stay as they are because the buffer does not know it."""
+        target = question.target
+        if target != question.source or question.fixed is not None or not is_frame(target):
+            return False
+        return self._on_bus(question).target not in self.tree
 
     def _on_bus(self, question: Question) -> Question:
         """A question with the names of the bus."""

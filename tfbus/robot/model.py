@@ -91,6 +91,10 @@ class RobotModel:
         )
         set_field("_names", frozenset(named))
 
+    def __repr__(self) -> str:
+        moving = sum(joint.kind != "fixed" for joint in self.joints)
+        return f"<RobotModel {self.name!r}: {len(self.links)} links below {self.root!r}, {moving} moving joints>"
+
     @classmethod
     def from_urdf(cls, source: str | os.PathLike[str]) -> "RobotModel":
         """Read a URDF file, or its text.

@@ -25,6 +25,7 @@ from tfbus.stamps import (
     as_duration,
     as_stamp,
     as_stamps,
+    format_stamp,
     from_seconds,
 )
 from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
@@ -36,7 +37,7 @@ from tfbus.tree.history import Edge, FrameHistory, Outcome
 from tfbus.tree.html import legend, to_html
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, answer, bounds_of
 from tfbus.tree.policy import Hold, policy_of
-from tfbus.tree.rendering import describe, to_dot, to_yaml
+from tfbus.tree.rendering import counted, describe, to_dot, to_yaml
 
 
 class TransformTree:
@@ -543,6 +544,13 @@ class TransformTree:
     def to_yaml(self) -> str:
         """The tree as YAML with tf2's keys; stamps in s."""
         return to_yaml(self.edges())
+
+    def __repr__(self) -> str:
+        edges = self.edges()
+        stamps = [stamp for edge in edges for stamp in (edge.oldest, edge.newest) if stamp is not None]
+        span = f", {format_stamp(min(stamps))} to {format_stamp(max(stamps))}" if stamps else ""
+        samples = counted(sum(edge.samples for edge in edges), "sample")
+        return f"<TransformTree of {counted(len(self.frames()), 'frame')}, {samples}{span}>"
 
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the newest stamp in it."""
