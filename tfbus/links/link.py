@@ -136,6 +136,11 @@ class Link:
         """The ids of the other ends that are there, sorted."""
         return self._endpoint.peers.present
 
+    def __repr__(self) -> str:
+        count = len(self.peers)
+        state = f"{count} peer{'' if count == 1 else 's'}" if self._attached else "not joined"
+        return f"<{type(self).__name__} {self._name!r}: {state}>"
+
     def statistics(self) -> LinkStatistics:
         """All counters, as they are now."""
         endpoint, report = self._endpoint, self._send_report
