@@ -71,9 +71,7 @@ def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Com
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = (
-        "broadcast check compare convert demo echo foxglove info listen play plot query record robot router static"
-    )
+    commands = "bridge broadcast check compare convert demo echo foxglove info listen play plot query record robot router static"
     assert re.findall(r"│ ([a-z]+) ", done.stdout) == [*commands.split(), "tree", "view"]
 
 
