@@ -23,6 +23,7 @@ PUBLIC = [
     "tfbus.data",
     "tfbus.links.dds",
     "tfbus.links.foxglove",
+    "tfbus.links.rmw_zenoh",
     "tfbus.links.ros",
     "tfbus.links.rosbridge",
     "tfbus.links.zenoh",
