@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Unpack
 
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import SendReport
@@ -42,11 +42,11 @@ class ListCarrier(RosCarrier):
 class RosEnd:
     """A bus with a link to such a ROS."""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[RosOptions]) -> None:
         self.bus = Bus(SimulatedClock())
         self.heard: list[tuple[TransformStamped, ...]] = []
         self.bus.subscribe(self.heard.append)
-        self.carrier = ListCarrier(RosOptions(**options))
+        self.carrier = ListCarrier(options)
         self.errors: list[Exception] = []
         self.report = SendReport(self.errors.append)
         self.endpoint = Endpoint(self.bus, "ros", self.carrier, lambda: None)

@@ -10,7 +10,9 @@ from typing import Annotated, Literal
 try:
     from cyclopts import App, CycloptsError, Group, Parameter
 except ImportError:
-    raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
+    from tfbus.errors import pip_install
+
+    raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
 
 LOOKUP_FAILED = 1
 USAGE_ERROR = 2
@@ -38,7 +40,7 @@ COMMANDS = {
     "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at "
     "zero.",
     "router": "Pass on what programs of all domains send each other, until Ctrl-C.",
-    "static": "Publish the static transform of CHILD in PARENT, until Ctrl-C.",
+    "static": "Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.",
     "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",
     "view": "Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.",
 }

@@ -2,9 +2,9 @@
 
 import os
 from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
-from typing import Annotated, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
 import anyio
 from cyclopts import Parameter
@@ -14,11 +14,23 @@ from tfbus.cli._event_loop import run
 from tfbus.cli._ros import ros_link
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.errors import pip_install
+from tfbus.geometry.stamped import TransformStamped
 
 T = TypeVar("T")
 
 _SILENCE_BEFORE_NOTICE = 1.0
 """s."""
+_NO_ZENOH = f"joining a domain needs a package more: {pip_install('cli,zenoh')}"
+
+
+class RemoteLookups(Protocol):
+    """The part of a `tfbus.links.zenoh.BufferClient` that commands use; the extra may be missing."""
+
+    async def lookup(
+        self, target: str, source: str, /, *, timeout: float | None = None, max_age: float | None = None
+    ) -> TransformStamped:
+        """The transform in the other buffer."""
 
 
 @Parameter(name="*")
@@ -104,25 +116,58 @@ class LinkOptions:
         try:
             from tfbus.links.zenoh import ZenohLink
         except ImportError:
-            raise UsageError('joining a domain needs a package more: pip install "tfbus[cli,zenoh]"') from None
+            raise UsageError(_NO_ZENOH) from None
+        async with self._entered(
+            lambda: ZenohLink(
+                bus,
+                self.domain,
+                listen=self.listen or None,
+                connect=self.connect or None,
+                robot=self.robot,
+                robots=self.robots or None,
+            )
+        ):
+            yield
+
+    def run_remote(self, program: Callable[[RemoteLookups], Awaitable[T]]) -> T:
+        """Run a program that asks the buffer of another program, that of the robot in `robots`, until its end.
+
+        Raises
+        ------
+        UsageError
+            If `robots` names several robots, or the domain cannot be joined.
+        KeyboardInterrupt
+            After everything has ended, if Ctrl-C was pressed.
+        """
+        try:
+            from tfbus.links.zenoh import BufferClient
+        except ImportError:
+            raise UsageError(_NO_ZENOH) from None
+        if len(self.robots) > 1:
+            raise UsageError("--remote asks the buffer of one robot: give --robots once")
+        robot = self.robots[0] if self.robots else None
+
+        async def enter_and_run() -> T:
+            async with self._entered(
+                lambda: BufferClient(self.domain, robot=robot, listen=self.listen or None, connect=self.connect or None)
+            ) as remote:
+                return await program(remote)
+
+        return run(enter_and_run, self.backend)
+
+    @asynccontextmanager
+    async def _entered(self, make: Callable[[], AbstractAsyncContextManager[T]]) -> AsyncIterator[T]:
+        """Make and enter an end of the domain for the body of an ``async with``."""
         async with AsyncExitStack() as stack:
             try:
-                link = ZenohLink(
-                    bus,
-                    self.domain,
-                    listen=self.listen or None,
-                    connect=self.connect or None,
-                    robot=self.robot,
-                    robots=self.robots or None,
-                )
-                await stack.enter_async_context(link)
+                entered = await stack.enter_async_context(make())
             except ValueError as error:
                 raise UsageError(str(error)) from None
             except OSError as error:
                 where = " or ".join(self.listen) or "the loopback"
                 why = os.strerror(error.errno) if error.errno else error
                 raise UsageError(f"cannot listen at {where}: {why}") from None
-            yield
+            yield entered
 
     async def first_transform(self, bus: Bus) -> None:
         """Wait until something is published on the bus, with a notice if that takes more than a second."""

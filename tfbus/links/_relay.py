@@ -125,6 +125,11 @@ class Relay:
         if self._passed is not None:
             self._passed.forget_moving()
 
+    def newest_number(self, frame: str) -> tuple[bytes, int] | None:
+        """Origin and number of the newest batch with a frame; None if the frame is not there."""
+        latest = self._latest.get(frame)
+        return None if latest is None else (latest.origin, latest.sequence)
+
     def is_plausible(self, number: int) -> bool:
         """Whether a number may be one that a bus has given by now."""
         return number - self._number <= LARGEST_JUMP

@@ -1,6 +1,6 @@
 from random import Random
 
-from tfbus.links.zenoh._hearing import DEAF, FIRST_PAUSE, LONGEST_PAUSE, SECOND_PAUSE, Hearing
+from tfbus.links.zenoh._hearing import DEAF, FIRST_PAUSE, LONGEST_PAUSE, MOST_SILENT, SECOND_PAUSE, Hearing
 
 
 class Scene:
@@ -61,3 +61,14 @@ def test_a_peer_that_comes_back_is_asked_anew() -> None:
     scene.hearing.joined("a")
     assert is_about(scene.until_due(), FIRST_PAUSE)
     assert not scene.hearing.is_deaf("a", hears=False)
+
+
+def test_a_peer_that_never_answers_is_taken_for_deaf_a_few_times_only() -> None:
+    scene = Scene()
+    assert not scene.hearing.is_silent("a")
+    scene.hearing.joined("a")
+    scene.until_due()
+    for _ in range(2):
+        verdicts = [scene.hearing.is_silent("a") for _ in range(DEAF * (MOST_SILENT + 2))]
+        assert verdicts == ([False] * (DEAF - 1) + [True]) * MOST_SILENT + [False] * 2 * DEAF
+        scene.hearing.joined("a")

@@ -123,10 +123,9 @@ async def test_a_server_that_goes_ends_the_lookups_and_one_that_never_was_is_tol
                     await client.lookup("map", "base")
                 reasons.append(lost.value.reason)
 
-            async with anyio.create_task_group() as tasks:
-                async with BufferServer(buffer, robot="r1", link=link) as server:
-                    tasks.start_soon(ask)
-                    await until(lambda: server.statistics().waiting == 1)
+            async with anyio.create_task_group() as tasks, BufferServer(buffer, robot="r1", link=link) as server:
+                tasks.start_soon(ask)
+                await until(lambda: server.statistics().waiting == 1)
             assert reasons == ["lost"]
 
 

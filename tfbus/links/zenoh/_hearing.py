@@ -16,6 +16,8 @@ SECOND_PAUSE = 0.5
 """s; after an answer that the link is not heard, for its presence may be on its way."""
 DEAF = 2
 """So many such answers in a row mean that it will not come."""
+MOST_SILENT = 3
+"""A peer that answers nothing is taken for deaf so often; it may have no right to answer."""
 
 
 @dataclass(slots=True)
@@ -23,6 +25,7 @@ class _Check:
     due: float
     pause: float = FIRST_PAUSE
     unheard: int = 0
+    silent: int = 0
 
 
 class Hearing:
@@ -74,6 +77,15 @@ class Hearing:
         check.unheard = 0
         check.due = self._now() + self._jitter(2 * FIRST_PAUSE)
         return True
+
+    def is_silent(self, peer: str) -> bool:
+        """Note that a peer has not answered; returns whether it is taken for deaf."""
+        check = self._checks.get(peer)
+        if check is None or check.silent >= MOST_SILENT:
+            return False
+        deaf = self.is_deaf(peer, hears=False)
+        check.silent += deaf
+        return deaf
 
     def _jitter(self, seconds: float) -> float:
         return seconds * self._random.uniform(0.8, 1.2)

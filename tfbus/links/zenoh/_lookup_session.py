@@ -126,6 +126,7 @@ class LookupSession:
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout,
             congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
         )
 
     async def close(self) -> None:

@@ -8,6 +8,7 @@ same mends a connection of which only one end hears the other; see `tfbus.links.
 import re
 import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from time import monotonic
 from uuid import uuid4
 
@@ -58,15 +59,23 @@ class ZenohSessions:
         self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
-        self._main = ZenohSession(config, keys, receive, self._note_directly, note_asked=self._note_asked)
+        self._main = ZenohSession(
+            config,
+            keys,
+            receive,
+            self._note_directly,
+            note_asked=self._note_asked,
+            note_connection=self._note_connection,
+        )
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
         self._changes: list[tuple[str, Presence]] = []
         self._dialing = Dialing(monotonic) if dialing is None else dialing
         self._hearing = Hearing(monotonic)
         self._deaf: set[str] = set()
+        self._connected: set[str] = set()
         self._asking: list[zenoh.Query] = []
-        self._heard_by: list[tuple[str, list[str]]] = []
+        self._heard_by: list[tuple[str, list[str] | None]] = []
         self._closing: list[threading.Thread] = []
 
     @property
@@ -102,8 +111,15 @@ class ZenohSessions:
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
+        self._to(peer).ask(peer, since)
+
+    def ask_history(self, peer: str, seconds: float, after: str) -> None:
+        """Ask a peer for the last seconds of its moving frames."""
+        self._to(peer).ask_history(peer, seconds, after)
+
+    def _to(self, peer: str) -> ZenohSession:
         patch = self._patches.get(peer)
-        (patch if patch is not None and patch.is_open else self._main).ask(peer, since)
+        return patch if patch is not None and patch.is_open else self._main
 
     def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
         """Answer questions; for a worker thread."""
@@ -126,16 +142,20 @@ class ZenohSessions:
                 with self._lock:
                     changes, self._changes = self._changes, []
                     asking, self._asking = self._asking, []
+                    connected, self._connected = self._connected, set()
                     heard_by, self._heard_by = self._heard_by, []
                     answers = [(query, self._names_heard(query)) for query in asking]
                 await self._note(changes)
+                for peer in connected:
+                    if self._is_direct(peer):
+                        self._hearing.joined(peer)
                 for peer, names in heard_by:
                     self._judge(peer, names)
                 if answers:
                     # zenoh may wait for a peer that is frozen.
                     await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
                 for peer in self._hearing.take_due():
-                    self._main.ask_hearing(peer, lambda names, peer=peer: self._note_heard_by(peer, names))
+                    self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
                 for peer, address in self._dialing.take_due():
                     if peer not in self._patches:
@@ -166,14 +186,18 @@ class ZenohSessions:
     def _is_direct(self, peer: str) -> bool:
         return (None, FIRST_SESSION) in self._present.get(peer, ())
 
-    def _judge(self, peer: str, names: list[str]) -> None:
+    def _judge(self, peer: str, names: list[str] | None) -> None:
         """Note which sessions of this link a peer hears, and have it dialled if there is none."""
-        if FIRST_SESSION in names and peer in self._deaf:
+        if names and FIRST_SESSION in names and peer in self._deaf:
             self._deaf.discard(peer)
             self._dialing.joined(peer)
             if self._is_direct(peer):
                 self._drop_patch(peer)
-        if self._hearing.is_deaf(peer, bool(names)):
+        if names is None:
+            deaf = self._is_direct(peer) and self._hearing.is_silent(peer)
+        else:
+            deaf = self._hearing.is_deaf(peer, bool(names))
+        if deaf:
             self._deaf.add(peer)
             self._drop_patch(peer)
             self._dialing.left(peer)
@@ -191,6 +215,10 @@ class ZenohSessions:
             return None
         return found[0]
 
+    def _note_connection(self, peer: str) -> None:
+        with self._lock:
+            self._connected.add(peer)
+
     def _note_asked(self, query: zenoh.Query) -> None:
         with self._lock:
             if len(self._asking) < _MOST_ASKING and self._asker(query) is not None:
@@ -198,7 +226,7 @@ class ZenohSessions:
                 return
         query.drop()
 
-    def _note_heard_by(self, peer: str, names: list[str]) -> None:
+    def _note_heard_by(self, peer: str, names: list[str] | None) -> None:
         with self._lock:
             self._heard_by.append((peer, names))
 

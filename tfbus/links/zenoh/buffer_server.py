@@ -17,7 +17,7 @@ from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.sample_queue import check_capacity
-from tfbus.errors import RemoteLookupError, TransformError
+from tfbus.errors import MAY_COME, RemoteLookupError, TransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import (
     MAX_BYTES,
@@ -193,8 +193,15 @@ class BufferServer:
         elif not self._admit():
             self._refuse(query, "busy", f"more than {self._rate:g} lookups come in a second")
         else:
-            self._waiting[key] = scope = anyio.CancelScope()
-            tasks.start_soon(self._answer, query, question, key, scope)
+            try:
+                answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
+            except MAY_COME:
+                self._waiting[key] = scope = anyio.CancelScope()
+                tasks.start_soon(self._wait, query, question, key, scope)
+                return
+            except (TransformError, TypeError, ValueError) as error:
+                answer = error
+            self._answer(query, answer)
 
     def _admit(self) -> bool:
         now = monotonic()
@@ -211,31 +218,24 @@ class BufferServer:
             self._counts["cancelled"] += 1
             scope.cancel()
 
-    async def _answer(
+    async def _wait(
         self, query: zenoh.Query, question: RemoteQuestion, key: tuple[str, int], scope: anyio.CancelScope
     ) -> None:
         answer: TransformStamped | Exception | None = None
         with scope:
             try:
-                answer = await self._buffer.lookup(
-                    question.target,
-                    question.source,
-                    question.at,
-                    timeout=as_timeout(question.timeout, LONGEST_WAIT),
-                    max_age=question.max_age,
-                    source_at=question.source_at,
-                    fixed=question.fixed,
-                    tolerance=question.tolerance,
-                    max_gap=question.max_gap,
-                    extrapolate=None if question.hold is None else Hold(question.hold),
-                )
+                timeout = as_timeout(question.timeout, LONGEST_WAIT)
+                answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
             except (TransformError, TypeError, ValueError) as error:
                 answer = error
             finally:
                 self._waiting.pop(key, None)
         if answer is None:
             query.drop()
-            return
+        else:
+            self._answer(query, answer)
+
+    def _answer(self, query: zenoh.Query, answer: TransformStamped | Exception) -> None:
         self._counts["failed" if isinstance(answer, Exception) else "answered"] += 1
         self._reply(query, write_answer(answer))
 
@@ -259,9 +259,23 @@ class BufferServer:
             await self._replied.wait()
 
 
+def _arguments(question: RemoteQuestion) -> dict[str, Any]:
+    return {
+        "target": question.target,
+        "source": question.source,
+        "at": question.at,
+        "max_age": question.max_age,
+        "source_at": question.source_at,
+        "fixed": question.fixed,
+        "tolerance": question.tolerance,
+        "max_gap": question.max_gap,
+        "extrapolate": None if question.hold is None else Hold(question.hold),
+    }
+
+
 def _send(batch: list[tuple[zenoh.Query, bytes]]) -> None:
     for query, answer in batch:
         # An asker that has gone needs no answer.
         with suppress(zenoh.ZError):
-            query.reply(query.key_expr, answer)
+            query.reply(query.key_expr, answer, express=True)
         query.drop()
