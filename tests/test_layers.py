@@ -60,7 +60,7 @@ EXTRAS = {
     "urdf_parser_py": ("robot",),
     "viser": ("view",),
     "wsproto": ("links.rosbridge",),
-    "zenoh": ("links.zenoh",),
+    "zenoh": ("links.rmw_zenoh", "links.zenoh"),
     "zstandard": ("recording.formats",),
 }
 NEVER_LOADED = {*EXTRAS, "hypothesis", "starlette", "uvicorn"}

@@ -55,8 +55,8 @@ class LinkOptions:
     robots
         Hear only these robots, such as r1 or r*; may be given several times.
     ros
-        Join ROS in place of a domain: dds for ROS 2, dds:42 if its ROS_DOMAIN_ID is 42, or ws://host:9090 for a
-        rosbridge server of ROS 1 or ROS 2; may be given several times.
+        Join ROS in place of a domain: dds for ROS 2, dds:42 if its ROS_DOMAIN_ID is 42, zenoh:host:7447 for a router
+        of rmw_zenoh, or ws://host:9090 for a rosbridge server of ROS 1 or ROS 2; may be given several times.
     backend
         The event loop to run on.
     """
