@@ -71,12 +71,10 @@ class Forest:
         Samples since `forget_changes` that are part of a loop of parents at a past stamp.
     expired_frames : list of str
         The frame of each sample that expired since `forget_changes`.
-    inserted, replaced, expired : int
-        Number of samples that had each `Outcome`.
+    replaced, expired : int
+        Number of samples that had each of these outcomes.
     looped : int
         Number of samples that have been in `looping`.
-    version : int
-        Another number after each change.
     """
 
     __slots__ = (
@@ -87,7 +85,6 @@ class Forest:
         "expired",
         "expired_frames",
         "frames",
-        "inserted",
         "lock",
         "looped",
         "looping",
@@ -95,7 +92,6 @@ class Forest:
         "new_parents",
         "paths",
         "replaced",
-        "version",
         "window",
     )
 
@@ -112,11 +108,27 @@ class Forest:
         self._suspects: list[TransformStamped] = []
         self._readers: dict[int, set[str]] = {}
         self.expired_frames: list[str] = []
-        self.inserted = 0
         self.replaced = 0
         self.expired = 0
         self.looped = 0
-        self.version = 0
+
+    @property
+    def inserted(self) -> int:
+        """The number of samples that were `INSERTED`."""
+        return self.paths.inserted
+
+    @inserted.setter
+    def inserted(self, inserted: int) -> None:
+        self.paths.inserted = inserted
+
+    @property
+    def version(self) -> int:
+        """Another number after each change."""
+        return self.paths.version
+
+    @version.setter
+    def version(self, version: int) -> None:
+        self.paths.version = version
 
     # Changes
 
@@ -128,14 +140,11 @@ class Forest:
         InvalidTransformError
             If a sample would close a loop of parents, judged after the whole batch.
         """
+        if self.paths.commit(self.frames, self._readers, batch):
+            # Nearly always so: samples that only continue their histories close no loop and change no path.
+            return [Outcome.INSERTED] * len(batch)
         with self.lock:
             self.version += 1
-            if len(batch) == 1 and commit(self.frames, batch, 0):
-                # Nearly always so: a sample that only continues its history closes no loop and changes no path.
-                self.inserted += 1
-                if self._readers:
-                    self._tell_readers([batch[0].child])
-                return [Outcome.INSERTED]
             _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
@@ -153,6 +162,8 @@ class Forest:
         bool
             Whether every sample was the next one of its frame, so that nothing but stamps has changed.
         """
+        if self.paths.commit(self.frames, self._readers, batch):
+            return True
         count = len(batch)
         with self.lock:
             self.version += 1
