@@ -41,8 +41,12 @@ DEFAULT_SUITE = "not thorough"
 """The expression of marks that pyproject.toml gives."""
 
 EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("default", EXAMPLES, max_examples=25, derandomize=True)
+settings.register_profile("default", EXAMPLES, max_examples=15, derandomize=True)
 settings.register_profile("thorough", EXAMPLES, max_examples=100, derandomize="CI" in os.environ)
+
+
+# pytest-xdist sets it in its workers, where commands would take it for the width of their output.
+os.environ.pop("COLUMNS", None)
 
 
 def is_default_suite(config: pytest.Config) -> bool:

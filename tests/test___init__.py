@@ -1,4 +1,7 @@
+import ast
+from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -16,4 +19,16 @@ def test_the_version_is_that_of_the_installed_package() -> None:
 
 def test_another_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'tfbus' has no attribute 'Transfrom'"):
-        tfbus.Transfrom  # noqa: B018
+        tfbus.Transfrom  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_type_checkers_read_the_names_and_modules_that_are_loaded() -> None:
+    stub = ast.parse(Path(tfbus.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [(node.module, alias) for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    assert all(alias.name == alias.asname for _, alias in imports)
+    names = {alias.name: module for module, alias in imports if module != "tfbus"}
+    assert sorted(names) == tfbus.__all__
+    for name, module in names.items():
+        assert getattr(tfbus, name) is getattr(import_module(str(module)), name)
+    for room in (alias.name for module, alias in imports if module == "tfbus"):
+        assert getattr(tfbus, room) is import_module(f"tfbus.{room}")

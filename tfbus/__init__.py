@@ -4,195 +4,144 @@ A `Bus` broadcasts transforms to its buffers; a `Buffer` keeps a few seconds of 
 seen from another, and lets a lookup wait for data that are still on their way. Works on asyncio and trio, without ROS.
 """
 
-from tfbus.analysis.diagnose import diagnose
-from tfbus.analysis.finding import Finding
-from tfbus.buffer.buffer import Buffer
-from tfbus.buffer.watch import Watch
-from tfbus.bus.broadcaster import TransformBroadcaster
-from tfbus.bus.bus import Bus
-from tfbus.bus.event_stream import EventStream
-from tfbus.bus.stream import Stream
-from tfbus.bus.thread_publisher import ThreadPublisher
-from tfbus.clock import Clock, SimulatedClock, SystemClock, Ticks
-from tfbus.data import (
-    LaserScan,
-    PointCloud,
-    PointStamped,
-    Polygon,
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    QuaternionStamped,
-    Stamped,
-    TwistStamped,
-    Vector3Stamped,
-    WrenchStamped,
-    do_transform,
-)
-from tfbus.errors import (
-    AheadError,
-    BusClosedError,
-    ClockResetError,
-    DisconnectedError,
-    ExtrapolationError,
-    FutureExtrapolationError,
-    GapError,
-    InvalidRobotError,
-    InvalidTransformError,
-    LookupTimeoutError,
-    PastExtrapolationError,
-    RecordingError,
-    TransformError,
-    TransformLookupError,
-    UnknownFrameError,
-)
-from tfbus.events import (
-    AuthorityConflict,
-    ClockReset,
-    Event,
-    FrameAdded,
-    FrameLive,
-    FrameRemoved,
-    FrameStale,
-    KindChanged,
-    PastLoop,
-    PeerJoined,
-    PeerLost,
-    PeerRejected,
-    RecordingDropped,
-    RecordingFailed,
-    Reparented,
-    SampleRejected,
-    StampAhead,
-    SubscriberFailed,
-)
-from tfbus.geometry.stamped import TransformStamped
-from tfbus.geometry.transform import Transform
-from tfbus.geometry.transform_array import TransformArray
-from tfbus.geometry.which_kernel import KERNEL
-from tfbus.message_filter.message_filter import MessageFilter
-from tfbus.registration import Registration
-from tfbus.robot.joint import Joint, Mimic
-from tfbus.robot.model import LimitViolation, RobotModel
-from tfbus.robot.state_publisher import RobotStatePublisher
-from tfbus.stamps import LATEST, SECOND, Latest, format_stamp, from_seconds, to_seconds
-from tfbus.statistics import (
-    BufferStatistics,
-    BusStatistics,
-    LinkStatistics,
-    QueueStatistics,
-    RecorderStatistics,
-    RobotStatistics,
-)
-from tfbus.tree.explanation import ExplainedEdge, Explanation
-from tfbus.tree.history import Edge, Outcome
-from tfbus.tree.policy import Hold
-from tfbus.tree.question import Question
-from tfbus.tree.tree import TransformTree
-from tfbus.waiting.waiting_index import PendingLookup
+from importlib import import_module
 
-kernel = KERNEL
-"""The kernel that runs: ``"compiled"``, or ``"python"`` where that was not built or ``TFBUS_KERNEL=python`` is set."""
+_NAMES_IN = {
+    "analysis.diagnose": ("diagnose",),
+    "analysis.finding": ("Finding",),
+    "buffer.buffer": ("Buffer",),
+    "buffer.watch": ("Watch",),
+    "bus.broadcaster": ("TransformBroadcaster",),
+    "bus.bus": ("Bus",),
+    "bus.event_stream": ("EventStream",),
+    "bus.stream": ("Stream",),
+    "bus.thread_publisher": ("ThreadPublisher",),
+    "clock": (
+        "Clock",
+        "SimulatedClock",
+        "SystemClock",
+        "Ticks",
+    ),
+    "data": (
+        "LaserScan",
+        "PointCloud",
+        "PointStamped",
+        "Polygon",
+        "PoseStamped",
+        "PoseWithCovarianceStamped",
+        "QuaternionStamped",
+        "Stamped",
+        "TwistStamped",
+        "Vector3Stamped",
+        "WrenchStamped",
+        "do_transform",
+    ),
+    "errors": (
+        "AheadError",
+        "BusClosedError",
+        "ClockResetError",
+        "DisconnectedError",
+        "ExtrapolationError",
+        "FutureExtrapolationError",
+        "GapError",
+        "InvalidRobotError",
+        "InvalidTransformError",
+        "LookupTimeoutError",
+        "MissingRecordingError",
+        "PastExtrapolationError",
+        "RecordingError",
+        "RemoteLookupError",
+        "TransformError",
+        "TransformLookupError",
+        "UnknownFrameError",
+    ),
+    "events": (
+        "AuthorityConflict",
+        "ClockReset",
+        "Event",
+        "FrameAdded",
+        "FrameLive",
+        "FrameRemoved",
+        "FrameStale",
+        "KindChanged",
+        "PastLoop",
+        "PeerJoined",
+        "PeerLost",
+        "PeerRejected",
+        "RecordingDropped",
+        "RecordingFailed",
+        "Reparented",
+        "SampleRejected",
+        "StampAhead",
+        "SubscriberFailed",
+    ),
+    "geometry.stamped": ("TransformStamped",),
+    "geometry.transform": ("Transform",),
+    "geometry.transform_array": ("TransformArray",),
+    "geometry.which_kernel": ("kernel",),
+    "message_filter.message_filter": ("MessageFilter",),
+    "registration": ("Registration",),
+    "robot.joint": (
+        "Joint",
+        "Mimic",
+    ),
+    "robot.model": (
+        "LimitViolation",
+        "RobotModel",
+    ),
+    "robot.state_publisher": ("RobotStatePublisher",),
+    "stamps": (
+        "LATEST",
+        "Latest",
+        "SECOND",
+        "format_stamp",
+        "from_seconds",
+        "to_seconds",
+    ),
+    "statistics": (
+        "BufferServerStatistics",
+        "BufferStatistics",
+        "BusStatistics",
+        "LinkStatistics",
+        "QueueStatistics",
+        "RecorderStatistics",
+        "RobotStatistics",
+    ),
+    "tree.explanation": (
+        "ExplainedEdge",
+        "Explanation",
+    ),
+    "tree.history": (
+        "Edge",
+        "Outcome",
+    ),
+    "tree.policy": ("Hold",),
+    "tree.question": ("Question",),
+    "tree.tree": ("TransformTree",),
+    "waiting.waiting_index": ("PendingLookup",),
+}
+"""The public names by the module that each is in. `__init__.pyi` says the same to type checkers, as imports."""
 
-__all__ = [
-    "LATEST",
-    "SECOND",
-    "AheadError",
-    "AuthorityConflict",
-    "Buffer",
-    "BufferStatistics",
-    "Bus",
-    "BusClosedError",
-    "BusStatistics",
-    "Clock",
-    "ClockReset",
-    "ClockResetError",
-    "DisconnectedError",
-    "Edge",
-    "Event",
-    "EventStream",
-    "ExplainedEdge",
-    "Explanation",
-    "ExtrapolationError",
-    "Finding",
-    "FrameAdded",
-    "FrameLive",
-    "FrameRemoved",
-    "FrameStale",
-    "FutureExtrapolationError",
-    "GapError",
-    "Hold",
-    "InvalidRobotError",
-    "InvalidTransformError",
-    "Joint",
-    "KindChanged",
-    "LaserScan",
-    "Latest",
-    "LimitViolation",
-    "LinkStatistics",
-    "LookupTimeoutError",
-    "MessageFilter",
-    "Mimic",
-    "Outcome",
-    "PastExtrapolationError",
-    "PastLoop",
-    "PeerJoined",
-    "PeerLost",
-    "PeerRejected",
-    "PendingLookup",
-    "PointCloud",
-    "PointStamped",
-    "Polygon",
-    "PoseStamped",
-    "PoseWithCovarianceStamped",
-    "QuaternionStamped",
-    "Question",
-    "QueueStatistics",
-    "RecorderStatistics",
-    "RecordingDropped",
-    "RecordingError",
-    "RecordingFailed",
-    "Registration",
-    "Reparented",
-    "RobotModel",
-    "RobotStatePublisher",
-    "RobotStatistics",
-    "SampleRejected",
-    "SimulatedClock",
-    "StampAhead",
-    "Stamped",
-    "Stream",
-    "SubscriberFailed",
-    "SystemClock",
-    "ThreadPublisher",
-    "Ticks",
-    "Transform",
-    "TransformArray",
-    "TransformBroadcaster",
-    "TransformError",
-    "TransformLookupError",
-    "TransformStamped",
-    "TransformTree",
-    "TwistStamped",
-    "UnknownFrameError",
-    "Vector3Stamped",
-    "Watch",
-    "WrenchStamped",
-    "diagnose",
-    "do_transform",
-    "format_stamp",
-    "from_seconds",
-    "kernel",
-    "to_seconds",
-]
+_HOMES = {name: module for module, names in _NAMES_IN.items() for name in names}
+_ROOMS = ("analysis", "data", "recording", "robot", "testing")
+
+__all__ = sorted(_HOMES)
 
 
-def __getattr__(name: str) -> str:
-    if name != "__version__":
+def __getattr__(name: str) -> object:
+    # A module is loaded when one of its names is used first: numpy alone takes longer than a command that prints help.
+    if name in _HOMES:
+        value = getattr(import_module(f"tfbus.{_HOMES[name]}"), name)
+    elif name in _ROOMS:
+        return import_module(f"tfbus.{name}")
+    elif name == "__version__":
+        from importlib.metadata import version
+
+        value = version("tfbus")
+    else:
         raise AttributeError(f"module 'tfbus' has no attribute {name!r}")
-    # Reading it takes as long as a quarter of the import.
-    from importlib.metadata import version
-
-    return version("tfbus")
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

@@ -15,10 +15,10 @@ from support.programs import PATIENCE, TFBUS
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
-from tfbus.cli import app
+from tfbus import kernel
+from tfbus.cli.application import application
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import LinkOptions
-from tfbus.geometry.which_kernel import KERNEL
 
 LINK = ("--domain STR", "--listen STR...", "--connect STR...", "--backend CHOICE")
 URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
@@ -62,18 +62,36 @@ def test_the_help_of_a_command_has_an_example_and_every_option(
     assert max(map(len, done.stdout.splitlines())) <= 80
 
 
+@pytest.mark.parametrize(
+    ("command", "defaults"),
+    [
+        ("check", ["10.0", "100000000.0", "100.0", "100.0", "tf"]),
+        ("compare", ["0.01", "1"]),
+        ("demo", ["inf", "100.0", "1.0"]),
+        ("echo", ["1.0", "inf"]),
+        ("foxglove", ["8765", "tf"]),
+        ("robot", ["10.0"]),
+        ("view", ["8080", "30.0", "tf"]),
+    ],
+)
+def test_the_help_tells_the_defaults(
+    command: str, defaults: Sequence[str], tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    found = re.findall(r"\[default: ([^\]]*)\]", tfbus(command, "--help").stdout)
+    assert found[: len(defaults)] == defaults
+
+
 def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Command) -> None:
     done = tfbus("--version")
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout == f"{version('tfbus')} ({KERNEL} kernel)\n"
+    assert done.stdout == f"{version('tfbus')} ({kernel} kernel)\n"
 
 
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = (
-        "broadcast check compare convert demo echo foxglove info listen play plot query record robot router static"
-    )
+    commands = "bridge broadcast check compare convert demo echo foxglove info listen play plot query record robot router static"
     assert re.findall(r"│ ([a-z]+) ", done.stdout) == [*commands.split(), "tree", "view"]
 
 
@@ -189,13 +207,13 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_silently(tmp_path: Path)
 
 @pytest.mark.thorough
 def test_an_optional_package_is_imported_only_by_the_command_that_needs_it() -> None:
-    script = "import sys, tfbus.cli; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
+    script = "import sys, tfbus.cli.application; print(*sorted({name.partition('.')[0] for name in sys.modules}))"
     loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout.split()
     assert "tfbus" in loaded
-    assert set(loaded) & {"zenoh", "rich", "trio", "mcap", "rosbags", "lxml"} == set()
+    assert set(loaded) & {"zenoh", "rich", "trio", "mcap", "rosbags", "lxml", "numpy", "anyio"} == set()
 
 
 def test_every_command_has_a_module_of_its_name() -> None:
     folder = Path(sys.modules["tfbus.cli.commands"].__path__[0])
     modules = {path.stem for path in folder.glob("*.py")} - {"__init__"}
-    assert {name for name in app if not name.startswith("-")} == modules
+    assert {name for name in application(None) if not name.startswith("-")} == modules

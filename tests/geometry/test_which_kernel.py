@@ -5,12 +5,12 @@ import sys
 import pytest
 from support.both_kernels import COMPILED, needs_both
 
-from tfbus.geometry.which_kernel import KERNEL
+import tfbus
 
 SHOW = """
 from tfbus import TransformStamped
-from tfbus.geometry.which_kernel import KERNEL
-print(KERNEL, TransformStamped.__mro__[1].__module__)
+from tfbus.geometry.which_kernel import kernel
+print(kernel, TransformStamped.__mro__[1].__module__)
 """
 
 
@@ -50,4 +50,4 @@ def test_a_compiled_kernel_that_is_asked_for_must_be_there() -> None:
 
 
 def test_this_process_runs_on_a_kernel_that_is_there() -> None:
-    assert KERNEL == "python" or COMPILED is not None
+    assert tfbus.kernel == "python" or COMPILED is not None

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import pytest
 
-from tfbus.cli import app
+from tfbus.cli.application import application
 
 ROOT = Path(__file__).parents[2]
 GUIDE = ROOT / "demos" / "guide"
@@ -122,7 +122,7 @@ def test_the_urls_of_the_package_lead_to_pages_that_are_here() -> None:
 def test_every_command_can_be_typed(command: str) -> None:
     words = shlex.split(command)
     if words[0] == "tfbus":
-        app.parse_args(words[1:], exit_on_error=False, print_error=False)
+        application(None).meta.parse_args(words[1:], exit_on_error=False, print_error=False)
         return
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     wanted = re.findall(r"\[(.*)\]", command)

@@ -15,8 +15,8 @@ from support.both_kernels import COMPILED, bits, needs_both, sample_class
 from support.samples import moving, over, static, tree_of
 from support.threads import threads_that
 
+import tfbus
 from tfbus import LATEST, TransformLookupError, TransformTree
-from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._kernel import History
 
 pytestmark = pytest.mark.thorough
@@ -213,4 +213,4 @@ else:
 def test_a_tree_of_this_process_uses_the_kernel() -> None:
     tree = tree_of(moving("a", "b", 1))
     assert isinstance(tree._forest.frames["b"], History)
-    assert KERNEL in ("compiled", "python")
+    assert tfbus.kernel in ("compiled", "python")

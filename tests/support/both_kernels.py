@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+import tfbus
 from tfbus.geometry import _python_sample
 from tfbus.geometry.rows import Row
-from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree import _python_kernel
 
 try:
@@ -40,7 +40,7 @@ def bits(row: Row | None) -> bytes | None:
 
 def tfbus_on(kernel: str) -> Any:
     """The package `tfbus` as it is on a kernel; a second copy of it, if this process runs on the other one."""
-    if kernel != KERNEL and kernel not in _copies:
+    if kernel != tfbus.kernel and kernel not in _copies:
         _copies[kernel] = _second_copy(kernel)
     return _copies.get(kernel) or importlib.import_module("tfbus")
 
@@ -55,7 +55,11 @@ def _second_copy(kernel: str) -> ModuleType:
     try:
         for name in ours:
             del sys.modules[name]
-        return importlib.import_module("tfbus")
+        copy = importlib.import_module("tfbus")
+        # The package loads its modules when their names are used: these are still the names of the copy.
+        for name in copy.__all__:
+            getattr(copy, name)
+        return copy
     finally:
         for name in [name for name in sys.modules if name.partition(".")[0] == "tfbus"]:
             del sys.modules[name]

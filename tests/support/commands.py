@@ -1,6 +1,5 @@
 """Runs ``tfbus`` in the process of the test."""
 
-import sys
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ import anyio.lowlevel
 import pytest
 
 from tfbus import SECOND, Bus, Clock, SimulatedClock
-from tfbus.cli import main
+from tfbus.cli.application import run
 from tfbus.cli.domain import LinkOptions
 from tfbus.testing import simulate
 
@@ -38,11 +37,12 @@ class Command:
 
     def __call__(self, *arguments: object) -> Done:
         """Run the command to its end."""
-        self._monkeypatch.setattr(sys, "argv", ["tfbus", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert isinstance(ended.value.code, int)
-        return Done(ended.value.code, *self._capsys.readouterr())
+        try:
+            status = run(list(map(str, arguments)))
+        except SystemExit as ended:
+            assert isinstance(ended.code, int)
+            status = ended.code
+        return Done(status, *self._capsys.readouterr())
 
     def on_domain(self, others: OtherPrograms, *arguments: object, clock: Clock | None = None) -> Done:
         """Run a command that joins a domain on a bus of this process, which no link connects to others.
@@ -57,14 +57,14 @@ class Command:
             By default a `SimulatedClock` that begins at `START` and goes on by itself.
         """
 
-        def run(options: LinkOptions, program: Callable[[Bus], Awaitable[Any]]) -> Any:
+        def run_beside(options: LinkOptions, program: Callable[[Bus], Awaitable[Any]]) -> Any:
             results = anyio.run(_run_beside, program, others, clock, backend=options.backend)
             if not results:
                 raise KeyboardInterrupt
             return results[0]
 
         with self._monkeypatch.context() as patch:
-            patch.setattr(LinkOptions, "run", run)
+            patch.setattr(LinkOptions, "run", run_beside)
             return self(*arguments)
 
 

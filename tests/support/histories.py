@@ -2,9 +2,9 @@
 
 from collections.abc import Iterable
 
+import tfbus
 from tfbus import Transform
 from tfbus.geometry.rows import Row
-from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree.history import FrameHistory
 
 
@@ -29,7 +29,7 @@ def moving_edge(
 
 def held(history: FrameHistory) -> int:
     """The number of samples that a history has memory for, those that have left its window included."""
-    if KERNEL == "python":
+    if tfbus.kernel == "python":
         return len(history.stamps)
     return memoryview(history.columns(0, history.count)[0]).nbytes // 64
 

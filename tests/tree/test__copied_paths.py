@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of
 
+import tfbus
 from tfbus import TransformStamped, TransformTree, UnknownFrameError
 from tfbus.geometry.rows import Row
-from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Query, copy_paths
 from tfbus.tree._runs import Runs
 from tfbus.tree.history import Samples
@@ -128,7 +128,7 @@ def test_only_the_neighbours_are_copied_where_samples_outnumber_stamps() -> None
     (samples,) = path.moving
     neighbours = [10, 20, 30, 40, 4_000, 4_010]
     # The compiled kernel gives them all, as views.
-    assert list(samples.stamps) == (neighbours if KERNEL == "python" else list(range(10, 4_020, 10)))
+    assert list(samples.stamps) == (neighbours if tfbus.kernel == "python" else list(range(10, 4_020, 10)))
     assert xs(samples) == [(stamp, float(stamp)) for stamp in samples.stamps]
 
 

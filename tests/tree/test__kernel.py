@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.both_kernels import needs_both, tfbus_on
 from support.strategies import TODAY, rotations, vectors
 
-from tfbus.geometry.which_kernel import KERNEL
+import tfbus
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree import _kernel
 
@@ -144,5 +144,5 @@ def test_both_copies_of_the_package_run_on_their_kernel() -> None:
 
 
 def test_the_tree_runs_on_the_kernel_of_this_process() -> None:
-    module = "tfbus._kernel" if KERNEL == "compiled" else "tfbus.tree._python_kernel"
+    module = "tfbus._kernel" if tfbus.kernel == "compiled" else "tfbus.tree._python_kernel"
     assert {kind.__module__ for kind in (_kernel.History, _kernel.Chain, _kernel.Paths)} == {module}

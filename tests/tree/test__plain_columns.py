@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of
 
+import tfbus
 from tfbus import PastExtrapolationError, TransformTree
-from tfbus.geometry.which_kernel import KERNEL
 from tfbus.tree._copied_paths import Query
 from tfbus.tree._plain_columns import plain_columns
 from tfbus.tree.tree import forest_of
 
-compiled = pytest.mark.skipif(KERNEL != "compiled", reason="the kernel in Python gives no answers at many stamps")
+compiled = pytest.mark.skipif(tfbus.kernel != "compiled", reason="the kernel in Python gives no answers at many stamps")
 
 
 def tree() -> TransformTree:

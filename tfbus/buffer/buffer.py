@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, SupportsIndex, TypeVar
 
 from tfbus.buffer._local_names import LocalNames
 from tfbus.buffer._waiting_lookup import Lookups
@@ -430,6 +430,9 @@ class Buffer:
         self.bus._detach(self._live)
         self._live.end("the buffer is closed")
         self._live.call_end_callbacks()
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
+        raise TypeError("a buffer belongs to its bus and cannot be copied or pickled: use buffer.tree.copy()")
 
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the clock's now."""

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from copy import copy
 from typing import Literal, get_args
 
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._ownership import Ownership
 from tfbus.bus._plausibility import Plausibility
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.errors import InvalidTransformError
 from tfbus.events import (
     AuthorityConflict,
@@ -25,14 +25,14 @@ from tfbus.events import (
     StampAhead,
 )
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.geometry.which_kernel import KERNEL
+from tfbus.geometry.which_kernel import kernel
 from tfbus.registration import Registration
 from tfbus.stamps import STAMP_MIN, format_duration
 from tfbus.tree.cycles import NewestEdge, admit
 
 _FORMER_PARENTS = 1_000
 
-if KERNEL == "python":
+if kernel == "python":
     from tfbus.bus._python_judge import Edge, judge
 else:
     from tfbus._kernel import Edge, judge  # type: ignore[assignment]
@@ -284,8 +284,9 @@ class Topology:
         while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
             rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
             if len(rest) < len(batch):
+                # An error for each sample, so that all are counted.
+                refused += [intruder] * (len(batch) - len(rest))
                 batch = rest
-                refused.append(intruder)
             else:
                 del edges[_child(intruder)]
                 removed.append(intruder)

@@ -34,5 +34,5 @@ def _choose(wanted: str | None) -> Kernel:
     return "compiled"
 
 
-KERNEL: Final = _choose(os.environ.get("TFBUS_KERNEL"))
+kernel: Final = _choose(os.environ.get("TFBUS_KERNEL"))
 """The kernel that runs in this process."""

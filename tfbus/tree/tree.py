@@ -5,6 +5,7 @@
 
 import math
 from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,9 @@ from tfbus.errors import TransformLookupError
 from tfbus.geometry.bounds import MAX_TRANSLATION, as_max_translation, check_translations
 from tfbus.geometry.stamped import TransformStamped, as_batch
 from tfbus.geometry.transform_array import TransformArray
-from tfbus.stamps import LATEST, Latest, Stamps, as_duration, as_stamp, as_stamps, from_seconds
+from tfbus.stamps import LATEST, Latest, StampLike, Stamps, as_duration, as_stamp, as_stamps, from_seconds
 from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
+from tfbus.tree._saved_frames import SavedFrame, samples_of, save_frame
 from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
@@ -354,10 +356,11 @@ class TransformTree:
             As `lookup`; and `FutureExtrapolationError` at an edge's newest sample if it is the only one, or the only
             one with its parent.
 
-        Notes ----- Use `do_transform` only on an answer with ``expressed_in=frame``. That answer is the twist of a
-        rigid body at the origin of `frame`, and `do_transform` gives it at another frame of the body. In other axes, as
-        by default, the twist does not refer to the origin of its own frame, and `do_transform` would give a wrong
-        velocity.
+        Notes
+        -----
+        Use `do_transform` only on an answer with ``expressed_in=frame``. That answer is the twist of a rigid body at
+        the origin of `frame`, and `do_transform` gives it at another frame of the body. In other axes, as by default,
+        the twist does not refer to the origin of its own frame, and `do_transform` would give a wrong velocity.
 
         tf2's `lookupVelocity` gives other numbers: it rotates a velocity that is in the observer's axes once more by
         the rotation of the body.
@@ -365,6 +368,8 @@ class TransformTree:
         axes = reference if expressed_in is None else expressed_in
         if at is not LATEST:
             at = as_stamp(at)
+        self._forest.search(reference, frame)
+        self._forest.search(axes, reference)
         with self._forest.lock:
             stamp, linear, angular = twist(self._forest, frame, reference, at, axes)
         return TwistStamped(axes, stamp, linear, angular)
@@ -377,6 +382,7 @@ class TransformTree:
         UnknownFrameError, DisconnectedError, FutureExtrapolationError
             As `lookup`.
         """
+        self._forest.search(target, source)
         with self._forest.lock:
             path = self._forest.find_path(target, source, LATEST)
             return path.newest_common()[0] if path.moving else None
@@ -390,6 +396,7 @@ class TransformTree:
         """
         if at is not LATEST:
             at = as_stamp(at)
+        self._forest.search(target, source)
         with self._forest.lock:
             return list(self._forest.find_path(target, source, at).frames)
 
@@ -421,6 +428,35 @@ class TransformTree:
                 raise history.extrapolation_error(at)
             return history.parent_at(at)
 
+    def samples_around(self, frame: str, at: StampLike) -> tuple[TransformStamped | None, TransformStamped | None]:
+        """The samples of a frame before and after a stamp, as they were sent: those that a lookup interpolates.
+
+        Parameters
+        ----------
+        frame : str
+        at : int
+            ns.
+
+        Returns
+        -------
+        before, after : TransformStamped or None
+            None where there is none on that side. Twice the same if a sample has the very stamp, or is static.
+
+        Raises
+        ------
+        UnknownFrameError
+        TypeError, ValueError
+            If `at` is no stamp.
+        """
+        stamp = as_stamp(at)
+        with self._forest.lock:
+            self._forest.check_known(frame)
+            history = self._forest.frames.get(frame)
+            found = [] if history is None else list(samples_of(history, stamp, stamp))
+        before = [sample for sample in found if sample.static or sample.stamp <= stamp]
+        after = [sample for sample in found if sample.static or sample.stamp >= stamp]
+        return (before[-1] if before else None), (after[0] if after else None)
+
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
         edges = self._forest.read_all(FrameHistory.edge)
@@ -447,11 +483,39 @@ class TransformTree:
         self._check_writable("clear a copy() of it")
         self._forest.clear()
 
+    def forget_before(self, stamp: StampLike) -> None:
+        """Drop all moving samples that are older than a stamp, in ns; static ones and names stay.
+
+        Later insertions are judged as before: a sample inside the window of its frame is stored, however old it is.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `stamp` is none.
+        """
+        self._check_writable("its samples leave it after `keep` seconds; or use a copy() of the tree")
+        self._forest.rebuild(partial(save_frame, oldest=as_stamp(stamp)))
+
     def copy(self) -> "TransformTree":
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
         twin = TransformTree(self.keep, max_translation=self.max_translation)
         twin._forest = self._forest.copy()
         return twin
+
+    def __deepcopy__(self, memo: object) -> "TransformTree":
+        return self.copy()
+
+    __copy__ = copy
+
+    def __getstate__(self) -> dict[str, Any]:
+        frames = self._forest.read_all(save_frame)
+        return {"keep": self.keep, "max_translation": self.max_translation, "frames": list(map(tuple, frames.values()))}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # As a copy: it can be changed, and its counters start at zero.
+        self.__init__(state["keep"], max_translation=state["max_translation"])  # type: ignore[misc]
+        for frame in state["frames"]:
+            self._forest.add_saved(SavedFrame(*frame))
 
     # Text
 

@@ -45,9 +45,6 @@ def record(
         Replace FILE if it exists.
     """
 
-    # The lines below say the same.
-    logging.getLogger("tfbus.recording").addHandler(logging.NullHandler())
-
     async def record_domain(bus: Bus) -> int:
         recorder = Recorder(bus, file, overwrite=overwrite)
         async with AsyncExitStack() as stack:
@@ -63,7 +60,7 @@ def record(
                 raise UsageError(str(error)) from None
             except OSError as error:
                 raise UsageError(f"cannot write {file}: {error.strerror or error}") from None
-            say(f"recording domain {link.domain!r} to {file}")
+            say(f"recording {link.place} to {file}")
             status = await _wait_for_end(bus, link, duration, events, signals)
         print_summary(file, recorder.statistics())
         if recorder.error is None:
@@ -71,7 +68,13 @@ def record(
         warn(f"the recording has ended early: {recorder.error}")
         return _RECORDING_FAILED
 
-    status = link.run(record_domain)
+    recorder_log = logging.getLogger("tfbus.recording")
+    # The lines of this command say the same.
+    recorder_log.propagate = False
+    try:
+        status = link.run(record_domain)
+    finally:
+        recorder_log.propagate = True
     if status == _ENDED_BY_SIGNAL + signal.SIGINT:
         raise KeyboardInterrupt
     sys.exit(status)
