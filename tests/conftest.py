@@ -45,6 +45,10 @@ settings.register_profile("default", EXAMPLES, max_examples=15, derandomize=True
 settings.register_profile("thorough", EXAMPLES, max_examples=100, derandomize="CI" in os.environ)
 
 
+# pytest-xdist sets it in its workers, where commands would take it for the width of their output.
+os.environ.pop("COLUMNS", None)
+
+
 def is_default_suite(config: pytest.Config) -> bool:
     return bool(config.option.markexpr == DEFAULT_SUITE)
 

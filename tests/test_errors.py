@@ -22,6 +22,7 @@ from tfbus import (
     InvalidRobotError,
     InvalidTransformError,
     LookupTimeoutError,
+    MissingRecordingError,
     PastExtrapolationError,
     RecordingError,
     RemoteLookupError,
@@ -125,6 +126,7 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         "in <joint name=\"elbow\">: parent link 'arm' is not there",
     ),
     (RecordingError("the file is empty", path="run.mcap", reason="empty"), "recording 'run.mcap': the file is empty"),
+    (MissingRecordingError(path="run.mcap"), "recording 'run.mcap': there is no such file"),
     (
         ClockResetError(before=from_seconds(90), after=from_seconds(3.5)),
         "the clock jumped back from 90.000 s to 3.500 s",

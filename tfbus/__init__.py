@@ -47,6 +47,7 @@ _NAMES_IN = {
         "InvalidRobotError",
         "InvalidTransformError",
         "LookupTimeoutError",
+        "MissingRecordingError",
         "PastExtrapolationError",
         "RecordingError",
         "RemoteLookupError",

@@ -40,6 +40,7 @@ from tfbus.errors import GapError as GapError
 from tfbus.errors import InvalidRobotError as InvalidRobotError
 from tfbus.errors import InvalidTransformError as InvalidTransformError
 from tfbus.errors import LookupTimeoutError as LookupTimeoutError
+from tfbus.errors import MissingRecordingError as MissingRecordingError
 from tfbus.errors import PastExtrapolationError as PastExtrapolationError
 from tfbus.errors import RecordingError as RecordingError
 from tfbus.errors import RemoteLookupError as RemoteLookupError

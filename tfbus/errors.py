@@ -16,6 +16,7 @@
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         InvalidRobotError (ValueError)         .element
         RecordingError (ValueError)            .path .reason
+            MissingRecordingError (FileNotFoundError)
         ClockResetError                        .before .after
         BusClosedError
 
@@ -37,6 +38,11 @@ LOOKED_AT = 30
 
 
 AnyError = TypeVar("AnyError", bound="TransformError")
+
+
+def pip_install(extras: str) -> str:
+    """The command that installs extras, such as ``"cli,zenoh"``: from an index, and in a checkout."""
+    return f'pip install "tfbus[{extras}]", or ".[{extras}]" in a checkout'
 
 
 def _restore(
@@ -498,6 +504,17 @@ class RecordingError(TransformError, ValueError):
         super().__init__(f"recording {path!r}: {' '.join(problem.split()).rstrip('.')}")
         self.path = path
         self.reason = reason
+
+
+class MissingRecordingError(RecordingError, FileNotFoundError):
+    """There is no file of this name; as with other files, ``except FileNotFoundError`` catches it."""
+
+    def __init__(self, *, path: str) -> None:
+        super().__init__("there is no such file", path=path, reason="missing")
+
+    def __str__(self) -> str:
+        # `OSError` would make a message of its own.
+        return Exception.__str__(self)
 
 
 class ClockResetError(TransformError):

@@ -1,7 +1,8 @@
 """A carrier to a ROS that is a list, and rows of transforms as ROS has them."""
 
+import struct
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Unpack
 
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import SendReport
@@ -41,11 +42,11 @@ class ListCarrier(RosCarrier):
 class RosEnd:
     """A bus with a link to such a ROS."""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options: Unpack[RosOptions]) -> None:
         self.bus = Bus(SimulatedClock())
         self.heard: list[tuple[TransformStamped, ...]] = []
         self.bus.subscribe(self.heard.append)
-        self.carrier = ListCarrier(RosOptions(**options))
+        self.carrier = ListCarrier(options)
         self.errors: list[Exception] = []
         self.report = SendReport(self.errors.append)
         self.endpoint = Endpoint(self.bus, "ros", self.carrier, lambda: None)
@@ -69,3 +70,18 @@ def named(payload: bytes, old: str, new: str) -> bytes:
     """A message with another name of the same length in it."""
     assert len(old) == len(new)
     return payload.replace(old.encode(), new.encode())
+
+
+def ros1(*transforms: tuple[bytes, bytes, int, int, tuple[float, ...]]) -> bytes:
+    """A message by the definition of ROS 1's serialization."""
+    parts = [struct.pack("<I", len(transforms))]
+    for number, (parent, child, seconds, nanoseconds, numbers) in enumerate(transforms):
+        parts.append(struct.pack("<III", number, seconds, nanoseconds))
+        parts += [struct.pack("<I", len(name)) + name for name in (parent, child)]
+        parts.append(struct.pack("<7d", *numbers))
+    return b"".join(parts)
+
+
+def ros1_of(sample: TransformStamped) -> tuple[bytes, bytes, int, int, tuple[float, ...]]:
+    numbers = *sample.transform.translation, *sample.transform.rotation
+    return sample.parent.encode(), sample.child.encode(), *divmod(sample.stamp, 10**9), numbers

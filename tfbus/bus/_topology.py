@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from copy import copy
 from typing import Literal, get_args
 
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._ownership import Ownership
 from tfbus.bus._plausibility import Plausibility
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.errors import InvalidTransformError
 from tfbus.events import (
     AuthorityConflict,

@@ -11,6 +11,7 @@ from typing import Any, Literal, NamedTuple
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import format_seconds, printable, say
+from tfbus.errors import pip_install
 
 Format = Literal["table", "csv", "json", "tum"]
 _BLOCK = 65_536
@@ -49,7 +50,7 @@ def write_parquet(rows: Iterator[Row], path: Path) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise UsageError('--parquet needs a package more: pip install "tfbus[parquet]"') from None
+        raise UsageError(f"--parquet needs a package more: {pip_install('parquet')}") from None
     names = pa.dictionary(pa.int32(), pa.string())
     fields = [("target", names), ("source", names), ("stamp", pa.int64())]
     schema = pa.schema(fields + [(name, pa.float64()) for name in _NUMBERS])

@@ -10,13 +10,16 @@ from typing import Annotated, Literal
 try:
     from cyclopts import App, CycloptsError, Group, Parameter
 except ImportError:
-    raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
+    from tfbus.errors import pip_install
+
+    raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
 
 LOOKUP_FAILED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
 
 COMMANDS = {
+    "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
     "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
     "receives it.",
     "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
@@ -37,7 +40,7 @@ COMMANDS = {
     "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at "
     "zero.",
     "router": "Pass on what programs of all domains send each other, until Ctrl-C.",
-    "static": "Publish the static transform of CHILD in PARENT, until Ctrl-C.",
+    "static": "Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.",
     "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",
     "view": "Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.",
 }

@@ -11,15 +11,17 @@ from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
+from tfbus.cli._ros import ros_link
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.errors import pip_install
 from tfbus.geometry.stamped import TransformStamped
 
 T = TypeVar("T")
 
 _SILENCE_BEFORE_NOTICE = 1.0
 """s."""
-_NO_ZENOH = 'joining a domain needs a package more: pip install "tfbus[cli,zenoh]"'
+_NO_ZENOH = f"joining a domain needs a package more: {pip_install('cli,zenoh')}"
 
 
 class RemoteLookups(Protocol):
@@ -50,6 +52,9 @@ class LinkOptions:
         The robot whose frames this program publishes.
     robots
         Hear only these robots, such as r1 or r*; may be given several times.
+    ros
+        Join ROS in place of a domain: dds for ROS 2, dds:42 if its ROS_DOMAIN_ID is 42, or ws://host:9090 for a
+        rosbridge server of ROS 1 or ROS 2; may be given several times.
     backend
         The event loop to run on.
     """
@@ -59,7 +64,13 @@ class LinkOptions:
     connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False, env_var="TFBUS_CONNECT")] = ()
     robot: Annotated[str | None, Parameter(show_default=False)] = None
     robots: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    ros: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
     backend: Backend = "asyncio"
+
+    @property
+    def place(self) -> str:
+        """What is joined, for people."""
+        return f"ROS at {' and '.join(self.ros)}" if self.ros else f"domain {self.domain!r}"
 
     def run(self, program: Callable[[Bus], Awaitable[T]]) -> T:
         """Run a program on a bus that has joined the domain, until its end or Ctrl-C.
@@ -85,13 +96,23 @@ class LinkOptions:
 
     @asynccontextmanager
     async def join(self, bus: Bus) -> AsyncIterator[None]:
-        """Link a bus to the domain for the body of an ``async with``.
+        """Link a bus to the domain, or to ROS, for the body of an ``async with``.
 
         Raises
         ------
         UsageError
-            If an option is not valid, an address cannot be listened at, or the extra is missing.
+            If an option is not valid, an address cannot be listened at or reached, or the extra is missing.
         """
+        if self.ros:
+            async with AsyncExitStack() as stack:
+                for place in self.ros:
+                    try:
+                        await stack.enter_async_context(ros_link(bus, place))
+                    except OSError as error:
+                        why = os.strerror(error.errno) if error.errno else error
+                        raise UsageError(f"cannot join ROS at {place}: {why}") from None
+                yield
+            return
         try:
             from tfbus.links.zenoh import ZenohLink
         except ImportError:
@@ -155,7 +176,7 @@ class LinkOptions:
             with bus.clock.move_on_after(_SILENCE_BEFORE_NOTICE):
                 await arrived.wait()
                 return
-            say(f"waiting for transforms on domain {self.domain!r} …")
+            say(f"waiting for transforms on {self.place} …")
             await arrived.wait()
 
 

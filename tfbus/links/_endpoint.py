@@ -6,8 +6,8 @@ from copy import copy
 from math import inf
 from time import monotonic
 
-from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import Asker
 from tfbus.links._carrier import AskableCarrier, Carrier, HistoryCarrier

@@ -11,8 +11,8 @@ import anyio.abc
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
-from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import check_capacity
 from tfbus.errors import BusClosedError
 from tfbus.links._carrier import Carrier, SendReport

@@ -12,7 +12,7 @@ from json import dumps
 from operator import itemgetter
 from pathlib import Path
 
-from tfbus.errors import RecordingError
+from tfbus.errors import RecordingError, pip_install
 from tfbus.recording.edits import Edits
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
 from tfbus.recording.formats._copies import BagCopy, CannotWriteError, Copy, McapCopy, SqliteCopy, transform_channel
@@ -142,7 +142,7 @@ def convert(
         try:
             copy = make(part, target.name)
         except ImportError as error:
-            problem = f'to write it, tfbus needs some packages more: pip install "tfbus[bag]" ({error})'
+            problem = f"to write it, tfbus needs some packages more: {pip_install('bag')} ({error})"
             raise RecordingError(problem, path=str(target), reason="missing extra") from error
         stack.callback(part.unlink, missing_ok=True)
         stack.callback(copy.close)

@@ -21,7 +21,7 @@ from tfbus.tree._path_cache import PathCache
 from tfbus.tree._saved_frames import SavedFrame, load_frame
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
-from tfbus.tree.path import Path, find_path, path_at
+from tfbus.tree.path import Path, find_edges, find_path, path_at
 
 AT_A_TIME = 100
 """The number of frames that are read before the lock is released, for questions about all of them."""
@@ -43,7 +43,7 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
+    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
     themselves. The caller of every other method holds it.
 
     Parameters
@@ -78,27 +78,9 @@ class Forest:
         Number of samples that have been in `looping`.
     version : int
         Another number after each change.
+    structure : int
+        Another number after each change that may make a path wrong.
     """
-
-    __slots__ = (
-        "_readers",
-        "_suspects",
-        "changed",
-        "changing_paths",
-        "expired",
-        "expired_frames",
-        "frames",
-        "inserted",
-        "lock",
-        "looped",
-        "looping",
-        "names",
-        "new_parents",
-        "paths",
-        "replaced",
-        "version",
-        "window",
-    )
 
     def __init__(self, window: int | None) -> None:
         self.lock = threading.Lock()
@@ -118,6 +100,7 @@ class Forest:
         self.expired = 0
         self.looped = 0
         self.version = 0
+        self.structure = 0
 
     # Changes
 
@@ -270,10 +253,30 @@ class Forest:
 
     def forget_paths(self) -> None:
         """Empty `paths` and `changing_paths`."""
+        self.structure += 1
         self.paths.clear()
         self.changing_paths.clear()
 
     # Questions
+
+    def search(self, target: str, source: str) -> None:
+        """Find the newest path and keep it, without the lock while it climbs, which may take long.
+
+        If a change may have made it wrong meanwhile, or there is none, nothing is kept: whoever asks then finds it, or
+        the error, under the lock.
+        """
+        if self.paths.holds(target, source) or (target, source) in self.changing_paths:
+            return
+        structure = self.structure
+        if target not in self.names or source not in self.names:
+            return
+        try:
+            edges = find_edges(self.frames, target, source, None)
+        except DisconnectedError:
+            return
+        with self.lock:
+            if self.structure == structure:
+                self._keep(target, source, Path(*edges))
 
     def find_path(self, target: str, source: str, at: int | Latest) -> Path:
         """The path between two frames that counts at a stamp (see `path_at`), or the one by the newest parents.
@@ -302,13 +305,16 @@ class Forest:
         self.check_known(target)
         self.check_known(source)
         path = find_path(self.frames, target, source, None)
+        self._keep(target, source, path)
+        return path
+
+    def _keep(self, target: str, source: str, path: Path) -> None:
         if path.permanent:
             self.paths.keep(target, source, path)
         else:
             if len(self.changing_paths) >= _CHANGING_PATHS_KEPT:
                 self.changing_paths.clear()
             self.changing_paths[target, source] = path
-        return path
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""

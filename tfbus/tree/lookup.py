@@ -71,6 +71,11 @@ def answer(
     if type(at) is not int and at is not LATEST:
         at = as_stamp(at)
     extrapolation = None if policy is None else Extrapolation(policy)
+    if fixed is None:
+        forest.search(target, source)
+    else:
+        forest.search(target, fixed)
+        forest.search(fixed, source)
     with forest.lock:
         if source_at is None and fixed is None:
             stamp, row, static = find(forest, target, source, at, bounds, extrapolation)

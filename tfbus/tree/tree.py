@@ -368,6 +368,8 @@ class TransformTree:
         axes = reference if expressed_in is None else expressed_in
         if at is not LATEST:
             at = as_stamp(at)
+        self._forest.search(reference, frame)
+        self._forest.search(axes, reference)
         with self._forest.lock:
             stamp, linear, angular = twist(self._forest, frame, reference, at, axes)
         return TwistStamped(axes, stamp, linear, angular)
@@ -380,6 +382,7 @@ class TransformTree:
         UnknownFrameError, DisconnectedError, FutureExtrapolationError
             As `lookup`.
         """
+        self._forest.search(target, source)
         with self._forest.lock:
             path = self._forest.find_path(target, source, LATEST)
             return path.newest_common()[0] if path.moving else None
@@ -393,6 +396,7 @@ class TransformTree:
         """
         if at is not LATEST:
             at = as_stamp(at)
+        self._forest.search(target, source)
         with self._forest.lock:
             return list(self._forest.find_path(target, source, at).frames)
 

@@ -55,6 +55,8 @@ r1/base
 └── r1/kite      wind    floating   xyz 1 2 3 m, rpy 3.14159 0 0 rad
 """
 
+ARM = Path(__file__).parents[3] / "demos" / "robot_arm.urdf"
+
 
 @pytest.fixture
 def crane(tmp_path: Path) -> str:
@@ -227,3 +229,23 @@ def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortene
         assert max(map(len, lines)) <= width
         assert len(lines) == len(whole)
         assert all("revolute" not in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("elbw=1",), "the URDF comes first: tfbus robot FILE elbw=1"),
+        ((ARM, "elbw=1"), "'arm' has no joint 'elbw', did you mean 'elbow_flex'?"),
+        ((ARM, "wrist=1"), "did you mean 'wrist_flex' or 'wrist_roll'?"),
+        ((ARM, "shoulderpan=1"), "did you mean 'shoulder_pan' or 'shoulder_lift'?"),
+    ],
+)
+def test_a_misspelt_joint_is_suggested_by_any_word_of_its_name(
+    words: Sequence[object], why: str, tfbus: Command
+) -> None:
+    check_wrong_call(tfbus("robot", *words), why)
+
+
+def test_a_joint_like_none_is_not_suggested(tfbus: Command) -> None:
+    done = tfbus("robot", ARM, "gripper=1")
+    assert done.stderr == "tfbus: 'arm' has no joint 'gripper'\n"

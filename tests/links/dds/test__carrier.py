@@ -57,7 +57,8 @@ class Node:
         gids: Any = [list(writer.guid.bytes) for writer in self.writers.values()]
         writers: Any = list(map(Gid, gids))
         nothing: Any = []
-        nodes: Any = [NodeEntitiesInfo(namespace, name, nothing, writers)]
+        make: Any = NodeEntitiesInfo
+        nodes: Any = [make(namespace, name, nothing, writers)]
         own: Any = list(self.participant.guid.bytes)
         self.info.write(ParticipantEntitiesInfo(Gid(own), nodes))
 

@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 from support.samples import moving, static
 
@@ -17,7 +19,7 @@ from tfbus.tf_message import decode, encode
 
 def test_the_bytes_of_a_message_are_those_that_the_library_writes_and_reads() -> None:
     samples = [moving("map", "base", 5_000_000_007, 1.0), static("base", "a camera", 2.0)]
-    rows = [
+    rows: Any = [
         TransformStamped(
             Header(Time(*divmod(sample.stamp, 10**9)), sample.parent),
             sample.child,
@@ -25,14 +27,14 @@ def test_the_bytes_of_a_message_are_those_that_the_library_writes_and_reads() ->
         )
         for sample in samples
     ]
-    declared = RawTFMessage.__idl__
+    declared: Any = RawTFMessage.__idl__
     assert bytes(declared.serialize(RawTFMessage(rows))) == encode(samples)
     assert declared.deserialize(encode(samples)).transforms == rows
 
 
 def test_a_message_keeps_its_bytes() -> None:
     payload = encode([moving("map", "base", 5)])
-    message = RawTFMessage.deserialize(memoryview(payload))
+    message = RawTFMessage.deserialize(payload)
     assert message.serialize() == payload
     assert decode(message.payload).samples == [moving("map", "base", 5)]
     assert RawTFMessage.deserialize_key(b"").serialize() == b""

@@ -34,7 +34,7 @@ def echo(
     rate: Rate = 1.0,
     max_age: Duration = math.inf,
     as_json: JsonFlag = False,
-    remote: Annotated[bool, Parameter(negative="")] = False,
+    remote: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
     """Print the transform of SOURCE in TARGET again and again, until Ctrl-C.

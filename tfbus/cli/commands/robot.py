@@ -1,6 +1,7 @@
 """``tfbus robot``."""
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -22,6 +23,8 @@ from tfbus.tree.history import Edge
 from tfbus.tree.rendering import Branch, branches
 
 AUTHORITY = "robot"
+_ALIKE = 0.7
+"""The least ratio of equal letters in a misspelt name and the one that was meant."""
 _LEAST_POSITION = 16
 """The shortest that a position is made for the frames to have room, in columns."""
 _COLUMNS = (Column("frame"), Column("joint", importance=2), Column("type", importance=1), Column("position"))
@@ -58,6 +61,8 @@ def robot(
     prefix
         A prefix for the names of all frames, such as robot1/.
     """
+    if "=" in file.name and not file.exists():
+        raise UsageError(f"the URDF comes first: tfbus robot FILE {file}")
     model = _read_model(file)
     positions = {**model.zeros(), **_parse_positions(model, position)}
     try:
@@ -73,7 +78,7 @@ def robot(
         return
 
     async def publish(bus: Bus) -> None:
-        where = f"on domain {link.domain!r} at {rate:g} Hz"
+        where = f"on {link.place} at {rate:g} Hz"
         say(f"publishing {len(transforms)} frames of {model.name!r} {where}, until Ctrl-C")
         async with anyio.create_task_group() as tasks:
             await tasks.start(publish_static, bus, model.fixed_transforms(bus.clock.now(), AUTHORITY, prefix))
@@ -155,7 +160,7 @@ def _parse_positions(model: RobotModel, assignments: Sequence[str]) -> dict[str,
             raise UsageError(f"a position is NAME=NUMBER, such as elbow=0.5, not {assignment!r}")
         if name not in joints:
             moving = [joint.name for joint in model.joints if joint.kind != "fixed"]
-            hint = " or ".join(map(repr, difflib.get_close_matches(name, moving)))
+            hint = " or ".join(map(repr, _similar(name, moving)))
             raise UsageError(f"{model.name!r} has no joint {name!r}" + (f", did you mean {hint}?" if hint else ""))
         if joints[name].kind == "fixed":
             raise UsageError(f"joint {name!r} is fixed and has no position")
@@ -163,6 +168,16 @@ def _parse_positions(model: RobotModel, assignments: Sequence[str]) -> dict[str,
             raise UsageError(f"joint {name!r} has two positions")
         positions[name] = _parse_position(joints[name], text)
     return positions
+
+
+def _similar(name: str, names: Sequence[str]) -> list[str]:
+    """At most three names that are like a misspelt one, as a whole or in one of their words."""
+
+    def likeness(known: str) -> float:
+        parts = [known, *re.split(r"[_\-/ ]+", known)]
+        return max(difflib.SequenceMatcher(None, name.lower(), part.lower()).ratio() for part in parts)
+
+    return sorted((known for known in names if likeness(known) >= _ALIKE), key=likeness, reverse=True)[:3]
 
 
 def _parse_position(joint: Joint, text: str) -> Position:

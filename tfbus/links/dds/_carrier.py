@@ -104,12 +104,12 @@ class DdsCarrier(RosCarrier):
         topic: Topic[Any],
         qos: Qos,
         take: Callable[[DataReader[Any]], object],
-        match: Callable[[DataReader[Any]], object] | None,
+        match: Callable[[DataReader[Any]], None] | None,
     ) -> None:
         reader = DataReader(participant, topic, qos)
         listener = Listener(on_data_available=lambda _: take(reader))
         if match is not None:
-            listener.set_on_subscription_matched(lambda *_: match(reader))
+            listener.set_on_subscription_matched(lambda _, __: match(reader))
         self._open.callback(_delete, reader)
         # Only now, because a listener is called with no reader before the library knows the one that it makes.
         reader.set_listener(listener)

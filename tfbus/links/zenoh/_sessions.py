@@ -8,6 +8,7 @@ same mends a connection of which only one end hears the other; see `tfbus.links.
 import re
 import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from time import monotonic
 from uuid import uuid4
 
@@ -154,7 +155,7 @@ class ZenohSessions:
                     # zenoh may wait for a peer that is frozen.
                     await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
                 for peer in self._hearing.take_due():
-                    self._main.ask_hearing(peer, lambda names, peer=peer: self._note_heard_by(peer, names))
+                    self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
                 for peer, address in self._dialing.take_due():
                     if peer not in self._patches:
