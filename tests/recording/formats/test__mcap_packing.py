@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.writer import CompressionType, Writer
@@ -14,7 +15,7 @@ from tfbus.tf_message import encode
 def test_a_damaged_chunk_among_packed_ones_is_lost_alone(tmp_path: Path, wrong: str) -> None:
     path = tmp_path / "run.mcap"
     with path.open("wb") as file:
-        writer = Writer(file, 1, CompressionType.NONE, enable_crcs=False)
+        writer: Any = Writer(file, 1, CompressionType.NONE, enable_crcs=False)
         writer.start("ros2", "")
         channel = writer.register_channel(
             "/tf", "cdr", writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")

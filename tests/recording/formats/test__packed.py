@@ -29,7 +29,7 @@ def test_packed_messages_are_those_that_were_packed_in_the_order_of_their_log_ti
     packed = pack(stored)
     assert packed is not None
     assert packed.stored() == stored
-    assert packed.count == len(stored)
+    assert packed.size == len(stored)
     assert sum(packed.counts().values()) == len(stored)
     expected = sorted((each for each in stored if low <= each[0] <= high), key=lambda each: each[0])
     assert unpacked(in_order(packed, low, high)) == expected
