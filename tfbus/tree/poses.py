@@ -63,11 +63,17 @@ class PoseReader:
     Parameters
     ----------
     forest : Forest
+
+    Attributes
+    ----------
+    topology : object
+        Another object whenever the frames and their parents may have changed between two readings.
     """
 
     def __init__(self, forest: Forest) -> None:
         self._forest = forest
         self._plans: dict[str, _Plan] = {}
+        self.topology: object = None
 
     def read(self, fixed: str, at: int | Latest = LATEST) -> Poses:
         """The poses in the frame `fixed` at a stamp, or for each frame at the one that `LATEST` means.
@@ -82,22 +88,33 @@ class PoseReader:
             forest.check_known(fixed)
             plan = self._plan(fixed, at)
             histories = [None if child == "" else forest.frames[child] for child in plan.edges]
-            gathered = (_gather_newest(plan, histories) if at is LATEST else None) or _gather(plan, histories, at)
+            together = _gather_newest(plan, histories) if at is LATEST else None
+            gathered = _gather(plan, histories, at) if together is None else together.gathered
             moved = _moved_to_another_parent(plan, histories) if at is LATEST else []
             corrections = [(place, _find(forest, fixed, plan.frames[place])) for place in moved]
-            own = [forest.frames.get(frame) for frame in plan.frames]
-            static = np.array([history is not None and history.static for history in own])
-            if isinstance(at, Latest):
-                newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
+            if together is not None and not any(plan.inverted):
+                # Each frame is reached by its own edge.
+                static = np.array(together.static)
+                heard = np.where(static, STAMP_MIN, STAMP_MIN if together.stamp is None else together.stamp)
+                heard[0] = STAMP_MIN
             else:
-                newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
-            heard = np.array(newest, np.int64)
+                static, heard = self._own_edges(plan, at)
         columns, answered = gathered.compose()
         for place, row in corrections:
             answered[place] = row is not None
             if row is not None:
                 columns[:, place] = row
         return Poses(tuple(plan.frames), columns, plan.parents, answered, static, heard)
+
+    def _own_edges(self, plan: _Plan, at: int | Latest) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+        """Whether the edge above each frame is static, and its newest stamp."""
+        own = [self._forest.frames.get(frame) for frame in plan.frames]
+        static = np.array([history is not None and history.static for history in own])
+        if isinstance(at, Latest):
+            newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
+        else:
+            newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
+        return static, np.array(newest, np.int64)
 
     def _plan(self, fixed: str, at: int | Latest) -> _Plan:
         frames = self._forest.frames
@@ -111,6 +128,7 @@ class PoseReader:
         if plan is None or plan.topology != topology:
             # Only one: a picture seldom changes its fixed frame.
             self._plans = {fixed: (plan := _make_plan(fixed, topology))}
+            self.topology = topology
         return plan
 
 
@@ -235,11 +253,22 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     return gathered
 
 
-def _gather_newest(plan: _Plan, histories: Sequence[FrameHistory | None]) -> _Gathered | None:
+class _Together(NamedTuple):
+    """Edges that were all read at one stamp."""
+
+    gathered: _Gathered
+    static: list[bool]
+    stamp: int | None
+    """The newest stamp of all moving edges, in ns; None if all are static."""
+
+
+def _gather_newest(plan: _Plan, histories: Sequence[FrameHistory | None]) -> _Together | None:
     """Read every edge at its newest stamp, if that is the same for all moving edges, as it mostly is; else None."""
     rows = bytearray()
+    static = []
     common: int | None = None
     for history in histories:
+        static.append(history is not None and history.static)
         if history is None:
             rows += _IDENTITY
         elif history.static:
@@ -251,7 +280,8 @@ def _gather_newest(plan: _Plan, histories: Sequence[FrameHistory | None]) -> _Ga
             common = newest
             rows += _pack(*history.sample(history.count - 1)[1])
     every = list(range(len(histories)))
-    return _Gathered(plan, rows, every, [0, *plan.origins[1:]], [True] * len(every), every)
+    gathered = _Gathered(plan, rows, every, [0, *plan.origins[1:]], [True] * len(every), every)
+    return _Together(gathered, static, common)
 
 
 def _heard(stamp: int | None) -> int:
