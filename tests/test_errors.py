@@ -22,8 +22,10 @@ from tfbus import (
     InvalidRobotError,
     InvalidTransformError,
     LookupTimeoutError,
+    MissingRecordingError,
     PastExtrapolationError,
     RecordingError,
+    RemoteLookupError,
     TransformError,
     TransformLookupError,
     UnknownFrameError,
@@ -106,6 +108,14 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         "frame 'base_link': asked for 12.500 s, newest sample is 12.090 s (410 ms short), from 'odometry'",
     ),
     (
+        RemoteLookupError(domain="tf", robot="r1", reason="absent", detail="nobody offers it"),
+        "no answer from the buffer of robot 'r1' in domain 'tf': nobody offers it",
+    ),
+    (
+        RemoteLookupError(domain="tf", robot=None, reason="lost", detail="it has gone"),
+        "no answer from a buffer without a robot in domain 'tf': it has gone",
+    ),
+    (
         InvalidTransformError(
             "frame 'a' cannot be its own parent", reason="self transform", parent="a", child="a", authority="odometry"
         ),
@@ -116,6 +126,7 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         "in <joint name=\"elbow\">: parent link 'arm' is not there",
     ),
     (RecordingError("the file is empty", path="run.mcap", reason="empty"), "recording 'run.mcap': the file is empty"),
+    (MissingRecordingError(path="run.mcap"), "recording 'run.mcap': there is no such file"),
     (
         ClockResetError(before=from_seconds(90), after=from_seconds(3.5)),
         "the clock jumped back from 90.000 s to 3.500 s",

@@ -47,8 +47,10 @@ _NAMES_IN = {
         "InvalidRobotError",
         "InvalidTransformError",
         "LookupTimeoutError",
+        "MissingRecordingError",
         "PastExtrapolationError",
         "RecordingError",
+        "RemoteLookupError",
         "TransformError",
         "TransformLookupError",
         "UnknownFrameError",
@@ -97,6 +99,7 @@ _NAMES_IN = {
         "to_seconds",
     ),
     "statistics": (
+        "BufferServerStatistics",
         "BufferStatistics",
         "BusStatistics",
         "LinkStatistics",

@@ -12,9 +12,11 @@
                 GapError                   .before .after .max_gap            waiting cannot help: raised at once
                 AheadError                                                    waiting cannot help: raised at once
             LookupTimeoutError (TimeoutError)  __cause__ is the last lookup error
+            RemoteLookupError                  .domain .robot .reason .detail
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         InvalidRobotError (ValueError)         .element
         RecordingError (ValueError)            .path .reason
+            MissingRecordingError (FileNotFoundError)
         ClockResetError                        .before .after
         BusClosedError
 
@@ -36,6 +38,11 @@ LOOKED_AT = 30
 
 
 AnyError = TypeVar("AnyError", bound="TransformError")
+
+
+def pip_install(extras: str) -> str:
+    """The command that installs extras, such as ``"cli,zenoh"``: from an index, and in a checkout."""
+    return f'pip install "tfbus[{extras}]", or ".[{extras}]" in a checkout'
 
 
 def _restore(
@@ -384,6 +391,40 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
         return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {missing}"
 
 
+class RemoteLookupError(TransformLookupError):
+    """The server of another process's buffer has given no answer, not even that the lookup has failed.
+
+    Attributes
+    ----------
+    domain : str
+        The domain that was asked.
+    robot : str or None
+        The robot that was asked.
+    reason : str
+        ``"absent"``: there is no such server; ``"lost"``: it has gone, or cannot be reached any more; ``"busy"``: too
+        many lookups wait there, or come in a second; ``"silent"``: it is there, and does not answer;
+        ``"malformed"``: its answer, or the question, could not be read.
+    detail : str
+        The same in words.
+    """
+
+    domain: str
+    robot: str | None
+    reason: str
+    detail: str
+
+    def __init__(self, *, domain: str, robot: str | None, reason: str, detail: str) -> None:
+        super().__init__()
+        self.domain = domain
+        self.robot = robot
+        self.reason = reason
+        self.detail = detail
+
+    def _why(self) -> str:
+        whose = "a buffer without a robot" if self.robot is None else f"the buffer of robot {self.robot!r}"
+        return f"no answer from {whose} in domain {self.domain!r}: {self.detail}"
+
+
 class InvalidTransformError(TransformError, ValueError):
     """A sample is invalid, or its authority may not publish the child; nothing was stored.
 
@@ -463,6 +504,17 @@ class RecordingError(TransformError, ValueError):
         super().__init__(f"recording {path!r}: {' '.join(problem.split()).rstrip('.')}")
         self.path = path
         self.reason = reason
+
+
+class MissingRecordingError(RecordingError, FileNotFoundError):
+    """There is no file of this name; as with other files, ``except FileNotFoundError`` catches it."""
+
+    def __init__(self, *, path: str) -> None:
+        super().__init__("there is no such file", path=path, reason="missing")
+
+    def __str__(self) -> str:
+        # `OSError` would make a message of its own.
+        return Exception.__str__(self)
 
 
 class ClockResetError(TransformError):

@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from tfbus.plain import PlainData
+
 
 @dataclass(frozen=True, slots=True)
-class BufferStatistics:
+class BufferStatistics(PlainData):
     """The samples of one buffer since it was attached, and its waiting lookups.
 
     ``offered == inserted + replaced + expired``
@@ -38,7 +40,7 @@ class BufferStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class QueueStatistics:
+class QueueStatistics(PlainData):
     """One bounded queue: of a stream, of events, or of samples from other threads.
 
     Every moving sample that was put into the queue was read, or is counted as pending, dropped or conflated.
@@ -69,7 +71,7 @@ class QueueStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class BusStatistics:
+class BusStatistics(PlainData):
     """One bus since it was made.
 
     Attributes
@@ -111,7 +113,7 @@ class BusStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkStatistics:
+class LinkStatistics(PlainData):
     """One link since it was entered.
 
     Attributes
@@ -148,7 +150,33 @@ class LinkStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class RecorderStatistics:
+class BufferServerStatistics(PlainData):
+    """One buffer server since it was entered.
+
+    Attributes
+    ----------
+    waiting : int
+        Lookups of other processes that wait now.
+    answered, failed : int
+        Lookups that had a transform for an answer, and lookups that had an error.
+    cancelled : int
+        Lookups whose asker was cancelled, or has gone.
+    refused : mapping of str to int
+        Questions that were refused, by reason: ``"busy"``, because too many wait or come; ``"malformed"``.
+    queue : QueueStatistics
+        Questions that wait for the event loop.
+    """
+
+    waiting: int
+    answered: int
+    failed: int
+    cancelled: int
+    refused: Mapping[str, int]
+    queue: QueueStatistics
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatistics(PlainData):
     """One recorder since it was entered.
 
     The number of samples that the bus gave to it is
@@ -175,7 +203,7 @@ class RecorderStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotStatistics:
+class RobotStatistics(PlainData):
     """One robot state publisher since it was made.
 
     Attributes

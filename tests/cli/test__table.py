@@ -16,7 +16,22 @@ def test_columns_are_as_wide_as_their_cells_and_numbers_stand_at_the_right() -> 
 def test_what_matters_least_goes_first_where_it_does_not_fit() -> None:
     assert list(table_lines(COLUMNS, ROWS, 22)) == ["name       count", "a              1", "long name  1,000"]
     assert list(table_lines(COLUMNS, ROWS, 15)) == ["name", "a", "long name"]
-    assert list(table_lines(COLUMNS, ROWS, 3)) == ["name", "a", "long name"]
+
+
+def test_what_stays_always_is_shortened_but_to_eight_columns_at_least() -> None:
+    columns = (Column("name"), Column("kind"))
+    rows = [("left_shoulder_link", "fixed"), ("arm", "revolute")]
+    assert list(table_lines(columns, rows, 20)) == ["name        kind", "left…_link  fixed", "arm         revolute"]
+    assert list(table_lines(columns, rows, 3))[1] == "lef…link  fixed"
+
+
+def test_a_table_may_have_no_titles() -> None:
+    assert list(table_lines(COLUMNS[:1], [("a",)], None, titles=False)) == ["a"]
+    assert list(table_lines(COLUMNS, [], None, titles=False)) == []
+
+
+def test_wide_letters_take_two_columns() -> None:
+    assert list(table_lines(COLUMNS[::2], [("雷达", "1"), ("abcd", "2")], None, titles=False)) == ["雷达  1", "abcd  2"]
 
 
 def test_empty_columns_are_left_out() -> None:

@@ -84,3 +84,54 @@ def test_the_branches_can_be_drawn_in_ascii() -> None:
 
 def test_an_empty_tree_is_one_line() -> None:
     assert [line.plain for line in tree_lines([], 0)] == ["(no frames)"]
+
+
+ARM = [
+    Edge("base", "shoulder_pan_link", False, 11, 0, SECOND, "a_very_long_sender_of_joint_states"),
+    Edge("shoulder_pan_link", "elbow", False, 11, 0, SECOND, "a_very_long_sender_of_joint_states"),
+]
+
+
+@pytest.mark.parametrize(
+    ("width", "last"),
+    [
+        (200, "    └── elbow          10.0 Hz  age 1 s  span 1 s  from 'a_very_long_sender_of_joint_states'"),
+        (70, "    └── elbow          10.0 Hz  age 1 s  span 1 s  from 'a_v…t_states'"),
+        (63, "    └── elbow          10.0 Hz  age 1 s  span 1 s  from …tates'"),
+        (50, "    └── elbow          10.0 Hz  age 1 s  span 1 s"),
+        (47, "  └ elbow            10.0 Hz  age 1 s  span 1 s"),
+        (40, "  └ elbow            10.0 Hz  age 1 s"),
+        (36, " └elbow             10.0 Hz  age 1 s"),
+        (31, " └elbow        10.0 Hz  age 1 s"),
+    ],
+)
+def test_where_it_does_not_fit_it_keeps_frame_rate_and_age(width: int, last: str) -> None:
+    lines = [line.plain for line in tree_lines(ARM, 2 * SECOND, width=width)]
+    assert max(map(len, lines)) <= width
+    assert lines[-1] == last
+
+
+def test_of_a_tree_that_is_deeper_than_the_terminal_is_wide_the_nearest_levels_are_drawn() -> None:
+    chain = [Edge(f"frame{level}", f"frame{level + 1}", True, 1, None, None, "") for level in range(50)]
+    lines = [line.plain for line in tree_lines(chain, 0, width=40)]
+    assert max(map(len, lines)) <= 40
+    assert lines[-1].split() == ["…", "└frame50", "static"]
+
+
+def test_a_live_tree_that_is_higher_than_the_terminal_says_how_many_frames_do_not_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stdout", terminal)
+    for name, value in (("TERM", "xterm"), ("COLUMNS", "80"), ("LINES", "5")):
+        monkeypatch.setenv(name, value)
+    wide = [Edge("map", f"f{number}", True, 1, None, None, "") for number in range(9)]
+    with TreeDisplay(live=True) as display:
+        display.show(wide[:3], 0)
+        assert "more than fit" not in terminal.getvalue()
+        display.show(wide, 0)
+    shown = terminal.getvalue()
+    # Ten lines, four of which fit above the cursor's; one of them says so.
+    assert "… and 7 lines more than fit" in shown
+    assert ("f1" in shown, "f2" in shown) == (True, True)
+    assert "f3" not in shown

@@ -16,7 +16,7 @@ from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
 from tfbus import kernel
-from tfbus.cli.application import application
+from tfbus.cli.application import COMMANDS, application
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import LinkOptions
 
@@ -36,6 +36,10 @@ URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
         ("foxglove", ("--port INT", *LINK)),
         ("info", ("FILE", "--json", "--wide", "--namespaces")),
         ("listen", ("--rate FLOAT", *LINK)),
+        (
+            "monitor",
+            ("TARGET", "SOURCE", "--window FLOAT", "--rate FLOAT", "--once", "--duration FLOAT", "--json", *LINK),
+        ),
         ("play", ("FILE", "--rate FLOAT", "--loop", "--from TIME", "--to TIME", "--topic STR...", *LINK)),
         ("plot", ("FILE", "FRAMES", "--output", "--path", "--3d", "--gaps", "--text", "--compare PATH")),
         ("query", ("FILE", "TARGET", "SOURCE", "--at TIME", "--every SECONDS", "--tum", "--csv", "--json")),
@@ -62,6 +66,26 @@ def test_the_help_of_a_command_has_an_example_and_every_option(
     assert max(map(len, done.stdout.splitlines())) <= 80
 
 
+@pytest.mark.parametrize(
+    ("command", "defaults"),
+    [
+        ("check", ["10.0", "100000000.0", "100.0", "100.0", "tf"]),
+        ("compare", ["0.01", "1"]),
+        ("demo", ["inf", "100.0", "1.0"]),
+        ("echo", ["1.0", "inf"]),
+        ("foxglove", ["8765", "tf"]),
+        ("robot", ["10.0"]),
+        ("view", ["8080", "30.0", "tf"]),
+    ],
+)
+def test_the_help_tells_the_defaults(
+    command: str, defaults: Sequence[str], tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    found = re.findall(r"\[default: ([^\]]*)\]", tfbus(command, "--help").stdout)
+    assert found[: len(defaults)] == defaults
+
+
 def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Command) -> None:
     done = tfbus("--version")
     assert (done.returncode, done.stderr) == (0, "")
@@ -71,10 +95,7 @@ def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Com
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = (
-        "broadcast check compare convert demo echo foxglove info listen play plot query record robot router static"
-    )
-    assert re.findall(r"│ ([a-z]+) ", done.stdout) == [*commands.split(), "tree", "view"]
+    assert re.findall(r"│ ([a-z]+) ", done.stdout) == sorted(COMMANDS)
 
 
 @pytest.mark.parametrize(

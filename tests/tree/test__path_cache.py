@@ -33,6 +33,8 @@ def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() ->
             assert cache.find("a", "wanted") is kept
     assert cache.find("a", "0") is None
     assert cache.find("a", "29999") is kept
+    assert [cache.holds("a", name) for name in ("0", "26000", "29999", "wanted")] == [False, True, True, True]
+    assert not cache.holds("b", "wanted")
 
 
 class Name(str):

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from copy import copy
 from typing import Literal, get_args
 
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._ownership import Ownership
 from tfbus.bus._plausibility import Plausibility
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.errors import InvalidTransformError
 from tfbus.events import (
     AuthorityConflict,
@@ -284,8 +284,9 @@ class Topology:
         while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
             rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
             if len(rest) < len(batch):
+                # An error for each sample, so that all are counted.
+                refused += [intruder] * (len(batch) - len(rest))
                 batch = rest
-                refused.append(intruder)
             else:
                 del edges[_child(intruder)]
                 removed.append(intruder)

@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, suppress
 from threading import get_ident
 from types import TracebackType
 
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._late_buffer import LateBuffer
 from tfbus.bus._owner_thread import OwnerThread
@@ -20,6 +19,7 @@ from tfbus.bus._plausibility import Plausibility
 from tfbus.bus._subscribers import BatchCallback, FrameCallback, Subscribers
 from tfbus.bus._topology import Invalid, Topology, as_invalid
 from tfbus.bus.event_stream import EventStream
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import Overflow
 from tfbus.bus.stream import Stream
 from tfbus.bus.thread_publisher import ThreadPublisher
@@ -358,6 +358,11 @@ class Bus:
             ),
             ahead=self._topology.ahead,
         )
+
+    def __repr__(self) -> str:
+        state = f"{len(self._buffers)} buffers, {len(self._streams)} streams"
+        frames = len(self._topology)
+        return f"<Bus of {frames:,} child frame{'' if frames == 1 else 's'}, {'closed' if self._closed else state}>"
 
     def close(self) -> None:
         """End every stream and every waiting lookup; buffers go on answering what they can.

@@ -1,7 +1,9 @@
-"""Tables of text, which leave out the least important columns where they would not fit."""
+"""Tables of text, which leave out the least important columns where they would not fit, and shorten the others."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
+
+from tfbus.cli._width import align, cells, shorten, shorten_widest
 
 _GAP = "  "
 
@@ -23,7 +25,9 @@ class Column(NamedTuple):
     importance: int | None = None
 
 
-def table_lines(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int | None) -> Iterator[str]:
+def table_lines(
+    columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int | None, titles: bool = True
+) -> Iterator[str]:
     """The lines of a table, its titles first; empty columns are left out.
 
     Parameters
@@ -32,21 +36,22 @@ def table_lines(columns: Sequence[Column], rows: Sequence[Sequence[str]], width:
     rows : sequence of sequence of str
         The cells of each row; printable.
     width : int, optional
-        The greatest length of a line, as far as leaving out columns can keep it.
+        The greatest length of a line; where columns that stay always do not fit, their longest cells are shortened.
+    titles : bool
+        Whether the first line has the titles.
     """
     shown = [at for at in range(len(columns)) if any(row[at] for row in rows)]
-    widths = (
-        [max(len(column.title), *(len(row[at]) for row in rows)) for at, column in enumerate(columns)] if rows else []
-    )
+    lines = [[column.title for column in columns], *rows] if titles else list(rows)
+    widths = [max(cells(line[at]) for line in lines) for at in range(len(columns))] if rows else []
 
-    def too_wide() -> bool:
-        return width is not None and sum(widths[at] for at in shown) + len(_GAP) * (len(shown) - 1) > width
+    def room() -> int:
+        return sum(widths) if width is None else width - len(_GAP) * (len(shown) - 1)
 
-    while too_wide():
+    while sum(widths[at] for at in shown) > room():
         optional = [at for at in shown if columns[at].importance is not None]
         if not optional:
             break
         shown.remove(min(optional, key=lambda at: columns[at].importance or 0))
-    for row in [[column.title for column in columns], *rows]:
-        cells = (row[at].rjust(widths[at]) if columns[at].right else row[at].ljust(widths[at]) for at in shown)
-        yield _GAP.join(cells).rstrip()
+    fitted = dict(zip(shown, shorten_widest([widths[at] for at in shown], room()), strict=True))
+    for line in lines:
+        yield _GAP.join(align(shorten(line[at], fitted[at]), fitted[at], columns[at].right) for at in shown).rstrip()

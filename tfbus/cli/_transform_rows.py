@@ -8,11 +8,15 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import format_seconds, printable, say
+from tfbus.errors import pip_install
 
 Format = Literal["table", "csv", "json", "tum"]
 _BLOCK = 65_536
+_STAMP, _NUMBER = 20, 12
+"""The widths of a stamp and of a number in a table."""
 _NUMBERS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
@@ -46,7 +50,7 @@ def write_parquet(rows: Iterator[Row], path: Path) -> None:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise UsageError('--parquet needs a package more: pip install "tfbus[parquet]"') from None
+        raise UsageError(f"--parquet needs a package more: {pip_install('parquet')}") from None
     names = pa.dictionary(pa.int32(), pa.string())
     fields = [("target", names), ("source", names), ("stamp", pa.int64())]
     schema = pa.schema(fields + [(name, pa.float64()) for name in _NUMBERS])
@@ -92,15 +96,25 @@ def _print_tum(rows: Iterator[Row], _: bool) -> None:
 
 
 def _print_table(rows: Iterator[Row], several: bool) -> None:
+    """Print a line a row, or two lines where the terminal is too narrow for the numbers of one."""
+    width = terminal_width()
+    between = "" if width is None or width >= _STAMP + _NUMBER * len(_NUMBERS) else "\n" + " " * (_STAMP - _NUMBER)
     pair = None
     for row in rows:
         if pair != row[:2]:
             if several:
-                print(f"{'' if pair is None else chr(10)}{printable(row.source)} in {printable(row.target)}")
-            print(f"{'stamp [s]':>20}" + "".join(f"{name:>12}" for name in ("x [m]", "y [m]", "z [m]", *_NUMBERS[3:])))
+                heading = f"{printable(row.source)} in {printable(row.target)}"
+                print(*([] if pair is None else [""]), *wrapped(heading, width, 2), sep="\n")
+            titles = [f"{name:>{_NUMBER}}" for name in ("x [m]", "y [m]", "z [m]", *_NUMBERS[3:])]
+            print(f"{'stamp [s]':>{_STAMP}}{''.join(titles[:3])}{between}{''.join(titles[3:])}")
             pair = row[:2]
-        values = "".join(f"{value:z12.6f}" for value in (*row.translation, *row.rotation))
-        print(f"{format_seconds(row.stamp):>20}{values}")
+        values = [_number(value) for value in (*row.translation, *row.rotation)]
+        print(f"{format_seconds(row.stamp):>{_STAMP}}{''.join(values[:3])}{between}{''.join(values[3:])}")
+
+
+def _number(value: float) -> str:
+    text = f"{value:z{_NUMBER}.6f}"
+    return text if len(text) <= _NUMBER else f" {value:{_NUMBER - 1}.4e}"
 
 
 _PRINTERS: dict[Format, Callable[[Iterator[Row], bool], None]] = {

@@ -10,13 +10,16 @@ from typing import Annotated, Literal
 try:
     from cyclopts import App, CycloptsError, Group, Parameter
 except ImportError:
-    raise SystemExit('tfbus: the command needs some packages more: pip install "tfbus[cli]"') from None
+    from tfbus.errors import pip_install
+
+    raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
 
 LOOKUP_FAILED = 1
 USAGE_ERROR = 2
 INTERRUPTED = 130
 
 COMMANDS = {
+    "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
     "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
     "receives it.",
     "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
@@ -30,6 +33,8 @@ COMMANDS = {
     "info": "Print the contents of a recording: its topics, its frames with parents, rates, gaps and delays, and its "
     "senders.",
     "listen": "Print a point of the tutorial's laser in the frame of the base, again and again, until Ctrl-C.",
+    "monitor": "Measure the rate, the delay, the jitter and the losses of each frame and sender of a domain, until "
+    "Ctrl-C.",
     "play": "Publish a recording on a domain with its original stamps and timing, static transforms first.",
     "plot": "Plot the transforms of some frames from a recording over time: FILE TARGET SOURCE...",
     "query": "Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.",
@@ -37,7 +42,7 @@ COMMANDS = {
     "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at "
     "zero.",
     "router": "Pass on what programs of all domains send each other, until Ctrl-C.",
-    "static": "Publish the static transform of CHILD in PARENT, until Ctrl-C.",
+    "static": "Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.",
     "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",
     "view": "Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.",
 }

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
 from tfbus.geometry.transform import Transform
 from tfbus.stamps import SECOND
@@ -16,6 +17,11 @@ ItemT = TypeVar("ItemT")
 def print_now(line: str) -> None:
     """Print a line of the result at once; through a pipe it would otherwise wait for a block of many lines."""
     print(line, flush=True)
+
+
+def fitted(line: str) -> str:
+    """A line of the result, broken between words where it is longer than the terminal is wide."""
+    return "\n".join(wrapped(line, terminal_width(), 2))
 
 
 def say(line: str) -> None:

@@ -9,7 +9,7 @@ from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.geometry.which_kernel import kernel
 from tfbus.plain import from_fields
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_stamp, format_duration, format_stamp
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp
 
 if kernel == "python":
     from tfbus.geometry._python_sample import Sample
@@ -53,7 +53,7 @@ class TransformStamped(Sample):
         self,
         parent: str,
         child: str,
-        stamp: int,
+        stamp: StampLike,
         transform: Transform,
         authority: str = "",
         static: bool = False,
@@ -91,6 +91,11 @@ class TransformStamped(Sample):
                 str(error), reason="stamp", parent=parent, child=child, authority=authority
             ) from None
         self._fields = parent, child, stamp, transform._row, authority, bool(static)
+
+    @property
+    def frame(self) -> str:
+        """The frame in which the pose of `child` is expressed: `parent`, as other stamped data call it."""
+        return self.parent
 
     @property
     def transform(self) -> Transform:
@@ -142,12 +147,17 @@ class TransformStamped(Sample):
         ValueError
             If the data are not those of a `TransformStamped`. The message names the field.
         """
-        if "gap" not in data:
-            return TransformStamped(**from_fields(TransformStamped, data, _KINDS))
-        fields = from_fields(TransformStamped, data, {**_KINDS, "extrapolated_by": int, "gap": int})
-        policy_use = fields.pop("extrapolated_by"), fields.pop("gap")
-        answer = TransformStamped(**fields)
-        target, source, stamp, row, _, static = answer._fields
+        kinds = _KINDS if "gap" not in data else {**_KINDS, "extrapolated_by": int, "gap": int}
+        fields = from_fields(TransformStamped, data, kinds)
+        policy_use = fields.pop("extrapolated_by", None), fields.pop("gap", None)
+        target, source = fields["parent"], fields["child"]
+        if target == source:
+            # The answer of a lookup may be of one frame in itself; a sample may not.
+            fields["child"] = f"{target}'"
+        answer = renamed(TransformStamped(**fields), target, source)
+        if None in policy_use:
+            return answer
+        _, _, stamp, row, _, static = answer._fields
         return qualified_answer(target, source, stamp, row, static, *policy_use)
 
     def __eq__(self, other: object) -> bool:

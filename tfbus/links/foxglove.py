@@ -10,7 +10,7 @@ import anyio.to_thread
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus.bus.bus import Bus
-from tfbus.errors import BusClosedError
+from tfbus.errors import BusClosedError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
 from tfbus.stamps import SECOND
@@ -21,9 +21,7 @@ try:
     from foxglove.messages import FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3
     from foxglove.websocket import ChannelView, Client, ServerListener, WebSocketServer
 except ImportError as error:
-    raise ImportError(
-        f'to serve Foxglove, tfbus needs a package more: pip install "tfbus[foxglove]" ({error})'
-    ) from error
+    raise ImportError(f"to serve Foxglove, tfbus needs a package more: {pip_install('foxglove')} ({error})") from error
 
 _STAMP_END = 2**32 * SECOND
 """ns; Foxglove counts the seconds of a stamp in 32 bits, from zero."""

@@ -11,16 +11,18 @@ import anyio.abc
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
-from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import check_capacity
 from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._clock_follower import ClockFollower, HearsTime
 from tfbus.links._endpoint import Endpoint
+from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._receive_queue import Received, ReceiveQueue
 from tfbus.registration import Registration
+from tfbus.stamps import as_duration
 from tfbus.statistics import LinkStatistics
 
 _FULL_TURN = 5_000
@@ -50,6 +52,8 @@ class Link:
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
         How many live messages may wait for the event loop; beyond that the oldest are dropped and counted.
+    history : float, optional
+        Ask each new peer once for the last so many seconds of its moving frames, if the carrier can.
     clock : SimulatedClock, optional
         Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
         time is followed until it is lost; the time of others is refused and counted.
@@ -84,6 +88,7 @@ class Link:
         drop_lost: bool = False,
         max_frames: int = 10_000,
         capacity: int = 10_000,
+        history: float | None = None,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
     ) -> None:
@@ -93,6 +98,8 @@ class Link:
             raise TypeError(f"frames must be several names, not {frames!r}")
         check_capacity(capacity)
         check_capacity(max_frames, "max_frames")
+        if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
+            raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
         self.bus = bus
         self.id = carrier.id
         self._name = name
@@ -109,6 +116,7 @@ class Link:
             drop_lost=drop_lost,
             max_frames=max_frames,
             wake=self._stir,
+            history=history,
             follower=follower,
         )
         self._told_clock = bus.clock if tell_clock and isinstance(bus.clock, SimulatedClock) else None
@@ -127,6 +135,11 @@ class Link:
     def peers(self) -> tuple[str, ...]:
         """The ids of the other ends that are there, sorted."""
         return self._endpoint.peers.present
+
+    def __repr__(self) -> str:
+        count = len(self.peers)
+        state = f"{count} peer{'' if count == 1 else 's'}" if self._attached else "not joined"
+        return f"<{type(self).__name__} {self._name!r}: {state}>"
 
     def statistics(self) -> LinkStatistics:
         """All counters, as they are now."""
@@ -234,3 +247,4 @@ class Link:
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
             self._receive_queue.discard_moving()
+            self._endpoint.clock_jumped_back()

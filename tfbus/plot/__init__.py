@@ -4,6 +4,8 @@
 heard; each returns matplotlib's own figure. `sparklines` draws with letters. Needs ``pip install "tfbus[plot]"``.
 """
 
+from tfbus.errors import pip_install
+
 try:
     from tfbus.plot.gaps import plot_gaps
     from tfbus.plot.path import plot_path
@@ -12,7 +14,7 @@ try:
 except ImportError as error:
     if error.name is None or error.name.startswith("tfbus"):
         raise
-    raise ImportError(f'for plots, tfbus needs a package more: pip install "tfbus[plot]" ({error})') from error
+    raise ImportError(f"for plots, tfbus needs a package more: {pip_install('plot')} ({error})") from error
 from tfbus.plot.reception import Reception, read_reception
 from tfbus.plot.series import Series, read_series
 from tfbus.plot.sparklines import sparklines

@@ -2,7 +2,8 @@
 
 A `Recorder` writes everything that a bus publishes to an MCAP file, and a `Player` publishes a recording on a bus.
 `load` reads a whole recording into a `tfbus.TransformTree`, `summarise` lists its frames and problems, and
-`open_recording` gives its messages one after the other. The file formats are in `tfbus.recording.formats`.
+`open_recording` gives its messages one after the other. `load_static` reads a file with static transforms. The file
+formats are in `tfbus.recording.formats`.
 """
 
 from tfbus.errors import RecordingError
@@ -17,6 +18,7 @@ from tfbus.recording.player import Player
 from tfbus.recording.recorder import Recorder
 from tfbus.recording.recording import RecordedTopic, Recording, open_recording
 from tfbus.recording.spread import Spread
+from tfbus.recording.static_frames import load_static, save_static
 from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
 
 __all__ = [
@@ -39,6 +41,8 @@ __all__ = [
     "header_stamps",
     "load",
     "load_joint_states",
+    "load_static",
     "open_recording",
+    "save_static",
     "summarise",
 ]

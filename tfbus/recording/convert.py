@@ -13,7 +13,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Literal
 
-from tfbus.errors import RecordingError
+from tfbus.errors import RecordingError, pip_install
 from tfbus.recording.edits import Edits
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
 from tfbus.recording.formats._copies import (
@@ -161,7 +161,7 @@ def convert(
             copy = make(part, target.name)
         except ImportError as error:
             extras = "bag,foxglove" if schema == "foxglove" else "bag"
-            problem = f'to write it, tfbus needs some packages more: pip install "tfbus[{extras}]" ({error})'
+            problem = f"to write it, tfbus needs some packages more: {pip_install(extras)} ({error})"
             raise RecordingError(problem, path=str(target), reason="missing extra") from error
         stack.callback(part.unlink, missing_ok=True)
         stack.callback(copy.close)

@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from tfbus.errors import RecordingError
+from tfbus.errors import MissingRecordingError, RecordingError, pip_install
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._selection import Selection, Topics, looks_like_transforms
@@ -272,10 +272,10 @@ def open_storage(file: Path) -> Storage:
     try:
         return _open_storage(file, folders=True)
     except ImportError as error:
-        problem = f'to read it, tfbus needs some packages more: pip install "tfbus[bag]" ({error})'
+        problem = f"to read it, tfbus needs some packages more: {pip_install('bag')} ({error})"
         raise RecordingError(problem, path=str(file), reason="missing extra") from error
     except FileNotFoundError as error:
-        raise RecordingError("there is no such file", path=str(file), reason="missing") from error
+        raise MissingRecordingError(path=str(file)) from error
     except OSError as error:
         raise RecordingError(
             f"it cannot be read: {error.strerror or error}", path=str(file), reason="unreadable"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 from xml.etree.ElementTree import Element
 
-from tfbus.errors import InvalidRobotError, InvalidTransformError
+from tfbus.errors import InvalidRobotError, InvalidTransformError, pip_install
 from tfbus.geometry.transform import Transform
 from tfbus.robot.joint import Joint, Mimic, element
 
@@ -101,7 +101,7 @@ def read_elements(source: str | os.PathLike[str]) -> tuple[str, list[Described]]
     try:
         from urdf_parser_py import urdf
     except ImportError as error:
-        raise ImportError('to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"') from error
+        raise ImportError(f"to read URDF, tfbus needs a package more: {pip_install('urdf')}") from error
     text = source if isinstance(source, str) and "<" in source else Path(source).read_bytes()
     robot = _parse(text)
     if robot.tag != "robot":

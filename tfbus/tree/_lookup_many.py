@@ -47,6 +47,8 @@ def lookup_many(
     queries = [Query(target, source, stamps)]
     if source_stamps is not None and fixed is not None:
         queries = [Query(target, fixed, stamps), Query(fixed, source, source_stamps)]
+    for query in queries:
+        forest.search(query.target, query.source)
     plain = plain_columns(forest, queries, out_of_range == "nan") if policy is None else None
     if plain is not None:
         return from_columns(plain[0] if len(plain) == 1 else np.stack(compose((*plain[0],), (*plain[1],))))

@@ -43,6 +43,10 @@ class PathCache(Paths):
                 return path
         return None
 
+    def holds(self, target: str, source: str) -> bool:
+        """Whether the path between two frames is kept. May be asked without the lock."""
+        return any(source in paths.get(target, ()) for paths in (self.recent, self._older))
+
     def keep(self, target: str, source: str, path: Path) -> None:
         """Keep a permanent path."""
         if type(target) is not str or type(source) is not str:

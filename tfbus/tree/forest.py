@@ -18,9 +18,10 @@ from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
 from tfbus.tree._kernel import commit
 from tfbus.tree._known_frames import KnownFrames
 from tfbus.tree._path_cache import PathCache
+from tfbus.tree._saved_frames import SavedFrame, load_frame
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
-from tfbus.tree.path import Path, find_path, path_at
+from tfbus.tree.path import Path, find_edges, find_path, path_at
 
 AT_A_TIME = 100
 """The number of frames that are read before the lock is released, for questions about all of them."""
@@ -42,7 +43,7 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
+    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
     themselves. The caller of every other method holds it.
 
     Parameters
@@ -75,26 +76,11 @@ class Forest:
         Number of samples that had each `Outcome`.
     looped : int
         Number of samples that have been in `looping`.
+    version : int
+        Another number after each change.
+    structure : int
+        Another number after each change that may make a path wrong.
     """
-
-    __slots__ = (
-        "_readers",
-        "_suspects",
-        "changed",
-        "changing_paths",
-        "expired",
-        "expired_frames",
-        "frames",
-        "inserted",
-        "lock",
-        "looped",
-        "looping",
-        "names",
-        "new_parents",
-        "paths",
-        "replaced",
-        "window",
-    )
 
     def __init__(self, window: int | None) -> None:
         self.lock = threading.Lock()
@@ -113,6 +99,8 @@ class Forest:
         self.replaced = 0
         self.expired = 0
         self.looped = 0
+        self.version = 0
+        self.structure = 0
 
     # Changes
 
@@ -125,6 +113,7 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         with self.lock:
+            self.version += 1
             if len(batch) == 1 and commit(self.frames, batch, 0):
                 # Nearly always so: a sample that only continues its history closes no loop and changes no path.
                 self.inserted += 1
@@ -150,6 +139,7 @@ class Forest:
         """
         count = len(batch)
         with self.lock:
+            self.version += 1
             stored = commit(self.frames, batch, 0)
             self.inserted += stored
             plain = stored == count
@@ -183,6 +173,7 @@ class Forest:
     def append(self, child: str, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
         """Store the samples that `can_append` has approved; the rows have shape (n, 7)."""
         with self.lock:
+            self.version += 1
             self.frames[child].append_many(stamps, rows)
             self.inserted += len(stamps)
             if self._readers:
@@ -224,12 +215,14 @@ class Forest:
             If no sample names the frame.
         """
         with self.lock:
+            self.version += 1
             self.check_known(frame)
             self._remove(frame)
 
     def clear(self) -> None:
         """Drop all moving samples. Static ones and names stay."""
         with self.lock:
+            self.version += 1
             for history in self.frames.values():
                 history.clear()
                 history.changed = False
@@ -260,10 +253,30 @@ class Forest:
 
     def forget_paths(self) -> None:
         """Empty `paths` and `changing_paths`."""
+        self.structure += 1
         self.paths.clear()
         self.changing_paths.clear()
 
     # Questions
+
+    def search(self, target: str, source: str) -> None:
+        """Find the newest path and keep it, without the lock while it climbs, which may take long.
+
+        If a change may have made it wrong meanwhile, or there is none, nothing is kept: whoever asks then finds it, or
+        the error, under the lock.
+        """
+        if self.paths.holds(target, source) or (target, source) in self.changing_paths:
+            return
+        structure = self.structure
+        if target not in self.names or source not in self.names:
+            return
+        try:
+            edges = find_edges(self.frames, target, source, None)
+        except DisconnectedError:
+            return
+        with self.lock:
+            if self.structure == structure:
+                self._keep(target, source, Path(*edges))
 
     def find_path(self, target: str, source: str, at: int | Latest) -> Path:
         """The path between two frames that counts at a stamp (see `path_at`), or the one by the newest parents.
@@ -292,13 +305,16 @@ class Forest:
         self.check_known(target)
         self.check_known(source)
         path = find_path(self.frames, target, source, None)
+        self._keep(target, source, path)
+        return path
+
+    def _keep(self, target: str, source: str, path: Path) -> None:
         if path.permanent:
             self.paths.keep(target, source, path)
         else:
             if len(self.changing_paths) >= _CHANGING_PATHS_KEPT:
                 self.changing_paths.clear()
             self.changing_paths[target, source] = path
-        return path
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""
@@ -366,6 +382,21 @@ class Forest:
     def copy_within(self, window: int | None) -> "Forest":
         """An independent copy of the samples in the windows, with windows of another length (ns) from now on."""
         return self._copy_of(window, lambda history: history.copy_within(window))
+
+    def add_saved(self, saved: SavedFrame) -> None:
+        """Take in a frame that `save_frame` has made of another forest without loops; none of that name is here."""
+        with self.lock:
+            history = self.frames[saved.child] = load_frame(saved, self.window)
+            self.names.update(saved.child, history.named_parents)
+
+    def rebuild(self, save: Callable[[FrameHistory], SavedFrame]) -> None:
+        """Replace the history of each frame by what is saved of it."""
+        with self.lock:
+            for child, history in self.frames.items():
+                self.frames[child] = load_frame(save(history), self.window)
+                self.names.update(child, self.frames[child].named_parents)
+            self.forget_paths()
+            self._tell_readers(self.frames)
 
     def _copy_of(self, window: int | None, copied: Callable[[FrameHistory], FrameHistory]) -> "Forest":
         twin = Forest(window)

@@ -157,7 +157,17 @@ def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
 
 
 def find_path(frames: Frames, target: str, source: str, at: int | None) -> Path:
-    """A path by the parents that hold at a stamp, or the one by the newest parents.
+    """A path by the parents that hold at a stamp, or the one by the newest parents: see `find_edges`."""
+    return Path(*find_edges(frames, target, source, at))
+
+
+def find_edges(
+    frames: Frames, target: str, source: str, at: int | None
+) -> tuple[list[FrameHistory], list[FrameHistory], str]:
+    """The edges of a path, from source and from target up to the common ancestor, and that.
+
+    It reads nothing but parents, so that it may run while another thread inserts; whoever does so has to check whether
+    the edges still hold.
 
     Both ends climb in turn, so the search stops at most one side's length beyond the common ancestor.
 
@@ -177,7 +187,7 @@ def find_path(frames: Frames, target: str, source: str, at: int | None) -> Path:
     while True:
         for meeting in (up.here, down.here):
             if meeting in up.seen and meeting in down.seen:
-                return Path(up.edges[: up.seen[meeting]], down.edges[: down.seen[meeting]], meeting)
+                return up.edges[: up.seen[meeting]], down.edges[: down.seen[meeting]], meeting
         if up.ended and down.ended:
             raise DisconnectedError(
                 target=target, source=source, roots=(down.here, up.here), stamp=at, loop=up.loop or down.loop

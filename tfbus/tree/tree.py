@@ -5,26 +5,39 @@
 
 import math
 from collections.abc import Iterable
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from tfbus.data import PointCloud, TwistStamped
 from tfbus.errors import TransformLookupError
 from tfbus.geometry.bounds import MAX_TRANSLATION, as_max_translation, check_translations
 from tfbus.geometry.stamped import TransformStamped, as_batch
-from tfbus.geometry.transform_array import TransformArray
-from tfbus.stamps import LATEST, Latest, Stamps, as_duration, as_stamp, as_stamps, from_seconds
+from tfbus.geometry.transform_array import TransformArray, with_stamps
+from tfbus.stamps import (
+    LATEST,
+    AtLike,
+    Latest,
+    StampLike,
+    Stamps,
+    StampsLike,
+    as_duration,
+    as_stamp,
+    as_stamps,
+    format_stamp,
+    from_seconds,
+)
 from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
+from tfbus.tree._saved_frames import SavedFrame, samples_of, save_frame
 from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome
 from tfbus.tree.html import legend, to_html
-from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer, bounds_of
+from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, answer, bounds_of
 from tfbus.tree.policy import Hold, policy_of
-from tfbus.tree.rendering import describe, to_dot, to_yaml
+from tfbus.tree.rendering import counted, describe, to_dot, to_yaml
 
 
 class TransformTree:
@@ -124,12 +137,12 @@ class TransformTree:
         self,
         target: str,
         source: str,
-        at: At = LATEST,
+        at: AtLike = LATEST,
         *,
-        source_at: At | None = None,
+        source_at: AtLike | None = None,
         fixed: str | None = None,
-        not_before: int | None = None,
-        not_after: int | None = None,
+        not_before: StampLike | None = None,
+        not_after: StampLike | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -200,7 +213,7 @@ class TransformTree:
         bounds = bounds_of(not_before, not_after)
         return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
-    def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
+    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
         try:
             self.lookup(target, source, at, **question)
@@ -212,10 +225,10 @@ class TransformTree:
         self,
         target: str,
         source: str,
-        at: At = LATEST,
+        at: AtLike = LATEST,
         *,
-        not_before: int | None = None,
-        not_after: int | None = None,
+        not_before: StampLike | None = None,
+        not_after: StampLike | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -247,9 +260,9 @@ class TransformTree:
         self,
         target: str,
         source: str,
-        stamps: npt.ArrayLike,
+        stamps: StampsLike,
         *,
-        source_at: npt.ArrayLike | None = None,
+        source_at: StampLike | StampsLike | None = None,
         fixed: str | None = None,
         out_of_range: OutOfRange = "raise",
         tolerance: float = 0.0,
@@ -275,8 +288,8 @@ class TransformTree:
         Returns
         -------
         TransformArray
-            One transform for each stamp, in the order of `stamps`. With a policy, its `extrapolated_by` and `gap` say
-            how far each answer departs from its stamp.
+            One transform for each stamp, in the order of `stamps`, which it has as its own `stamps`. With a policy, its
+            `extrapolated_by` and `gap` say how far each answer departs from its stamp.
 
         Raises
         ------
@@ -295,7 +308,8 @@ class TransformTree:
             raise TypeError(GO_TOGETHER)
         source_stamps = None if source_at is None else _as_many(source_at, len(asked))
         policy = policy_of(tolerance, max_gap, extrapolate)
-        return lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
+        found = lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
+        return with_stamps(found, asked)
 
     def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
         """A cloud from a moving sensor, corrected as if all points had been seen at the stamp of the cloud.
@@ -329,7 +343,9 @@ class TransformTree:
         """
         return deskew(self._forest, cloud, target, fixed, out_of_range)
 
-    def twist(self, frame: str, reference: str, at: At = LATEST, *, expressed_in: str | None = None) -> TwistStamped:
+    def twist(
+        self, frame: str, reference: str, at: AtLike = LATEST, *, expressed_in: str | None = None
+    ) -> TwistStamped:
         """The velocity of `frame` in `reference`: the derivative of the interpolation of `lookup`.
 
         Parameters
@@ -354,10 +370,11 @@ class TransformTree:
             As `lookup`; and `FutureExtrapolationError` at an edge's newest sample if it is the only one, or the only
             one with its parent.
 
-        Notes ----- Use `do_transform` only on an answer with ``expressed_in=frame``. That answer is the twist of a
-        rigid body at the origin of `frame`, and `do_transform` gives it at another frame of the body. In other axes, as
-        by default, the twist does not refer to the origin of its own frame, and `do_transform` would give a wrong
-        velocity.
+        Notes
+        -----
+        Use `do_transform` only on an answer with ``expressed_in=frame``. That answer is the twist of a rigid body at
+        the origin of `frame`, and `do_transform` gives it at another frame of the body. In other axes, as by default,
+        the twist does not refer to the origin of its own frame, and `do_transform` would give a wrong velocity.
 
         tf2's `lookupVelocity` gives other numbers: it rotates a velocity that is in the observer's axes once more by
         the rotation of the body.
@@ -365,6 +382,8 @@ class TransformTree:
         axes = reference if expressed_in is None else expressed_in
         if at is not LATEST:
             at = as_stamp(at)
+        self._forest.search(reference, frame)
+        self._forest.search(axes, reference)
         with self._forest.lock:
             stamp, linear, angular = twist(self._forest, frame, reference, at, axes)
         return TwistStamped(axes, stamp, linear, angular)
@@ -377,11 +396,12 @@ class TransformTree:
         UnknownFrameError, DisconnectedError, FutureExtrapolationError
             As `lookup`.
         """
+        self._forest.search(target, source)
         with self._forest.lock:
             path = self._forest.find_path(target, source, LATEST)
             return path.newest_common()[0] if path.moving else None
 
-    def chain(self, target: str, source: str, at: At = LATEST) -> list[str]:
+    def chain(self, target: str, source: str, at: AtLike = LATEST) -> list[str]:
         """The frames on the path, from target to source, both included.
 
         Raises
@@ -390,6 +410,7 @@ class TransformTree:
         """
         if at is not LATEST:
             at = as_stamp(at)
+        self._forest.search(target, source)
         with self._forest.lock:
             return list(self._forest.find_path(target, source, at).frames)
 
@@ -399,7 +420,7 @@ class TransformTree:
         """Every frame that a sample in the tree names, sorted."""
         return list(self._forest.known_frames())
 
-    def parent(self, frame: str, at: At = LATEST) -> str | None:
+    def parent(self, frame: str, at: AtLike = LATEST) -> str | None:
         """The frame's parent: at a stamp, or the newest one. None for a root.
 
         Raises
@@ -420,6 +441,35 @@ class TransformTree:
             if not history.covers(at):
                 raise history.extrapolation_error(at)
             return history.parent_at(at)
+
+    def samples_around(self, frame: str, at: StampLike) -> tuple[TransformStamped | None, TransformStamped | None]:
+        """The samples of a frame before and after a stamp, as they were sent: those that a lookup interpolates.
+
+        Parameters
+        ----------
+        frame : str
+        at : int
+            ns.
+
+        Returns
+        -------
+        before, after : TransformStamped or None
+            None where there is none on that side. Twice the same if a sample has the very stamp, or is static.
+
+        Raises
+        ------
+        UnknownFrameError
+        TypeError, ValueError
+            If `at` is no stamp.
+        """
+        stamp = as_stamp(at)
+        with self._forest.lock:
+            self._forest.check_known(frame)
+            history = self._forest.frames.get(frame)
+            found = [] if history is None else list(samples_of(history, stamp, stamp))
+        before = [sample for sample in found if sample.static or sample.stamp <= stamp]
+        after = [sample for sample in found if sample.static or sample.stamp >= stamp]
+        return (before[-1] if before else None), (after[0] if after else None)
 
     def edges(self) -> list[Edge]:
         """Every frame that has a parent, with its newest edge, sorted by name."""
@@ -447,11 +497,39 @@ class TransformTree:
         self._check_writable("clear a copy() of it")
         self._forest.clear()
 
+    def forget_before(self, stamp: StampLike) -> None:
+        """Drop all moving samples that are older than a stamp, in ns; static ones and names stay.
+
+        Later insertions are judged as before: a sample inside the window of its frame is stored, however old it is.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `stamp` is none.
+        """
+        self._check_writable("its samples leave it after `keep` seconds; or use a copy() of the tree")
+        self._forest.rebuild(partial(save_frame, oldest=as_stamp(stamp)))
+
     def copy(self) -> "TransformTree":
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
         twin = TransformTree(self.keep, max_translation=self.max_translation)
         twin._forest = self._forest.copy()
         return twin
+
+    def __deepcopy__(self, memo: object) -> "TransformTree":
+        return self.copy()
+
+    __copy__ = copy
+
+    def __getstate__(self) -> dict[str, Any]:
+        frames = self._forest.read_all(save_frame)
+        return {"keep": self.keep, "max_translation": self.max_translation, "frames": list(map(tuple, frames.values()))}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # As a copy: it can be changed, and its counters start at zero.
+        self.__init__(state["keep"], max_translation=state["max_translation"])  # type: ignore[misc]
+        for frame in state["frames"]:
+            self._forest.add_saved(SavedFrame(*frame))
 
     # Text
 
@@ -478,6 +556,13 @@ class TransformTree:
     def to_yaml(self) -> str:
         """The tree as YAML with tf2's keys; stamps in s."""
         return to_yaml(self.edges())
+
+    def __repr__(self) -> str:
+        edges = self.edges()
+        stamps = [stamp for edge in edges for stamp in (edge.oldest, edge.newest) if stamp is not None]
+        span = f", {format_stamp(min(stamps))} to {format_stamp(max(stamps))}" if stamps else ""
+        samples = counted(sum(edge.samples for edge in edges), "sample")
+        return f"<TransformTree of {counted(len(self.frames()), 'frame')}, {samples}{span}>"
 
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the newest stamp in it."""
@@ -514,11 +599,11 @@ def window_of(keep: float | None) -> int | None:
     return None if seconds is None or seconds == math.inf else from_seconds(seconds)
 
 
-def _as_many(source_at: npt.ArrayLike, count: int) -> Stamps:
+def _as_many(source_at: StampLike | StampsLike, count: int) -> Stamps:
     """An array of `count` stamps, made of one stamp for all or of one each."""
-    if np.ndim(source_at) == 0:
+    if np.ndim(cast(Any, source_at)) == 0:
         return np.full(count, as_stamp(source_at))
-    stamps = as_stamps(source_at)
+    stamps = as_stamps(cast(Any, source_at))
     if len(stamps) != count:
         raise ValueError(f"source_at must be one stamp, or have shape ({count},) as stamps has, got {stamps.shape}")
     return stamps

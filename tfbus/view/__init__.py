@@ -4,13 +4,13 @@ What a picture shows is decided without a browser and without an event loop (pag
 panel draw it with viser. Needs ``pip install "tfbus[view]"``.
 """
 
+from tfbus.errors import pip_install
+
 try:
     from tfbus.view.view import View
 except ImportError as error:
     if error.name is None or error.name.startswith("tfbus"):
         raise
-    raise ImportError(
-        f'for the live page, tfbus needs some packages more: pip install "tfbus[view]" ({error})'
-    ) from error
+    raise ImportError(f"for the live page, tfbus needs some packages more: {pip_install('view')} ({error})") from error
 
 __all__ = ["View"]

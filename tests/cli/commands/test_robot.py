@@ -10,7 +10,8 @@ from support.commands import START, Command, check_wrong_call
 from support.processes import new_domain
 from support.programs import free_address, start_tfbus
 
-from tfbus import SECOND, Buffer, Bus, TransformStamped
+from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
+from tfbus.cli.commands.robot import tree_lines
 
 CRANE = """<?xml version="1.0"?>
 <robot name="crane">
@@ -53,6 +54,8 @@ r1/base
 ├── r1/cart      wheels  planar     xy 1 -2 m, angle 0.5 rad
 └── r1/kite      wind    floating   xyz 1 2 3 m, rpy 3.14159 0 0 rad
 """
+
+ARM = Path(__file__).parents[3] / "demos" / "robot_arm.urdf"
 
 
 @pytest.fixture
@@ -214,3 +217,35 @@ def test_other_programs_receive_the_frames_of_the_robot(crane: str) -> None:
         assert robot.end() == 130
     assert robot.output.text == ""
     assert len(robot.errors.text.splitlines()) == 1
+
+
+def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortened(crane: str) -> None:
+    model = RobotModel.from_urdf(crane)
+    whole = list(tree_lines(model, model.zeros()))
+    widest = max(map(len, whole))
+    assert list(tree_lines(model, model.zeros(), width=widest)) == whole
+    for width in range(24, widest):
+        lines = list(tree_lines(model, model.zeros(), width=width))
+        assert max(map(len, lines)) <= width
+        assert len(lines) == len(whole)
+        assert all("revolute" not in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("elbw=1",), "the URDF comes first: tfbus robot FILE elbw=1"),
+        ((ARM, "elbw=1"), "'arm' has no joint 'elbw', did you mean 'elbow_flex'?"),
+        ((ARM, "wrist=1"), "did you mean 'wrist_flex' or 'wrist_roll'?"),
+        ((ARM, "shoulderpan=1"), "did you mean 'shoulder_pan' or 'shoulder_lift'?"),
+    ],
+)
+def test_a_misspelt_joint_is_suggested_by_any_word_of_its_name(
+    words: Sequence[object], why: str, tfbus: Command
+) -> None:
+    check_wrong_call(tfbus("robot", *words), why)
+
+
+def test_a_joint_like_none_is_not_suggested(tfbus: Command) -> None:
+    done = tfbus("robot", ARM, "gripper=1")
+    assert done.stderr == "tfbus: 'arm' has no joint 'gripper'\n"

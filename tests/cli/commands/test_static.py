@@ -1,6 +1,7 @@
 import json
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import anyio.lowlevel
 import pytest
@@ -91,9 +92,68 @@ def test_it_may_be_killed_and_started_again_with_other_numbers() -> None:
         (("", "b"), "must not be empty"),
         (("a", "\udcff"), "UTF-8"),
         (("a",), "CHILD"),
+        (("a", "--xyz", "1", "2", "3"), "CHILD"),
+        (("a", "b", "c"), "'c'"),
+        (("a", "b", "--rpy", "0", "0", "1", "--rpy-deg", "0", "0", "1"), "--rpy and --rpy-deg"),
+        (("a", "b", "--rpy-deg", "0", "nan", "0"), "not finite"),
+        (("calibration.yaml",), "there is no such file"),
+        # tf2 has x y z yaw pitch roll, or a quaternion, before the frames; ROS 1 has a period behind them.
+        (["1", "-2", "3", "0.1", "0.2", "0.3", "a", "b"], "type tfbus static a b --xyz 1 -2 3 --rpy 0.3 0.2 0.1"),
+        (["1", "2", "3", "0", "0", "0", "1", "a", "b"], "type tfbus static a b --xyz 1 2 3 --quaternion 0 0 0 1"),
+        (
+            ["-1", "2", "3", "0.1", "0.2", "0.3", "a", "b", "100"],
+            "type tfbus static a b --xyz -1 2 3 --rpy 0.3 0.2 0.1",
+        ),
+        (["1", "2", "3", "a", "b"], "expected PARENT and CHILD"),
     ],
 )
 def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
     arguments: Sequence[str], why: str, tfbus: Command
 ) -> None:
     check_wrong_call(tfbus("static", *arguments), why)
+
+
+def published(tfbus: Command, *arguments: object) -> tuple[list[TransformStamped], str]:
+    """What a command publishes, and what it says."""
+    received: list[TransformStamped] = []
+
+    async def join_late(bus: Bus) -> None:
+        await bus.clock.sleep(1.0)
+        with bus.subscribe(received.extend):
+            await anyio.lowlevel.checkpoint()
+
+    done = tfbus.on_domain(join_late, "static", *arguments)
+    assert (done.returncode, done.stdout) == (130, "")
+    return received, done.stderr
+
+
+def test_degrees_are_degrees_and_an_angle_of_more_than_a_turn_is_questioned(tfbus: Command) -> None:
+    (sample,), said = published(tfbus, "a", "b", "--rpy-deg", 0, 0, 90)
+    assert sample.transform.is_close(Transform((0, 0, 0), TURNED))
+    assert "more than a turn" not in said
+    (sample,), said = published(tfbus, "a", "b", "--rpy", 0, 0, 90)
+    assert sample.transform.is_close(Transform.from_xyz_rpy((0, 0, 0), (0, 0, 90)))
+    assert said.startswith("tfbus: --rpy 0 0 90 is in rad and more than a turn: are these degrees, for --rpy-deg?\n")
+    assert "more than a turn" not in published(tfbus, "a", "b", "--rpy", 0, 0, 2 * math.pi)[1]
+
+
+def test_all_transforms_of_a_file_are_published(tfbus: Command, tmp_path: Path) -> None:
+    file = tmp_path / "calibration.json"
+    file.write_text(json.dumps([{"parent": "a", "child": "b", "xyz": [1, 2, 3]}, {"parent": "b", "child": "c"}]))
+    samples, said = published(tfbus, file, "--authority", "me")
+    assert [(sample.parent, sample.child, sample.stamp, sample.authority) for sample in samples] == [
+        ("a", "b", START, "me"),
+        ("b", "c", START, "me"),
+    ]
+    assert samples[0].transform.translation == (1.0, 2.0, 3.0)
+    assert len(said.splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [("[]", "there is no transform"), ('[{"parent": "a", "child": "b", "xyz": [1e13, 0, 0]}]', "not physical")],
+)
+def test_a_file_that_cannot_be_published_is_named(tfbus: Command, tmp_path: Path, content: str, why: str) -> None:
+    file = tmp_path / "calibration.json"
+    file.write_text(content)
+    check_wrong_call(tfbus("static", file), why)

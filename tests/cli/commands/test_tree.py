@@ -194,3 +194,38 @@ def test_on_a_terminal_it_is_redrawn_in_place_and_in_colour_unless_forbidden(
     # The cursor is shown at the end.
     assert seen.rindex(b"\x1b[?25h") > seen.rindex(b"\x1b[?25l")
     assert b"Traceback" not in seen
+
+
+def test_it_listens_until_each_frame_was_heard_twice_and_all_are_connected(tfbus: Command) -> None:
+    async def publish_slowly(bus: Bus) -> None:
+        bus.publish([static("base", "camera"), static("odom_combined", "anchor")])
+        async for _ in bus.clock.ticks(0.5):
+            bus.publish(moving("odom_combined", "base", bus.clock.now()))
+
+    done = tfbus.on_domain(publish_slowly, "tree")
+    assert (done.returncode, done.stderr) == (0, "")
+    # The first tick is at once, the second one after 2 s.
+    assert done.stdout.splitlines()[:3] == [
+        "odom_combined",
+        "├── anchor      static",
+        "└── base        0.5 Hz  age 0 ns  span 2 s",
+    ]
+
+
+def test_it_says_what_it_could_not_see_within_five_seconds(tfbus: Command) -> None:
+    async def publish_once(bus: Bus) -> None:
+        bus.publish([static(f"root{number}", f"leaf{number}") for number in range(6)])
+        await bus.clock.sleep(0.5)
+        bus.publish(moving("root0", "laser", bus.clock.now()))
+        await bus.clock.sleep(60.0)
+
+    done = tfbus.on_domain(publish_once, "tree", "--json")
+    assert json.loads(done.stdout)["stamp"] == START + 5 * SECOND
+    assert done.stderr.splitlines() == [
+        "one sample only, so the rate is not known: laser",
+        "6 trees, below root0, root1, root2, root3, root4 and 1 more: what connects them was not sent meanwhile",
+    ]
+    # A duration that is given is kept.
+    assert json.loads(tfbus.on_domain(publish_once, "tree", "--json", "--duration", "2").stdout)["stamp"] == (
+        START + 2 * SECOND
+    )

@@ -108,7 +108,7 @@ class Game:
                 self.waiting = [waiting for waiting in self.waiting if self.still_waits(waiting)]
                 self.check()
                 # An answer must not depend on earlier questions, so there are some.
-                self.ask_every_buffer(20)
+                self.ask_every_buffer(40)
                 await self.clock.advance(burst.then)
                 self.elapsed += burst.then
                 self.waiting = [waiting for waiting in self.waiting if self.still_waits_as_time_passes(waiting)]
@@ -121,7 +121,7 @@ class Game:
             self.waiting = [waiting for waiting in self.waiting if self.still_waits(waiting)]
             assert self.waiting == []
         self.check()
-        self.ask_every_buffer(5)
+        self.ask_every_buffer(9)
 
     # What happens
 

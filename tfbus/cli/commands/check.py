@@ -13,6 +13,7 @@ from tfbus.analysis.examiner import Examiner
 from tfbus.analysis.finding import Finding
 from tfbus.analysis.limits import Limits
 from tfbus.bus.bus import Bus
+from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import (
     DEFAULT_TOPICS,
     Duration,
@@ -110,7 +111,7 @@ def _check_domain(link: LinkOptions, limits: Limits, duration: float) -> list[Fi
 
         with bus.subscribe(note):
             await link.first_transform(bus)
-            say(f"listening to domain {link.domain!r} for {duration:g} s")
+            say(f"listening to {link.place} for {duration:g} s")
             await bus.clock.sleep(duration)
         return examiner.findings()
 
@@ -121,5 +122,5 @@ def _print(findings: Sequence[Finding]) -> None:
     if not findings:
         print("nothing is wrong")
     for finding in findings:
-        print(printable(f"{finding.kind:<16}  {finding}"))
-        print(f"{'':16}  -> {finding.advice}")
+        for line in (printable(f"{finding.kind:<16}  {finding}"), f"{'':16}  -> {finding.advice}"):
+            print("\n".join(wrapped(line, terminal_width(), 18)))

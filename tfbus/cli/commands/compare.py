@@ -13,13 +13,19 @@ from cyclopts import Parameter
 from tfbus.analysis import Comparison
 from tfbus.analysis.compare import compare as compare_trees
 from tfbus.cli._table import Column, table_lines
+from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import DEFAULT_TOPICS, Duration, Flag, JsonFlag, TopicOptions, UsageError
 from tfbus.cli.output import format_counts, format_seconds, printable, progress, warn
 from tfbus.recording.load import Problems, fill
 from tfbus.tree.tree import TransformTree
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
-_COLUMNS = (Column("error"), Column("unit"), *(Column(name, right=True) for name in _STATISTICS))
+_IMPORTANCE = (6, 4, 2, 1, 3, 5)
+_COLUMNS = (
+    Column("error"),
+    Column("unit"),
+    *(Column(name, True, importance) for name, importance in zip(_STATISTICS, _IMPORTANCE, strict=True)),
+)
 
 
 def compare(
@@ -135,12 +141,13 @@ def _print_tables(found: dict[tuple[str, bool], Comparison]) -> None:
         if each.alignment is not None and each.alignment.scale != 1.0:
             how += f" and scaled by {each.alignment.scale:.6g}"
         before = "\n" if number else ""
-        print(f"{before}{printable(text)}, {how}: {each.poses:,} poses of {each.of[0]:,} and {each.of[1]:,}")
+        heading = f"{printable(text)}, {how}: {each.poses:,} poses of {each.of[0]:,} and {each.of[1]:,}"
+        print(before + "\n".join(wrapped(heading, terminal_width(), 2)))
         rows = [
             (name, unit, *(f"{getattr(statistics, key):.6g}" for key in _STATISTICS))
             for name, unit, statistics in _rows(each)
         ]
-        for line in table_lines(_COLUMNS, rows, None):
+        for line in table_lines(_COLUMNS, rows, terminal_width()):
             print(line)
 
 

@@ -5,7 +5,7 @@ from functools import partial
 from tfbus.cli import tutorial
 from tfbus.cli._event_loop import run
 from tfbus.cli.arguments import Backend, Duration, Flag, Rate
-from tfbus.cli.output import print_now
+from tfbus.cli.output import fitted, print_now
 from tfbus.clock import Clock, SimulatedClock, SystemClock
 
 
@@ -45,6 +45,6 @@ def demo(
         listen_rate=listen_rate,
         duration=duration,
         broadcaster=broadcaster,
-        output=print_now,
+        output=lambda line: print_now(fitted(line)),
     )
     run(robot, backend)

@@ -1,7 +1,6 @@
 """``tfbus info``."""
 
 import json
-import shutil
 from collections.abc import Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tfbus.cli._table import Column, table_lines
+from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, JsonFlag, TopicOptions
 from tfbus.cli.output import format_counts, format_seconds, printable, progress
 from tfbus.recording.recording import RecordedTopic
@@ -22,6 +22,8 @@ _SPREADS = tuple(
 # The mean is the rate in other words; the least important column has the lowest number.
 _IMPORTANCE = (1, 2, 4, 3, 5, 6)
 _TIMES = tuple(column._replace(importance=importance) for column, importance in zip(_SPREADS, _IMPORTANCE, strict=True))
+_INDENT = 10
+"""The column at which the facts of the heading begin."""
 _FRAMES = (
     Column("frame"),
     Column("parent"),
@@ -60,9 +62,9 @@ def info(
     if as_json:
         print(json.dumps(_to_json(summary), indent=2))
         return
-    width = None if wide else shutil.get_terminal_size((80, 24)).columns
+    width = None if wide else terminal_width()
     for line in _heading(summary):
-        print(line)
+        print("\n".join(wrapped(line, width, _INDENT)))
     frames = [_frame_row(frame) for frame in summary.frames]
     timed = [frame for frame in summary.frames if frame.moving]
     times = [(printable(frame.frame), *_times(frame.period, frame.delay)) for frame in timed]

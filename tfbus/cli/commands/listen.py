@@ -6,7 +6,7 @@ from tfbus.cli import tutorial
 from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import print_now
+from tfbus.cli.output import fitted, print_now
 
 
 def listen(*, rate: Rate = 1.0, link: LinkOptions = DEFAULT_LINK) -> None:
@@ -25,6 +25,6 @@ def listen(*, rate: Rate = 1.0, link: LinkOptions = DEFAULT_LINK) -> None:
     async def print_points(bus: Bus) -> None:
         with Buffer(bus) as buffer:
             await link.first_transform(bus)
-            await tutorial.listen(buffer, rate, output=print_now)
+            await tutorial.listen(buffer, rate, output=lambda line: print_now(fitted(line)))
 
     link.run(print_points, clock=ReplayClock())

@@ -1,6 +1,7 @@
 """``tfbus robot``."""
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import anyio
 
 from tfbus.bus.bus import Bus
 from tfbus.cli._static_frames import publish_static
+from tfbus.cli._table import Column, table_lines
+from tfbus.cli._width import cells, narrow_guides, shorten, terminal_width
 from tfbus.cli.arguments import Flag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_numbers, format_transform, printable, say, warn
@@ -20,6 +23,11 @@ from tfbus.tree.history import Edge
 from tfbus.tree.rendering import Branch, branches
 
 AUTHORITY = "robot"
+_ALIKE = 0.7
+"""The least ratio of equal letters in a misspelt name and the one that was meant."""
+_LEAST_POSITION = 16
+"""The shortest that a position is made for the frames to have room, in columns."""
+_COLUMNS = (Column("frame"), Column("joint", importance=2), Column("type", importance=1), Column("position"))
 
 
 def robot(
@@ -53,6 +61,8 @@ def robot(
     prefix
         A prefix for the names of all frames, such as robot1/.
     """
+    if "=" in file.name and not file.exists():
+        raise UsageError(f"the URDF comes first: tfbus robot FILE {file}")
     model = _read_model(file)
     positions = {**model.zeros(), **_parse_positions(model, position)}
     try:
@@ -64,11 +74,11 @@ def robot(
     for violation in violations:
         warn(str(violation))
     if tree:
-        print("\n".join(tree_lines(model, positions, prefix)))
+        print("\n".join(tree_lines(model, positions, prefix, terminal_width())))
         return
 
     async def publish(bus: Bus) -> None:
-        where = f"on domain {link.domain!r} at {rate:g} Hz"
+        where = f"on {link.place} at {rate:g} Hz"
         say(f"publishing {len(transforms)} frames of {model.name!r} {where}, until Ctrl-C")
         async with anyio.create_task_group() as tasks:
             await tasks.start(publish_static, bus, model.fixed_transforms(bus.clock.now(), AUTHORITY, prefix))
@@ -78,8 +88,13 @@ def robot(
     link.run(publish)
 
 
-def tree_lines(model: RobotModel, positions: Mapping[str, Position], prefix: str = "") -> Iterator[str]:
-    """The tree of frames, one a line, with the name, the type and the position of the joint above each."""
+def tree_lines(
+    model: RobotModel, positions: Mapping[str, Position], prefix: str = "", width: int | None = None
+) -> Iterator[str]:
+    """The tree of frames, one a line, with the name, the type and the position of the joint above each.
+
+    Where they do not fit the width, types are left out first, then the names of joints.
+    """
     joint_above = {joint.child: joint for joint in model.joints}
     resolved = {joint.name: position for joint, position in model.resolve(positions)}
     edges = [Edge(joint.parent, joint.child, joint.kind == "fixed", 0, None, None, "") for joint in model.joints]
@@ -93,10 +108,27 @@ def tree_lines(model: RobotModel, positions: Mapping[str, Position], prefix: str
                 position = _format_position(joint, resolved[joint.name])
                 if joint.mimic is not None and joint.name not in positions:
                     position += f", mimics {printable(joint.mimic.joint)}"
-        rows.append((guides + printable(prefix + frame), name, kind, position))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        rows.append((guides, printable(prefix + frame), name, kind, position))
+    step, room = _layout(rows, width)
+    return table_lines(
+        _COLUMNS,
+        [(narrow_guides(row[0], step) + row[1], *row[2:4], shorten(row[4], room)) for row in rows],
+        width,
+        titles=False,
+    )
+
+
+def _layout(rows: Sequence[tuple[str, str, str, str, str]], width: int | None) -> tuple[int, int]:
+    """The width of a level, and that of the positions, which are shortened first where the frames would not fit."""
+    positions = max(cells(row[4]) for row in rows)
+    least = min(_LEAST_POSITION, positions)
+    for step in (4, 2, 1):
+        room = (
+            positions if width is None else width - 2 - max(cells(narrow_guides(row[0], step) + row[1]) for row in rows)
+        )
+        if room >= least:
+            break
+    return step, max(room, least)
 
 
 def _format_position(joint: Joint, position: Position) -> str:
@@ -128,7 +160,7 @@ def _parse_positions(model: RobotModel, assignments: Sequence[str]) -> dict[str,
             raise UsageError(f"a position is NAME=NUMBER, such as elbow=0.5, not {assignment!r}")
         if name not in joints:
             moving = [joint.name for joint in model.joints if joint.kind != "fixed"]
-            hint = " or ".join(map(repr, difflib.get_close_matches(name, moving)))
+            hint = " or ".join(map(repr, _similar(name, moving)))
             raise UsageError(f"{model.name!r} has no joint {name!r}" + (f", did you mean {hint}?" if hint else ""))
         if joints[name].kind == "fixed":
             raise UsageError(f"joint {name!r} is fixed and has no position")
@@ -136,6 +168,16 @@ def _parse_positions(model: RobotModel, assignments: Sequence[str]) -> dict[str,
             raise UsageError(f"joint {name!r} has two positions")
         positions[name] = _parse_position(joints[name], text)
     return positions
+
+
+def _similar(name: str, names: Sequence[str]) -> list[str]:
+    """At most three names that are like a misspelt one, as a whole or in one of their words."""
+
+    def likeness(known: str) -> float:
+        parts = [known, *re.split(r"[_\-/ ]+", known)]
+        return max(difflib.SequenceMatcher(None, name.lower(), part.lower()).ratio() for part in parts)
+
+    return sorted((known for known in names if likeness(known) >= _ALIKE), key=likeness, reverse=True)[:3]
 
 
 def _parse_position(joint: Joint, text: str) -> Position:

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 from tfbus.cli._event_loop import run
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.errors import pip_install
 
 _MEETING_POINT = "tcp/127.0.0.1:17447"
 
@@ -37,7 +38,7 @@ def router(
     try:
         from tfbus.links.zenoh import ZenohRouter
     except ImportError:
-        raise UsageError('a router needs a package more: pip install "tfbus[cli,zenoh]"') from None
+        raise UsageError(f"a router needs a package more: {pip_install('cli,zenoh')}") from None
 
     async def route() -> None:
         try:

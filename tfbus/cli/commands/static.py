@@ -1,5 +1,8 @@
 """``tfbus static``."""
 
+import math
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import anyio
@@ -9,27 +12,31 @@ from tfbus.bus.bus import Bus
 from tfbus.cli._static_frames import publish_static
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import format_transform, say
+from tfbus.cli.output import format_numbers, format_transform, say, warn
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
 from tfbus.geometry.rows import Quaternion, Vector
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.recording.static_frames import load_static
 from tfbus.tf_message import refusal
+
+_FILES = (".json", ".yaml", ".yml")
 
 
 def static(
     parent: str,
-    child: str,
+    child: Annotated[str | None, Parameter(show_default=False)] = None,
     /,
-    *,
+    *further: Annotated[str, Parameter(show=False)],
     xyz: Annotated[Vector, Parameter(negative="")] = (0.0, 0.0, 0.0),
     rpy: Annotated[Vector | None, Parameter(negative="")] = None,
+    rpy_deg: Annotated[Vector | None, Parameter(negative="")] = None,
     quaternion: Annotated[Quaternion | None, Parameter(negative="")] = None,
     authority: str = "tfbus static",
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
-    """Publish the static transform of CHILD in PARENT, until Ctrl-C.
+    """Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.
 
     Programs that join later receive it too. If an edge of another program is in its way, it is tried again once a
     second. After the end, programs that have it keep it; those that join do not get
@@ -37,47 +44,116 @@ def static(
 
     Example: tfbus static base_link base_laser --xyz 0.1 0 0.2 --rpy 0 0 1.5708
 
+    Example: tfbus static calibration.yaml
+
     Parameters
     ----------
     parent
-        The frame in which the numbers are expressed.
+        The frame in which the numbers are expressed; or, without CHILD, a file of YAML or JSON: a list whose entries
+        have a parent, a child, xyz, and rpy, rpy_deg or quaternion.
     child
         The frame to place.
     xyz
         The origin of CHILD in PARENT: x y z, in m.
     rpy
         The rotation of CHILD as roll, pitch and yaw about the fixed axes x, y and z of PARENT, in rad.
+    rpy_deg
+        The same in degrees.
     quaternion
         The rotation of CHILD as a unit quaternion x y z w.
     authority
         The sender that tools show.
     """
-    sample = _sample(parent, child, xyz, rpy, quaternion, authority)
+    _check_habits((parent, *([] if child is None else [child]), *further))
+    if child is None:
+        if any(given is not None for given in (rpy, rpy_deg, quaternion)) or any(xyz):
+            raise UsageError("CHILD is missing; without it, the numbers are those of a file, and no option gives them")
+        samples = _from_file(Path(parent), authority)
+    else:
+        samples = [_sample(parent, child, _transform(xyz, rpy, rpy_deg, quaternion), authority)]
 
     async def publish(bus: Bus) -> None:
-        numbers = format_transform(sample.transform)
-        say(f"publishing {child!r} in {parent!r} on domain {link.domain!r}, until Ctrl-C: {numbers}")
-        await publish_static(bus, [sample.replace(stamp=bus.clock.now())])
+        for sample in samples:
+            what = f"{sample.child!r} in {sample.parent!r} on {link.place}"
+            say(f"publishing {what}, until Ctrl-C: {format_transform(sample.transform)}")
+        stamp = bus.clock.now()
+        await publish_static(bus, [sample.replace(stamp=stamp) for sample in samples])
         await anyio.sleep_forever()
 
     link.run(publish)
 
 
-def _sample(
-    parent: str, child: str, xyz: Vector, rpy: Vector | None, quaternion: Quaternion | None, authority: str
-) -> TransformStamped:
-    if rpy is not None and quaternion is not None:
-        raise UsageError("--rpy and --quaternion are two ways to say the same: give one of them")
+def _check_habits(words: Sequence[str]) -> None:
+    """Raise an error that says the right form, if somebody types what tf2's static_transform_publisher takes."""
+    if len(words) <= 2:
+        return
+    count = next((at for at, word in enumerate(words) if not _is_number(word)), len(words))
+    frames = words[count : count + 2]
+    if count not in (6, 7) or len(frames) < 2:
+        raise UsageError(f"expected PARENT and CHILD, or a file, but there is {words[2]!r} as well")
+    numbers = words[:count]
+    # tf2 has yaw first.
+    rotation = f"--quaternion {' '.join(numbers[3:])}" if count == 7 else f"--rpy {' '.join(numbers[:2:-1])}"
+    raise UsageError(
+        f"tf2's order of arguments is another one: type tfbus static {' '.join(frames)} "
+        f"--xyz {' '.join(numbers[:3])} {rotation}"
+    )
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _from_file(file: Path, authority: str) -> list[TransformStamped]:
+    if file.suffix not in _FILES and not file.exists():
+        raise UsageError(f"CHILD is missing: tfbus static {file} CHILD, or a file that ends in {' or '.join(_FILES)}")
+    try:
+        samples = load_static(file, authority=authority)
+    except ImportError as error:
+        raise UsageError(str(error)) from None
+    if not samples:
+        raise UsageError(f"there is no transform in {file}")
+    for sample in samples:
+        _check(sample)
+    return samples
+
+
+def _transform(xyz: Vector, rpy: Vector | None, rpy_deg: Vector | None, quaternion: Quaternion | None) -> Transform:
+    given = {"--rpy": rpy, "--rpy-deg": rpy_deg, "--quaternion": quaternion}
+    names = [name for name, value in given.items() if value is not None]
+    if len(names) > 1:
+        raise UsageError(f"{' and '.join(names)} are ways to say the same: give one of them")
     try:
         if quaternion is not None:
-            transform = Transform(xyz, quaternion)
-        else:
-            transform = Transform.from_xyz_rpy(xyz, (0, 0, 0) if rpy is None else rpy)
+            return Transform(xyz, quaternion)
+        angles: Sequence[float] = (0.0, 0.0, 0.0) if rpy is None else rpy
+        if rpy_deg is not None:
+            angles = [math.radians(angle) for angle in rpy_deg]
+        elif any(math.inf > abs(angle) > 2 * math.pi for angle in angles):
+            warn(f"--rpy {format_numbers(angles)} is in rad and more than a turn: are these degrees, for --rpy-deg?")
+        return Transform.from_xyz_rpy(xyz, angles)
+    except InvalidTransformError as error:
+        raise UsageError(str(error)) from None
+
+
+def _sample(parent: str, child: str, transform: Transform, authority: str) -> TransformStamped:
+    try:
         sample = TransformStamped(parent, child, 0, transform, authority, static=True)
+    except InvalidTransformError as error:
+        raise UsageError(str(error)) from None
+    _check(sample)
+    return sample
+
+
+def _check(sample: TransformStamped) -> None:
+    try:
         check_translations((sample,), MAX_TRANSLATION)
     except InvalidTransformError as error:
         raise UsageError(str(error)) from None
     unsendable = refusal(sample)
     if unsendable is not None:
         raise UsageError(str(unsendable))
-    return sample

@@ -1,11 +1,12 @@
 """``tfbus tree``."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import anyio.to_thread
+from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
@@ -14,15 +15,22 @@ from tfbus.cli._graphviz import draw
 from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import print_now, write_file
+from tfbus.cli.output import print_now, printable, say, write_file
 from tfbus.stamps import to_seconds
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import to_dot
+from tfbus.tree.tree import TransformTree
+
+_LEAST_DURATION, _LONGEST_DURATION = 1.0, 5.0
+_LOOK_AGAIN = 0.1
+"""s."""
+_NAMED = 5
+"""The number of frames that a remark names."""
 
 
 def tree(
     *,
-    duration: Duration = 1.0,
+    duration: Annotated[Duration | None, Parameter(show_default=False)] = None,
     watch: Flag = False,
     rate: Rate = 1.0,
     dot: Path | None = None,
@@ -39,7 +47,8 @@ def tree(
     Parameters
     ----------
     duration
-        How many seconds to listen, from the first transform on.
+        How many seconds to listen, from the first transform on; by default until every frame has been heard twice and
+        all are connected, at least 1 and at most 5.
     watch
         Show it live until Ctrl-C; if the output is no terminal, print it again and again.
     rate
@@ -87,10 +96,41 @@ def tree(
                 async for _ in bus.clock.ticks(rate):
                     await show_once()
             else:
-                await bus.clock.sleep(duration)
+                if duration is None:
+                    await _listen_for_a_period(bus, buffer.tree)
+                else:
+                    await bus.clock.sleep(duration)
                 await show_once()
+                for remark in remarks(buffer.tree.edges()):
+                    say(remark)
 
     link.run(show_tree, clock=ReplayClock())
+
+
+async def _listen_for_a_period(bus: Bus, tree: TransformTree) -> None:
+    """Wait until each moving frame has been heard twice and all frames are connected, or that takes too long."""
+    await bus.clock.sleep(_LEAST_DURATION)
+    with bus.clock.move_on_after(_LONGEST_DURATION - _LEAST_DURATION):
+        while remarks(tree.edges()):
+            await bus.clock.sleep(_LOOK_AGAIN)
+
+
+def remarks(edges: Sequence[Edge]) -> list[str]:
+    """What a drawing of the edges does not show: rates of frames that were heard once, and what connects trees."""
+    lines = []
+    once = [edge.child for edge in edges if not edge.static and edge.samples == 1]
+    if once:
+        lines.append(f"one sample only, so the rate is not known: {_names(once)}")
+    children = {edge.child for edge in edges}
+    roots = sorted({edge.parent for edge in edges} - children)
+    if len(roots) > 1:
+        lines.append(f"{len(roots):,} trees, below {_names(roots)}: what connects them was not sent meanwhile")
+    return lines
+
+
+def _names(frames: Sequence[str]) -> str:
+    named = ", ".join(map(printable, frames[:_NAMED]))
+    return named + (f" and {len(frames) - _NAMED:,} more" if len(frames) > _NAMED else "")
 
 
 def to_document(domain: str, frames: Iterable[str], edges: Iterable[Edge], now: int) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import uuid4
 
+import zenoh
+
 from tfbus.bus.bus import Bus
 from tfbus.clock import SimulatedClock
 from tfbus.links._clock_follower import HearsTime
@@ -59,6 +61,10 @@ class ZenohLink(Link):
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
         How many live messages may wait for the event loop; then the oldest are dropped and counted.
+    history : float, optional
+        Ask each peer once, when it is met, for the last so many seconds of its moving frames, as far as buffers on its
+        bus hold them: 2,000 samples of each frame at most. They are published before what it sends live, so lookups at
+        stamps before the joining can be answered.
     clock : SimulatedClock, optional
         Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
         time is followed until it is lost; the time of others is refused and counted.
@@ -112,6 +118,7 @@ class ZenohLink(Link):
         lease: float = 2.0,
         max_frames: int = 10_000,
         capacity: int = 10_000,
+        history: float | None = None,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
     ) -> None:
@@ -150,6 +157,14 @@ class ZenohLink(Link):
             drop_lost=drop_lost,
             max_frames=max_frames,
             capacity=capacity,
+            history=history,
             clock=clock,
             tell_clock=tell_clock,
         )
+        self._zenoh = carrier
+
+    def _zenoh_session(self) -> zenoh.Session:
+        """The session of zenoh; raises `RuntimeError` unless the link is entered."""
+        if not self._attached:
+            raise RuntimeError("the link is not entered")
+        return self._zenoh.session

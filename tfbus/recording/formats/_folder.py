@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryDirectory, gettempdir
 from typing import Any, BinaryIO, Final, cast
 
-from tfbus.errors import RecordingError
+from tfbus.errors import MissingRecordingError, RecordingError
 from tfbus.recording.formats._bounds import MAX_METADATA, max_unpacked
 from tfbus.recording.formats._packed import Packed, Stored, batches, blocks_of
 from tfbus.recording.formats._storage import (
@@ -59,7 +59,7 @@ class FolderStorage:
                 except RecordingError as error:
                     refused.append(error)
                 except FileNotFoundError:
-                    refused.append(RecordingError("there is no such file", path=str(file), reason="missing"))
+                    refused.append(MissingRecordingError(path=str(file)))
             if not self._files:
                 if refused:
                     raise refused[0]

@@ -13,7 +13,7 @@ from itertools import groupby
 from typing import Any, cast
 
 from tfbus.bus.sample_queue import TimedBatch
-from tfbus.errors import InvalidTransformError
+from tfbus.errors import InvalidTransformError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.recording.formats._channels import Channels
 from tfbus.tf_message import encode, refusal
@@ -71,7 +71,7 @@ class McapOutput:
         try:
             from mcap.writer import Writer
         except ImportError:
-            raise ImportError('to record needs a package more: pip install "tfbus[bag]"') from None
+            raise ImportError(f"to record needs a package more: {pip_install('bag')}") from None
         self.samples = 0
         self.messages = 0
         self.buffered = 0

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
+from tfbus.errors import pip_install
 from tfbus.recording.formats._bounds import MAX_MESSAGE
 from tfbus.recording.formats._storage import Channel
 from tfbus.recording.formats._unfold import UnfoldError, unfold
@@ -210,7 +211,7 @@ def _protobuf_parser(channel: Channel, single: bool) -> Callable[[bytes], list[R
             ]
         except ImportError as error:
             raise MalformedMessageError(
-                "missing extra", f'to read it, tfbus needs a package more: pip install "tfbus[foxglove]" ({error})'
+                "missing extra", f"to read it, tfbus needs a package more: {pip_install('foxglove')} ({error})"
             ) from None
         # The schema is in the file: a damaged one raises anything.
         except Exception as error:  # noqa: BLE001

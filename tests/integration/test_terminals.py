@@ -1,0 +1,74 @@
+"""What commands draw on a real terminal fits its width, and keeps what matters."""
+
+from pathlib import Path
+
+import pytest
+from support import pr2
+from support.processes import new_domain
+from support.programs import free_address, start_tfbus
+from support.recorded import SMALL
+from support.terminal import lines_on_a_terminal
+
+from tfbus.cli._width import cells
+
+pytestmark = [pytest.mark.thorough, pytest.mark.parametrize("width", [60, 80, 120, 200])]
+
+ARM = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
+URDFS = [pytest.param(ARM, id="arm"), pytest.param(pr2.URDF, id="PR2", marks=pr2.needed)]
+RECORDINGS = [
+    pytest.param(SMALL, ("map", "base_link"), id="small"),
+    pytest.param(pr2.BAG, ("base_footprint", "l_gripper_tool_frame"), id="PR2", marks=pr2.needed),
+]
+
+
+def check(lines: list[str], width: int, *, least: int = 2) -> None:
+    assert [line for line in lines if cells(line) > width] == []
+    assert len(lines) >= least
+
+
+@pytest.mark.parametrize("urdf", URDFS)
+def test_the_frames_of_a_robot_fit(urdf: Path, width: int) -> None:
+    lines = lines_on_a_terminal(width, "robot", urdf, "--tree")
+    check(lines, width, least=5)
+    if width >= 80:
+        text = "\n".join(lines)
+        assert ("base_link" in text, " 0 rad" in text) == (True, True)
+
+
+@pytest.mark.parametrize("urdf", URDFS)
+def test_the_tree_of_a_domain_fits_with_frame_rate_and_age(urdf: Path, width: int) -> None:
+    domain, address = new_domain(), free_address()
+    with start_tfbus("robot", str(urdf), "--domain", domain, "--listen", address) as robot:
+        robot.errors.expect("publishing")
+        options = ("--domain", domain, "--connect", address)
+        once = lines_on_a_terminal(width, "tree", *options)
+        watched = lines_on_a_terminal(width, "tree", "--watch", *options, seconds=1.5)
+        echoed = lines_on_a_terminal(width, "echo", *pair_of(urdf), *options, seconds=0.5)
+        monitored = lines_on_a_terminal(width, "monitor", "--once", "--duration", "1.5", *options)
+    for lines in (once, watched, echoed, monitored):
+        check(lines, width)
+    moving = [line for line in once if " Hz" in line]
+    assert moving
+    assert all("age" in line or "ahead" in line for line in moving)
+    if urdf == pr2.URDF:
+        assert len(once) > 82
+        assert any("lines more than fit" in line for line in watched)
+
+
+def pair_of(urdf: Path) -> tuple[str, str]:
+    return ("base_footprint", "l_gripper_tool_frame") if urdf == pr2.URDF else ("base_link", "hand")
+
+
+@pytest.mark.parametrize(("recording", "pair"), RECORDINGS)
+def test_the_facts_of_a_recording_fit(recording: Path, pair: tuple[str, str], width: int) -> None:
+    check(lines_on_a_terminal(width, "info", recording), width, least=20)
+    check(lines_on_a_terminal(width, "check", recording), width)
+    lines = lines_on_a_terminal(width, "query", recording, *pair, "--every", "1")
+    check(lines, width)
+    assert lines[0].split()[:2] == ["stamp", "[s]"]
+
+
+def test_the_lines_of_the_tutorial_fit(width: int) -> None:
+    lines = lines_on_a_terminal(width, "demo", "--simulated", "--duration", "2")
+    check(lines, width)
+    assert "base_link:" in " ".join(lines)

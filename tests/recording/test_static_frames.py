@@ -1,0 +1,98 @@
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support.samples import moving, static
+
+from tfbus import MissingRecordingError, RecordingError, Transform, TransformStamped, TransformTree
+from tfbus.recording import load_static, save_static
+
+HALF = math.sqrt(0.5)
+
+
+def test_what_was_saved_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
+    samples = [
+        TransformStamped("base", "lidar", 0, Transform.from_xyz_rpy((0.1, 1e-300, -3), (1, 2, 3)), "me", static=True),
+        static("base", "雷达"),
+    ]
+    for name in ("calibration.json", "calibration.yaml"):
+        save_static(tmp_path / name, samples)
+        assert load_static(tmp_path / name) == samples
+    save_static(tmp_path / "empty.json", [])
+    assert load_static(tmp_path / "empty.json") == []
+
+
+def test_a_moving_sample_becomes_static_with_the_stamp_0(tmp_path: Path) -> None:
+    save_static(tmp_path / "a.json", [moving("map", "base", 7, 2.0)])
+    assert load_static(tmp_path / "a.json", authority="me") == [static("map", "base", 2.0, 0, "me")]
+
+
+def test_plain_data_of_samples_are_entries_and_a_tree_is_filled_by_them(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps([static("base", "lidar", 2.0, 5).to_dict()]))
+    tree = TransformTree()
+    tree.insert_many(load_static(file))
+    assert tree.lookup("base", "lidar").transform.translation == (2.0, 0.0, 0.0)
+
+
+def test_a_file_written_by_hand_has_angles_in_either_unit(tmp_path: Path) -> None:
+    pytest.importorskip("ruamel.yaml", reason="the extra bag is not installed")
+    file = tmp_path / "calibration.yaml"
+    file.write_text(
+        """
+        # The camera was measured on Monday.
+        - {parent: base, child: camera, xyz: [1, 0, 0.5], rpy: [0, 0, 1.5707963267948966]}
+        - {parent: base, child: lidar, rpy_deg: [0, 0, 90], authority: tape measure}
+        - {parent: base, child: imu, quaternion: [0, 0, 1, 0]}
+        - {parent: base, child: plate}
+        """
+    )
+    camera, lidar, imu, plate = load_static(file, authority="me")
+    assert camera.transform.is_close(Transform((1, 0, 0.5), (0, 0, HALF, HALF)))
+    assert lidar.transform.is_close(Transform((0, 0, 0), (0, 0, HALF, HALF)))
+    assert imu.transform.rotation == (0.0, 0.0, 1.0, 0.0)
+    assert plate.transform == Transform()
+    assert [sample.authority for sample in (camera, lidar, imu, plate)] == ["me", "tape measure", "me", "me"]
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        ({"parent": "a", "child": "b"}, "it is not a list of transforms"),
+        ([3], "transform 1: expected a parent, a child and numbers, not 3"),
+        ([{"child": "b"}], "transform 1: it has no 'parent'"),
+        ([{"parent": "a"}], "transform 1: it has no 'child'"),
+        ([{"parent": "a", "child": "b", "zyx": []}], "transform 1: it has an unknown 'zyx'"),
+        ([{"parent": "a", "child": "b"}, {"parent": "a", "child": "a"}], "transform 2: frame 'a' cannot be its own"),
+        ([{"parent": "a", "child": "b", "xyz": [1, 2]}], "'xyz' is a list of 3 numbers, not [1, 2]"),
+        ([{"parent": "a", "child": "b", "xyz": [1, 2, "3"]}], "'xyz' is a list of 3 numbers"),
+        ([{"parent": "a", "child": "b", "xyz": [1, 2, True]}], "'xyz' is a list of 3 numbers"),
+        ([{"parent": "a", "child": "b", "xyz": "abc"}], "'xyz' is a list of 3 numbers"),
+        ([{"parent": "a", "child": "b", "quaternion": [0, 0, 0, 0]}], "transform 1: "),
+        ([{"parent": "a", "child": "b", "rpy": [0, 0, 0], "rpy_deg": [0, 0, 0]}], "rpy and rpy_deg say the same"),
+        ([{"parent": 1, "child": "b"}], "transform 1: "),
+        ([{"parent": "a", "child": "b", "authority": 1}], "transform 1: "),
+        ([{"parent": "a", "child": "b", "transform": 1}], "transform 1: "),
+    ],
+)
+def test_a_wrong_entry_is_named(content: Any, why: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    file.write_text(json.dumps(content))
+    with pytest.raises(RecordingError) as refused:
+        load_static(file)
+    assert why in str(refused.value)
+    assert refused.value.path == str(file)
+
+
+def test_a_file_that_is_no_text_or_not_there_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    with pytest.raises(FileNotFoundError, match="there is no such file") as missing:
+        load_static(file)
+    assert isinstance(missing.value, MissingRecordingError)
+    file.write_bytes(b"\xff\xfe")
+    with pytest.raises(RecordingError, match="it is neither YAML nor JSON"):
+        load_static(file)
+    with pytest.raises(RecordingError, match="it cannot be read"):
+        load_static(tmp_path)

@@ -1,0 +1,140 @@
+"""Static transforms in a file: a calibration that is written once and published at each start."""
+
+import json
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from tfbus.errors import InvalidTransformError, MissingRecordingError, RecordingError, pip_install
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
+from tfbus.stamps import is_real
+
+_SIZES = {"xyz": 3, "rpy": 3, "rpy_deg": 3, "quaternion": 4}
+_ROTATIONS = ("rpy", "rpy_deg", "quaternion")
+
+
+def save_static(path: str | os.PathLike[str], samples: Iterable[TransformStamped]) -> None:
+    """Write transforms to a file that `load_static` reads, as JSON, which is YAML as well.
+
+    Parameters
+    ----------
+    path : path
+    samples : iterable of TransformStamped
+        Their rotations are written as quaternions x, y, z, w, to the last bit.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    lines = [
+        json.dumps(
+            {
+                "parent": sample.parent,
+                "child": sample.child,
+                "xyz": sample.transform.translation,
+                "quaternion": sample.transform.rotation,
+                "authority": sample.authority,
+            }
+        )
+        for sample in samples
+    ]
+    Path(path).write_text("[\n  " + ",\n  ".join(lines) + "\n]\n" if lines else "[]\n", encoding="utf-8")
+
+
+def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[TransformStamped]:
+    """The static transforms of a file, in its order, with the stamp 0.
+
+    The file is a list in YAML or JSON. Each entry has a ``parent`` and a ``child``; ``xyz`` in m; one of ``rpy`` (roll,
+    pitch and yaw about fixed axes, in rad), ``rpy_deg`` (degrees) and ``quaternion`` (x, y, z, w); and an
+    ``authority``. All but the names of the frames may be left out. What `TransformStamped.to_dict` gives is an entry
+    too.
+
+    Parameters
+    ----------
+    path : path
+        Of YAML, unless it ends in ``.json``.
+    authority : str
+        The sender of entries that name none.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not such a list, or an entry is not valid; the message has its number. A file that is not there
+        is a `FileNotFoundError` as well.
+    ImportError
+        If YAML beyond JSON needs the extra: ``pip install "tfbus[bag]"``.
+    """
+    file = Path(path)
+    try:
+        entries = _parse(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise MissingRecordingError(path=str(file)) from None
+    except OSError as error:
+        raise RecordingError(
+            f"it cannot be read: {error.strerror or error}", path=str(file), reason="unreadable"
+        ) from error
+    except ValueError as error:
+        raise RecordingError(f"it is neither YAML nor JSON: {error}", path=str(file), reason="foreign") from error
+    if not isinstance(entries, list):
+        problem = "it is not a list of transforms, each with a parent and a child"
+        raise RecordingError(problem, path=str(file), reason="foreign")
+    samples = []
+    for number, entry in enumerate(entries, 1):
+        try:
+            samples.append(_sample(entry, authority))
+        except (ValueError, TypeError) as error:
+            raise RecordingError(f"transform {number}: {error}", path=str(file), reason="damaged") from error
+    return samples
+
+
+def _parse(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        pass
+    try:
+        from ruamel.yaml import YAML
+        from ruamel.yaml.error import YAMLError
+    except ImportError as error:
+        raise ImportError(f"to read YAML, tfbus needs a package more: {pip_install('bag')}") from error
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        raise ValueError(str(error)) from None
+
+
+def _sample(entry: Any, authority: str) -> TransformStamped:
+    if not isinstance(entry, Mapping):
+        raise ValueError(f"expected a parent, a child and numbers, not {entry!r}")  # noqa: TRY004 - the file is wrong
+    if "transform" in entry:
+        sample = TransformStamped.from_dict(entry)
+        return sample.replace(stamp=0, static=True, authority=sample.authority or authority)
+    unknown = [str(name) for name in entry if name not in {"parent", "child", "authority", *_SIZES}]
+    missing = [name for name in ("parent", "child") if name not in entry]
+    if unknown or missing:
+        raise ValueError(f"it has no {missing[0]!r}" if missing else f"it has an unknown {unknown[0]!r}")
+    rotations = [name for name in _ROTATIONS if name in entry]
+    if len(rotations) > 1:
+        raise ValueError(f"{' and '.join(rotations)} say the same: give one of them")
+    numbers = {name: _numbers(name, entry[name]) for name in _SIZES if name in entry}
+    xyz = numbers.get("xyz", [0.0, 0.0, 0.0])
+    if "quaternion" in numbers:
+        transform = Transform(xyz, numbers["quaternion"])
+    else:
+        degrees = [math.radians(angle) for angle in numbers.get("rpy_deg", [0.0, 0.0, 0.0])]
+        transform = Transform.from_xyz_rpy(xyz, numbers.get("rpy", degrees))
+    sender = entry.get("authority") or authority
+    try:
+        return TransformStamped(entry["parent"], entry["child"], 0, transform, sender, static=True)
+    except InvalidTransformError as error:
+        raise ValueError(str(error)) from None
+
+
+def _numbers(name: str, value: Any) -> list[float]:
+    if not isinstance(value, Sequence) or len(value) != _SIZES[name] or not all(map(is_real, value)):
+        raise ValueError(f"{name!r} is a list of {_SIZES[name]} numbers, not {value!r}")
+    return [float(number) for number in value]
