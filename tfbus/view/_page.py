@@ -106,6 +106,7 @@ class Page:
         self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self._live_tree = tree
         self._root: str | None = None
+        self._counted: object = None
         self._stale_after = stale_after
         self._tree_key: object = None
         self._tree_html = ""
@@ -247,7 +248,7 @@ class Page:
     def _show(self, tree: TransformTree) -> None:
         self._tree = tree
         self._root = None
-        self._counted: object = None
+        self._counted = None
         self._scenes = SceneReader(forest_of(tree), self._stale_after)
 
 
