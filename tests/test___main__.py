@@ -1,13 +1,15 @@
-import subprocess
+import runpy
 import sys
 
-from support.programs import TFBUS
+import pytest
+from support.commands import Command
 
 
-def test_the_package_runs_as_the_command() -> None:
-    first, second = (
-        subprocess.run([*command, "query"], capture_output=True, text=True, check=False)
-        for command in ([sys.executable, "-m", "tfbus"], [TFBUS])
-    )
-    assert first.returncode == second.returncode == 2
-    assert first.stderr == second.stderr != ""
+def test_the_package_runs_as_the_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    command = Command(monkeypatch, capsys)("query")
+    monkeypatch.setattr(sys, "argv", ["tfbus", "query"])
+    monkeypatch.delitem(sys.modules, "tfbus.__main__", raising=False)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("tfbus", run_name="__main__")
+    assert ended.value.code == command.returncode == 2
+    assert capsys.readouterr().err == command.stderr != ""

@@ -328,6 +328,21 @@ async def test_move_on_after_counts_simulated_time_across_jumps() -> None:
         assert asked.answer == 1 * SECOND
 
 
+async def test_call_after_calls_once_after_a_simulated_duration_across_jumps_unless_it_is_closed() -> None:
+    clock = SimulatedClock()
+    calls: list[tuple[str, int]] = []
+    for name, seconds in (("late", 2.0), ("soon", 1.0), ("closed", 1.5), ("never", math.inf), ("late too", 2.0)):
+        registration = clock.call_after(seconds, partial(lambda name: calls.append((name, clock.now())), name))
+        if name in ("closed", "never"):
+            registration.close()
+    clock.set(5 * SECOND)
+    assert not calls
+    await clock.advance(10.0)
+    assert calls == [("soon", 6 * SECOND), ("late", 7 * SECOND), ("late too", 7 * SECOND)]
+    with pytest.raises(ValueError, match="seconds"):
+        clock.call_after(-1.0, list)
+
+
 async def test_an_outer_move_on_after_that_expires_first_cancels_only_its_own_scope() -> None:
     clock = SimulatedClock()
 

@@ -50,6 +50,7 @@ _NAMES_IN = {
         "MissingRecordingError",
         "PastExtrapolationError",
         "RecordingError",
+        "RemoteLookupError",
         "TransformError",
         "TransformLookupError",
         "UnknownFrameError",
@@ -77,6 +78,7 @@ _NAMES_IN = {
     "geometry.stamped": ("TransformStamped",),
     "geometry.transform": ("Transform",),
     "geometry.transform_array": ("TransformArray",),
+    "geometry.which_kernel": ("kernel",),
     "message_filter.message_filter": ("MessageFilter",),
     "registration": ("Registration",),
     "robot.joint": (
@@ -97,6 +99,7 @@ _NAMES_IN = {
         "to_seconds",
     ),
     "statistics": (
+        "BufferServerStatistics",
         "BufferStatistics",
         "BusStatistics",
         "LinkStatistics",

@@ -43,6 +43,7 @@ from tfbus.errors import LookupTimeoutError as LookupTimeoutError
 from tfbus.errors import MissingRecordingError as MissingRecordingError
 from tfbus.errors import PastExtrapolationError as PastExtrapolationError
 from tfbus.errors import RecordingError as RecordingError
+from tfbus.errors import RemoteLookupError as RemoteLookupError
 from tfbus.errors import TransformError as TransformError
 from tfbus.errors import TransformLookupError as TransformLookupError
 from tfbus.errors import UnknownFrameError as UnknownFrameError
@@ -67,6 +68,7 @@ from tfbus.events import SubscriberFailed as SubscriberFailed
 from tfbus.geometry.stamped import TransformStamped as TransformStamped
 from tfbus.geometry.transform import Transform as Transform
 from tfbus.geometry.transform_array import TransformArray as TransformArray
+from tfbus.geometry.which_kernel import kernel as kernel
 from tfbus.message_filter.message_filter import MessageFilter as MessageFilter
 from tfbus.registration import Registration as Registration
 from tfbus.robot.joint import Joint as Joint
@@ -80,6 +82,7 @@ from tfbus.stamps import Latest as Latest
 from tfbus.stamps import format_stamp as format_stamp
 from tfbus.stamps import from_seconds as from_seconds
 from tfbus.stamps import to_seconds as to_seconds
+from tfbus.statistics import BufferServerStatistics as BufferServerStatistics
 from tfbus.statistics import BufferStatistics as BufferStatistics
 from tfbus.statistics import BusStatistics as BusStatistics
 from tfbus.statistics import LinkStatistics as LinkStatistics

@@ -230,6 +230,14 @@ class SimulatedClock:
             finally:
                 self._stop_timer(timer)
 
+    def call_after(self, seconds: float, callback: Callable[[], object]) -> Registration:
+        """Call `callback` once, after a simulated duration in s, unless the registration is closed before."""
+        duration = as_duration(seconds, "seconds")
+        if duration * SECOND >= STAMP_MAX:
+            return Registration(lambda: None)
+        timer = self._start_timer(self._elapsed + from_seconds(duration), callback)
+        return Registration(lambda: self._stop_timer(timer))
+
     def on_jump(self, callback: JumpCallback) -> Registration:
         """Call `callback` with the stamps before and after each `set`."""
         key = next(self._order)

@@ -12,6 +12,7 @@
                 GapError                   .before .after .max_gap            waiting cannot help: raised at once
                 AheadError                                                    waiting cannot help: raised at once
             LookupTimeoutError (TimeoutError)  __cause__ is the last lookup error
+            RemoteLookupError                  .domain .robot .reason .detail
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
         InvalidRobotError (ValueError)         .element
         RecordingError (ValueError)            .path .reason
@@ -133,7 +134,8 @@ class UnknownFrameError(TransformLookupError):
     frame : str
         The unknown frame.
     close_matches : tuple of str
-        Known frames with a similar name, the most similar first; computed when first read.
+        Known frames with a similar name, the most similar first; computed when first read, from the frames that are
+        known then.
     """
 
     frame: str
@@ -387,6 +389,40 @@ class LookupTimeoutError(TransformLookupError, TimeoutError):
         # One that comes back from JSON has only its cause.
         missing = self.__cause__ if self._missing is None else self._missing
         return f"no transform from {self.source!r} to {self.target!r} within {self.timeout:g} s: {missing}"
+
+
+class RemoteLookupError(TransformLookupError):
+    """The server of another process's buffer has given no answer, not even that the lookup has failed.
+
+    Attributes
+    ----------
+    domain : str
+        The domain that was asked.
+    robot : str or None
+        The robot that was asked.
+    reason : str
+        ``"absent"``: there is no such server; ``"lost"``: it has gone, or cannot be reached any more; ``"busy"``: too
+        many lookups wait there, or come in a second; ``"silent"``: it is there, and does not answer;
+        ``"malformed"``: its answer, or the question, could not be read.
+    detail : str
+        The same in words.
+    """
+
+    domain: str
+    robot: str | None
+    reason: str
+    detail: str
+
+    def __init__(self, *, domain: str, robot: str | None, reason: str, detail: str) -> None:
+        super().__init__()
+        self.domain = domain
+        self.robot = robot
+        self.reason = reason
+        self.detail = detail
+
+    def _why(self) -> str:
+        whose = "a buffer without a robot" if self.robot is None else f"the buffer of robot {self.robot!r}"
+        return f"no answer from {whose} in domain {self.domain!r}: {self.detail}"
 
 
 class InvalidTransformError(TransformError, ValueError):

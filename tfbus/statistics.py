@@ -150,6 +150,32 @@ class LinkStatistics(PlainData):
 
 
 @dataclass(frozen=True, slots=True)
+class BufferServerStatistics(PlainData):
+    """One buffer server since it was entered.
+
+    Attributes
+    ----------
+    waiting : int
+        Lookups of other processes that wait now.
+    answered, failed : int
+        Lookups that had a transform for an answer, and lookups that had an error.
+    cancelled : int
+        Lookups whose asker was cancelled, or has gone.
+    refused : mapping of str to int
+        Questions that were refused, by reason: ``"busy"``, because too many wait or come; ``"malformed"``.
+    queue : QueueStatistics
+        Questions that wait for the event loop.
+    """
+
+    waiting: int
+    answered: int
+    failed: int
+    cancelled: int
+    refused: Mapping[str, int]
+    queue: QueueStatistics
+
+
+@dataclass(frozen=True, slots=True)
 class RecorderStatistics(PlainData):
     """One recorder since it was entered.
 

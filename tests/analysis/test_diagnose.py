@@ -18,6 +18,13 @@ def test_a_tree_is_examined_with_its_senders_and_parents() -> None:
     assert [each.kind for each in diagnose(tree, Limits(speed=0.5)) if each.frame == "base"][-1] == "jump"
 
 
+def test_each_sample_has_its_own_sender_even_if_it_came_late() -> None:
+    tree = tree_of(*(moving("odom", "base", k * SECOND, float(k), "odometry") for k in range(0, 10, 2)), keep=None)
+    tree.insert_many([moving("odom", "base", k * SECOND, float(k), "slam") for k in (3, 7)])
+    found = [(each.kind, each.frame, each.count, each.first) for each in diagnose(tree)]
+    assert found == [("two authorities", "base", 4, 3 * SECOND)]
+
+
 def test_only_the_window_is_examined() -> None:
     tree = tree_of(moving("a", "b", 0, 1e10), *(moving("a", "b", k * SECOND) for k in range(11, 15)))
     assert diagnose(tree) == []

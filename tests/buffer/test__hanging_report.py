@@ -67,7 +67,6 @@ def test_a_jump_back_of_the_clock_delays_no_report(caplog: pytest.LogCaptureFixt
 
 
 @pytest.mark.anyio
-@pytest.mark.every_loop
 async def test_a_thousand_lookups_that_hang_look_for_the_similar_names_of_three(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -336,6 +336,29 @@ async def test_a_woken_lookup_reads_the_tree_when_its_task_runs() -> None:
     assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("change", ["replace", "remove", "reset"])
+async def test_the_answer_that_woke_a_lookup_is_dropped_if_the_tree_changes_in_the_same_turn(change: str) -> None:
+    clock, bus, buffer = make()
+    bus.publish(moving("map", "a", 0))
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
+        await settle()
+        bus.publish(moving("map", "a", 5, 1.0))
+        if change == "replace":
+            bus.publish(moving("map", "a", 5, 2.0))
+        elif change == "remove":
+            bus.remove_frame("a")
+            await settle()
+            assert not asked.ended
+            bus.publish(moving("map", "a", 5, 2.0))
+        else:
+            clock.set(clock.now() - 1)
+    if change == "reset":
+        assert isinstance(asked.error, ClockResetError)
+    else:
+        assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
+
+
 async def test_a_thousand_waiters_of_one_publish_are_all_answered() -> None:
     _, bus, buffer = make()
     bus.publish(driving("map", "a", 0))

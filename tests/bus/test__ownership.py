@@ -231,8 +231,10 @@ def test_in_one_batch_the_edge_of_the_other_is_refused() -> None:
             bus.publish(batch)
         assert (caught.value.authority, caught.value.reason, caught.value.owner) == ("stranger", "reserved", "owner")
         assert bus.statistics().frames == 0
-        bus.publish(batch, invalid="drop")
+        bus.publish([batch[0], *batch], invalid="drop")
     assert [event.frame for event in bus._topology.known()] == ["base"]
+    # One when all was refused, then each of the two that were left out.
+    assert bus.statistics().rejected == {"reserved": 3}
 
 
 def test_a_batch_that_is_refused_for_another_reason_removes_nothing() -> None:

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from support.samples import any_samples, moving, newest_samples, static
 
 from tfbus import InvalidTransformError, SimulatedClock, TransformStamped
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._ownership import OnConflict, Ownership
 from tfbus.bus._plausibility import Plausibility
 from tfbus.bus._topology import Topology
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.geometry.bounds import MAX_TRANSLATION
 
 

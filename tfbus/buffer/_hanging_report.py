@@ -5,7 +5,7 @@ import math
 from collections.abc import Hashable
 from itertools import islice
 
-from tfbus._log import SeenKeys
+from tfbus.bus.once_logger import SeenKeys
 from tfbus.clock import Clock
 from tfbus.errors import TransformLookupError
 from tfbus.stamps import from_seconds, to_seconds

@@ -2,11 +2,14 @@
 
 import math
 from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from contextlib import suppress
+from functools import partial
 
 import anyio
 import anyio.lowlevel
 
+from tfbus._aio.wake_up import WakeUp
+from tfbus.buffer._alarms import Alarm, Alarms, alarms_of
 from tfbus.buffer._hanging_report import REPORT_AFTER, HangingReport
 from tfbus.buffer._local_names import LocalNames
 from tfbus.clock import Clock
@@ -26,6 +29,54 @@ from tfbus.tree.lookup import Bounds, answer
 from tfbus.tree.question import Question
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import Waiter, without_traceback
+
+
+class _Wait:
+    """A lookup that waits, from its first error to its end."""
+
+    __slots__ = (
+        "blocker",
+        "end",
+        "expired",
+        "is_long",
+        "last_reset",
+        "others",
+        "question",
+        "reminder",
+        "since",
+        "woken",
+    )
+
+    def __init__(
+        self,
+        question: Question,
+        since: int,
+        last_reset: ClockResetError | None,
+        blocker: TransformLookupError,
+        others: tuple[Question, ...],
+    ) -> None:
+        self.question = question
+        self.since = since
+        self.last_reset = last_reset
+        self.blocker = blocker
+        self.others = others
+        self.end: Alarm | None = None
+        self.reminder: Alarm | None = None
+        self.expired = False
+        self.is_long = False
+        self.woken: WakeUp | None = None
+
+    def expire(self) -> None:
+        """End the wait."""
+        self.expired = True
+        if self.woken is not None:
+            self.woken.end()
+
+    def close_alarms(self) -> None:
+        """Cancel the alarms that have not rung."""
+        for alarm in (self.end, self.reminder):
+            if alarm is not None:
+                alarm.close()
 
 
 class Lookups:
@@ -58,6 +109,7 @@ class Lookups:
         self._newest_plausible = newest_plausible
         self._local_names = local_names
         self._report = HangingReport(live.waiting, clock)
+        self._alarms = alarms_of(clock)
 
     def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
         """The stamps that count as `LATEST` now; None for any."""
@@ -76,6 +128,10 @@ class Lookups:
     def lookup_nowait(self, question: Question) -> TransformStamped:
         """The answer, or an error at once."""
         bounds = None
+        if question.is_plain:
+            plain = self._live.forest.paths.answer(question.target, question.source, question.at)
+            if plain is not None:
+                return plain if self._local_names is None else self._local_names.answer(plain)
         if question.max_age is not None:
             bounds = self.bounds(question.max_age, question.at, question.source_at)
         try:
@@ -110,74 +166,100 @@ class Lookups:
             self._check_names(question)
             blocker = without_traceback(error)
         self._check_thread()
-        since = self._clock.now()
-        silent = min(limit, REPORT_AFTER)
-        found = await self._lookup_within(silent, question, since, last_reset, blocker, others, report=False)
-        if isinstance(found, TransformLookupError) and silent < limit:
-            found = await self._lookup_within(limit - silent, question, since, last_reset, found, others, report=True)
-        if isinstance(found, TransformLookupError):
+        wait = _Wait(question, self._clock.now(), last_reset, blocker, others)
+        alarms = self._alarms
+        found = await (self._wait_in_scopes(wait, limit) if alarms is None else self._wait(wait, limit, alarms))
+        if found is None:
             raise LookupTimeoutError(
-                target=question.target, source=question.source, timeout=limit, missing=found
-            ) from found
+                target=question.target, source=question.source, timeout=limit, missing=wait.blocker
+            ) from wait.blocker
         return found
-
-    async def park(
-        self, question: Question, since: int, blocker: TransformLookupError, others: tuple[Question, ...] = ()
-    ) -> None:
-        """Wait for a sample that may have removed the cause of `blocker`.
-
-        Raises
-        ------
-        BusClosedError
-            If no more samples will come.
-        """
-        if self._live.end_reason is not None:
-            raise BusClosedError(self._live.end_reason) from blocker
-        woken = anyio.Event()
-        waiter = Waiter(question, since, woken.set, others)
-        self._live.park(waiter, blocker)
-        try:
-            await woken.wait()
-        except BaseException:
-            # Cancelled. A waiter that is woken has been removed before.
-            self._live.waiting.remove(waiter)
-            raise
 
     def report(self, question: Question, since: int, blocker: TransformLookupError) -> float:
         """Log a lookup that has waited for long; return the time, in s, after which to call this again."""
         return self._report.tell(question, since, blocker)
 
-    async def _lookup_within(
-        self,
-        seconds: float,
-        question: Question,
-        since: int,
-        last_reset: ClockResetError | None,
-        blocker: TransformLookupError,
-        others: tuple[Question, ...],
-        *,
-        report: bool,
-    ) -> TransformStamped | TransformLookupError:
-        """Wait for the answer for some time; return it, or the error that still blocks it."""
-        pause = math.inf
-        with self._clock.move_on_after(seconds):
+    async def _wait(self, wait: "_Wait", limit: float, alarms: Alarms) -> TransformStamped | None:
+        """Wait for the answer for some time (s); None if there was none."""
+        if limit == 0.0:
+            wait.expired = True
+        elif limit < math.inf:
+            wait.end = alarms.call_after(limit, wait.expire)
+        if limit > REPORT_AFTER:
+            wait.reminder = alarms.call_after(REPORT_AFTER, partial(self._remind, wait, alarms))
+        try:
             while True:
-                if report:
-                    pause = self.report(question, since, blocker)
-                with nullcontext() if pause == math.inf else self._clock.move_on_after(pause):
-                    await self.park(question, since, blocker, others)
+                waiter, woken = self._park(wait)
                 try:
-                    return self._lookup_since(last_reset, question)
-                except MAY_COME as error:
-                    blocker = without_traceback(error)
-                for other in others:
-                    with suppress(*MAY_COME):
-                        self.lookup_nowait(other)
+                    # Timeouts of zero give the others a turn as well.
+                    await (anyio.lowlevel.checkpoint() if wait.expired else woken)
+                finally:
+                    # Cancelled, or out of time. A waiter that a sample has woken was removed before.
+                    self._live.waiting.remove(waiter)
+                found = self._answer_of(waiter, wait)
+                if found is not None or wait.expired:
+                    return found
+                if wait.is_long:
+                    self._remind(wait, alarms)
+        finally:
+            wait.close_alarms()
+
+    def _park(self, wait: "_Wait") -> tuple[Waiter, WakeUp]:
+        """Park a lookup under what it lacks, with a new wake-up."""
+        live = self._live
+        if live.end_reason is not None:
+            raise BusClosedError(live.end_reason) from wait.blocker
+        wait.woken = woken = WakeUp()
+        waiter = Waiter(wait.question, wait.since, woken.end, wait.others)
+        live.park(waiter, wait.blocker)
+        return waiter, woken
+
+    def _answer_of(self, waiter: Waiter, wait: "_Wait") -> TransformStamped | None:
+        """The answer that a waiter was woken with if it is still right, else that of now."""
+        found = waiter.answer
+        if found is not None and waiter.version == self._live.forest.version:
+            return found if self._local_names is None else self._local_names.answer(found)
+        return self._ask_again(wait)
+
+    def _ask_again(self, wait: "_Wait") -> TransformStamped | None:
+        """The answer, or None; then the error that blocks it is noted."""
         try:
             # The data may have come in the same turn of the loop in which the time was up.
-            return self._lookup_since(last_reset, question)
+            return self._lookup_since(wait.last_reset, wait.question)
         except MAY_COME as error:
-            return without_traceback(error)
+            wait.blocker = without_traceback(error)
+        for other in wait.others:
+            with suppress(*MAY_COME):
+                self.lookup_nowait(other)
+        return None
+
+    def _remind(self, wait: "_Wait", alarms: Alarms) -> None:
+        """Log a lookup that has waited for long, now or when the next line may be logged."""
+        wait.is_long = True
+        pause = self.report(wait.question, wait.since, wait.blocker)
+        if pause < math.inf:
+            if wait.reminder is not None:
+                wait.reminder.close()
+            wait.reminder = alarms.call_after(pause, partial(self._remind, wait, alarms))
+
+    async def _wait_in_scopes(self, wait: "_Wait", limit: float) -> TransformStamped | None:
+        """As `_wait`, by a clock that knows no alarms."""
+        pause = REPORT_AFTER
+        found = None
+        with self._clock.move_on_after(limit):
+            while found is None:
+                with self._clock.move_on_after(pause):
+                    while found is None:
+                        waiter, woken = self._park(wait)
+                        try:
+                            await woken
+                        finally:
+                            self._live.waiting.remove(waiter)
+                        found = self._answer_of(waiter, wait)
+                if found is None:
+                    pause = min(self.report(wait.question, wait.since, wait.blocker), REPORT_AFTER)
+                    found = self._ask_again(wait)
+        return self._ask_again(wait) if found is None else found
 
     def _lookup_since(self, last_reset: ClockResetError | None, question: Question) -> TransformStamped:
         """The answer, or `ClockResetError` if the clock has jumped back after `last_reset`."""

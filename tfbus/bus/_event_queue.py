@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Hashable, Iterable
 
-from tfbus._log import SeenKeys
+from tfbus.bus.once_logger import SeenKeys
 from tfbus.bus.sample_queue import check_capacity
 from tfbus.events import (
     AuthorityConflict,

@@ -6,8 +6,8 @@ from inspect import iscoroutinefunction
 from itertools import count
 from typing import TypeVar
 
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.events import SubscriberFailed
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration

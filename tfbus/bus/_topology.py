@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from copy import copy
 from typing import Literal, get_args
 
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._ownership import Ownership
 from tfbus.bus._plausibility import Plausibility
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.errors import InvalidTransformError
 from tfbus.events import (
     AuthorityConflict,
@@ -25,11 +25,17 @@ from tfbus.events import (
     StampAhead,
 )
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.geometry.which_kernel import kernel
 from tfbus.registration import Registration
 from tfbus.stamps import STAMP_MIN, format_duration
 from tfbus.tree.cycles import NewestEdge, admit
 
 _FORMER_PARENTS = 1_000
+
+if kernel == "python":
+    from tfbus.bus._python_judge import Edge, judge
+else:
+    from tfbus._kernel import Edge, judge  # type: ignore[assignment]
 
 Invalid = Literal["raise", "drop"]
 
@@ -41,27 +47,23 @@ def as_invalid(invalid: Invalid) -> Invalid:
     return invalid
 
 
-class _Edge:
+class _Edge(Edge):
     """The newest edge of one child, and the authority of its newest sample.
 
     `last` is the authority of its last sample, which may have been a late one.
-    `trusted` is the authority whose moving samples under the same parent need no judgement; None if there is none.
     `since` numbers the parents of all frames in the order in which they were published.
-    `before` is the newest stamp before the batch whose number is `turn`, which may have to be taken back.
     """
 
-    __slots__ = ("authority", "before", "last", "newest", "parent", "since", "static", "trusted", "turn")
+    __slots__ = ("authority", "last", "since", "static")
 
     def __init__(self, parent: str, static: bool, authority: str, since: int) -> None:
         self.parent = parent
         self.static = static
-        self.newest: int | None = None
+        self.newest = None
         self.authority = authority
         self.last = authority
-        self.trusted: str | None = None
+        self.trusted = None
         self.since = since
-        self.turn = 0
-        self.before: int | None = None
 
 
 class Topology:
@@ -108,7 +110,6 @@ class Topology:
         self._announcer = announcer
         self._evict = evict
         self._parents = 0
-        self._turn = 0
         self._newest: dict[str, _Edge] = {}
         # Every parent of a newest edge, and some that were one.
         self._named: set[str] = set()
@@ -169,31 +170,13 @@ class Topology:
             If `invalid` is ``"raise"`` and a sample closes a loop, or its authority may not publish the child; then
             nothing was noted.
         """
-        newest = self._newest
-        horizon = self._horizon
-        square = self._square
-        self._turn = turn = self._turn + 1
         # Nearly always all samples continue known edges, so that only the stamps are new.
-        for sample in batch:
-            parent, child, stamp, row, authority, static = sample._fields
-            known = newest.get(child)
-            if known is None or known.parent != parent or known.trusted != authority or static:
-                break
-            if stamp > horizon and stamp > (horizon := self._renew_horizon()):
-                break
-            x, y, z, _, _, _, _ = row
-            # Not `>`, which is false for NaN.
-            if not x * x + y * y + z * z <= square:
-                break
-            if known.newest is None or stamp > known.newest:
-                # One loop, in which stamps may have to be taken back, is a fifth faster than two.
-                if known.turn != turn:
-                    known.turn = turn
-                    known.before = known.newest
-                known.newest = stamp
-        else:
+        before = self._horizon
+        if judge(self._newest, batch, before, self._square):
             return batch
-        self._take_back(batch, turn)
+        horizon = self._renew_horizon()
+        if horizon > before and judge(self._newest, batch, horizon, self._square):
+            return batch
         return self._judge(batch, invalid)
 
     def reserve(self, child: str, authority: str) -> Registration:
@@ -240,14 +223,6 @@ class Topology:
         """Note that a jump of the clock was announced."""
         self._plausibility.clock_jumped = True
         self._horizon = STAMP_MIN
-
-    def _take_back(self, batch: Batch, turn: int) -> None:
-        """Undo what `accept` has recorded of a batch."""
-        for sample in batch:
-            known = self._newest.get(sample.child)
-            if known is not None and known.turn == turn:
-                known.turn = 0
-                known.newest = known.before
 
     def _renew_horizon(self) -> int:
         newest = self._plausibility.newest_plausible()
@@ -309,8 +284,9 @@ class Topology:
         while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
             rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
             if len(rest) < len(batch):
+                # An error for each sample, so that all are counted.
+                refused += [intruder] * (len(batch) - len(rest))
                 batch = rest
-                refused.append(intruder)
             else:
                 del edges[_child(intruder)]
                 removed.append(intruder)

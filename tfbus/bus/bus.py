@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, suppress
 from threading import get_ident
 from types import TracebackType
 
-from tfbus._log import OnceLogger
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._late_buffer import LateBuffer
 from tfbus.bus._owner_thread import OwnerThread
@@ -20,6 +19,7 @@ from tfbus.bus._plausibility import Plausibility
 from tfbus.bus._subscribers import BatchCallback, FrameCallback, Subscribers
 from tfbus.bus._topology import Invalid, Topology, as_invalid
 from tfbus.bus.event_stream import EventStream
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import Overflow
 from tfbus.bus.stream import Stream
 from tfbus.bus.thread_publisher import ThreadPublisher

@@ -19,6 +19,7 @@ USAGE_ERROR = 2
 INTERRUPTED = 130
 
 COMMANDS = {
+    "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
     "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
     "receives it.",
     "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
@@ -59,6 +60,15 @@ LogLevel = Literal["debug", "info", "warning", "error", "critical"]
 Program = Callable[[], object]
 
 
+def _version() -> str:
+    # Loaded here, because most commands do without.
+    from importlib.metadata import version
+
+    from tfbus.geometry.which_kernel import kernel
+
+    return f"{version('tfbus')} ({kernel} kernel)"
+
+
 def application(command: str | None) -> App:
     """The command line with all its subcommands, none of which is loaded before it is parsed.
 
@@ -70,6 +80,7 @@ def application(command: str | None) -> App:
     app = App(
         name="tfbus",
         help="Stamped coordinate transforms for asyncio and trio.",
+        version=_version,
         help_epilogue=_EXIT_STATUSES,
         # To load a parser of Markdown takes as long as all the rest of the list of commands.
         help_format="plaintext" if command is None else "markdown",

@@ -7,15 +7,24 @@ from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
 from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
+from tfbus.geometry.which_kernel import kernel
 from tfbus.plain import from_fields
-from tfbus.stamps import StampLike, as_stamp, format_duration, format_stamp
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp
+
+if kernel == "python":
+    from tfbus.geometry._python_sample import Sample
+else:
+    from tfbus._kernel import Sample  # type: ignore[assignment]
 
 Fields = tuple[str, str, int, Row, str, bool]
 
 _KINDS = {"parent": str, "child": str, "stamp": int, "transform": Transform, "authority": str, "static": bool}
 
+_NO_BEGINNING = ("", "/")
+"""The first characters of strings that are no frame names."""
 
-class TransformStamped:
+
+class TransformStamped(Sample):
     """A transform with its two frames and its stamp: a published sample, or the answer of a lookup. Immutable.
 
     Parameters
@@ -38,9 +47,7 @@ class TransformStamped:
         If an argument has the wrong type; a float stamp is the usual one.
     """
 
-    # One slot, because the hot paths read all six fields at once.
-    __slots__ = ("_fields",)
-    _fields: Fields
+    __slots__ = ()
 
     def __init__(
         self,
@@ -51,6 +58,18 @@ class TransformStamped:
         authority: str = "",
         static: bool = False,
     ) -> None:
+        if (
+            type(parent) is type(child) is type(authority) is str
+            and parent[:1] not in _NO_BEGINNING
+            and child[:1] not in _NO_BEGINNING
+            and parent != child
+            and type(stamp) is int
+            and STAMP_MIN <= stamp <= STAMP_MAX
+            and type(transform) is Transform
+        ):
+            # Nearly always so. Below are the same checks with their errors, which take three times as long.
+            self._fields = parent, child, stamp, transform._row, authority, bool(static)
+            return
         for name in (parent, child):
             check_frame(name, parent, child, authority)
         if parent == child:
@@ -74,34 +93,9 @@ class TransformStamped:
         self._fields = parent, child, stamp, transform._row, authority, bool(static)
 
     @property
-    def parent(self) -> str:
-        """The frame that the transform maps into; the target, in an answer."""
-        return self._fields[0]
-
-    @property
-    def child(self) -> str:
-        """The frame that the transform maps from; the source, in an answer."""
-        return self._fields[1]
-
-    @property
-    def stamp(self) -> int:
-        """Nanoseconds; never `LATEST`."""
-        return self._fields[2]
-
-    @property
     def transform(self) -> Transform:
         """Maps `child` coordinates into `parent`."""
-        return from_row(self._fields[3])
-
-    @property
-    def authority(self) -> str:
-        """The sender; empty in an answer."""
-        return self._fields[4]
-
-    @property
-    def static(self) -> bool:
-        """Whether it holds at every stamp."""
-        return self._fields[5]
+        return from_row(self._row)
 
     @property
     def extrapolated_by(self) -> int:
@@ -148,12 +142,17 @@ class TransformStamped:
         ValueError
             If the data are not those of a `TransformStamped`. The message names the field.
         """
-        if "gap" not in data:
-            return TransformStamped(**from_fields(TransformStamped, data, _KINDS))
-        fields = from_fields(TransformStamped, data, {**_KINDS, "extrapolated_by": int, "gap": int})
-        policy_use = fields.pop("extrapolated_by"), fields.pop("gap")
-        answer = TransformStamped(**fields)
-        target, source, stamp, row, _, static = answer._fields
+        kinds = _KINDS if "gap" not in data else {**_KINDS, "extrapolated_by": int, "gap": int}
+        fields = from_fields(TransformStamped, data, kinds)
+        policy_use = fields.pop("extrapolated_by", None), fields.pop("gap", None)
+        target, source = fields["parent"], fields["child"]
+        if target == source:
+            # The answer of a lookup may be of one frame in itself; a sample may not.
+            fields["child"] = f"{target}'"
+        answer = renamed(TransformStamped(**fields), target, source)
+        if None in policy_use:
+            return answer
+        _, _, stamp, row, _, static = answer._fields
         return qualified_answer(target, source, stamp, row, static, *policy_use)
 
     def __eq__(self, other: object) -> bool:
@@ -166,6 +165,9 @@ class TransformStamped:
         parent, child, stamp, row, authority, static = self._fields
         extra = (f", authority={authority!r}" if authority else "") + (", static=True" if static else "")
         return f"TransformStamped({parent!r}, {child!r}, {stamp}, {from_row(row)}{extra})"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), self._fields), getattr(self, "__dict__", None)
 
     def __str__(self) -> str:
         when = "static" if self.static else f"at {format_stamp(self.stamp)}"
@@ -191,6 +193,9 @@ class QualifiedTransform(TransformStamped):
     def to_dict(self) -> dict[str, Any]:
         """As that of a `TransformStamped`, with ``"extrapolated_by"`` and ``"gap"`` in ns."""
         return {**super().to_dict(), "extrapolated_by": self.extrapolated_by, "gap": self.gap}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restored, (type(self), self._fields, self._policy_use), getattr(self, "__dict__", None)
 
     def __str__(self) -> str:
         held = f", extrapolated by {format_duration(self.extrapolated_by)}" if self.extrapolated_by else ""
@@ -221,6 +226,15 @@ def renamed(answer: TransformStamped, target: str, source: str) -> TransformStam
     if isinstance(answer, QualifiedTransform) and isinstance(copy, QualifiedTransform):
         copy._policy_use = answer._policy_use
     return copy
+
+
+def _restored(kind: type[TransformStamped], fields: Fields, policy_use: tuple[int, int] | None = None) -> Any:
+    """A sample that was copied or pickled."""
+    sample = kind.__new__(kind)
+    sample._fields = fields
+    if isinstance(sample, QualifiedTransform) and policy_use is not None:
+        sample._policy_use = policy_use
+    return sample
 
 
 Batch = tuple[TransformStamped, ...]

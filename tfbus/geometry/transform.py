@@ -9,6 +9,7 @@ A transform holds one tuple of seven floats, a row; `tfbus.geometry.rows` has th
 
 import math
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from typing import Any, overload
 
 import numpy as np
@@ -65,6 +66,15 @@ class Transform:
         translation: Numbers = (0.0, 0.0, 0.0),
         rotation: Numbers = (0.0, 0.0, 0.0, 1.0),
     ) -> None:
+        if type(translation) is tuple and type(rotation) is tuple and len(translation) == 3 and len(rotation) == 4:
+            x, y, z = translation
+            i, j, k, w = rotation
+            if type(x) is type(y) is type(z) is type(i) is type(j) is type(k) is type(w) is float:
+                # Nearly always so. `as_vector` and `as_rotation` check the same, and take eight times as long.
+                square = i * i + j * j + k * k + w * w
+                if abs(square - 1.0) <= ROUNDING and isfinite(x) and isfinite(y) and isfinite(z):
+                    self._row = x, y, z, i, j, k, w
+                    return
         self._row = (*as_vector(translation, "translation"), *as_rotation(rotation, "rotation"))
 
     @classmethod

@@ -1,13 +1,13 @@
 """The protocol between a link and the carrier below it."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._outbox import Turn
-from tfbus.links._receive_queue import Question, Received
+from tfbus.links._receive_queue import HistoryQuestion, Question, Received
 from tfbus.links._state import StateEntry, StateStep
 
 
@@ -138,11 +138,22 @@ class AskableCarrier(Carrier, Protocol):
         Then `receive` is called with an `Answer` from that peer, one without a message if there is none in a while.
         """
 
-    def answer(self, question: Question, entries: list[StateEntry], step: StateStep) -> None:
+    def answer(self, question: Question | HistoryQuestion, entries: Sequence[StateEntry], step: StateStep) -> None:
         """Answer a question that came as an item.
 
         Raises
         ------
         ValueError
             If one message cannot hold so many entries; fewer may do.
+        """
+
+
+@runtime_checkable
+class HistoryCarrier(AskableCarrier, Protocol):
+    """A carrier whose peers can also be asked for the last seconds of their moving frames."""
+
+    def ask_history(self, peer: str, seconds: float, after: str) -> None:
+        """Ask a peer for the frames whose names come after `after`; must not block or raise.
+
+        Then `receive` is called with a `HistoryAnswer` from that peer, one without a message if there is none.
         """

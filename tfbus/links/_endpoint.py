@@ -6,15 +6,16 @@ from copy import copy
 from math import inf
 from time import monotonic
 
-from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import Asker
-from tfbus.links._carrier import AskableCarrier, Carrier
-from tfbus.links._inbox import Inbox
+from tfbus.links._carrier import AskableCarrier, Carrier, HistoryCarrier
+from tfbus.links._history import HistoryAsker, HistoryTeller
+from tfbus.links._inbox import Inbox, ReceivedMessage
 from tfbus.links._outbox import Outbox
 from tfbus.links._peers import Peers
-from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links._reconciler import Reconciler
 from tfbus.links._relay import relay_of
 from tfbus.links._state import CHUNK
@@ -46,6 +47,8 @@ class Endpoint:
         Returns a monotonic time in s.
     wake : callable
         Called when `reconcile` has to be called earlier than it said before.
+    history : float or None
+        How many seconds of the past each new peer is asked for.
 
     Attributes
     ----------
@@ -66,6 +69,7 @@ class Endpoint:
         max_frames: int = 10_000,
         now: Callable[[], float] = monotonic,
         wake: Callable[[], object] = lambda: None,
+        history: float | None = None,
     ) -> None:
         self._bus = bus
         self._name = name
@@ -86,6 +90,11 @@ class Endpoint:
             else Reconciler(self.inbox, self.peers, self._askable.ask, Asker(now), wake, max_frames)
         )
 
+        self._teller = HistoryTeller(bus, self._relay, self.outbox)
+        self._history: HistoryAsker | None = None
+        if history is not None and isinstance(carrier, HistoryCarrier):
+            self._history = HistoryAsker(history, carrier.ask_history, now)
+
     def attach(self) -> None:
         """Join the bus: from now on, all that is latched or published gathers in the outbox.
 
@@ -93,13 +102,18 @@ class Endpoint:
         ------
         BusClosedError
         """
-        self._relay.attach(self.outbox)
+        # Peers that cannot be asked are of a world that knows no buses.
+        self._relay.attach(self.outbox, foreign=self._askable is None)
 
     def detach(self) -> None:
         """Leave the bus; its peers are forgotten, and their frames stay."""
         for peer in self.peers.forget_all():
             self._relay.lose(peer, self.outbox, drop=False)
         self._relay.detach(self.outbox)
+
+    def clock_jumped_back(self) -> None:
+        """Take samples with the stamps of earlier ones for news."""
+        self._relay.clock_jumped_back()
 
     def send(self) -> None:
         """Hand to the carrier all that has gathered in the outbox, if there is anything."""
@@ -127,7 +141,12 @@ class Endpoint:
             if not self.outbox.pending:
                 self._askable.claim(self.outbox.step())
         asking = self.next_question()
-        return due if asking is None else min(due, asking)
+        history = None
+        if self._history is not None:
+            for peer in self._history.overdue():
+                self._end_history(peer)
+            history = self._history.next_due()
+        return min(when for when in (due, asking, history) if when is not None)
 
     def handle(self, item: Received) -> None:
         """Handle one item that the carrier has received; nothing in it makes this raise."""
@@ -143,14 +162,47 @@ class Endpoint:
                 self._answer(content)
             elif isinstance(content, Answer):
                 self._take_answer(item.sender, content)
+            elif isinstance(content, HistoryQuestion):
+                self._tell_history(content)
+            elif isinstance(content, HistoryAnswer):
+                self._take_history(item.sender, content)
             else:
-                self.inbox.receive(item.sender, self._carrier.read(content))
-                if self._reconciler is not None:
-                    self._reconciler.heard(item.sender)
+                message = self._carrier.read(content)
+                if self._history is None or not self._history.holds(item.sender, message):
+                    self._end_history(item.sender)
+                    self._take_live(item.sender, message)
         except MalformedMessageError as error:
             self.peers.reject(item.sender, error.reason, error)
         except Exception as error:  # noqa: BLE001 - no peer, and no subscriber, may end the event loop
             self.peers.reject(item.sender, "not published", error)
+
+    def _take_live(self, sender: str, message: ReceivedMessage) -> None:
+        self.inbox.receive(sender, message)
+        if self._reconciler is not None:
+            self._reconciler.heard(sender)
+
+    def _tell_history(self, question: HistoryQuestion) -> None:
+        if self._askable is not None:
+            self._askable.answer(question, *self._teller.chunk(question.seconds, question.after))
+
+    def _take_history(self, sender: str, answer: HistoryAnswer) -> None:
+        if self._history is None or not self._history.is_open(sender):
+            return
+        goes_on = False
+        try:
+            message = None if answer.message is None else self._carrier.read(answer.message)
+            if message is not None:
+                self.inbox.receive_history(sender, message)
+            goes_on = self._history.goes_on(sender, message)
+        finally:
+            if not goes_on:
+                self._end_history(sender)
+
+    def _end_history(self, sender: str) -> None:
+        """Publish what waited for the past of a peer, with it or without it."""
+        if self._history is not None:
+            for message in self._history.end(sender):
+                self._take_live(sender, message)
 
     def _answer(self, question: Question) -> None:
         if self._askable is None:
@@ -186,9 +238,12 @@ class Endpoint:
             peer.present = True
             if self._reconciler is not None:
                 self._reconciler.joined(peer)
+            if self._history is not None:
+                self._history.joined(sender)
             self._bus._announce(PeerJoined(self._bus.clock.now(), self._name, sender))
 
     def _peer_left(self, sender: str) -> None:
+        self._end_history(sender)
         peer = self.peers.forget(sender)
         if peer is not None:
             if self._reconciler is not None:

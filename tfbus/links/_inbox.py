@@ -149,6 +149,17 @@ class Inbox:
             self._relay.keep_only(peer, mirror, self._outbox)
         return mirror.number > before
 
+    def receive_history(self, sender: str, message: ReceivedMessage) -> None:
+        """Publish the samples of the last seconds that a peer has told."""
+        peer = self._peers.get(sender)
+        if peer is None or self._bus.closed:
+            return
+        self.messages += 1
+        for error in message.errors:
+            self._peers.reject(sender, error.reason, error)
+        batches = [entry for entry in message.entries if isinstance(entry, ReceivedBatch) and entry.origin is not None]
+        self._publish(peer, batches, live=False)
+
     def _take(self, peer: Peer, message: ReceivedMessage, live: bool) -> None:
         for error in message.errors:
             self._peers.reject(peer.id, error.reason, error)

@@ -39,6 +39,22 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
+class HistoryQuestion:
+    """The content of an item that asks for the last seconds of the moving frames whose names come after `after`."""
+
+    seconds: float
+    after: str
+    handle: Any
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryAnswer:
+    """The content of an item that answers such a question; `message` is None if there was no answer."""
+
+    message: Any
+
+
+@dataclass(frozen=True, slots=True)
 class Received:
     """One item that a carrier has received.
 

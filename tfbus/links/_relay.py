@@ -2,8 +2,11 @@
 
 Every batch is numbered by the bus on which it was published first, its *origin*. The same batch may arrive on several
 ways, for a bus with two links passes on by each what came by the other. So a sample is news only if its number is
-higher than that of the newest sample of the same origin and child; then no ring of buses has an echo. Batches of a
-world that has no origins, such as ROS, get this bus as their origin.
+higher than that of the newest sample of the same origin and child; then no ring of buses has an echo.
+
+Batches of a world that has no origins, such as ROS, get this bus as their origin. Such a world gives back what it was
+sent, by another link of this bus or by another bus, and nothing in it tells. So while a link to such a world is
+attached, the relay remembers the newest samples of each child, and takes the same one for news only once.
 
 A bus numbers on from the highest number that it has seen of any origin (Lamport, "Time, clocks, and the ordering of
 events in a distributed system", 1978). So of two things that are said of one frame, such as a static sample and a
@@ -27,6 +30,7 @@ from tfbus.errors import UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.links._entries import OutgoingBatch, RemovedFrame
 from tfbus.links._outbox import Outbox
+from tfbus.links._passed import PassedSamples
 from tfbus.links._peers import Peer, next_age
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.registration import Registration
@@ -83,14 +87,23 @@ class Relay:
         self._settled: dict[str, tuple[int, bytes]] = {}
         self._removed: dict[str, tuple[int, bytes]] = {}
         self._removing: tuple[str, Provenance] | None = None
+        self._passed: PassedSamples | None = None
 
-    def attach(self, outbox: Outbox) -> None:
+    def attach(self, outbox: Outbox, foreign: bool = False) -> None:
         """Give a link all that is latched, and all that is published from now on.
+
+        Parameters
+        ----------
+        outbox : Outbox
+        foreign : bool
+            Whether it is a link to a world whose samples have no origin.
 
         Raises
         ------
         BusClosedError
         """
+        if foreign and self._passed is None:
+            self._passed = PassedSamples()
         if not self._outboxes:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
         self._bus.subscribe(lambda batch: self._send_latched(batch, outbox)).close()
@@ -105,6 +118,17 @@ class Relay:
                 memory.clear()
             for by_frame in (self._latest, self._settled, self._removed):
                 by_frame.clear()
+            self._passed = None
+
+    def clock_jumped_back(self) -> None:
+        """Take samples with the stamps of earlier ones for news."""
+        if self._passed is not None:
+            self._passed.forget_moving()
+
+    def newest_number(self, frame: str) -> tuple[bytes, int] | None:
+        """Origin and number of the newest batch with a frame; None if the frame is not there."""
+        latest = self._latest.get(frame)
+        return None if latest is None else (latest.origin, latest.sequence)
 
     def is_plausible(self, number: int) -> bool:
         """Whether a number may be one that a bus has given by now."""
@@ -141,7 +165,7 @@ class Relay:
     def publish_foreign(
         self, outbox: Outbox, peer: Peer, samples: Iterable[ReceivedTransform], max_frames: int
     ) -> tuple[int, int]:
-        """Publish a batch of a world that has neither origins nor numbers; all its samples are news.
+        """Publish a batch of a world that has neither origins nor numbers; what went over this bus before is no news.
 
         The batch gets this bus as its origin and the next number of this bus. It goes out by all links but the one that
         brought it, whose outbox is `outbox`. Parameters and results are those of `publish`.
@@ -231,9 +255,13 @@ class Relay:
         self._number = max(self._number, provenance.sequence)
         rank = provenance.rank
         newest = self._newest.setdefault(provenance.origin, {})
+        passed, foreign = self._passed, provenance.origin == self.origin
         for sample in samples:
             fields = sample._fields
             child = fields[1]
+            # A static one with an origin has to be ranked, so that all buses agree in the end.
+            if passed is not None and (foreign or not fields[5]) and sample in passed:
+                continue
             if (child in self._settled or child in self._removed or fields[5]) and self._is_outranked(sample, rank):
                 continue
             known = newest.get(child)
@@ -278,6 +306,8 @@ class Relay:
             samples = tuple(group)
             for sample in samples:
                 fields = sample._fields
+                if self._passed is not None:
+                    self._passed.add(sample)
                 self._latest[fields[1]] = provenance
                 if fields[5]:
                     self._settled[fields[1]] = provenance.rank
@@ -294,6 +324,8 @@ class Relay:
                 provenance = Provenance(self.origin, self._next_number(), None, None)
             samples = tuple(group)
             for sample in samples:
+                if self._passed is not None:
+                    self._passed.add(sample)
                 self._latest[sample.child] = provenance
                 self._settled[sample.child] = provenance.rank
             outgoing = OutgoingBatch(provenance.origin, provenance.sequence, samples)
@@ -313,6 +345,9 @@ class Relay:
     def _forget_frame(self, frame: str, provenance: Provenance) -> None:
         lost_at, told_by = None, ""
         self._settled.pop(frame, None)
+        if self._passed is not None:
+            # What is lost may come again just as it was.
+            (self._passed.forget if provenance.lost else self._passed.retire)(frame)
         if provenance.lost and provenance.peer is not None:
             lost_at, told_by = next_age(), provenance.peer.id
         else:

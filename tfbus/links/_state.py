@@ -68,6 +68,10 @@ class LinkState:
         entry = self._entries.get(frame)
         return None if entry is None else entry[1]
 
+    def moving(self) -> list[str]:
+        """The moving frames that the link brings."""
+        return [frame for frame, (_, entry) in self._entries.items() if isinstance(entry, MovingFrame)]
+
     def brings(self, frame: str) -> bool:
         """Whether the link brings a frame."""
         return frame in self._digests

@@ -11,14 +11,16 @@ import anyio.abc
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
-from tfbus._log import OnceLogger
 from tfbus.bus.bus import Bus
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import check_capacity
 from tfbus.errors import BusClosedError
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._endpoint import Endpoint
+from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._receive_queue import Received, ReceiveQueue
 from tfbus.registration import Registration
+from tfbus.stamps import as_duration
 from tfbus.statistics import LinkStatistics
 
 _FULL_TURN = 5_000
@@ -48,6 +50,8 @@ class Link:
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
         How many live messages may wait for the event loop; beyond that the oldest are dropped and counted.
+    history : float, optional
+        Ask each new peer once for the last so many seconds of its moving frames, if the carrier can.
 
     Attributes
     ----------
@@ -77,11 +81,14 @@ class Link:
         drop_lost: bool = False,
         max_frames: int = 10_000,
         capacity: int = 10_000,
+        history: float | None = None,
     ) -> None:
         if isinstance(frames, str):
             raise TypeError(f"frames must be several names, not {frames!r}")
         check_capacity(capacity)
         check_capacity(max_frames, "max_frames")
+        if history is not None and not 0 < as_duration(history, "history") <= LONGEST_HISTORY:
+            raise ValueError(f"history must be a time that passes, {LONGEST_HISTORY:g} s at most, got {history}")
         self.bus = bus
         self.id = carrier.id
         self._name = name
@@ -96,6 +103,7 @@ class Link:
             drop_lost=drop_lost,
             max_frames=max_frames,
             wake=self._stir,
+            history=history,
         )
         self._stirred: anyio.Event | None = None
         self._send_report = SendReport(self._warn_not_sent)
@@ -216,3 +224,4 @@ class Link:
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
             self._receive_queue.discard_moving()
+            self._endpoint.clock_jumped_back()

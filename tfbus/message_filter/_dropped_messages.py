@@ -6,7 +6,7 @@ from collections.abc import Callable
 from inspect import iscoroutinefunction
 from typing import Generic, Literal, TypeVar
 
-from tfbus._log import OnceLogger
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.errors import BusClosedError, ClockResetError, LookupTimeoutError, TransformError, UnknownFrameError
 
 MessageT = TypeVar("MessageT")

@@ -3,11 +3,9 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from tfbus.recording.formats._columns import ColumnDecoder, Columns
+from tfbus.recording.formats._packed import Packed, Stored, pack
 from tfbus.recording.formats._storage import StoredMessage
 from tfbus.recording.message import RecordedMessage
-
-SIZE = 8_192
-"""The number of messages in a block."""
 
 
 class Block:
@@ -15,8 +13,7 @@ class Block:
 
     Parameters
     ----------
-    stored : sequence of StoredMessage
-        Also an attribute.
+    content : Packed or list of StoredMessage
     columns : ColumnDecoder
     decode : callable
         Decodes one message.
@@ -24,20 +21,26 @@ class Block:
 
     def __init__(
         self,
-        stored: Sequence[StoredMessage],
+        content: Stored,
         columns: ColumnDecoder,
         decode: Callable[[StoredMessage], RecordedMessage],
     ) -> None:
-        self.stored = stored
+        self._content = content
         self._columns = columns
         self._decode = decode
 
     def __len__(self) -> int:
-        return len(self.stored)
+        return self._content.count if isinstance(self._content, Packed) else len(self._content)
+
+    @property
+    def stored(self) -> list[StoredMessage]:
+        """The messages as they are in the file."""
+        return self._content.stored() if isinstance(self._content, Packed) else self._content
 
     def columns(self) -> list[Columns] | None:
-        """All samples, by frame; None if the messages have to be decoded one by one."""
-        return self._columns.decode(self.stored)
+        """All samples, by frame and authority; None if the messages have to be decoded one by one."""
+        packed = self._content if isinstance(self._content, Packed) else pack(self._content)
+        return None if packed is None else self._columns.decode(packed)
 
     def messages(self) -> Iterator[RecordedMessage]:
         """All messages, one by one."""

@@ -3,13 +3,14 @@
 import logging
 import os
 from collections import Counter
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
+from operator import itemgetter
 
 import numpy as np
 
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
-from tfbus.geometry.stamped import Batch
+from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._selection import Topics
 from tfbus.recording.formats._columns import Columns
@@ -149,14 +150,32 @@ def fill(
 
 
 def _append(forest: Forest, columns: list[Columns], max_translation: float) -> bool:
-    """Append the samples of a block, if none of them has to be judged; returns whether that was so."""
+    """Insert the samples of a block, if no edge changes by them; returns whether that was so."""
+    together: dict[str, list[Columns]] = {}
     for each in columns:
         near = np.square(each.rows[:, :3]).sum(axis=1).max() <= max_translation**2
-        if each.static or not near or not forest.can_append(each.parent, each.child, each.authority, each.stamps):
+        history = forest.frames.get(each.child)
+        if not near or history is None or (history.parent, history.static) != (each.parent, each.static):
             return False
-    for each in columns:
-        forest.append(each.child, each.stamps, each.rows)
+        together.setdefault(each.child, []).append(each)
+    for child, parts in together.items():
+        first = parts[0]
+        if len(parts) == 1 and forest.can_append(first.parent, child, first.authority, first.stamps):
+            forest.append(child, first.stamps, first.rows)
+        else:
+            # Such as a stamp that comes again, or several authorities.
+            samples = [
+                (place, sample) for part in parts for place, sample in zip(part.order, _samples(part), strict=True)
+            ]
+            forest.commit(tuple(sample for _, sample in sorted(samples, key=itemgetter(0))))
     return True
+
+
+def _samples(columns: Columns) -> Iterator[TransformStamped]:
+    for stamp, row in zip(columns.stamps.tolist(), columns.rows.tolist(), strict=True):
+        sample = TransformStamped.__new__(TransformStamped)
+        sample._fields = columns.parent, columns.child, stamp, tuple(row), columns.authority, columns.static
+        yield sample
 
 
 def _commit(

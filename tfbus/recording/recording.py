@@ -3,17 +3,17 @@
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
 from tfbus.errors import MissingRecordingError, RecordingError, pip_install
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.recording._blocks import SIZE, Block, DecodedBlock
+from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._selection import Selection, Topics, looks_like_transforms
 from tfbus.recording.formats._columns import ColumnDecoder
 from tfbus.recording.formats._decoder import ChannelDecoder
+from tfbus.recording.formats._packed import blocks_of
 from tfbus.recording.formats._storage import Channel, Storage, StoredMessage
 from tfbus.recording.message import RecordedMessage
 from tfbus.tf_message import MalformedMessageError
@@ -141,9 +141,8 @@ class Recording:
         columns = ColumnDecoder(self._decoders)
         if since is not None:
             yield DecodedBlock(list(self._latched(storage, since)))
-        messages = storage.messages(self._is_wanted, since, until)
-        while block := list(islice(messages, SIZE)):
-            yield Block(block, columns, self._message)
+        for content in blocks_of(storage, self._is_wanted, since, until):
+            yield Block(content, columns, self._message)
 
     def _latched(self, storage: Storage, since: int) -> Iterator[RecordedMessage]:
         """The newest static transform of each frame from before a log time."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class Spread:
     """The mean of some durations, the one that 99 % of them do not exceed, and the greatest; in s.
 
-    Of delays, the one that 99 % do not exceed is known to 1 %.
+    The one that 99 % do not exceed is known to 1 %.
     """
 
     mean: float

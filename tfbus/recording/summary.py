@@ -3,26 +3,21 @@
 The recording is read once and not kept: only one stamp, 8 bytes, of each moving transform stays in memory.
 """
 
-import math
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from tfbus.geometry.stamped import Batch
 from tfbus.recording._blocks import Block, DecodedBlock
-from tfbus.recording._delays import Delays
+from tfbus.recording._durations import Durations
+from tfbus.recording._periods import Periods
 from tfbus.recording.formats._columns import Columns
 from tfbus.recording.load import Problems, sound_samples
 from tfbus.recording.message import RecordedMessage
 from tfbus.recording.recording import RecordedTopic, Recording
 from tfbus.recording.spread import Spread
-from tfbus.stamps import SECOND, to_seconds
-
-_BLOCK = 1_000_000
+from tfbus.stamps import SECOND
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +181,6 @@ def summarise(
         summaries,
         tuple(sorted(parents - frames.keys())),
         dict(counts.problems.most_common()),
-        # Last, because it takes the samples of the frames away.
         tuple(_sender(frames, authority) for authority in sorted(counts.authorities)),
         recording.topics,
         recording.remarks,
@@ -243,7 +237,7 @@ class _Sent:
         self.static = 0
         self.moving = 0
         self.stamps = array("q")
-        self.delays = Delays()
+        self.delays = Durations()
 
 
 class _Frame:
@@ -267,7 +261,7 @@ class _Frame:
         else:
             sent.moving += 1
             sent.stamps.append(stamp)
-            sent.delays.add(np.array([received - stamp]))
+            sent.delays.add_one(received - stamp)
         if static or self.newest is None or stamp >= self.newest:
             self.parent, self.authority, self.static = parent, authority, static
             self.newest = None if static else stamp
@@ -287,22 +281,19 @@ class _Frame:
 
     def summary(self) -> FrameSummary:
         """The summary of all samples so far."""
-        stamps = np.unique(np.concatenate([np.array(sent.stamps, np.int64) for sent in self.sent.values()]))
-        several = len(stamps) > 1
-        oldest, newest = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (None, None)
-        span = newest - oldest if several and newest is not None and oldest is not None else 0
+        periods = Periods([sent.stamps for sent in self.sent.values()])
         return FrameSummary(
             self.frame,
             tuple(self.parents),
             sum(sent.static for sent in self.sent.values()),
             sum(sent.moving for sent in self.sent.values()),
-            oldest,
-            newest,
-            (len(stamps) - 1) * SECOND / span if several else None,
-            int(np.diff(stamps).max()) / SECOND if several else None,
+            periods.oldest,
+            periods.newest,
+            periods.rate,
+            periods.longest,
             tuple(authority for authority in self.sent if authority),
-            _periods(stamps),
-            Delays.joined(sent.delays for sent in self.sent.values()).spread(),
+            periods.spread(),
+            Durations.joined(sent.delays for sent in self.sent.values()).spread(),
         )
 
     def _sent_by(self, authority: str) -> _Sent:
@@ -313,37 +304,13 @@ class _Frame:
 
 
 def _sender(frames: Mapping[str, _Frame], authority: str) -> SenderSummary:
-    """The summary of an authority; its samples are taken away, so that they are not in memory twice."""
+    """The summary of an authority."""
     own = {child: frame.sent[authority] for child, frame in frames.items() if authority in frame.sent}
-    stamps = np.empty(sum(len(sent.stamps) for sent in own.values()), np.int64)
-    at = 0
-    for sent in own.values():
-        end = at + len(sent.stamps)
-        stamps[at:end] = sent.stamps
-        at = end
-        sent.stamps = array("q")
-    stamps.sort()
     return SenderSummary(
         authority,
         tuple(sorted(own)),
         sum(sent.static for sent in own.values()),
         sum(sent.moving for sent in own.values()),
-        _periods(stamps),
-        Delays.joined(sent.delays for sent in own.values()).spread(),
+        Periods([sent.stamps for sent in own.values()]).spread(),
+        Durations.joined(sent.delays for sent in own.values()).spread(),
     )
-
-
-def _periods(stamps: npt.NDArray[np.int64]) -> Spread | None:
-    """The spread of the times between different stamps, which ascend."""
-    # In blocks, because the differences of millions of stamps would need as much memory once more.
-    periods = array("d")
-    for first in range(0, len(stamps), _BLOCK):
-        differences = np.diff(stamps[first : first + _BLOCK + 1])
-        periods.frombytes((differences[differences > 0] / SECOND).tobytes())
-    if not periods:
-        return None
-    values = np.array(periods)
-    rank = math.ceil(0.99 * len(values)) - 1
-    values.partition(rank)
-    mean = to_seconds(int(stamps[-1] - stamps[0])) / len(values)
-    return Spread(mean, float(values[rank]), float(values[rank:].max()))

@@ -2,11 +2,9 @@
 
 While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies the
 samples on them: as blocks of memory, or only those next to a stamp where there are many more samples than stamps. All
-other work in numpy comes after that, on the copies.
+other work in numpy comes after that, on the copies. The compiled kernel copies nothing: its blocks can be held.
 """
 
-from array import array
-from bisect import bisect_left, bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +13,9 @@ import numpy.typing as npt
 from tfbus.errors import DisconnectedError
 from tfbus.geometry.rows import Row
 from tfbus.stamps import Stamps
-from tfbus.tree._python_kernel import Step
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import RECORD_SIZE, FrameHistory, Samples
-from tfbus.tree.path import Path
+from tfbus.tree.history import FrameHistory, Samples
+from tfbus.tree.path import Path, Step
 
 Places = slice | npt.NDArray[np.intp]
 """Indices into the stamps that were asked for."""
@@ -53,13 +50,13 @@ class CopiedPath(NamedTuple):
     def covers_all(self, stamps: Stamps) -> bool:
         """Whether each edge covers every one of the stamps."""
         low, high = stamps.min(), stamps.max()
-        return all(edge.stamps and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
+        return all(len(edge.stamps) and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
 
     def covered(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
         """A mask of the stamps that all edges cover, shape (n,)."""
         covered = np.ones(len(stamps), np.bool_)
         for samples in self.moving:
-            if not samples.stamps:
+            if not len(samples.stamps):
                 covered[:] = False
             else:
                 covered &= (samples.stamps[0] <= stamps) & (stamps <= samples.stamps[-1])
@@ -127,11 +124,11 @@ def _changes(forest: Forest, target: str, source: str, path: Path | None, low: i
     if path is not None and path.permanent and path.root not in forest.frames:
         return []
     edges = forest.edges_above(target, source)
-    if all(edge.parents is None for edge in edges):
+    if not any(edge.mixed for edge in edges):
         return []
     # Of two ways round a loop of parents, the one whose samples cover the stamp counts.
     changes = {stamp for edge in edges for stamp in edge.beginnings()}
-    changes.update(edge.stamps[-1] + 1 for edge in edges if edge.stamps)
+    changes.update(edge.newest + 1 for edge in edges if edge.newest is not None)
     return sorted(stamp for stamp in changes if low < stamp <= high)
 
 
@@ -145,22 +142,5 @@ def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
 def _copy(step: Step, query: Query, low: int, high: int) -> Samples | Row:
     if not isinstance(step, FrameHistory):
         return step
-    between = bisect_right(step.stamps, high) - bisect_left(step.stamps, low)
-    return (
-        step.samples_between(low, high) if between <= _BLOCK * len(query.stamps) else samples_around(step, query.stamps)
-    )
-
-
-def samples_around(edge: FrameHistory, stamps: Stamps) -> Samples:
-    """Copies of the samples next to each of some stamps (ns), on both sides; one that has the stamp counts as before.
-
-    The edge must have samples.
-    """
-    start = edge.start
-    # The views on the history end with each line, because a history that is being viewed cannot grow.
-    after = np.frombuffer(edge.stamps, np.int64)[start:].searchsorted(stamps, "right")
-    places = start + np.unique(np.concatenate((after - 1, after)).clip(0, len(edge.stamps) - start - 1))
-    own = np.frombuffer(edge.stamps, np.int64)[places]
-    records = np.frombuffer(edge.records, np.uint8).reshape(-1, RECORD_SIZE)[places]
-    parents = None if edge.parents is None else [edge.origins[place][0] for place in places.tolist()]
-    return Samples(array("q", own.tobytes()), bytearray(records), parents)
+    many = step.find(high) - step.find(low) > _BLOCK * len(query.stamps)
+    return step.samples_between(low, high, query.stamps if many else None)

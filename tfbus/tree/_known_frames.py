@@ -1,6 +1,6 @@
 """The names of all frames that a sample in some window names."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 
 
 class KnownFrames:
@@ -15,6 +15,10 @@ class KnownFrames:
 
     def __contains__(self, frame: object) -> bool:
         return frame in self._parents_of or frame in self._mentions
+
+    def __iter__(self) -> Iterator[str]:
+        """The names in alphabetical order, sorted only now: most errors that hold them never look at them."""
+        return iter(self.sorted())
 
     @property
     def parents(self) -> Collection[str]:

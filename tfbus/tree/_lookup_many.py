@@ -4,7 +4,7 @@ The samples are copied under the lock, and numpy works on the copies in chunks t
 no answer, the lookup at one stamp is asked, so that both raise the same error.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from tfbus.geometry.rows import IDENTITY, Columns, Row, compose, invert
 from tfbus.geometry.transform_array import TransformArray, from_columns, from_rows, move
 from tfbus.stamps import LATEST, Stamps
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Places, Query, copy_paths
+from tfbus.tree._plain_columns import plain_columns
 from tfbus.tree._segments import Floats, Segments
 from tfbus.tree.extrapolation import read_stamps_at_many
 from tfbus.tree.forest import Forest
@@ -43,6 +44,14 @@ def lookup_many(
 ) -> TransformArray:
     """The answers of `TransformTree.lookup_many`; `source_stamps` and `fixed` are given both or not at all."""
     check_out_of_range(out_of_range)
+    queries = [Query(target, source, stamps)]
+    if source_stamps is not None and fixed is not None:
+        queries = [Query(target, fixed, stamps), Query(fixed, source, source_stamps)]
+    for query in queries:
+        forest.search(query.target, query.source)
+    plain = plain_columns(forest, queries, out_of_range == "nan") if policy is None else None
+    if plain is not None:
+        return from_columns(plain[0] if len(plain) == 1 else np.stack(compose((*plain[0],), (*plain[1],))))
     if len(stamps) <= ONE_BY_ONE and policy is None:
         try:
             with forest.lock:
@@ -56,9 +65,6 @@ def lookup_many(
         source_stamp = None if source_stamps is None else int(source_stamps[place])
         answer(forest, target, source, int(stamps[place]), source_stamp, fixed, None, policy)
 
-    queries = [Query(target, source, stamps)]
-    if source_stamps is not None and fixed is not None:
-        queries = [Query(target, fixed, stamps), Query(fixed, source, source_stamps)]
     return _composed(_answers(forest, queries, lookup_one, policy, out_of_range))
 
 
@@ -72,9 +78,34 @@ def deskew(forest: Forest, cloud: PointCloud, target: str, fixed: str, out_of_ra
     check_out_of_range(out_of_range)
     target_from_fixed = answer(forest, target, fixed, at, None, None, None, None)
     query = Query(fixed, cloud.frame, cloud.stamps)
-    (answers,) = _answers(forest, [query], partial(_lookup_at, forest, query), None, out_of_range)
-    points = answers.apply(cloud.points, target_from_fixed.transform._row)
+    plain = plain_columns(forest, [query], out_of_range == "nan")
+    if plain is None:
+        (answers,) = _answers(forest, [query], partial(_lookup_at, forest, query), None, out_of_range)
+        chunks = answers.chunks()
+    else:
+        chunks = _chunks_of(plain[0])
+    points = _applied(chunks, cloud.points, target_from_fixed.transform._row)
     return PointCloud(target, target_from_fixed.stamp, points, fields=cloud.fields)
+
+
+def _chunks_of(columns: Floats) -> Iterator[tuple[Places, Columns]]:
+    for start in range(0, columns.shape[1], _CHUNK):
+        part = slice(start, start + _CHUNK)
+        yield part, (*columns[:, part],)
+
+
+def _applied(chunks: Iterable[tuple[Places, Columns]], points: npt.NDArray[Any], then: Row) -> npt.NDArray[Any]:
+    """Points of shape (n, 3), each moved by the answer at its place and then by the transform `then`."""
+    moved = np.full(points.shape, np.nan, points.dtype)
+    # A sensor may send infinity where it saw nothing.
+    with np.errstate(invalid="ignore"):
+        for places, chunk in chunks:
+            x, y, z = move(chunk, *points[places].T.astype(np.float64))
+            if then != IDENTITY:
+                x, y, z = move(then, x, y, z)
+            for axis, values in enumerate((x, y, z)):
+                moved[places, axis] = values
+    return moved
 
 
 def check_out_of_range(value: OutOfRange) -> None:
@@ -87,9 +118,9 @@ def _rows_one_by_one(
     forest: Forest, target: str, source: str, stamps: Stamps, source_stamps: Stamps | None, fixed: str | None
 ) -> list[Row]:
     """The rows at a few stamps; errors as for the lookup at one stamp. The caller holds the lock."""
-    path = forest.paths.get((target, source))
+    path = forest.paths.find(target, source)
     if path is not None and source_stamps is None:
-        return path.rows(stamps.tolist())
+        return [path.row_at(at) for at in stamps.tolist()]
     for name in (target, source) if fixed is None else (target, source, fixed):
         forest.check_known(name)
     if source_stamps is None:
@@ -172,23 +203,10 @@ class Answers:
     def columns(self) -> Floats:
         """All answers, shape (7, n); NaN where there is none."""
         columns = np.full((7, self._count), np.nan)
-        for places, chunk in self._chunks():
+        for places, chunk in self.chunks():
             for column, values in zip(columns, chunk, strict=True):
                 column[places] = values
         return columns
-
-    def apply(self, points: npt.NDArray[Any], then: Row) -> npt.NDArray[Any]:
-        """Points of shape (n, 3), each moved by the answer at its place and then by the transform `then`."""
-        moved = np.full(points.shape, np.nan, points.dtype)
-        # A sensor may send infinity where it saw nothing.
-        with np.errstate(invalid="ignore"):
-            for places, chunk in self._chunks():
-                x, y, z = move(chunk, *points[places].T.astype(np.float64))
-                if then != IDENTITY:
-                    x, y, z = move(then, x, y, z)
-                for axis, values in enumerate((x, y, z)):
-                    moved[places, axis] = values
-        return moved
 
     def _add_part(self, places: Places, stamps: Stamps, path: CopiedPath, policy: Policy | None) -> None:
         """Note the answers along one path, and which of its stamps have none."""
@@ -211,7 +229,8 @@ class Answers:
         first = int(np.arange(self._count)[places][answered.argmin()])
         self.first_missing = first if self.first_missing is None else min(first, self.first_missing)
 
-    def _chunks(self) -> Iterator[tuple[Places, Columns]]:
+    def chunks(self) -> Iterator[tuple[Places, Columns]]:
+        """Places and the answers there, chunk by chunk."""
         for part in self._parts:
             yield from part.chunks()
 

@@ -1,6 +1,5 @@
 """The samples of a frame as plain columns: to write a tree to a pickle, and to read single samples."""
 
-from bisect import bisect_left
 from collections.abc import Iterator
 from itertools import groupby
 from typing import NamedTuple
@@ -39,7 +38,7 @@ def save_frame(history: FrameHistory, oldest: int = STAMP_MIN) -> SavedFrame:
     runs = [(parent, authority, len(list(run))) for (parent, authority), run in groupby(origins[first:])]
     static = None
     if history.static and history.static_stamp is not None:
-        static = history.static_stamp, history.row
+        static = history.static_stamp, history.static_row
     return SavedFrame(history.child, history.parent, history.authority, static, stamps[first:], rows[first:], runs)
 
 
@@ -70,7 +69,7 @@ def samples_of(history: FrameHistory, low: int, high: int) -> Iterator[Transform
     if history.static:
         stamp = history.static_stamp or 0
         yield TransformStamped(
-            history.parent, history.child, stamp, from_row(history.row), history.authority, static=True
+            history.parent, history.child, stamp, from_row(history.static_row), history.authority, static=True
         )
         return
     stamps, rows, origins = _columns(history, low, high)
@@ -83,10 +82,10 @@ def _columns(
 ) -> tuple[Stamps, npt.NDArray[np.float64], list[tuple[str, str]]]:
     """Stamps, rows, parents and authorities of the samples from `low` to `high`, and of the next one on either side."""
     samples = history.samples_between(low, high)
-    stamps = np.array(samples.stamps, np.int64)
-    rows = np.frombuffer(samples.records, np.float64).reshape(-1, 8)[:, 1:]
-    first = bisect_left(history.stamps, samples.stamps[0]) if len(stamps) else 0
-    return stamps, np.ascontiguousarray(rows), history.origins[first : first + len(stamps)]
+    count = len(samples)
+    parents = samples.parents or [history.parent] * count
+    authorities = samples.authorities or [history.authority] * count
+    return samples.stamps, np.ascontiguousarray(samples.rows), list(zip(parents, authorities, strict=True))
 
 
 def _row(row: npt.NDArray[np.float64]) -> Row:

@@ -27,8 +27,7 @@ class Segments:
     """
 
     def __init__(self, samples: Samples, stamps: Stamps) -> None:
-        own_stamps = np.frombuffer(samples.stamps, np.int64)
-        rows = np.frombuffer(samples.records, np.float64).reshape(-1, 8)[:, 1:]
+        own_stamps, rows = samples.stamps, samples.rows
         self._segments: npt.NDArray[np.intp] | None = own_stamps.searchsorted(stamps, "right") - 1
         self._elapsed = _nanoseconds(own_stamps[self._segments], stamps)
         first = np.arange(len(own_stamps))

@@ -6,17 +6,15 @@ sample of a window, or of a new parent, it is the one from after.
 """
 
 import math
-from bisect import bisect_left
 from typing import NamedTuple
 
 from tfbus.errors import PastExtrapolationError
 from tfbus.geometry.rows import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
 from tfbus.stamps import LATEST, SECOND
-from tfbus.tree._python_kernel import Step, climb
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import RECORD, RECORD_SIZE, FrameHistory
+from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, find
-from tfbus.tree.path import Path
+from tfbus.tree.path import Path, Step
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 
@@ -88,27 +86,20 @@ def _climb(steps: tuple[Step, ...], at: int) -> Motion:
 
 
 def _edge_motion(edge: FrameHistory, at: int) -> Motion:
-    row = climb((edge,), at)
-    i = bisect_left(edge.stamps, at)
-    if edge.stamps[i] == at and not _is_segment(edge, i):
+    row = edge.row_at(at)
+    i = edge.find(at)
+    if edge.stamp(i) == at and not edge.is_segment(i):
         i += 1
-        if i == len(edge.stamps):
+        if i == edge.count:
             # A lone sample has a pose but no velocity.
             raise edge.extrapolation_error(at + 1)
-    if not _is_segment(edge, i):
+    if not edge.is_segment(i):
         return Motion(row, ZERO, ZERO)
-    stamp, ax, ay, az, *before = RECORD.unpack_from(edge.records, (i - 1) * RECORD_SIZE)
-    until, bx, by, bz, *after = RECORD.unpack_from(edge.records, i * RECORD_SIZE)
+    stamp, before = edge.sample(i - 1)
+    until, after = edge.sample(i)
     rate = SECOND / (until - stamp)
-    linear = (bx - ax) * rate, (by - ay) * rate, (bz - az) * rate
-    return Motion(row, linear, _turn_rate(tuple(before), tuple(after), rate))
-
-
-def _is_segment(edge: FrameHistory, i: int) -> bool:
-    """Whether samples i - 1 and i are both in the window and have the same parent."""
-    if not edge.start < i < len(edge.stamps):
-        return False
-    return edge.parents is None or edge.origins[i - 1][0] == edge.origins[i][0]
+    x, y, z = _difference(after[:3], before[:3])
+    return Motion(row, (x * rate, y * rate, z * rate), _turn_rate(before[3:], after[3:], rate))
 
 
 def _turn_rate(before: Quaternion, after: Quaternion, rate: float) -> Vector:

@@ -166,32 +166,40 @@ def _aligned(rows: list[list[str]]) -> list[str]:
 
 
 class _Finding(NamedTuple):
-    """The answer of a lookup or its error, and the edges to explain, each as child and parent."""
+    """The answer of a lookup or its error, and the path, or how far the two ends come."""
 
     stamp: int | None
     raised: TransformLookupError | None
     instant: int | None
-    chain: tuple[str, ...] = ()
+    path: Path | None = None
     half_chains: tuple[tuple[str, ...], ...] = ()
-    links: tuple[tuple[str, str], ...] = ()
+
+    def links(self) -> list[tuple[str, str]]:
+        """The edges to explain, each as child and parent."""
+        if self.path is None:
+            return [link for half in self.half_chains for link in pairwise(half)]
+        chain, top = self.path.frames, self.path.frames.index(self.path.root)
+        return [*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:]))]
 
 
 def explain(
     forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, policy: Policy | None, now: int | None
 ) -> Explanation:
     """The explanation of a lookup; the parameters are those of `TransformTree.explain`. Takes the lock."""
+    forest.search(target, source)
     with forest.lock:
         found = _find(forest, target, source, at, bounds, policy)
         if isinstance(found.raised, UnknownFrameError):
             return Explanation(target, source, at, None, now, errors=_unknown(forest, target, source))
-        if now is None:
-            reached = (edge.stamps[-1] for edge in forest.frames.values() if edge.stamps)
-            now = max(reached, default=None)
+    if now is None:
+        reached = forest.read_all(lambda history: history.newest).values()
+        now = max((stamp for stamp in reached if stamp is not None), default=None)
     raised = found.raised
+    links = found.links()
     edges: list[ExplainedEdge] = []
-    for first in range(0, len(found.links), AT_A_TIME):
+    for first in range(0, len(links), AT_A_TIME):
         with forest.lock:
-            for child, parent in found.links[first : first + AT_A_TIME]:
+            for child, parent in links[first : first + AT_A_TIME]:
                 edge = forest.frames.get(child)
                 if edge is None:
                     # Another thread has removed it meanwhile.
@@ -202,7 +210,8 @@ def explain(
     errors: tuple[TransformLookupError, ...] = tuple(edge.error for edge in edges if edge.error is not None)
     if raised is not None and raised not in errors:
         errors = (raised, *errors)
-    return Explanation(target, source, at, found.stamp, now, found.chain, found.half_chains, tuple(edges), errors)
+    chain = () if found.path is None else found.path.frames
+    return Explanation(target, source, at, found.stamp, now, chain, found.half_chains, tuple(edges), errors)
 
 
 def _find(forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, policy: Policy | None) -> _Finding:
@@ -215,19 +224,16 @@ def _find(forest: Forest, target: str, source: str, at: At, bounds: Bounds | Non
         return _Finding(None, error, None)
     except DisconnectedError as error:
         halves = tuple(_up_to_root(forest, frame, error.stamp) for frame in (target, source))
-        links = tuple(link for half in halves for link in pairwise(half))
-        return _Finding(None, error, error.stamp, half_chains=halves, links=links)
+        return _Finding(None, error, error.stamp, half_chains=halves)
     except TransformLookupError as error:
         raised = error
     path = forest.find_path(target, source, at)
     if stamp is not None and not path.permanent:
         path = forest.find_path(target, source, stamp)
-    chain, top = path.frames, path.frames.index(path.root)
-    links = (*pairwise(chain[: top + 1]), *((child, parent) for parent, child in pairwise(chain[top:])))
     instant = stamp
     if raised is not None:
-        instant = _reached(path) if isinstance(at, Latest) else at
-    return _Finding(stamp, raised, instant, chain, links=links)
+        instant = path.latest() if isinstance(at, Latest) else at
+    return _Finding(stamp, raised, instant, path)
 
 
 def _unknown(forest: Forest, *frames: str) -> tuple[UnknownFrameError, ...]:
@@ -250,11 +256,6 @@ def _up_to_root(forest: Forest, frame: str, instant: int | None) -> tuple[str, .
             return (*walk, here)
         walk[here] = None
     return tuple(walk)
-
-
-def _reached(path: Path) -> int | None:
-    """The newest common stamp of all moving edges; None if one has no samples."""
-    return path.newest_common()[0] if all(edge.stamps for edge in path.moving) else None
 
 
 def _explained(
@@ -305,7 +306,7 @@ def _block(edge: FrameHistory, at: At, raised: ExtrapolationError, policy: Polic
         return None
     # `LATEST` waits until the lagging edges reach what the others still hold.
     if isinstance(raised.stamp, Latest):
-        return None if edge.stamps else edge.extrapolation_error(LATEST)
-    if edge.stamps and edge.stamps[-1] >= raised.stamp - raised.slack:
+        return None if len(edge) else edge.extrapolation_error(LATEST)
+    if edge.newest is not None and edge.newest >= raised.stamp - raised.slack:
         return None
     return edge.extrapolation_error(raised.stamp, raised.slack)

@@ -8,9 +8,8 @@ import numpy as np
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, GapError
 from tfbus.geometry.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, Stamps
-from tfbus.tree._python_kernel import Step, climb
 from tfbus.tree.history import FrameHistory, Samples
-from tfbus.tree.path import Path
+from tfbus.tree.path import Path, Step
 from tfbus.tree.policy import Policy
 
 
@@ -86,7 +85,7 @@ def _decisive(error: ExtrapolationError) -> int:
 
 def read_stamps_at_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps, Stamps, Stamps]:
     """The fields of `ReadStamp` at many stamps, as arrays of shape (n,); `extrapolated_by` is -1 without an answer."""
-    own = np.frombuffer(samples.stamps, np.int64)
+    own = samples.stamps
     if not len(own):
         return stamps, np.full(len(stamps), -1), np.zeros(len(stamps), np.int64)
     i = own.searchsorted(stamps)
@@ -148,6 +147,6 @@ class Extrapolation:
 def _climb(steps: tuple[Step, ...], stamps: Iterator[ReadStamp]) -> Row:
     row = IDENTITY
     for step in steps:
-        here = climb((step,), next(stamps).stamp) if isinstance(step, FrameHistory) else step
+        here = step.row_at(next(stamps).stamp) if isinstance(step, FrameHistory) else step
         row = compose(here, row)
     return row

@@ -15,18 +15,20 @@ from tfbus.errors import DisconnectedError, UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import STAMP_MIN, Latest, as_stamp
 from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
+from tfbus.tree._kernel import commit
 from tfbus.tree._known_frames import KnownFrames
+from tfbus.tree._path_cache import PathCache
 from tfbus.tree._saved_frames import SavedFrame, load_frame
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
-from tfbus.tree.path import Path, find_path, path_at
-
-_PATHS_KEPT = 10_000
+from tfbus.tree.path import Path, find_edges, find_path, path_at
 
 AT_A_TIME = 100
 """The number of frames that are read before the lock is released, for questions about all of them."""
 
 _ROUNDS = 3
+
+_CHANGING_PATHS_KEPT = 5_000
 
 T = TypeVar("T")
 
@@ -41,7 +43,7 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
+    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
     themselves. The caller of every other method holds it.
 
     Parameters
@@ -57,7 +59,7 @@ class Forest:
     frames : dict of str to FrameHistory
         By child.
     names : KnownFrames
-    paths : dict of (target, source) to Path
+    paths : PathCache
         The newest paths that have been found and are permanent. A change that could make one wrong empties it.
     changing_paths : dict of (target, source) to Path
         The same of newest paths that are not permanent.
@@ -74,33 +76,18 @@ class Forest:
         Number of samples that had each `Outcome`.
     looped : int
         Number of samples that have been in `looping`.
+    version : int
+        Another number after each change.
+    structure : int
+        Another number after each change that may make a path wrong.
     """
-
-    __slots__ = (
-        "_readers",
-        "_suspects",
-        "changed",
-        "changing_paths",
-        "expired",
-        "expired_frames",
-        "frames",
-        "inserted",
-        "lock",
-        "looped",
-        "looping",
-        "names",
-        "new_parents",
-        "paths",
-        "replaced",
-        "window",
-    )
 
     def __init__(self, window: int | None) -> None:
         self.lock = threading.Lock()
         self.window = window
         self.frames: dict[str, FrameHistory] = {}
         self.names = KnownFrames()
-        self.paths: dict[tuple[str, str], Path] = {}
+        self.paths = PathCache(self.lock)
         self.changing_paths: dict[tuple[str, str], Path] = {}
         self.changed: set[str] = set()
         self.new_parents: set[str] = set()
@@ -112,6 +99,8 @@ class Forest:
         self.replaced = 0
         self.expired = 0
         self.looped = 0
+        self.version = 0
+        self.structure = 0
 
     # Changes
 
@@ -124,6 +113,13 @@ class Forest:
             If a sample would close a loop of parents, judged after the whole batch.
         """
         with self.lock:
+            self.version += 1
+            if len(batch) == 1 and commit(self.frames, batch, 0):
+                # Nearly always so: a sample that only continues its history closes no loop and changes no path.
+                self.inserted += 1
+                if self._readers:
+                    self._tell_readers([batch[0].child])
+                return [Outcome.INSERTED]
             _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
@@ -141,17 +137,17 @@ class Forest:
         bool
             Whether every sample was the next one of its frame, so that nothing but stamps has changed.
         """
-        frames = self.frames
-        plain = True
+        count = len(batch)
         with self.lock:
-            for sample in batch:
-                parent, child, stamp, row, authority, static = sample._fields
-                history = frames.get(child)
-                if history is not None and not static and history.append(parent, stamp, row, authority):
-                    self.inserted += 1
-                else:
-                    plain = False
-                    self.insert_judged(sample)
+            self.version += 1
+            stored = commit(self.frames, batch, 0)
+            self.inserted += stored
+            plain = stored == count
+            while stored < count:
+                self.insert_judged(batch[stored])
+                end = commit(self.frames, batch, stored + 1)
+                self.inserted += end - stored - 1
+                stored = end
             if self._suspects:
                 self.find_past_loops()
             if self._readers:
@@ -177,6 +173,7 @@ class Forest:
     def append(self, child: str, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
         """Store the samples that `can_append` has approved; the rows have shape (n, 7)."""
         with self.lock:
+            self.version += 1
             self.frames[child].append_many(stamps, rows)
             self.inserted += len(stamps)
             if self._readers:
@@ -191,7 +188,7 @@ class Forest:
             if child in self.changed:
                 self._suspects.append(sample)
         if static:
-            if row != history.row:
+            if row != history.static_row:
                 # The paths hold the rows of static edges.
                 self.forget_paths()
             outcome = history.insert_static(parent, stamp, row, authority)
@@ -218,12 +215,14 @@ class Forest:
             If no sample names the frame.
         """
         with self.lock:
+            self.version += 1
             self.check_known(frame)
             self._remove(frame)
 
     def clear(self) -> None:
         """Drop all moving samples. Static ones and names stay."""
         with self.lock:
+            self.version += 1
             for history in self.frames.values():
                 history.clear()
                 history.changed = False
@@ -254,10 +253,30 @@ class Forest:
 
     def forget_paths(self) -> None:
         """Empty `paths` and `changing_paths`."""
+        self.structure += 1
         self.paths.clear()
         self.changing_paths.clear()
 
     # Questions
+
+    def search(self, target: str, source: str) -> None:
+        """Find the newest path and keep it, without the lock while it climbs, which may take long.
+
+        If a change may have made it wrong meanwhile, or there is none, nothing is kept: whoever asks then finds it, or
+        the error, under the lock.
+        """
+        if self.paths.holds(target, source) or (target, source) in self.changing_paths:
+            return
+        structure = self.structure
+        if target not in self.names or source not in self.names:
+            return
+        try:
+            edges = find_edges(self.frames, target, source, None)
+        except DisconnectedError:
+            return
+        with self.lock:
+            if self.structure == structure:
+                self._keep(target, source, Path(*edges))
 
     def find_path(self, target: str, source: str, at: int | Latest) -> Path:
         """The path between two frames that counts at a stamp (see `path_at`), or the one by the newest parents.
@@ -280,17 +299,22 @@ class Forest:
 
     def _newest_path(self, target: str, source: str) -> Path:
         """The path by the newest parents; it is kept until a change may make it wrong."""
-        path = self.paths.get((target, source)) or self.changing_paths.get((target, source))
+        path = self.paths.find(target, source) or self.changing_paths.get((target, source))
         if path is not None:
             return path
         self.check_known(target)
         self.check_known(source)
         path = find_path(self.frames, target, source, None)
-        if len(self.paths) + len(self.changing_paths) >= _PATHS_KEPT:
-            self.forget_paths()
-        kept = self.paths if path.permanent else self.changing_paths
-        kept[target, source] = path
+        self._keep(target, source, path)
         return path
+
+    def _keep(self, target: str, source: str, path: Path) -> None:
+        if path.permanent:
+            self.paths.keep(target, source, path)
+        else:
+            if len(self.changing_paths) >= _CHANGING_PATHS_KEPT:
+                self.changing_paths.clear()
+            self.changing_paths[target, source] = path
 
     def known_frames(self) -> tuple[str, ...]:
         """Every frame that a sample names, sorted. Takes the lock."""
@@ -302,7 +326,7 @@ class Forest:
         if frame not in self.names:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
-            raise UnknownFrameError(frame=frame, known=self.names.sorted())
+            raise UnknownFrameError(frame=frame, known=self.names)
 
     def edges_above(self, *names: str) -> list[FrameHistory]:
         """The edges of some frames and of all above them, by any parent that a sample in the window names."""

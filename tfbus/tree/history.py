@@ -1,30 +1,23 @@
-"""The samples of one frame in the order of their stamps.
+"""The samples of one frame: moving ones in its window, or a static one.
 
-Storage is by column: stamps for `bisect`; one 64-byte record a sample (stamp, translation, rotation), from which the
-lookup unpacks two neighbours in a single call; and the parent and authority of each sample. Samples older than the
-horizon do not count. They are cut off later, many at once, because each cut moves all remaining samples. Every sample
-carries its own parent, because a frame may be reparented.
+The kernel stores the moving samples, and appends those that only continue the others, as nearly all do. Everything else
+is decided here: late samples, changes of the parent, static samples. Every sample may name its own parent, because a
+frame may be reparented; parents and authorities are stored as runs of samples with the same one.
 """
 
-from array import array
-from bisect import bisect_left, bisect_right
-from collections import Counter
 from dataclasses import dataclass
 from enum import Enum
-from struct import Struct
-from typing import NamedTuple, final
+from functools import cached_property
+from typing import final
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, PastExtrapolationError
-from tfbus.geometry.rows import IDENTITY, Row
-from tfbus.stamps import SECOND, STAMP_MIN, Latest
-
-RECORD = Struct("q7d")
-RECORD_SIZE = RECORD.size
-FOREVER = 2**64
-_pack = RECORD.pack
+from tfbus.geometry.rows import IDENTITY, Row, interpolate
+from tfbus.stamps import SECOND, Latest, Stamps
+from tfbus.tree._kernel import Columns, History
+from tfbus.tree._runs import Runs
 
 
 class Outcome(Enum):
@@ -58,19 +51,53 @@ class Edge:
         return (self.samples - 1) * SECOND / (self.newest - self.oldest)
 
 
-class Samples(NamedTuple):
-    """Copies of moving samples of one frame, in stamp order; numpy reads them without another copy."""
+class Samples:
+    """Moving samples of one frame in stamp order, which no insertion changes.
 
-    stamps: "array[int]"
-    """ns."""
-    records: bytearray
-    """64 bytes each: the stamp, then the seven floats of the row."""
-    parents: list[str] | None
-    """The parent of each sample; None if all have the same."""
+    The arrays are made when they are read, because the lock that guards the history is not held for numpy.
+
+    Parameters
+    ----------
+    columns : Columns
+        The memory of the samples.
+    parents, authorities : Runs
+    """
+
+    def __init__(self, columns: Columns, parents: Runs, authorities: Runs) -> None:
+        self._columns = columns
+        self._parents = parents
+        self._authorities = authorities
+
+    def __len__(self) -> int:
+        return self._columns[-1]
+
+    @cached_property
+    def stamps(self) -> Stamps:
+        """ns, shape (n,)."""
+        memory, begin, _, _, _, count = self._columns
+        return np.frombuffer(memory, np.int64, count, begin) if count else np.empty(0, np.int64)
+
+    @cached_property
+    def rows(self) -> npt.NDArray[np.float64]:
+        """Shape (n, 7)."""
+        _, _, memory, begin, width, count = self._columns
+        if not count:
+            return np.empty((0, 7))
+        return np.frombuffer(memory, np.float64, width * count, begin).reshape(count, width)[:, -7:]
+
+    @cached_property
+    def parents(self) -> list[str] | None:
+        """The parent of each sample; None if all have the same."""
+        return self._parents.at_all(self.stamps) if self._parents else None
+
+    @cached_property
+    def authorities(self) -> list[str] | None:
+        """The authority of each sample; None if all have the same."""
+        return self._authorities.at_all(self.stamps) if self._authorities else None
 
 
 @final
-class FrameHistory:
+class FrameHistory(History):
     """The moving samples of one child frame inside its window, or its one static sample.
 
     Parameters
@@ -85,135 +112,69 @@ class FrameHistory:
     ----------
     parent, authority : str
         Of the newest sample; they stay after `clear`.
+    mixed : bool
+        Whether samples in the window name several parents.
     static : bool
-        Whether the one sample holds at every stamp; then `row` is its transform and `static_stamp` its stamp in ns.
-    parents : Counter or None
-        How many samples name each parent, while there are several; None while all agree.
-    horizon : int
-        Samples with a stamp before this one, in ns, have left the window.
+        Whether the one sample holds at every stamp; then `static_row` is its transform and `static_stamp` its stamp in
+        ns.
     changed : bool
         Set by an insertion that may change the path of a lookup: another parent or kind, or a longer past. The forest
         clears it.
     """
 
-    __slots__ = (
-        "_cut_after",
-        "_keep",
-        "_origin",
-        "authority",
-        "changed",
-        "child",
-        "horizon",
-        "origins",
-        "parent",
-        "parents",
-        "records",
-        "row",
-        "stamps",
-        "static",
-        "static_stamp",
-    )
+    __slots__ = ("_authorities", "_parents", "changed", "child", "static", "static_row", "static_stamp")
 
     def __init__(self, child: str, parent: str, static: bool, keep: int | None) -> None:
+        super().__init__(parent, keep)
         self.child = child
-        self._keep = FOREVER if keep is None else keep
-        self.parent = parent
-        self.authority = ""
         self.static = static
         self.static_stamp: int | None = None
-        self.row: Row = IDENTITY
-        self.parents: Counter[str] | None = None
+        self.static_row: Row = IDENTITY
         self.changed = False
-        self.stamps = array("q")
-        self.records = bytearray()
-        self.origins: list[tuple[str, str]] = []
-        self.horizon = -FOREVER
-        self._cut_after = STAMP_MIN
-        self._origin = (parent, "")
+        self._parents = Runs()
+        self._authorities = Runs()
 
     def __len__(self) -> int:
-        return 1 if self.static else len(self.stamps) - self.start
-
-    @property
-    def start(self) -> int:
-        """The index of the oldest sample in the window."""
-        return bisect_left(self.stamps, self.horizon)
-
-    @property
-    def oldest(self) -> int | None:
-        """The oldest stamp in the window; None when there is no moving sample."""
-        return self.stamps[self.start] if self.stamps else None
-
-    @property
-    def newest(self) -> int | None:
-        """The newest stamp; None when there is no moving sample."""
-        return self.stamps[-1] if self.stamps else None
+        return 1 if self.static else self.count
 
     @property
     def named_parents(self) -> tuple[str, ...]:
         """The parents that samples in the window name."""
-        return (self.parent,) if self.parents is None else tuple(self.parents)
-
-    def append(self, parent: str, stamp: int, row: Row, authority: str) -> bool:
-        """Store a moving sample that is newer and has the same parent and authority, as nearly all; else do nothing."""
-        stamps = self.stamps
-        origin = self._origin
-        if (
-            not stamps
-            or stamp <= stamps[-1]
-            or parent != origin[0]
-            or authority != origin[1]
-            or self.parents is not None
-        ):
-            return False
-        # Spelt out, because `*row` would build a list of the arguments first.
-        x, y, z, qx, qy, qz, qw = row
-        record = _pack(stamp, x, y, z, qx, qy, qz, qw)
-        # No call before the last of the three, so that Ctrl-C cannot come between them.
-        self.records += record
-        self.origins += (origin,)
-        stamps.append(stamp)
-        self.horizon = stamp - self._keep
-        if stamp > self._cut_after:
-            self._cut()
-        return True
+        return self._parents.names() if self.mixed else (self.parent,)
 
     def can_append(self, parent: str, authority: str, oldest: int) -> bool:
         """Whether moving samples from a stamp on are newer, and have the parent and the authority of the others."""
-        stamps = self.stamps
-        return bool(stamps) and stamps[-1] < oldest and self._origin == (parent, authority) and self.parents is None
+        newest = self.newest
+        return (
+            newest is not None
+            and newest < oldest
+            and (self.parent, self.authority) == (parent, authority)
+            and not self.mixed
+        )
 
     def append_many(self, stamps: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> None:
         """Store moving samples that `can_append` has approved; their stamps ascend. The rows have shape (n, 7)."""
-        records = np.empty((len(stamps), 8))
-        records[:, 0] = stamps.view(np.float64)
-        records[:, 1:] = rows
-        self.records += records.data.cast("B")
-        self.origins += [self._origin] * len(stamps)
-        self.stamps.frombytes(stamps.tobytes())
-        self.horizon = self.stamps[-1] - self._keep
-        if self.stamps[-1] > self._cut_after:
-            self._cut()
+        self.push_many(np.ascontiguousarray(stamps), np.ascontiguousarray(rows))
 
     def insert(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
         """Store a moving sample; the window ends at the newest. A static sample is dropped first."""
-        if self.static:
-            self._become_moving(parent)
-        if self.stamps and stamp <= self.stamps[-1]:
+        newest = self.newest
+        if newest is not None and stamp <= newest:
             return self._insert_late(parent, stamp, row, authority)
+        self.push(stamp, row)
+        if self.static:
+            self.static = False
+            self.static_stamp = None
+            self.changed = True
+        if newest is not None:
+            self._parents.push(stamp, parent, self.parent)
+            self._authorities.push(stamp, authority, self.authority)
         if parent != self.parent:
-            self._reparent(parent)
+            self.parent = parent
+            self.changed = True
         self.authority = authority
-        self._origin = self._shared(parent, authority)
-        if self.parents is not None:
-            self.parents[parent] += 1
-        record = _pack(stamp, *row)
-        self.records += record
-        self.origins += (self._origin,)
-        self.stamps.append(stamp)
-        self.horizon = stamp - self._keep
-        if stamp > self._cut_after:
-            self._cut()
+        if self._parents or self._authorities:
+            self._forget_old_names()
         return Outcome.INSERTED
 
     def insert_static(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
@@ -226,30 +187,58 @@ class FrameHistory:
         self.static_stamp = stamp
         self.parent = parent
         self.authority = authority
-        self.row = row
+        self.static_row = row
         return Outcome.INSERTED if fresh else Outcome.REPLACED
 
     def clear(self) -> None:
         """Drop all moving samples; the newest parent is remembered."""
-        del self.stamps[:]
-        del self.records[:]
-        del self.origins[:]
-        self.horizon = -FOREVER
-        self._cut_after = STAMP_MIN
-        if self.parents is not None:
-            self.parents = None
+        super().clear()
+        self._parents.clear()
+        self._authorities.clear()
+        if self.mixed:
+            self.mixed = False
             self.changed = True
 
     def parent_at(self, stamp: int) -> str:
         """The parent that holds at `stamp`; outside the window, that of the nearest sample."""
-        if self.parents is None:
-            return self.parent
-        start = self.start
-        return self.origins[max(bisect_right(self.stamps, stamp, start) - 1, start)][0]
+        return self._parents.at(stamp) if self.mixed else self.parent
 
     def covers(self, stamp: int) -> bool:
         """Whether the samples surround `stamp`, or the edge is static."""
-        return self.static or (bool(self.stamps) and self.stamps[self.start] <= stamp <= self.stamps[-1])
+        if self.static:
+            return True
+        oldest, newest = self.oldest, self.newest
+        return oldest is not None and newest is not None and oldest <= stamp <= newest
+
+    def row_at(self, at: int) -> Row:
+        """The row of the child in its parent at a stamp.
+
+        Raises
+        ------
+        ExtrapolationError
+            If the samples do not surround it.
+        """
+        if self.static:
+            return self.static_row
+        plain = self.row(at)
+        if plain is not None:
+            return plain
+        i = self.find(at)
+        stamp, row = self.sample(i) if i < self.count else (None, IDENTITY)
+        if stamp == at:
+            return row
+        if stamp is None or not i:
+            raise self.extrapolation_error(at)
+        before, row_before = self.sample(i - 1)
+        if not self.is_segment(i):
+            return row_before
+        return interpolate(row_before, row, (at - before) / (stamp - before))
+
+    def is_segment(self, i: int) -> bool:
+        """Whether samples i - 1 and i are both in the window and have the same parent."""
+        if not 0 < i < self.count:
+            return False
+        return not self.mixed or self.parent_at(self.stamp(i - 1)) == self.parent_at(self.stamp(i))
 
     def extrapolation_error(self, stamp: int | Latest, slack: int = 0) -> ExtrapolationError:
         """The error of a `stamp` that is not covered, and is further than `slack` ns from every sample."""
@@ -260,36 +249,43 @@ class FrameHistory:
 
     def parent_changes(self) -> list[int]:
         """The stamps inside the window at which the parent changes."""
-        if self.parents is None:
-            return []
-        parents = [parent for parent, _ in self.origins[self.start :]]
-        stamps = self.stamps[self.start :]
-        return [stamp for stamp, old, new in zip(stamps[1:], parents, parents[1:], strict=False) if new != old]
+        return self._parents.changes()
 
     def beginnings(self) -> list[int]:
         """The stamps inside the window at which a parent begins to hold: the oldest, and each change."""
-        return [self.stamps[self.start], *self.parent_changes()] if self.stamps else []
+        oldest = self.oldest
+        return [] if oldest is None else [oldest, *self.parent_changes()]
 
     def begins_by(self, stamp: int) -> bool:
         """Whether the edge is static, or has a sample in the window at `stamp` or before."""
-        return self.static or (bool(self.stamps) and self.stamps[self.start] <= stamp)
+        oldest = self.oldest
+        return self.static or (oldest is not None and oldest <= stamp)
+
+    def around(self, stamp: int) -> tuple[int | None, int | None]:
+        """The stamp of the last sample not after `stamp`, and that of the next one, in ns."""
+        i, count = self.find(stamp), self.count
+        if i < count and self.stamp(i) == stamp:
+            i += 1
+        return self.stamp(i - 1) if i else None, self.stamp(i) if i < count else None
 
     def neighbours(self, stamp: int) -> tuple[int | None, int | None]:
         """The stamps of the samples before and after `stamp`, in ns; twice the same if a sample has it."""
-        stamps, start = self.stamps, self.start
-        i = bisect_left(stamps, stamp, start)
-        after = stamps[i] if i < len(stamps) else None
+        i = self.find(stamp)
+        after = self.stamp(i) if i < self.count else None
         if after == stamp:
             return after, after
-        return stamps[i - 1] if i > start else None, after
+        return self.stamp(i - 1) if i else None, after
 
-    def samples_between(self, low: int, high: int) -> Samples:
-        """Copies of the samples from stamp `low` to `high`, and of the next one on either side."""
-        start = self.start
-        first = max(bisect_right(self.stamps, low) - 1, start)
-        end = max(bisect_left(self.stamps, high), start) + 1
-        parents = None if self.parents is None else [parent for parent, _ in self.origins[first:end]]
-        return Samples(self.stamps[first:end], self.records[first * RECORD_SIZE : end * RECORD_SIZE], parents)
+    def samples_between(self, low: int, high: int, wanted: Stamps | None = None) -> Samples:
+        """The samples from stamp `low` to `high`, and the next one on either side.
+
+        Those that are next to none of the `wanted` stamps (ns) may be left out.
+        """
+        first = self.find(low)
+        if first and (first == self.count or self.stamp(first) != low):
+            first -= 1
+        columns = self.columns(first, self.find(high) + 1, wanted)
+        return Samples(columns, self._parents.copy(), self._authorities.copy())
 
     def edge(self) -> Edge:
         """The newest edge as plain data."""
@@ -297,96 +293,52 @@ class FrameHistory:
 
     def copy(self) -> "FrameHistory":
         """An independent copy."""
-        twin = FrameHistory(self.child, self.parent, self.static, self._keep)
-        for name in ("authority", "static_stamp", "row", "horizon", "_origin", "_cut_after"):
-            setattr(twin, name, getattr(self, name))
-        twin.stamps = self.stamps[:]
-        twin.records = self.records[:]
-        twin.origins = self.origins[:]
-        twin.parents = None if self.parents is None else self.parents.copy()
+        twin = FrameHistory(self.child, self.parent, self.static, self.keep)
+        twin.authority = self.authority
+        twin.static_stamp = self.static_stamp
+        twin.static_row = self.static_row
+        twin.take(self)
+        twin._parents = self._parents.copy()
+        twin._authorities = self._authorities.copy()
+        twin.mixed = self.mixed
         return twin
 
     def copy_within(self, keep: int | None) -> "FrameHistory":
         """An independent copy of the samples in the window, with a window of another length from now on."""
         twin = self.copy()
-        twin._keep = FOREVER if keep is None else keep
-        if twin.stamps:
-            horizon = twin.stamps[-1] - twin._keep
-            twin.horizon = max(self.horizon, horizon)
-            twin._cut()
-            twin.horizon = horizon
-            twin.changed = False
+        twin.keep = keep
+        twin._forget_old_names()
+        twin.changed = False
         return twin
-
-    def _become_moving(self, parent: str) -> None:
-        self.static = False
-        self.static_stamp = None
-        self.parent = parent
-        self.changed = True
-
-    def _reparent(self, parent: str) -> None:
-        """Note that the next sample, which will be the newest, names another parent."""
-        if self.stamps and self.parents is None:
-            self._cut()
-            self.parents = Counter({self.parent: len(self)})
-        self.parent = parent
-        self._cut_after = STAMP_MIN
-        self.changed = True
 
     def _insert_late(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:
         """Store a sample that is not newer than the newest."""
-        stamps = self.stamps
         if stamp < self.horizon:
             return Outcome.EXPIRED
-        at = bisect_left(stamps, stamp)
-        replaces = stamps[at] == stamp
-        if at == self.start and not replaces:
+        at = self.find(stamp)
+        replaces = self.stamp(at) == stamp
+        if not at and not replaces:
             self.changed = True
-        if self.parents is not None or parent != self.parent:
-            self._cut()
-            self._cut_after = STAMP_MIN
-            at = bisect_left(stamps, stamp)
-            self.parents = self.parents or Counter({self.parent: len(self)})
-            self.parents[parent] += 1
-            if replaces:
-                self._forget(self.origins[at][0])
+        is_newest = replaces and at == self.count - 1
+        before = self.stamp(at - 1) if at else None
+        behind = at + replaces
+        after = self.stamp(behind) if behind < self.count else None
+        self.put(at, stamp, row)
+        self._authorities.put(stamp, authority, before, after, self.authority)
+        if self.mixed or parent != self.parent:
+            self._parents.put(stamp, parent, before, after, self.parent)
+            self.mixed = bool(self._parents)
             self.changed = True
-        record = _pack(stamp, *row)
-        end = at + 1 if replaces else at
-        self.records[at * RECORD_SIZE : end * RECORD_SIZE] = record
-        self.origins[at:end] = (self._shared(parent, authority),)
-        if not replaces:
-            stamps.insert(at, stamp)
-        if at == len(stamps) - 1:
-            self.parent, self.authority = self._origin = self.origins[at]
-        self._settle_parents()
+        if is_newest:
+            self.parent = parent
+            self.authority = authority
         return Outcome.REPLACED if replaces else Outcome.INSERTED
 
-    def _shared(self, parent: str, authority: str) -> tuple[str, str]:
-        """A parent and an authority. Equal ones share one tuple, because one for each sample would take 56 bytes."""
-        origin = parent, authority
-        return self._origin if self._origin == origin else origin
-
-    def _cut(self) -> None:
-        """Cut off samples that have left the window; with only one parent, not again before 1/16 of it has passed."""
-        start = self.start
-        if self.parents is not None:
-            for parent, _ in self.origins[:start]:
-                self._forget(parent)
-            self._settle_parents()
-        del self.stamps[:start]
-        del self.origins[:start]
-        del self.records[: start * RECORD_SIZE]
-        self._cut_after = self.stamps[0] + self._keep + (0 if self.parents is not None else self._keep // 16)
-
-    def _forget(self, parent: str) -> None:
-        """Note that a sample that names `parent` has gone."""
-        assert self.parents is not None
-        self.parents[parent] -= 1
-        if not self.parents[parent]:
-            del self.parents[parent]
-            self.changed = True
-
-    def _settle_parents(self) -> None:
-        if self.parents is not None and len(self.parents) == 1:
-            self.parents = None
+    def _forget_old_names(self) -> None:
+        """Forget the parents and authorities that no sample in the window names any longer."""
+        oldest = self.oldest
+        if oldest is not None:
+            self._authorities.forget_before(oldest)
+            if self._parents.forget_before(oldest):
+                self.changed = True
+        self.mixed = bool(self._parents)

@@ -14,7 +14,6 @@ from tfbus.errors import (
 from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, AtLike, Latest, StampLike, as_at, as_stamp
-from tfbus.tree._python_kernel import climb
 from tfbus.tree.extrapolation import Extrapolation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
@@ -63,11 +62,20 @@ def answer(
     policy: Policy | None,
 ) -> TransformStamped:
     """The answer of `TransformTree.lookup`, without keywords: each of them costs a twentieth of a lookup."""
+    if policy is None and bounds is None and source_at is None and fixed is None:
+        found = forest.paths.answer(target, source, at)
+        if found is not None:
+            return found
     if bounds is not None and at is not LATEST and source_at is not LATEST:
         raise TypeError(AT_LATEST_ONLY)
     if type(at) is not int and at is not LATEST:
         at = as_stamp(at)
     extrapolation = None if policy is None else Extrapolation(policy)
+    if fixed is None:
+        forest.search(target, source)
+    else:
+        forest.search(target, fixed)
+        forest.search(fixed, source)
     with forest.lock:
         if source_at is None and fixed is None:
             stamp, row, static = find(forest, target, source, at, bounds, extrapolation)
@@ -84,19 +92,19 @@ def find(
     forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, extrapolation: Extrapolation | None = None
 ) -> Found:
     """Source in target at one stamp. The caller holds the lock; the errors are those of `TransformTree.lookup`."""
-    path = forest.paths.get((target, source))
+    path = forest.paths.find(target, source)
     if path is None:
         path = forest.find_path(target, source, at)
     if not path.moving:
         if isinstance(at, Latest):
             at = path.static_stamp if len(path.frames) > 1 else _newest_stamp(forest, target)
-        return as_stamp(at), path.row(0), True
+        return as_stamp(at), path.row_at(0), True
     if at is LATEST:
         return _find_latest(forest, path, bounds, extrapolation)
     if extrapolation is not None:
         return at, _extrapolated(forest.find_path(target, source, at), at, extrapolation), False
     try:
-        return at, climb(path.up, at) if not path.down else path.row(at), False
+        return at, path.row_at(as_stamp(at)), False
     except ExtrapolationError:
         # Another edge, or another way, may decide. That is found outside, so that an error keeps no traceback of this
         # one alive.
@@ -104,7 +112,7 @@ def find(
     if path.root in forest.frames:
         path = forest.find_path(target, source, at)
         if path.covers(at):
-            return at, path.row(at), False
+            return at, path.row_at(at), False
     raise path.deciding_error(as_stamp(at))
 
 
@@ -124,17 +132,17 @@ def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolatio
     """
     common, lagging = path.newest_common()
     if extrapolation is not None:
-        common = min(common + extrapolation.policy.hold, max(edge.stamps[-1] for edge in path.moving))
+        common = min(common + extrapolation.policy.hold, max(map(_newest, path.moving)))
     if bounds is not None and common < bounds.not_before:
         raise _latest_error(path, lagging, bounds.not_before, extrapolation, 0)
     if bounds is not None and common > bounds.not_after:
-        edge = lagging if extrapolation is None else max(path.moving, key=lambda edge: edge.stamps[-1])
+        edge = lagging if extrapolation is None else max(path.moving, key=_newest)
         raise AheadError(
             child=edge.child, stamp=bounds.not_after, oldest=edge.oldest, newest=edge.newest, authority=edge.authority
         )
     if extrapolation is None and path.permanent:
         try:
-            return common, path.row(common), False
+            return common, path.row_at(common), False
         except ExtrapolationError:
             # Another way may count there. It is found outside, so that an error keeps no traceback of this one alive.
             pass
@@ -142,7 +150,7 @@ def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolatio
         way = path
         if not path.permanent or path.root in forest.frames:
             way = forest.find_path(path.frames[0], path.frames[-1], common)
-        return common, way.row(common) if extrapolation is None else extrapolation.row(way, common), False
+        row = way.row_at(common) if extrapolation is None else extrapolation.row(way, common)
     except TransformLookupError as error:
         # The lagging edge has to reach what the others still hold, or the far end of their gap. Where a parent has
         # changed, any later stamp of it may be enough.
@@ -153,6 +161,7 @@ def _find_latest(forest: Forest, path: Path, bounds: Bounds | None, extrapolatio
             needed = max(common if edge.oldest is None else edge.oldest for edge in path.moving)
         tolerance = 0 if extrapolation is None else extrapolation.policy.tolerance
         raise _latest_error(path, lagging, needed, extrapolation, tolerance) from error
+    return common, row, False
 
 
 def _latest_error(
@@ -202,6 +211,11 @@ def find_in_time_travel(
     if at is LATEST and target_static and not source_static:
         stamp = source_stamp
     return stamp, compose(target_from_fixed, fixed_from_source), target_static and source_static
+
+
+def _newest(edge: FrameHistory) -> int:
+    """The newest stamp of an edge that has samples, in ns."""
+    return STAMP_MIN if edge.newest is None else edge.newest
 
 
 def _newest_stamp(forest: Forest, frame: str) -> int:

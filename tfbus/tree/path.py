@@ -11,16 +11,19 @@ which of them counts, by what is stored and never by what was asked before.
 from collections.abc import Mapping
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, FutureExtrapolationError
-from tfbus.geometry.rows import Row, compose, invert
+from tfbus.geometry.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN
-from tfbus.tree._python_kernel import Step, climb
+from tfbus.tree._kernel import Chain
 from tfbus.tree.history import FrameHistory
 
 Frames = Mapping[str, FrameHistory]
 """By child."""
 
+Step = FrameHistory | Row
+"""A moving edge, or the row of a run of static edges."""
 
-class Path:
+
+class Path(Chain):
     """The edges from `source` to `target`, by the parents that hold at one stamp.
 
     Attributes
@@ -39,16 +42,17 @@ class Path:
         The other way round a loop, if the samples cover the stamp on neither of them.
     """
 
-    __slots__ = ("_changing", "_static", "down", "frames", "moving", "permanent", "rival", "root", "up")
+    __slots__ = ("_changing", "_static", "frames", "moving", "permanent", "rival", "root")
+    up: tuple[Step, ...]
+    down: tuple[Step, ...]
 
     def __init__(self, ups: list[FrameHistory], downs: list[FrameHistory], root: str) -> None:
+        super().__init__(_fold(ups), _fold(downs))
         edges = ups + downs
-        self.up = _fold(ups)
-        self.down = _fold(downs)
         self.root = root
         self.frames = (*(edge.child for edge in downs), root, *(edge.child for edge in reversed(ups)))
         self.moving = tuple(edge for edge in edges if not edge.static)
-        self._changing = tuple(edge for edge in edges if edge.parents is not None)
+        self._changing = tuple(edge for edge in edges if edge.mixed)
         self.permanent = not self._changing
         self.rival: Path | None = None
         self._static = tuple(edge for edge in edges if edge.static)
@@ -71,23 +75,20 @@ class Path:
         """Whether the samples of every edge cover a stamp."""
         return all(edge.covers(at) for edge in self.moving)
 
-    def row(self, at: int) -> Row:
-        """The row of source in target at a stamp.
+    def row_at(self, at: int) -> Row:
+        """The row of source in target at a stamp: that of the kernel or, if it is not plain, the same step by step.
 
         Raises
         ------
         ExtrapolationError
             If an edge does not cover it.
         """
-        if not self.down:
-            return climb(self.up, at)
-        return compose(invert(climb(self.down, at)), climb(self.up, at))
-
-    def rows(self, stamps: list[int]) -> list[Row]:
-        """The rows at some stamps."""
-        if not self.down:
-            return [climb(self.up, at) for at in stamps]
-        return [self.row(at) for at in stamps]
+        row = self.row(at)
+        if row is None:
+            row = _climb(self.up, at)
+            if self.down:
+                row = compose(invert(_climb(self.down, at)), row)
+        return row
 
     def newest_common(self) -> tuple[int, FrameHistory]:
         """The newest stamp that every moving edge has reached, and the edge that has come no further.
@@ -97,14 +98,10 @@ class Path:
         FutureExtrapolationError
             If an edge has no samples.
         """
-        lagging = self.moving[0]
-        common = STAMP_MAX
-        for edge in self.moving:
-            if not edge.stamps:
-                raise edge.extrapolation_error(LATEST)
-            if edge.stamps[-1] < common:
-                lagging, common = edge, edge.stamps[-1]
-        return common, lagging
+        common = self.latest()
+        if common is None:
+            raise next(edge for edge in self.moving if not len(edge)).extrapolation_error(LATEST)
+        return common, next(edge for edge in self.moving if edge.newest == common)
 
     def deciding_error(self, at: int) -> ExtrapolationError:
         """The error of a stamp that is not covered: of an edge that has lost it, else of the one that lags most.
@@ -129,13 +126,22 @@ class Path:
     def _own_error(self, at: int) -> ExtrapolationError:
         lagging, reached = self.moving[0], STAMP_MAX + 1
         for edge in self.moving:
-            newest = edge.stamps[-1] if edge.stamps else STAMP_MIN
-            if edge.stamps and newest >= at:
-                if edge.stamps[edge.start] > at:
+            oldest, newest = edge.oldest, edge.newest
+            if oldest is not None and newest is not None and newest >= at:
+                if oldest > at:
                     return edge.extrapolation_error(at)
-            elif newest < reached:
-                lagging, reached = edge, newest
+            elif (came_to := STAMP_MIN if newest is None else newest) < reached:
+                lagging, reached = edge, came_to
         return lagging.extrapolation_error(at)
+
+
+def _climb(steps: tuple[Step, ...], at: int) -> Row:
+    """The first step's child, seen from the last step's parent, at a stamp."""
+    row: Row | None = None
+    for step in steps:
+        here = step.row_at(at) if isinstance(step, FrameHistory) else step
+        row = here if row is None else compose(here, row)
+    return IDENTITY if row is None else row
 
 
 def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
@@ -144,14 +150,24 @@ def _fold(edges: list[FrameHistory]) -> tuple[Step, ...]:
         if not edge.static:
             steps.append(edge)
         elif steps and isinstance(steps[-1], tuple):
-            steps[-1] = compose(edge.row, steps[-1])
+            steps[-1] = compose(edge.static_row, steps[-1])
         else:
-            steps.append(edge.row)
+            steps.append(edge.static_row)
     return tuple(steps)
 
 
 def find_path(frames: Frames, target: str, source: str, at: int | None) -> Path:
-    """A path by the parents that hold at a stamp, or the one by the newest parents.
+    """A path by the parents that hold at a stamp, or the one by the newest parents: see `find_edges`."""
+    return Path(*find_edges(frames, target, source, at))
+
+
+def find_edges(
+    frames: Frames, target: str, source: str, at: int | None
+) -> tuple[list[FrameHistory], list[FrameHistory], str]:
+    """The edges of a path, from source and from target up to the common ancestor, and that.
+
+    It reads nothing but parents, so that it may run while another thread inserts; whoever does so has to check whether
+    the edges still hold.
 
     Both ends climb in turn, so the search stops at most one side's length beyond the common ancestor.
 
@@ -171,7 +187,7 @@ def find_path(frames: Frames, target: str, source: str, at: int | None) -> Path:
     while True:
         for meeting in (up.here, down.here):
             if meeting in up.seen and meeting in down.seen:
-                return Path(up.edges[: up.seen[meeting]], down.edges[: down.seen[meeting]], meeting)
+                return up.edges[: up.seen[meeting]], down.edges[: down.seen[meeting]], meeting
         if up.ended and down.ended:
             raise DisconnectedError(
                 target=target, source=source, roots=(down.here, up.here), stamp=at, loop=up.loop or down.loop

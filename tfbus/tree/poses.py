@@ -5,9 +5,9 @@ at which it is needed, which is usually one. The samples are read under the lock
 level of the tree at a time.
 """
 
-from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
+from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
@@ -16,14 +16,14 @@ import numpy.typing as npt
 from tfbus.errors import TransformLookupError
 from tfbus.geometry.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MIN, Latest
-from tfbus.tree._python_kernel import climb
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import RECORD, RECORD_SIZE, FrameHistory
+from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import find
 
-_pack = RECORD.pack
-_IDENTITY = _pack(0, *IDENTITY)
-_NO_ROW = _pack(0, *(np.nan,) * 7)
+_WIDTH = 7
+_pack = Struct(f"{_WIDTH}d").pack
+_IDENTITY = _pack(*IDENTITY)
+_NO_ROW = _pack(*(np.nan,) * _WIDTH)
 
 
 class Poses(NamedTuple):
@@ -90,11 +90,9 @@ class PoseReader:
             own = [forest.frames.get(frame) for frame in plan.frames]
             static = np.array([history is not None and history.static for history in own])
             if isinstance(at, Latest):
-                newest = [
-                    history.stamps[-1] if history is not None and history.stamps else STAMP_MIN for history in own
-                ]
+                newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
             else:
-                newest = [STAMP_MIN if history is None else _heard(history, at) for history in own]
+                newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
             heard = np.array(newest, np.int64)
         columns, answered = gathered.compose()
         for place, row in corrections:
@@ -145,8 +143,8 @@ class _Gathered(NamedTuple):
     """The edges of a plan, each as it is at the stamps at which the frames behind it need it."""
 
     plan: _Plan
-    records: bytearray
-    """A record of the history for each edge."""
+    rows: bytearray
+    """The row of each edge, seven floats."""
     places: list[int]
     """The place of the frame behind each edge."""
     origins: list[int]
@@ -162,7 +160,7 @@ class _Gathered(NamedTuple):
         order = levels.argsort(kind="stable")
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
-        columns = np.frombuffer(self.records, np.float64).reshape(-1, RECORD_SIZE // 8).T[1:, order]
+        columns = np.frombuffer(self.rows, np.float64).reshape(-1, _WIDTH).T[:, order]
         origins = rank[np.array(self.origins, np.intp)[order]]
         upside_down = np.flatnonzero(np.array(self.plan.inverted, np.bool_)[places][order])
         columns[:, upside_down] = invert((*columns[:, upside_down],))
@@ -179,7 +177,7 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     The inner functions share local lists, because attributes would cost half as much again.
     """
     gathered = _Gathered(plan, bytearray(), [], [], [], [])
-    _, records, places, origins, answered, own = gathered
+    _, rows, places, origins, answered, own = gathered
     before_each = plan.origins
     # The stamp of each frame; None while the path from the fixed frame is static, and holds at every stamp.
     stamps: list[int | None] = []
@@ -187,23 +185,22 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
 
     def add(place: int, stamp: int | None, above: int) -> int:
         """Read one edge at one stamp; where it has no sample, its nearest stands in."""
-        nonlocal records
+        nonlocal rows
         history = histories[place]
         is_answered = True
-        record: bytes | bytearray
         if history is None:
-            record = _IDENTITY
+            row = _IDENTITY
         elif history.static:
-            record = _pack(0, *history.row)
-        elif not history.stamps or stamp is None:
-            record, is_answered = _NO_ROW, False
-        elif stamp >= history.stamps[-1]:
-            record, is_answered = history.records[-RECORD_SIZE:], stamp == history.stamps[-1]
+            row = _pack(*history.static_row)
+        elif (newest := history.newest) is None or stamp is None:
+            row, is_answered = _NO_ROW, False
+        elif stamp >= newest:
+            row, is_answered = _pack(*history.sample(history.count - 1)[1]), stamp == newest
         else:
-            oldest = history.stamps[history.start]
-            record, is_answered = _pack(0, *climb((history,), max(stamp, oldest))), stamp >= oldest
+            oldest = history.stamp(0)
+            row, is_answered = _pack(*history.row_at(max(stamp, oldest))), stamp >= oldest
         index = len(places)
-        records += record
+        rows += row
         places.append(place)
         origins.append(above)
         answered.append(is_answered and (index == 0 or answered[above]))
@@ -226,10 +223,10 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
         if history is not None and not history.static:
             if isinstance(at, int):
                 stamp = at
-            elif not history.stamps:
+            elif (newest := history.newest) is None:
                 stamp = before or 0
-            elif before is None or history.stamps[-1] < before:
-                stamp = history.stamps[-1]
+            elif before is None or newest < before:
+                stamp = newest
         stamps.append(stamp)
         if place == 0 or before is None or before == stamp:
             above = own[origin] if place else 0
@@ -240,15 +237,8 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     return gathered
 
 
-def _heard(history: FrameHistory, at: int) -> int:
-    """The stamp of the newest sample not after `at`; `STAMP_MIN` if there is none."""
-    stamps = history.stamps
-    if not stamps:
-        return STAMP_MIN
-    if stamps[-1] <= at:
-        return stamps[-1]
-    before = bisect_right(stamps, at, history.start) - 1
-    return stamps[before] if before >= history.start else STAMP_MIN
+def _heard(stamp: int | None) -> int:
+    return STAMP_MIN if stamp is None else stamp
 
 
 def _moved_to_another_parent(plan: _Plan, histories: Sequence[FrameHistory | None]) -> list[int]:
@@ -256,7 +246,7 @@ def _moved_to_another_parent(plan: _Plan, histories: Sequence[FrameHistory | Non
     moved = [False] * len(histories)
     for place, history in enumerate(histories):
         if history is not None:
-            moved[place] = history.parents is not None or moved[plan.origins[place]]
+            moved[place] = history.mixed or moved[plan.origins[place]]
     return [place for place, has in enumerate(moved) if has]
 
 

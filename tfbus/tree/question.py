@@ -19,6 +19,11 @@ class Question:
     max_age: float | None = None
     policy: Policy | None = None
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether it asks for nothing but a stamp, so that the kernel may answer it."""
+        return self.source_at is None and self.fixed is None and self.max_age is None and self.policy is None
+
 
 def question_of(
     data: Stamped, target: str, at: int | Latest | None, fixed: str | None, max_age: float | None, policy: Policy | None

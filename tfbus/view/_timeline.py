@@ -79,8 +79,7 @@ class Timeline:
 def span_of(forest: Forest) -> tuple[int, int] | None:
     """The oldest and the newest stamp of any moving sample, in ns; None if there is none."""
     with forest.lock:
-        moving = [history for history in forest.frames.values() if history.stamps]
-        if not moving:
-            return None
-        oldest = [history.stamps[history.start] for history in moving]
-        return min(oldest), max(history.stamps[-1] for history in moving)
+        oldest = [history.oldest for history in forest.frames.values()]
+        newest = [history.newest for history in forest.frames.values()]
+    stamps = [stamp for stamp in (*oldest, *newest) if stamp is not None]
+    return (min(stamps), max(stamps)) if stamps else None

@@ -17,10 +17,10 @@ import numpy as np
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
-from tfbus._log import OnceLogger
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.bus.delays import Delays
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.data import PointCloud
 from tfbus.errors import BusClosedError
 from tfbus.events import FrameAdded

@@ -1,7 +1,5 @@
 """The limits of a waiting lookup: how far each edge of its path may go on before it loses the lookup's stamp."""
 
-from bisect import bisect_right
-
 from tfbus.errors import DisconnectedError, ExtrapolationError, GapError, UnknownFrameError
 from tfbus.stamps import STAMP_MAX, Latest
 from tfbus.tree.extrapolation import read_stamp
@@ -40,31 +38,29 @@ def _limits_at(
 ) -> Limits:
     if at is None or isinstance(at, Latest):
         return []
-    path = forest.paths.get((target, source))
+    path = forest.paths.find(target, source)
     edges = _edges(forest, target, source, at) if path is None or path.root in forest.frames else path.moving
     window = STAMP_MAX if forest.window is None else forest.window
     limits = []
     asked = at
     if policy is not None:
         at = min(at + policy.tolerance, STAMP_MAX)
-    # One loop without calls, because it runs for each wait.
     for edge in edges:
         if edge.child == blocking:
             continue
-        stamps = edge.stamps
-        i = bisect_right(stamps, at)
-        if not i or stamps[i - 1] < edge.horizon:
+        before, after = edge.around(at)
+        if before is None:
             # The first sample decides, or has decided.
             limit = at
-        elif i < len(stamps):
+        elif after is not None:
             # Until the sample before the stamp leaves the window.
-            limit = stamps[i - 1] + window
+            limit = before + window
             if policy is not None and policy.max_gap is not None and _is_in_gap(edge, asked, policy):
                 limit = at
         else:
             # Until a sample after the stamp comes, and the one before it has left the window or is too far away.
             near = window if policy is None or policy.max_gap is None else min(window, policy.max_gap)
-            limit = max(stamps[-1] + near, at)
+            limit = max(before + near, at)
         if limit < STAMP_MAX:
             limits.append((edge.child, limit))
     return limits

@@ -64,15 +64,15 @@ class LiveTree:
             limit = self.waiting.limit
             passed = None
             for sample in batch:
-                fields = sample._fields
-                if fields[1] in waiters:
-                    _wake(self.waiting.pop_unblocked(fields[1], fields[2]))
-                if fields[2] > limit:
-                    passed = limit = fields[2]
+                child, stamp = sample.child, sample.stamp
+                if child in waiters:
+                    self._wake_with_answers(self.waiting.pop_unblocked(child, stamp))
+                if stamp > limit:
+                    passed = limit = stamp
             if passed is not None:
                 self._wake_hopeless(passed)
         if self._watches:
-            _wake(self.watching.mark([sample._fields[1] for sample in batch]))
+            _wake(self.watching.mark([sample.child for sample in batch]))
         if not plain:
             for frame in self.forest.expired_frames:
                 history = self.forest.frames.get(frame)
@@ -154,6 +154,16 @@ class LiveTree:
             self.superseded,
             forest.looped,
         )
+
+    def _wake_with_answers(self, waiters: Iterable[Waiter]) -> None:
+        """Wake waiters, each with its answer if the kernel has one; it counts as long as the forest stays as it is."""
+        forest = self.forest
+        for waiter in waiters:
+            question = waiter.question
+            if question.is_plain:
+                waiter.answer = forest.paths.answer(question.target, question.source, question.at)
+                waiter.version = forest.version
+        _wake(waiters)
 
     def _limits(self, waiter: Waiter, error: TransformLookupError | None) -> list[tuple[str, int]]:
         """The limits of a waiter, but for that of the edge that blocks it, whose next samples wake it anyway."""

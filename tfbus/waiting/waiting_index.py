@@ -14,7 +14,7 @@ the waiter is kept under the edges that have not, such as one that has stopped.
 from bisect import bisect_left, insort
 from collections.abc import Callable, Iterable, Iterator, KeysView
 from dataclasses import dataclass
-from itertools import count
+from itertools import count, takewhile
 
 from tfbus.errors import (
     MAY_COME,
@@ -25,6 +25,7 @@ from tfbus.errors import (
     TransformLookupError,
     UnknownFrameError,
 )
+from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import STAMP_MIN, Latest
 from tfbus.tree.question import Question
 
@@ -60,11 +61,26 @@ class Waiter:
 
     Attributes
     ----------
-    asked : set of str
-        The frames that the questions name.
+    answer : TransformStamped or None
+        The answer that whoever woke it has found, if there was one then.
+    version : int
+        That of the forest which has this answer.
     """
 
-    __slots__ = ("asked", "blocked_by", "limit", "limits", "names", "others", "place", "question", "since", "wake")
+    __slots__ = (
+        "answer",
+        "blocked_by",
+        "indexed",
+        "limit",
+        "limits",
+        "names",
+        "others",
+        "place",
+        "question",
+        "since",
+        "version",
+        "wake",
+    )
 
     def __init__(
         self, question: Question, since: int, wake: Callable[[], object], others: tuple[Question, ...] = ()
@@ -73,16 +89,23 @@ class Waiter:
         self.since = since
         self.wake = wake
         self.others = others
-        self.asked = {question.target, question.source}
-        if question.fixed is not None:
-            self.asked.add(question.fixed)
-        for other in others:
-            self.asked.update((other.target, other.source))
+        self.answer: TransformStamped | None = None
+        self.version = 0
         self.blocked_by: TransformLookupError | None = None
         self.names: tuple[str, ...] = ()
         self.place: _Place | None = None
         self.limit: _Place | None = None
         self.limits: list[tuple[str, _Place]] = []
+        self.indexed = False
+
+    def asked(self) -> set[str]:
+        """The frames that the questions name."""
+        names = {self.question.target, self.question.source}
+        if self.question.fixed is not None:
+            names.add(self.question.fixed)
+        for other in self.others:
+            names.update((other.target, other.source))
+        return names
 
 
 def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
@@ -147,6 +170,8 @@ class WaitingIndex:
     def __init__(self) -> None:
         self.by_frame: dict[str, _FrameWaiters] = {}
         self._waiters: dict[Waiter, None] = {}
+        # Made when it is read, because most waiters are woken by the edge that blocks them: the first ones have their
+        # places in it, and those that were parked since have not.
         self._by_name: dict[str, dict[Waiter, None]] = {}
         self._limits: list[_Place] = []
         self._passed = STAMP_MIN
@@ -158,7 +183,7 @@ class WaitingIndex:
     @property
     def names(self) -> KeysView[str]:
         """The frames that the questions of the waiters name."""
-        return self._by_name.keys()
+        return self._index().keys()
 
     @property
     def limit(self) -> int:
@@ -196,11 +221,6 @@ class WaitingIndex:
                 self._under(name).for_any[waiter] = None
         waiter.blocked_by = error
         self._waiters[waiter] = None
-        for name in waiter.asked:
-            waiters = self._by_name.get(name)
-            if waiters is None:
-                waiters = self._by_name[name] = {}
-            waiters[waiter] = None
         self.set_limits(waiter, limits)
 
     def set_limits(self, waiter: Waiter, limits: Iterable[tuple[str, int]]) -> None:
@@ -275,7 +295,8 @@ class WaitingIndex:
 
     def pop_asking_for(self, frames: Iterable[str]) -> list[Waiter]:
         """Remove and return the waiters whose question names one of the frames."""
-        ready = dict.fromkeys(waiter for name in frames for waiter in self._by_name.get(name, ()))
+        by_name = self._index()
+        ready = dict.fromkeys(waiter for name in frames for waiter in by_name.get(name, ()))
         for waiter in ready:
             self.remove(waiter)
         return list(ready)
@@ -286,6 +307,7 @@ class WaitingIndex:
         for waiter in ready:
             waiter.place = waiter.limit = None
             waiter.limits.clear()
+            waiter.indexed = False
         self._waiters.clear()
         self._by_name.clear()
         self.by_frame.clear()
@@ -296,16 +318,27 @@ class WaitingIndex:
     def _forget(self, waiter: Waiter) -> None:
         """Forget a waiter, but for the frames that block it."""
         del self._waiters[waiter]
-        for name in waiter.asked:
-            waiters = self._by_name[name]
-            del waiters[waiter]
-            if not waiters:
-                del self._by_name[name]
+        if waiter.indexed:
+            waiter.indexed = False
+            for name in waiter.asked():
+                waiters = self._by_name[name]
+                del waiters[waiter]
+                if not waiters:
+                    del self._by_name[name]
         if waiter.limit is not None:
             del self._limits[bisect_left(self._limits, waiter.limit)]
             waiter.limit = None
         if waiter.limits:
             self._forget_limits(waiter)
+
+    def _index(self) -> dict[str, dict[Waiter, None]]:
+        """The waiters by the frames that their questions name."""
+        fresh = list(takewhile(lambda waiter: not waiter.indexed, reversed(self._waiters)))
+        for waiter in reversed(fresh):
+            waiter.indexed = True
+            for name in waiter.asked():
+                self._by_name.setdefault(name, {})[waiter] = None
+        return self._by_name
 
     def _forget_limits(self, waiter: Waiter) -> None:
         """Take a waiter from under the edges that it is kept under by limit."""

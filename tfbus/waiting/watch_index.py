@@ -89,7 +89,7 @@ class WatchIndex:
         if state not in self._open:
             return
         target, source = state.target, state.source
-        path = forest.paths.get((target, source))
+        path = forest.paths.find(target, source)
         if path is not None and path is state.path:
             return
         state.path = path

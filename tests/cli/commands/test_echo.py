@@ -3,14 +3,17 @@ import signal
 import subprocess
 from collections.abc import Sequence
 
+import anyio
+import anyio.to_thread
 import pytest
 from support.commands import Command, check_wrong_call
 from support.processes import new_domain
 from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
 from support.samples import moving, static
 
-from tfbus import SECOND, Bus, Transform, TransformStamped, from_seconds
+from tfbus import SECOND, Buffer, Bus, Transform, TransformStamped, from_seconds
 from tfbus.cli.commands.echo import describe, to_json
+from tfbus.links.zenoh import BufferServer
 
 MOVING = TransformStamped(
     "map", "base_link", 1_700_000_000_000_000_001, Transform.from_xyz_rpy((1, -2, 0.5), (0, 0, -0.5))
@@ -123,6 +126,27 @@ def test_it_prints_what_programs_on_the_domain_send_and_notices_their_death(back
 
 
 @pytest.mark.thorough
+def test_remote_transforms_come_from_the_buffer_of_another_program() -> None:
+    domain, address = new_domain(), free_address()
+    options = ("--remote", "--rate", "5", "--json", "--domain", domain, "--connect", address)
+
+    async def serve() -> None:
+        with Bus() as bus, Buffer(bus) as buffer:
+            async with BufferServer(buffer, domain, robot="r1", listen=address):
+                bus.publish(static("map", "base", 2.0))
+                with start_tfbus("echo", "map", "base", *options, "--robots", "r1") as echo:
+                    line = await anyio.to_thread.run_sync(echo.output.expect, "translation")
+                    assert json.loads(line)["translation"] == [2.0, 0.0, 0.0]
+                    assert echo.end() == 130
+                with start_tfbus("echo", "map", "base", *options) as echo:
+                    missing = await anyio.to_thread.run_sync(echo.errors.expect, "waiting")
+                    assert missing.endswith(f"a buffer without a robot in domain '{domain}': nobody offers it")
+                    assert echo.end() == 130
+
+    anyio.run(serve)
+
+
+@pytest.mark.thorough
 def test_a_reader_that_closes_the_pipe_ends_it_silently() -> None:
     options = ("--domain", new_domain())
     command = [TFBUS, "echo", "laser", "base_link", "--rate", "50", *options]
@@ -146,6 +170,8 @@ def test_a_reader_that_closes_the_pipe_ends_it_silently() -> None:
         (("map",), "SOURCE"),
         (("map", "base_link", "--rate", "0"), "--rate"),
         (("map", "base_link", "--max-age=-1"), "--max-age"),
+        (("map", "base_link", "--remote", "--robots", "r1", "--robots", "r2"), "one robot"),
+        (("map", "base_link", "--remote", "--robots", "a/b"), "robot"),
     ],
 )
 def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(

@@ -21,7 +21,9 @@ def recording(tmp_path: Path) -> Path:
     return write_mcap(tmp_path / "run.mcap", lines)
 
 
-@pytest.mark.parametrize(("kind", "begin"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("PDF", b"%PDF")])
+@pytest.mark.parametrize(
+    ("kind", "begin"), [("png", b"\x89PNG"), pytest.param("PDF", b"%PDF", marks=pytest.mark.thorough)]
+)
 def test_the_name_of_the_output_decides_its_kind(
     recording: Path, tmp_path: Path, tfbus: Command, kind: str, begin: bytes
 ) -> None:
@@ -40,10 +42,10 @@ def texts_of(svg: Path) -> str:
     ("options", "texts"),
     [
         (("map", "base"), ["in map", "x [m]", "yaw [deg]", "base"]),
-        (("map", "base", "--path"), ["x in map [m]", "base"]),
-        (("map", "base", "--3d"), ["z in map [m]"]),
+        pytest.param(("map", "base", "--path"), ["x in map [m]", "base"], marks=pytest.mark.thorough),
+        pytest.param(("map", "base", "--3d"), ["z in map [m]"], marks=pytest.mark.thorough),
         (("--gaps",), ["period [ms]", "delay [ms]", "base", "laser"]),
-        (("--gaps", "base"), ["period [ms]", "base"]),
+        pytest.param(("--gaps", "base"), ["period [ms]", "base"], marks=pytest.mark.thorough),
     ],
 )
 def test_every_picture_is_drawn(
@@ -56,6 +58,7 @@ def test_every_picture_is_drawn(
     assert ("<!-- laser -->" in texts_of(output)) is ("laser" in texts)
 
 
+@pytest.mark.thorough
 def test_two_recordings_are_drawn_over_each_other(recording: Path, tmp_path: Path, tfbus: Command) -> None:
     other = write_mcap(tmp_path / "other.mcap", [(0, "/tf", [moving("map", "base", 5), moving("map", "base", 9)])])
     output = tmp_path / "picture.svg"
@@ -79,7 +82,7 @@ def test_text_prints_the_curves(recording: Path, tfbus: Command) -> None:
         (("map", "base", "-o", "a.gif"), ".png, .svg or .pdf"),
         (("--gaps", "--path"), "--gaps"),
         (("map", "base", "--text", "--path"), "--text"),
-        (("map", "base", "-o", "nowhere/a.png"), "cannot write nowhere/a.png"),
+        pytest.param(("map", "base", "-o", "nowhere/a.png"), "cannot write nowhere/a.png", marks=pytest.mark.thorough),
     ],
 )
 def test_what_cannot_be_drawn_is_a_usage_error(

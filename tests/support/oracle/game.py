@@ -9,7 +9,6 @@ from itertools import product
 import anyio
 import pytest
 from anyio.abc import TaskGroup
-from hypothesis import event
 from support.asking import Asked
 from support.oracle.plain_bus import Held, Joined, Left, PlainBus, Published, Removed, Reset
 from support.oracle.plain_tree import Answer, At, Blocked, Facts, Sample, facts_of
@@ -93,7 +92,7 @@ class Game:
 
     async def play(self, bursts: list[Burst]) -> None:
         self.join(Join(None))
-        self.join(Join(4))
+        self.join(Join(2))
         async with anyio.create_task_group() as tasks:
             for burst in bursts:
                 self.middle += 1
@@ -109,20 +108,20 @@ class Game:
                 self.waiting = [waiting for waiting in self.waiting if self.still_waits(waiting)]
                 self.check()
                 # An answer must not depend on earlier questions, so there are some.
-                self.ask_every_buffer(12)
+                self.ask_every_buffer(40)
                 await self.clock.advance(burst.then)
                 self.elapsed += burst.then
                 self.waiting = [waiting for waiting in self.waiting if self.still_waits_as_time_passes(waiting)]
             if not self.bus.closed:
                 self.join(Join(None))
-                self.join(Join(2, prefill=0))
+                self.join(Join(4, prefill=0))
                 self.held = self.plain.buffers()
             self.bus.close()
             await self.clock.advance(0)
             self.waiting = [waiting for waiting in self.waiting if self.still_waits(waiting)]
             assert self.waiting == []
         self.check()
-        self.ask_every_buffer(3)
+        self.ask_every_buffer(9)
 
     # What happens
 
@@ -263,7 +262,6 @@ class Game:
         else:
             assert not asked.ended
             return True
-        event("cancelled" if asked.cancelled else type(asked.error).__name__)
         return False
 
     def still_waits_as_time_passes(self, waiting: Waiting) -> bool:
@@ -277,7 +275,6 @@ class Game:
         assert isinstance(error, LookupTimeoutError)
         assert isinstance(error.__cause__, TransformLookupError)
         assert facts_of(error.__cause__) in expected.acceptable
-        event("LookupTimeoutError")
         return False
 
     def check(self) -> None:
@@ -311,7 +308,7 @@ class Game:
             for target, source in list(product(frames, frames))[self.published % every :: every]:
                 latest = partial(real.buffer.lookup_nowait, real.name(target), real.name(source))
                 compare(latest, partial(held.tree.lookup, target, source, LATEST))
-                for stamp in range(START + OFFSETS[0] + self.published % 5, self.middle + OFFSETS[-1], 5):
+                for stamp in range(START + OFFSETS[0] + self.published % 8, self.middle + OFFSETS[-1], 8):
                     at = stamp * SECOND + self.published % 3 - 1
                     compare(partial(latest, at), partial(held.tree.lookup, target, source, at))
 

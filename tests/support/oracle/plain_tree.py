@@ -26,6 +26,8 @@ At = int | Latest
 Facts = tuple[object, ...]
 Way = list[tuple[str, str, bool]]
 """The edges from source to target, each a child and its parent; True for those that are climbed."""
+Steps = dict[str, list[tuple[str, tuple[str, str, bool]]]]
+"""The frames that one edge leads to, each with that edge."""
 Within = tuple[int, int] | None
 """The oldest and the newest stamp that count as the latest, in ns."""
 
@@ -255,8 +257,12 @@ class PlainTree:
 
     def ways(self, target: str, source: str, at: At) -> list[Way]:
         """Every way from source to target along the edges that hold at `at`."""
-        held = [(name, child.parent_at(at)) for name, child in self.children.items()]
-        return list(ways(held, target, source, frozenset()))
+        steps: Steps = {}
+        for name, child in self.children.items():
+            parent = child.parent_at(at)
+            steps.setdefault(name, []).append((parent, (name, parent, True)))
+            steps.setdefault(parent, []).append((name, (name, parent, False)))
+        return list(ways(steps, target, source, frozenset()))
 
     def along(self, way: Way, at: int) -> Pose:
         pose = Pose(0.0, 0j, 0.0)
@@ -266,16 +272,15 @@ class PlainTree:
         return pose
 
 
-def ways(held: list[tuple[str, str]], target: str, here: str, seen: frozenset[str]) -> Iterator[Way]:
-    """Every way along edges, each a child and its parent, that passes no frame twice."""
+def ways(steps: Steps, target: str, here: str, seen: frozenset[str]) -> Iterator[Way]:
+    """Every way that passes no frame twice."""
     if here == target:
         yield []
         return
-    for child, parent in held:
-        for end, there, up in ((child, parent, True), (parent, child, False)):
-            if end == here and there not in seen:
-                for rest in ways(held, target, there, seen | {here}):
-                    yield [(child, parent, up), *rest]
+    for there, step in steps.get(here, ()):
+        if there not in seen:
+            for rest in ways(steps, target, there, seen | {here}):
+                yield [step, *rest]
 
 
 def climb(parents: dict[str, str], name: str) -> list[str]:

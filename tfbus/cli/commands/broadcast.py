@@ -20,7 +20,7 @@ def broadcast(*, rate: Rate = 100.0, link: LinkOptions = DEFAULT_LINK) -> None:
 
     async def broadcast_laser(bus: Bus) -> None:
         laser = f"{tutorial.LASER!r} in {tutorial.BASE!r}"
-        say(f"broadcasting {laser} at {rate:g} Hz on domain {link.domain!r}, until Ctrl-C")
+        say(f"broadcasting {laser} at {rate:g} Hz on {link.place}, until Ctrl-C")
         await tutorial.broadcast(bus, rate)
 
     link.run(broadcast_laser)

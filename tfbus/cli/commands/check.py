@@ -111,7 +111,7 @@ def _check_domain(link: LinkOptions, limits: Limits, duration: float) -> list[Fi
 
         with bus.subscribe(note):
             await link.first_transform(bus)
-            say(f"listening to domain {link.domain!r} for {duration:g} s")
+            say(f"listening to {link.place} for {duration:g} s")
             await bus.clock.sleep(duration)
         return examiner.findings()
 

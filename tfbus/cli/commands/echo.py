@@ -2,14 +2,18 @@
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.cli._width import cells, terminal_width, wrapped
 from tfbus.cli.arguments import Duration, JsonFlag, Rate, UsageError
-from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
 from tfbus.cli.output import format_seconds, print_now, say
+from tfbus.clock import Clock, SystemClock
 from tfbus.errors import MAY_COME, InvalidTransformError, TransformLookupError
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
@@ -30,6 +34,7 @@ def echo(
     rate: Rate = 1.0,
     max_age: Duration = math.inf,
     as_json: JsonFlag = False,
+    remote: Annotated[bool, Parameter(negative="", show_default=False)] = False,
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
     """Print the transform of SOURCE in TARGET again and again, until Ctrl-C.
@@ -52,6 +57,8 @@ def echo(
     as_json
         Print one JSON object a line: target, source, stamp (ns), translation (x y z, m), rotation (x y z w), static,
         and age (s; null if static).
+    remote
+        Ask the buffer that a program of the robot in --robots offers to others, instead of hearing all transforms.
     """
     try:
         for frame in (target, source):
@@ -59,25 +66,45 @@ def echo(
     except InvalidTransformError as error:
         raise UsageError(str(error)) from None
 
+    def show(transform: TransformStamped, now: int) -> str:
+        return to_json(transform, now) if as_json else describe(transform, now, terminal_width())
+
     async def print_transforms(bus: Bus) -> None:
         with Buffer(bus) as buffer:
             await link.first_transform(bus)
-            reported: _Cause | None = None
-            async for _ in bus.clock.ticks(rate):
-                try:
-                    transform = await buffer.lookup(target, source, timeout=_TIMEOUT, max_age=max_age)
-                except TransformLookupError as error:
-                    missing = error.__cause__ or error
-                    cause = _cause(missing)
-                    if cause != reported:
-                        say(f"waiting for {source!r} in {target!r}: {missing}")
-                        reported = cause
-                else:
-                    reported = None
-                    now = bus.clock.now()
-                    print_now(to_json(transform, now) if as_json else describe(transform, now, terminal_width()))
+            await _print_from(buffer, bus.clock, target, source, rate, max_age, show)
 
-    link.run(print_transforms)
+    async def print_remote(buffer: RemoteLookups) -> None:
+        await _print_from(buffer, SystemClock(), target, source, rate, max_age, show)
+
+    if remote:
+        link.run_remote(print_remote)
+    else:
+        link.run(print_transforms)
+
+
+async def _print_from(
+    buffer: RemoteLookups,
+    clock: Clock,
+    target: str,
+    source: str,
+    rate: float,
+    max_age: float,
+    show: Callable[[TransformStamped, int], str],
+) -> None:
+    reported: _Cause | None = None
+    async for _ in clock.ticks(rate):
+        try:
+            transform = await buffer.lookup(target, source, timeout=_TIMEOUT, max_age=max_age)
+        except TransformLookupError as error:
+            missing = error.__cause__ or error
+            cause = _cause(missing)
+            if cause != reported:
+                say(f"waiting for {source!r} in {target!r}: {missing}")
+                reported = cause
+        else:
+            reported = None
+            print_now(show(transform, clock.now()))
 
 
 def to_json(sample: TransformStamped, now: int) -> str:

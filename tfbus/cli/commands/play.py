@@ -54,7 +54,7 @@ def play(
     async def play_to_domain(bus: Bus) -> None:
         player = Player(bus, file, rate=rate, loop=loop, since=start, until=end, **topics.arguments())
         await _wait_for_peer(bus)
-        say(f"playing {file} on domain {link.domain!r}")
+        say(f"playing {file} on {link.place}")
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(_show_progress, player)
             await player.play()

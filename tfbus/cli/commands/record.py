@@ -60,7 +60,7 @@ def record(
                 raise UsageError(str(error)) from None
             except OSError as error:
                 raise UsageError(f"cannot write {file}: {error.strerror or error}") from None
-            say(f"recording domain {link.domain!r} to {file}")
+            say(f"recording {link.place} to {file}")
             status = await _wait_for_end(bus, link, duration, events, signals)
         print_summary(file, recorder.statistics())
         if recorder.error is None:

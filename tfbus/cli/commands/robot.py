@@ -78,7 +78,7 @@ def robot(
         return
 
     async def publish(bus: Bus) -> None:
-        where = f"on domain {link.domain!r} at {rate:g} Hz"
+        where = f"on {link.place} at {rate:g} Hz"
         say(f"publishing {len(transforms)} frames of {model.name!r} {where}, until Ctrl-C")
         async with anyio.create_task_group() as tasks:
             await tasks.start(publish_static, bus, model.fixed_transforms(bus.clock.now(), AUTHORITY, prefix))

@@ -1,7 +1,7 @@
 """The carrier of links over zenoh."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from threading import Thread
 
 import anyio
@@ -14,7 +14,7 @@ from tfbus.links._carrier import SendReport
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
 from tfbus.links._outbox import Turn
-from tfbus.links._receive_queue import Question, Received
+from tfbus.links._receive_queue import HistoryQuestion, Question, Received
 from tfbus.links._state import StateEntry, StateStep
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._newest import NewestSamples
@@ -52,6 +52,11 @@ class ZenohCarrier:
         self._answers: deque[tuple[zenoh.Query, Message]] = deque()
         self._woken = anyio.Event()
 
+    @property
+    def session(self) -> zenoh.Session:
+        """The session of zenoh, while the carrier is open."""
+        return self._sessions.session
+
     async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
         """Open the session; raises `OSError` if it cannot listen where it should, or as a client reaches nobody."""
         self._report = report
@@ -84,7 +89,11 @@ class ZenohCarrier:
         """Ask a peer for the changes of its state behind a number."""
         self._sessions.ask(peer, since)
 
-    def answer(self, question: Question, entries: list[StateEntry], step: StateStep) -> None:
+    def ask_history(self, peer: str, seconds: float, after: str) -> None:
+        """Ask a peer for the last seconds of the moving frames whose names come after `after`."""
+        self._sessions.ask_history(peer, seconds, after)
+
+    def answer(self, question: Question | HistoryQuestion, entries: Sequence[StateEntry], step: StateStep) -> None:
         """Answer a question; a worker thread sends the answers, because zenoh may wait for a peer that is frozen."""
         self._answers.append((question.handle, write_answer(entries, step)))
         self._woken.set()

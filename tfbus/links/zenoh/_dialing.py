@@ -48,6 +48,12 @@ class Dialing:
             del self._addresses[oldest]
             self._lost.pop(oldest, None)
 
+    def refused(self, peer: str, address: str) -> None:
+        """Nobody listens at an address: forget it, unless it is the only one."""
+        known = self._addresses.get(peer, [])
+        if len(known) > 1 and address in known:
+            known.remove(address)
+
     def joined(self, peer: str) -> None:
         """A peer is there."""
         self._lost.pop(peer, None)

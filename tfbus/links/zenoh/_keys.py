@@ -5,6 +5,8 @@ Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digi
     tfbus/domain/robot/live/link      all that is published and removed, one message a turn of the link's event loop
     tfbus/domain/robot/slow/link      the newest sample of each moving frame, now and then, while somebody subscribes
     tfbus/domain/robot/state/link     a queryable: the link's state, or what has changed of it since a number
+    tfbus/domain/robot/history/link   a queryable: the last seconds of the link's moving frames
+    tfbus/domain/robot/hears/link     a queryable: whom the link hears; see `tfbus.links.zenoh._hearing`
     tfbus/domain/robot/@alive/link/session
                                       a liveliness token for each session of the link; the first session is ``0``
 """

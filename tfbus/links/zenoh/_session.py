@@ -13,20 +13,26 @@ from typing import Any
 
 import zenoh
 
+from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._peers import MAX_PEERS
-from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import MalformedMessageError
 
 _LONGEST_SHOWN_KEY = 200
 MOST_QUESTIONS = 1_000
+MOST_NAMES = 1_000
+"""Bytes; so much is read of an answer with names of sessions."""
 _ANSWER_TIME = 2.0
+_HEARING_TIME = 1.0
 _TOGETHER = 0.02
 _EARLY = 0.9
 """s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
 _SINCE = struct.Struct("<Q")
+_SECONDS = struct.Struct("<d")
+_LONGEST_NAME = 2**16
 
 
 class ZenohSession:
@@ -41,6 +47,10 @@ class ZenohSession:
         attachment.
     note_presence : callable
         Called in zenoh's threads with a link, the name of a session of it, and its `Presence`.
+    note_asked : callable, optional
+        Called in zenoh's threads with each query of a link that asks whether it is heard; without it, none is answered.
+    note_connection : callable, optional
+        Called in zenoh's threads with the id of a session to which a connection was made or has broken.
     name : str
         The name of this session among those of the link.
 
@@ -56,9 +66,13 @@ class ZenohSession:
         receive: Callable[[Received], object],
         note_presence: Callable[[str, str, Presence], object],
         name: str = FIRST_SESSION,
+        note_asked: Callable[[zenoh.Query], object] | None = None,
+        note_connection: Callable[[str], object] | None = None,
     ) -> None:
         self._config = config
         self._note_presence = note_presence
+        self._note_asked = note_asked
+        self._note_connection = note_connection
         self._name = name
         self._keys = keys
         self._receive = receive
@@ -111,21 +125,31 @@ class ZenohSession:
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
         self._declared = [
             *(
-                session.declare_subscriber(key, _directly(self._receive_live), allowed_origin=remote)
+                session.declare_subscriber(key, directly(self._receive_live), allowed_origin=remote)
                 for key in keys.heard("live")
             ),
             *(
-                session.declare_subscriber(key, _directly(self._receive_slow(rate)), allowed_origin=remote)
+                session.declare_subscriber(key, directly(self._receive_slow(rate)), allowed_origin=remote)
                 for key, rate in keys.slow()
             ),
             *(
-                session.liveliness().declare_subscriber(key, _directly(self._receive_presence), history=True)
+                session.liveliness().declare_subscriber(key, directly(self._receive_presence), history=True)
                 for key in keys.heard("@alive")
             ),
-            session.declare_queryable(keys.own("state"), _directly(self._receive_question)),
+            session.declare_queryable(keys.own("state"), directly(self._receive_question)),
+            session.declare_queryable(keys.own("history"), directly(self._receive_history_question)),
+            *([session.declare_queryable(keys.own("hears"), directly(self._note_asked))] if self._note_asked else []),
             session.liveliness().declare_token(keys.token(self._name)),
         ]
+        if self._note_connection is not None:
+            self._declared.append(session.info.declare_link_events_listener(directly(self._receive_connection)))
         self.is_open = True
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session of zenoh, once it is open."""
+        assert self._session is not None
+        return self._session
 
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested."""
@@ -142,44 +166,82 @@ class ZenohSession:
     def addresses(self) -> dict[str, str]:
         """The address at which each directly connected session is reached, by the id of the session; may block."""
         try:
-            assert self._session is not None
-            return {str(link.zid): link.dst for link in self._session.info.links()}
+            return {str(link.zid): link.dst for link in self.session.info.links()}
         except zenoh.ZError:
             return {}
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number; the answer is received as an item."""
+        self._ask("state", peer, _SINCE.pack(since), Answer)
+
+    def ask_history(self, peer: str, seconds: float, after: str) -> None:
+        """Ask a peer for the last seconds of its moving frames behind a name; the answer is received as an item."""
+        self._ask("history", peer, _SECONDS.pack(seconds) + after.encode(), HistoryAnswer)
+
+    def _ask(self, kind: str, peer: str, payload: bytes, answer: type[Answer | HistoryAnswer]) -> None:
         answered = False
 
         def take(reply: zenoh.Reply) -> None:
             nonlocal answered
             if reply.ok is not None and not answered:
                 answered = True
-                self._receive_message(peer, reply.ok, as_answer=True)
+                self._receive_message(peer, reply.ok, answer)
 
         def end() -> None:
             if not answered:
-                self._receive(Received(peer, Answer(None)))
+                self._receive(Received(peer, answer(None)))
 
         try:
-            assert self._session is not None
-            self._session.get(
-                self._keys.of("state", peer),
+            self.session.get(
+                self._keys.of(kind, peer),
                 zenoh.handlers.Callback(take, end, indirect=False),
-                payload=_SINCE.pack(since),
+                payload=payload,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
             )
         except zenoh.ZError:
-            self._receive(Received(peer, Answer(None)))
+            self._receive(Received(peer, answer(None)))
+
+    def ask_hearing(self, peer: str, take: Callable[[list[str] | None], object]) -> None:
+        """Ask a peer which sessions of this link it hears; `take` is called in zenoh's threads, None for no answer."""
+        answered = False
+
+        def take_reply(reply: zenoh.Reply) -> None:
+            nonlocal answered
+            if reply.ok is not None and not answered:
+                answered = True
+                names = reply.ok.payload.to_bytes()[:MOST_NAMES].decode("ascii", "replace")
+                take(names.split(",") if names else [])
+
+        def end() -> None:
+            if not answered:
+                take(None)
+
+        # What cannot be asked is asked again.
+        with suppress(zenoh.ZError):
+            self.session.get(
+                self._keys.of("hears", peer),
+                zenoh.handlers.Callback(take_reply, end, indirect=False),
+                payload=self._keys.token(FIRST_SESSION),
+                timeout=_HEARING_TIME,
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+
+    def answer_hearing(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
+        """Answer links that ask whether they are heard; for a worker thread, as `answer`."""
+        for query, names in answers:
+            with suppress(zenoh.ZError):
+                query.reply(self._keys.own("hears"), ",".join(names)[:MOST_NAMES])
+            query.drop()
 
     def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
         """Answer questions; for a worker thread, because zenoh waits for a peer whose queue is full."""
         for query, message in answers:
             # A peer that has gone needs no answer.
             with suppress(zenoh.ZError):
-                query.reply(self._keys.own("state"), message.payload, attachment=message.attachment)
+                kind = str(query.key_expr).rsplit("/", 2)[1]
+                query.reply(self._keys.own(kind), message.payload, attachment=message.attachment)
             query.drop()
             with self._lock:
                 self._questions -= 1
@@ -227,7 +289,9 @@ class ZenohSession:
 
         return receive
 
-    def _receive_message(self, sender: str, sample: zenoh.Sample, as_answer: bool = False) -> None:
+    def _receive_message(
+        self, sender: str, sample: zenoh.Sample, answer: type[Answer | HistoryAnswer] | None = None
+    ) -> None:
         size = len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment))
         if size > MAX_BYTES:
             self._refuse(sender, "oversized", f"{size} bytes, more than {MAX_BYTES}")
@@ -235,8 +299,8 @@ class ZenohSession:
         # Copies, for the sample would keep the whole buffer in which it came.
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
         message = sample.payload.to_bytes(), attachment
-        if as_answer:
-            self._receive(Received(sender, Answer(message), size))
+        if answer is not None:
+            self._receive(Received(sender, answer(message), size))
         else:
             self._receive(Received(sender, message, size, moving=True))
 
@@ -248,13 +312,30 @@ class ZenohSession:
             present = sample.kind == zenoh.SampleKind.PUT
             self._note_presence(*found, Presence.JOINED if present else Presence.LEFT)
 
+    def _receive_connection(self, event: zenoh.LinkEvent) -> None:
+        if self._note_connection is not None:
+            self._note_connection(str(event.link.zid))
+
     def _receive_question(self, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
+        self._admit(query, Question(_SINCE.unpack(payload)[0], query) if len(payload) == _SINCE.size else None)
+
+    def _receive_history_question(self, query: zenoh.Query) -> None:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        question = None
+        if _SECONDS.size <= len(payload) <= _SECONDS.size + _LONGEST_NAME:
+            seconds = _SECONDS.unpack_from(payload)[0]
+            with suppress(UnicodeDecodeError):
+                after = payload[_SECONDS.size :].decode()
+                question = HistoryQuestion(seconds, after, query) if 0 < seconds <= LONGEST_HISTORY else None
+        self._admit(query, question)
+
+    def _admit(self, query: zenoh.Query, question: Question | HistoryQuestion | None) -> None:
         with self._lock:
-            admitted = len(payload) == _SINCE.size and self._questions < MOST_QUESTIONS
+            admitted = question is not None and self._questions < MOST_QUESTIONS
             self._questions += admitted
         if admitted:
-            self._receive(Received("", Question(_SINCE.unpack(payload)[0], query)))
+            self._receive(Received("", question))
         else:
             # Whoever means it asks again.
             query.drop()
@@ -282,7 +363,7 @@ def close_session(session: zenoh.Session | None) -> None:
             session.close()
 
 
-def _directly(callback: Callable[[Any], object]) -> Any:
+def directly(callback: Callable[[Any], object]) -> Any:
     # Otherwise each subscriber has a thread of its own, and one overtakes the other.
     return zenoh.handlers.Callback(callback, indirect=False)
 

@@ -1,12 +1,14 @@
 """All zenoh sessions of a link: the one that it was opened with, and one for each peer that only another way reaches.
 
 Peers in a mesh hear each other over direct connections only. When one of these breaks, while both ends are well with
-others, zenoh does not dial again. Then a session of its own does, the *patch*, which is connected to nobody else.
+others, zenoh does not dial again. Then a session of its own does, the *patch*, which is connected to nobody else. The
+same mends a connection of which only one end hears the other; see `tfbus.links.zenoh._hearing`.
 """
 
 import re
 import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from time import monotonic
 from uuid import uuid4
 
@@ -17,11 +19,13 @@ import zenoh
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._dialing import Dialing
+from tfbus.links.zenoh._hearing import Hearing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
 
 _PROBE_TIME = 1.0
 _MEETING_TIME = 3.0
+_MOST_ASKING = 1_000
 _TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
 
 _Way = tuple[ZenohSession | None, str]
@@ -55,12 +59,29 @@ class ZenohSessions:
         self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
-        self._main = ZenohSession(config, keys, receive, self._note_directly)
+        self._main = ZenohSession(
+            config,
+            keys,
+            receive,
+            self._note_directly,
+            note_asked=self._note_asked,
+            note_connection=self._note_connection,
+        )
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
         self._changes: list[tuple[str, Presence]] = []
         self._dialing = Dialing(monotonic) if dialing is None else dialing
+        self._hearing = Hearing(monotonic)
+        self._deaf: set[str] = set()
+        self._connected: set[str] = set()
+        self._asking: list[zenoh.Query] = []
+        self._heard_by: list[tuple[str, list[str] | None]] = []
         self._closing: list[threading.Thread] = []
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The session of zenoh that the link was opened with."""
+        return self._main.session
 
     def open(self) -> None:
         """Open the session; for a worker thread.
@@ -90,8 +111,15 @@ class ZenohSessions:
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
+        self._to(peer).ask(peer, since)
+
+    def ask_history(self, peer: str, seconds: float, after: str) -> None:
+        """Ask a peer for the last seconds of its moving frames."""
+        self._to(peer).ask_history(peer, seconds, after)
+
+    def _to(self, peer: str) -> ZenohSession:
         patch = self._patches.get(peer)
-        (patch if patch is not None and patch.is_open else self._main).ask(peer, since)
+        return patch if patch is not None and patch.is_open else self._main
 
     def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
         """Answer questions; for a worker thread."""
@@ -107,13 +135,27 @@ class ZenohSessions:
         return [*self._closing, *(session.close() for session in sessions)]
 
     async def keep_connected(self, interval: float = 0.5) -> None:
-        """Dial peers that were lost, until cancelled."""
+        """Dial peers that were lost, or do not hear this link, until cancelled."""
         async with anyio.create_task_group() as tasks:
             while True:
                 await anyio.sleep(interval)
                 with self._lock:
                     changes, self._changes = self._changes, []
+                    asking, self._asking = self._asking, []
+                    connected, self._connected = self._connected, set()
+                    heard_by, self._heard_by = self._heard_by, []
+                    answers = [(query, self._names_heard(query)) for query in asking]
                 await self._note(changes)
+                for peer in connected:
+                    if self._is_direct(peer):
+                        self._hearing.joined(peer)
+                for peer, names in heard_by:
+                    self._judge(peer, names)
+                if answers:
+                    # zenoh may wait for a peer that is frozen.
+                    await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
+                for peer in self._hearing.take_due():
+                    self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
                 for peer, address in self._dialing.take_due():
                     if peer not in self._patches:
@@ -124,6 +166,8 @@ class ZenohSessions:
             if presence is Presence.LEFT:
                 if peer not in self._present:
                     self._dialing.left(peer)
+                    self._hearing.left(peer)
+                    self._deaf.discard(peer)
                     self._drop_patch(peer)
             else:
                 self._dialing.joined(peer)
@@ -134,11 +178,65 @@ class ZenohSessions:
                 self._dialing.reached(peer, addresses[peer])
         for peer in joined:
             # A connection is not enough: zenoh may have it, and tell nothing of the other end.
-            if (None, FIRST_SESSION) in self._present.get(peer, ()):
+            if self._is_direct(peer):
+                self._hearing.joined(peer)
+                if peer not in self._deaf:
+                    self._drop_patch(peer)
+
+    def _is_direct(self, peer: str) -> bool:
+        return (None, FIRST_SESSION) in self._present.get(peer, ())
+
+    def _judge(self, peer: str, names: list[str] | None) -> None:
+        """Note which sessions of this link a peer hears, and have it dialled if there is none."""
+        if names and FIRST_SESSION in names and peer in self._deaf:
+            self._deaf.discard(peer)
+            self._dialing.joined(peer)
+            if self._is_direct(peer):
                 self._drop_patch(peer)
+        if names is None:
+            deaf = self._is_direct(peer) and self._hearing.is_silent(peer)
+        else:
+            deaf = self._hearing.is_deaf(peer, bool(names))
+        if deaf:
+            self._deaf.add(peer)
+            self._drop_patch(peer)
+            self._dialing.left(peer)
+
+    def _names_heard(self, query: zenoh.Query) -> list[str]:
+        """The sessions, by their names, that are heard of the link that asks; the lock is held."""
+        asker = self._asker(query)
+        return sorted({name for _, name in self._present.get(asker or "", ())})
+
+    def _asker(self, query: zenoh.Query) -> str | None:
+        """The link that asks whether it is heard; None for one that this link does not mean to hear."""
+        token = (b"" if query.payload is None else query.payload.to_bytes()).decode("ascii", "replace")
+        found = self._keys.session(token)
+        if found is None or not any(zenoh.KeyExpr(key).includes(token) for key in self._keys.heard("@alive")):
+            return None
+        return found[0]
+
+    def _note_connection(self, peer: str) -> None:
+        with self._lock:
+            self._connected.add(peer)
+
+    def _note_asked(self, query: zenoh.Query) -> None:
+        with self._lock:
+            if len(self._asking) < _MOST_ASKING and self._asker(query) is not None:
+                self._asking.append(query)
+                return
+        query.drop()
+
+    def _note_heard_by(self, peer: str, names: list[str] | None) -> None:
+        with self._lock:
+            self._heard_by.append((peer, names))
 
     async def _patch(self, peer: str, address: str) -> None:
-        if not await _is_reachable(address) or peer in self._patches:
+        try:
+            reachable = await _is_reachable(address)
+        except ConnectionRefusedError:
+            self._dialing.refused(peer, address)
+            return
+        if not reachable or peer in self._patches:
             return
         patch = ZenohSession(
             self._patch_config(address),
@@ -157,7 +255,7 @@ class ZenohSessions:
         with anyio.move_on_after(_MEETING_TIME):
             while peer not in self._present:  # noqa: ASYNC110 - zenoh's threads wake no event here
                 await anyio.sleep(0.05)
-        if peer not in self._present or (None, FIRST_SESSION) in self._present[peer]:
+        if peer not in self._present or (self._is_direct(peer) and peer not in self._deaf):
             self._drop_patch(peer)
 
     def _drop_patch(self, peer: str) -> None:
@@ -200,14 +298,22 @@ class ZenohSessions:
 
 
 async def _is_reachable(address: str) -> bool:
-    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try."""
+    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try.
+
+    Raises
+    ------
+    ConnectionRefusedError
+        If nobody does, rather than that the address cannot be reached.
+    """
     found = _TCP.match(address)
     if found is None:
         return True
     try:
         with anyio.fail_after(_PROBE_TIME):
             stream = await anyio.connect_tcp(found["six"] or found["four"], int(found["port"]))
-    except OSError:
+    except OSError as error:
+        if isinstance(error.__cause__, ConnectionRefusedError):
+            raise ConnectionRefusedError from error
         return False
     await stream.aclose()
     return True

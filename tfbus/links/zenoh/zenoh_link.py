@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 from uuid import uuid4
 
+import zenoh
+
 from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
@@ -57,6 +59,10 @@ class ZenohLink(Link):
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
         How many live messages may wait for the event loop; then the oldest are dropped and counted.
+    history : float, optional
+        Ask each peer once, when it is met, for the last so many seconds of its moving frames, as far as buffers on its
+        bus hold them: 2,000 samples of each frame at most. They are published before what it sends live, so lookups at
+        stamps before the joining can be answered.
 
     Attributes
     ----------
@@ -105,6 +111,7 @@ class ZenohLink(Link):
         lease: float = 2.0,
         max_frames: int = 10_000,
         capacity: int = 10_000,
+        history: float | None = None,
     ) -> None:
         if isinstance(robots, str):
             raise TypeError(f"robots must be several names, not {robots!r}")
@@ -134,5 +141,19 @@ class ZenohLink(Link):
             slow_rate,
         )
         super().__init__(
-            bus, domain, carrier, frames=frames, drop_lost=drop_lost, max_frames=max_frames, capacity=capacity
+            bus,
+            domain,
+            carrier,
+            frames=frames,
+            drop_lost=drop_lost,
+            max_frames=max_frames,
+            capacity=capacity,
+            history=history,
         )
+        self._zenoh = carrier
+
+    def _zenoh_session(self) -> zenoh.Session:
+        """The session of zenoh; raises `RuntimeError` unless the link is entered."""
+        if not self._attached:
+            raise RuntimeError("the link is not entered")
+        return self._zenoh.session

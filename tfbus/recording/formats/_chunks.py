@@ -2,6 +2,7 @@
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -33,10 +34,12 @@ def merge_chunks(
     read : callable
         Gives the messages of a chunk in the order of the file.
     """
+    # Then equal log times need not wait for the next chunk.
+    in_file_order = all(before.offset < after.offset for before, after in pairwise(places))
     waiting: list[StoredMessage] = []
     origins: list[int] = []
     for number, place in enumerate(places, 1):
-        following = places[number].start if number < len(places) else _END
+        following = places[number].start + in_file_order if number < len(places) else _END
         found = read(place)
         if not waiting and found and _in_order(found) and found[-1][0] < following:
             # The usual case: nothing overlaps.
@@ -50,6 +53,25 @@ def merge_chunks(
         ready = bisect_left(waiting, following, key=_log_time)
         yield waiting[:ready]
         del waiting[:ready], origins[:ready]
+
+
+def separate(places: Sequence[ChunkPlace]) -> list[slice]:
+    """The parts of an index between which no two chunks overlap, so that each can be sorted by itself.
+
+    Parameters
+    ----------
+    places : sequence of ChunkPlace
+        In the order of their starts.
+    """
+    in_file_order = all(before.offset < after.offset for before, after in pairwise(places))
+    parts = []
+    first, end = 0, 0
+    for at, place in enumerate(places):
+        if at > first and end < place.start + in_file_order:
+            parts.append(slice(first, at))
+            first = at
+        end = max(end, place.end)
+    return [*parts, slice(first, len(places))] if places else []
 
 
 def _in_order(messages: list[StoredMessage]) -> bool:

@@ -7,8 +7,7 @@ give the same bits.
 """
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from operator import itemgetter
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,8 +17,9 @@ from tfbus.frames import is_frame
 from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING
 from tfbus.recording.formats._bounds import MAX_MESSAGE
 from tfbus.recording.formats._decoder import ChannelDecoder
+from tfbus.recording.formats._packed import Packed
 from tfbus.recording.formats._raw_transforms import TF_TYPES
-from tfbus.recording.formats._storage import Channel, StoredMessage
+from tfbus.recording.formats._storage import Channel
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME
 
@@ -27,9 +27,10 @@ Stamps = npt.NDArray[np.int64]
 
 _LARGE: Final = 1e9
 """m; whether a longer translation is valid, the slow path decides."""
-_MAX_LAYOUTS: Final = 64
+_MAX_LAYOUTS: Final = 10_000
+_MAX_STRUCTURES: Final = 64
+"""Of one channel and one size of messages."""
 _SIZE: Final = struct.Struct("<I")
-_received = itemgetter(0)
 
 
 class Columns(NamedTuple):
@@ -61,15 +62,38 @@ class _Slot(NamedTuple):
 class _Layout(NamedTuple):
     """The bytes that are the same in all messages of a layout, and the transforms between them."""
 
-    fixed: tuple[tuple[int, int, npt.NDArray[np.uint8]], ...]
+    places: npt.NDArray[np.intp]
+    """Where those bytes are."""
+    fixed: npt.NDArray[np.uint8]
     slots: tuple[_Slot, ...]
 
-    def matches(self, matrix: npt.NDArray[np.uint8]) -> npt.NDArray[np.bool_]:
-        """Which rows of a matrix have this layout."""
-        found = np.ones(len(matrix), bool)
-        for start, end, part in self.fixed:
-            found &= (matrix[:, start:end] == part).all(axis=1)
-        return found
+
+class _Structure:
+    """Layouts whose names are equally long, so that all have their fixed bytes at the same places.
+
+    Parameters
+    ----------
+    places : array of int
+    """
+
+    def __init__(self, places: npt.NDArray[np.intp]) -> None:
+        self.places = places
+        self.layouts: dict[int, _Layout] = {}
+        words = -(-len(places) // 8)
+        self._padding = 8 * words - len(places)
+        # Odd numbers without a pattern; messages with the same sum are compared byte by byte as well.
+        self._weights = np.random.default_rng(words).integers(2**62, size=words, dtype=np.uint64) * 2 + 1
+
+    def fixed(self, matrix: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        """The bytes of each message at the fixed places."""
+        return matrix[:, self.places]
+
+    def hashes(self, fixed: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint64]:
+        """A number for the fixed bytes of each message."""
+        whole = np.zeros((len(fixed), fixed.shape[1] + self._padding), np.uint8)
+        whole[:, : fixed.shape[1]] = fixed
+        sums: npt.NDArray[np.uint64] = whole.view(np.uint64) @ self._weights
+        return sums
 
 
 class ColumnDecoder:
@@ -83,59 +107,92 @@ class ColumnDecoder:
 
     def __init__(self, decoders: Mapping[Channel, ChannelDecoder]) -> None:
         self._decoders = decoders
-        self._layouts: dict[tuple[Channel, int], list[_Layout]] = {}
+        self._structures: dict[tuple[Channel, int], list[_Structure]] = {}
+        self._layouts = 0
 
-    def decode(self, messages: Sequence[StoredMessage]) -> list[Columns] | None:
-        """One `Columns` for each frame; None if the messages have to be decoded one by one."""
-        groups: dict[tuple[Any, int], list[int]] = {}
-        for at, (_, channel, payload) in enumerate(messages):
-            key = channel, len(payload)
-            if key in groups:
-                groups[key].append(at)
-            else:
-                groups[key] = [at]
-        received = np.fromiter(map(_received, messages), np.int64, len(messages))
-        found: dict[str, list[Columns]] = {}
-        for (channel, size), places in groups.items():
+    def decode(self, messages: Packed) -> list[Columns] | None:
+        """One `Columns` for each frame and authority; None if the messages have to be decoded one by one."""
+        sizes = messages.ends - messages.starts
+        if not messages.count:
+            return []
+        if sizes.max() > MAX_MESSAGE:
+            return None
+        found: dict[tuple[str, str], list[Columns]] = {}
+        for order in _groups((messages.numbers << 32) | sizes):
+            channel = messages.channels[messages.numbers[order[0]]]
             decoder = self._decoders.get(channel)
             if decoder is None or channel.encoding not in ("cdr", "ros1") or channel.type not in TF_TYPES:
                 return None
-            if size > MAX_MESSAGE:
+            size = int(sizes[order[0]])
+            if not size:
                 return None
-            matrix = np.frombuffer(b"".join([messages[at][2] for at in places]), np.uint8).reshape(len(places), size)
-            parts = self._split(decoder, matrix, np.array(places))
+            everywhere = np.ndarray((len(messages.data) - size + 1,), f"V{size}", messages.data, strides=(1,))
+            matrix = everywhere[messages.starts[order]].view(np.uint8).reshape(-1, size)
+            parts = self._split(decoder, matrix, order)
             if parts is None:
                 return None
-            for layout, order, rows in parts:
+            for layout, its_order, rows in parts:
                 for place, slot in enumerate(layout.slots):
-                    columns = _columns(decoder, layout, place, slot, order, received, rows)
+                    columns = _columns(decoder, layout, place, slot, its_order, messages.received, rows)
                     if columns is None:
                         return None
-                    found.setdefault(columns.child, []).append(columns)
-        merged = list(map(_merge, found.values()))
-        return None if None in merged else [columns for columns in merged if columns is not None]
+                    found.setdefault((columns.child, columns.authority), []).append(columns)
+        edges: dict[str, tuple[str, bool]] = {}
+        for parts_of_one in found.values():
+            for each in parts_of_one:
+                if edges.setdefault(each.child, (each.parent, each.static)) != (each.parent, each.static):
+                    return None
+        return list(map(_merge, found.values()))
 
     def _split(
         self, decoder: ChannelDecoder, matrix: npt.NDArray[np.uint8], order: npt.NDArray[np.intp]
     ) -> list[tuple[_Layout, npt.NDArray[np.intp], npt.NDArray[np.uint8]]] | None:
         """Parts of a matrix that have one layout each, with the places of their messages."""
-        size = matrix.shape[1]
-        known = self._layouts.setdefault((decoder.channel, size), [])
+        known = self._structures.setdefault((decoder.channel, matrix.shape[1]), [])
         parts = []
-        for at in range(_MAX_LAYOUTS):
+        at = 0
+        while len(matrix):
             if at == len(known):
                 layout = _layout_of(matrix[0].tobytes(), decoder)
-                if layout is None:
+                if layout is None or at == _MAX_STRUCTURES:
                     return None
-                known.append(layout)
-            fits = known[at].matches(matrix)
-            if fits.all():
-                parts.append((known[at], order, matrix))
-                return parts
-            if fits.any():
-                parts.append((known[at], order[fits], matrix[fits]))
-                matrix, order = matrix[~fits], order[~fits]
-        return None
+                known.append(_Structure(layout.places))
+            structure = known[at]
+            at += 1
+            fixed = structure.fixed(matrix)
+            hashes = structure.hashes(fixed)
+            rest = np.zeros(len(matrix), bool)
+            for rows in _groups(hashes):
+                number = int(hashes[rows[0]])
+                layout = structure.layouts.get(number)
+                if layout is None:
+                    layout = _layout_of(matrix[rows[0]].tobytes(), decoder)
+                    if layout is None or self._layouts == _MAX_LAYOUTS:
+                        return None
+                    if not np.array_equal(layout.places, structure.places):
+                        rest[rows] = True
+                        continue
+                    structure.layouts[number] = layout
+                    self._layouts += 1
+                its = slice(None) if len(rows) == len(matrix) else rows
+                fits = (fixed[its] == layout.fixed).all(axis=1)
+                if fits.all():
+                    parts.append((layout, order[its], matrix[its]))
+                else:
+                    rest[rows[~fits]] = True
+                    if fits.any():
+                        parts.append((layout, order[rows[fits]], matrix[rows[fits]]))
+            if not rest.any():
+                break
+            matrix, order = matrix[rest], order[rest]
+        return parts
+
+
+def _groups(keys: npt.NDArray[Any]) -> list[npt.NDArray[np.intp]]:
+    """The places of equal keys, one array for each key; they ascend."""
+    order = np.argsort(keys, kind="stable")
+    ascending = keys[order]
+    return np.split(order, np.flatnonzero(ascending[1:] != ascending[:-1]) + 1)
 
 
 def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
@@ -176,8 +233,8 @@ def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
         return None
     if at != len(payload):
         return None
-    content = np.frombuffer(payload, np.uint8)
-    return _Layout(tuple((start, end, content[start:end]) for start, end in fixed if start < end), tuple(slots))
+    places = np.concatenate([np.arange(start, end) for start, end in fixed], dtype=np.intp)
+    return _Layout(places, np.frombuffer(payload, np.uint8)[places], tuple(slots))
 
 
 def _columns(
@@ -216,13 +273,11 @@ def _columns(
     return Columns(slot.parent, slot.child, authority, decoder.static, order, received[order], stamps, rows)
 
 
-def _merge(parts: list[Columns]) -> Columns | None:
-    """Several columns of one frame as one; None if they differ in more than their samples."""
+def _merge(parts: list[Columns]) -> Columns:
+    """Several columns of one frame as one; they differ only in their samples."""
     first = parts[0]
     if len(parts) == 1:
         return first
-    if any(part[:4] != first[:4] for part in parts):
-        return None
     order = np.concatenate([part.order for part in parts])
     by_message = np.argsort(order, kind="stable")
     joined: Iterator[Any] = (np.concatenate([part[at] for part in parts])[by_message] for at in range(4, 8))

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO, Final, cast
 
 from tfbus.errors import MissingRecordingError, RecordingError
 from tfbus.recording.formats._bounds import MAX_METADATA, max_unpacked
+from tfbus.recording.formats._packed import Packed, Stored, batches, blocks_of
 from tfbus.recording.formats._storage import (
     Channel,
     Storage,
@@ -146,6 +147,24 @@ class FolderStorage:
             yield stored
         if since is None and until is None and self._promised is not None:
             yield from self._shortfalls(now, wanted, read)
+
+    def packed(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[Stored]:
+        """The messages of `messages`, many at once; those of a single file are packed if that file packs them."""
+        if len(self._files) > 1 or self._refused:
+            yield from batches(self.messages(wanted, since, until))
+            return
+        read: Counter[Channel] = Counter()
+        now = (self.start or 0) if since is None else since
+        for block in blocks_of(self._files[0], wanted, since, until):
+            if isinstance(block, Packed):
+                read.update(block.counts())
+                now = int(block.received[-1])
+            else:
+                read.update(cast(Channel, channel) for _, channel, _ in block)
+                now = block[-1][0]
+            yield block
+        if since is None and until is None and self._promised is not None:
+            yield from batches(self._shortfalls(now, wanted, read))
 
     def _shortfalls(self, now: int, wanted: Wanted, read: Counter[Channel]) -> Iterator[StoredMessage]:
         """A report for each topic of which the metadata promise messages that the files neither promise nor have."""

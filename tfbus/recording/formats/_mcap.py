@@ -11,26 +11,31 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
-from io import BytesIO
+from itertools import accumulate, chain
+from operator import itemgetter
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
+import numpy as np
 from mcap import records
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats._bounds import MAX_INDEX
-from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks
+from tfbus.recording.formats._bounds import MAX_CHUNK_MESSAGES, MAX_INDEX
+from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks, separate
 from tfbus.recording.formats._mcap_records import (
     DAMAGE,
     Chunk,
     Torn,
     parse_record,
     read_records,
+    record_places,
+    scan_chunks,
     split_chunk,
     split_message,
 )
+from tfbus.recording.formats._packed import Packed, Stored, batches, in_order
 from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message, select, shortfalls
 from tfbus.stamps import STAMP_MAX
 
@@ -48,6 +53,12 @@ _KINDS: Final[dict[int, str]] = {
 }
 """The names of the records that are read."""
 _ANY: Final = Channel("", "", "")
+_PIECE: Final = 2**16
+_FIRST_BLOCK: Final = 2**16
+_BLOCK: Final = 2**20
+"""Bytes that are decoded at once: few at first, for the first message of each frame has to be judged by itself."""
+_MOST_OVERLAPPING: Final = 16
+"""Chunks; if more have to be in memory at once, their messages are merged one by one."""
 
 
 class _IndexedChunk(NamedTuple):
@@ -56,6 +67,14 @@ class _IndexedChunk(NamedTuple):
     place: ChunkPlace
     length: int
     channels: tuple[int, ...]
+
+
+class _OpenChunk(NamedTuple):
+    """The records of a chunk, and where each begins, with the end of the last."""
+
+    place: ChunkPlace
+    content: bytes
+    places: list[int]
 
 
 class McapStorage:
@@ -137,13 +156,39 @@ class McapStorage:
         ):
             now = stored[0]
             yield stored
+        yield from self._reports(reading, now, None if since is not None or until is not None else read)
+
+    def packed(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[Stored]:
+        """The messages of `messages`, many at once."""
+        parts = separate([chunk.place for chunk in self._chunks])
+        if not parts or max(part.stop - part.start for part in parts) > _MOST_OVERLAPPING:
+            yield from batches(self.messages(wanted, since, until))
+            return
+        low = 0 if since is None else since
+        high = STAMP_MAX if until is None else until
+        reading = _Reading(self, wanted)
+        read: Counter[Channel] = Counter()
+        now = low
+        for found in reading.packed(parts, low, high):
+            if isinstance(found, Packed):
+                read.update(found.counts())
+                now = max(now, int(found.received[-1]))
+                yield found
+            elif block := list(select([found], since, until, read)):
+                now = max(now, block[-1][0])
+                yield block
+        reports = self._reports(reading, now, None if since is not None or until is not None else read)
+        yield from batches(reports)
+
+    def _reports(self, reading: "_Reading", now: int, read: Counter[Channel] | None) -> Iterator[StoredMessage]:
+        """What a reading has found wrong; `read` has the number of the messages, if none was left out."""
         if reading.unknown:
             yield lost_message(now, f"{reading.unknown:,} messages are on channels that the file does not describe")
         if reading.contradictions:
             numbers = ", ".join(map(str, sorted(reading.contradictions)))
             yield lost_message(now, f"the descriptions of channel {numbers} contradict each other")
-        if since is None and until is None and self._statistics is not None:
-            promised = {channel: count or 0 for channel, count in self.channels.items() if wanted(channel)}
+        if read is not None and self._statistics is not None:
+            promised = {channel: count or 0 for channel, count in self.channels.items() if reading.wants(channel)}
             yield from shortfalls(now, promised, read)
 
     def _read_index(self) -> bool:
@@ -155,26 +200,34 @@ class McapStorage:
         opcode, length, start, _, checksum, magic = _FOOTER.unpack(footer)
         if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_LENGTH, MAGIC):
             return False
-        if start and start <= self.size and self.size - start <= MAX_INDEX:
-            self._file.seek(start)
-            index = self._file.read()
-            # The checksum covers the index up to the checksum itself.
-            if checksum in (0, zlib.crc32(index[: -len(MAGIC) - 4])):
-                with suppress(*DAMAGE, EndOfFile):
-                    self._use_index(index)
+        there_is_one = start and start <= self.size and self.size - start <= MAX_INDEX
+        # The checksum covers the index up to the checksum itself.
+        if there_is_one and checksum in (0, self._checksum(start, self.size - len(MAGIC) - 4)):
+            with suppress(*DAMAGE, EndOfFile):
+                self._use_index(start)
         if self._statistics is None:
             # They would contradict what the chunks say.
             self._schemas.clear()
             self._numbered.clear()
         return True
 
-    def _use_index(self, data: bytes) -> None:
+    def _checksum(self, start: int, end: int) -> int:
+        # In pieces: a large one in memory would, once it is freed, keep `malloc` from giving large ones back.
+        self._file.seek(start)
+        checksum = 0
+        while start < end and (piece := self._file.read(min(_PIECE, end - start))):
+            checksum = zlib.crc32(piece, checksum)
+            start += len(piece)
+        return checksum
+
+    def _use_index(self, start: int) -> None:
         chunks: list[_IndexedChunk] = []
         statistics: records.Statistics | None = None
         # Nearly all chunks have the same channels: one tuple for all of them saves most of the memory.
         shared: dict[tuple[int, ...], tuple[int, ...]] = {}
         kinds = {0}
-        for _, opcode, content in read_records(BytesIO(data), len(data)):
+        self._file.seek(start)
+        for _, opcode, content in read_records(self._file, self.size):
             record = None if content is None else parse_record(opcode, content)
             if isinstance(record, records.ChunkIndex):
                 numbers = tuple(record.message_index_offsets)
@@ -290,6 +343,8 @@ class _Reading:
 
     Attributes
     ----------
+    wants : callable
+        Whether the messages of a channel are read.
     unknown : int
         Messages on channels that the file does not describe.
     contradictions : set of int
@@ -298,8 +353,10 @@ class _Reading:
 
     def __init__(self, storage: McapStorage, wanted: Wanted) -> None:
         self._storage = storage
-        self._wanted = wanted
+        self.wants = wanted
         self._counts: Counter[int] = Counter()
+        self._table: list[Channel] = []
+        self._places: dict[Channel, int] = {}
         self.unknown = 0
         self.contradictions: set[int] = set()
 
@@ -320,10 +377,79 @@ class _Reading:
                     raise ValueError("it is behind the end of the file")
                 return self._in_chunk(self._storage.read_chunk(place.offset))
             except (*DAMAGE, EndOfFile) as error:
-                reason = str(error) if not isinstance(error, EndOfFile) else "it is cut off"
-                return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {reason}")]
+                return self._lost(place, low, error)
 
         return merge_chunks(places, read)
+
+    def packed(self, separated: list[slice], low: int, high: int) -> Iterator[Stored]:
+        """The messages of parts of the index that do not overlap, several parts at once."""
+        chunks: list[_OpenChunk] = []
+        size, enough = 0, _FIRST_BLOCK
+        for part in separated:
+            for place, length, numbers in sorted(self._storage.index[part], key=lambda chunk: chunk.place.offset):
+                if place.start > high or place.end < low or (numbers and not any(map(self._may_be_wanted, numbers))):
+                    continue
+                try:
+                    if place.offset + length > self._storage.size:
+                        raise ValueError("it is behind the end of the file")
+                    content = self._storage.read_chunk(place.offset).unfold()
+                    chunks.append(_OpenChunk(place, content, record_places(content)))
+                except (*DAMAGE, EndOfFile) as error:
+                    yield from self._pack(chunks, low, high)
+                    chunks.clear()
+                    yield self._lost(place, low, error)
+                else:
+                    size += len(content)
+            if size >= enough:
+                yield from self._pack(chunks, low, high)
+                chunks.clear()
+                size, enough = 0, min(4 * enough, _BLOCK)
+        yield from self._pack(chunks, low, high)
+
+    def _pack(self, chunks: "list[_OpenChunk]", low: int, high: int) -> Iterator[Stored]:
+        """The messages of some chunks; in the order of their log times, if no later chunk overlaps them."""
+        if not chunks:
+            return
+        shifts = list(accumulate((len(chunk.content) for chunk in chunks), initial=0))
+        data = b"".join([chunk.content for chunk in chunks])
+        places = [np.array(chunk.places) + shift for chunk, shift in zip(chunks, shifts, strict=False)]
+        begins = np.concatenate([found[:-1] for found in places])
+        ends = np.concatenate([found[1:] for found in places])
+        try:
+            if max(len(chunk.places) for chunk in chunks) > MAX_CHUNK_MESSAGES:
+                raise ValueError("one has too many messages")
+            numbers, received, starts, ends = scan_chunks(data, begins, ends, self._register)
+        except DAMAGE:
+            # One by one, to find out which of them is damaged.
+            yield sorted(chain.from_iterable(self._split(chunk, low) for chunk in chunks), key=itemgetter(0))
+            return
+        present, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+        self._count(dict(zip(present.tolist(), counts.tolist(), strict=True)))
+        wanted = [self._place(self._wanted_channel(number)) for number in present.tolist()]
+        # A log time that is no stamp becomes negative.
+        whole = Packed(data, self._table, np.array(wanted, np.int64)[which], received.view(np.int64), starts, ends)
+        yield from in_order(whole if min(wanted, default=0) >= 0 else whole.chosen(whole.numbers >= 0), low, high)
+
+    def _split(self, chunk: "_OpenChunk", low: int) -> list[StoredMessage]:
+        try:
+            found, counts = split_chunk(chunk.content, self._wanted_channel, self._register)
+        except DAMAGE as error:
+            return self._lost(chunk.place, low, error)
+        self._count(counts)
+        return found
+
+    def _place(self, channel: Channel | None) -> int:
+        """The place of a channel in the table of packed messages; -1 for one that is not read."""
+        if channel is None:
+            return -1
+        if channel not in self._places:
+            self._places[channel] = len(self._table)
+            self._table.append(channel)
+        return self._places[channel]
+
+    def _lost(self, place: ChunkPlace, low: int, error: Exception) -> list[StoredMessage]:
+        reason = str(error) if not isinstance(error, EndOfFile) else "it is cut off"
+        return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {reason}")]
 
     def in_sequence(self, low: int) -> Iterator[list[StoredMessage]]:
         """All messages in the order of the file, up to its end; damage before `low` is reported at `low`."""
@@ -381,11 +507,11 @@ class _Reading:
 
     def _wanted_channel(self, number: int) -> Channel | None:
         channel = self._storage.channel(number)
-        return channel if channel is not None and self._wanted(channel) else None
+        return channel if channel is not None and self.wants(channel) else None
 
     def _may_be_wanted(self, number: int) -> bool:
         channel = self._storage.channel(number)
-        return channel is None or self._wanted(channel)
+        return channel is None or self.wants(channel)
 
     def _register(self, record: records.McapRecord) -> None:
         if not self._storage.register(record) and isinstance(record, (records.Channel, records.Schema)):

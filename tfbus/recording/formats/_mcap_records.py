@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from io import BytesIO
 from typing import IO, Final, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
@@ -49,6 +51,10 @@ _READ: Final[dict[int, Callable[[ReadDataStream], records.McapRecord]]] = {
     Opcode.CHUNK_INDEX: records.ChunkIndex.read,
     Opcode.STATISTICS: records.Statistics.read,
 }
+
+_HEAD: Final = np.dtype(
+    {"names": ("channel", "received"), "formats": ("<u2", "<u8"), "offsets": (9, 15), "itemsize": 31}
+)
 
 
 class Torn(NamedTuple):
@@ -217,3 +223,68 @@ def split_chunk(
             register(record)
             channels.clear()
     return found, counts
+
+
+class ChunkMessages(NamedTuple):
+    """The messages of some chunks, in columns."""
+
+    numbers: npt.NDArray[np.uint16]
+    """Of the channels."""
+    received: npt.NDArray[np.uint64]
+    """The log times, in ns."""
+    starts: npt.NDArray[np.int64]
+    ends: npt.NDArray[np.int64]
+    """Where each payload begins and ends."""
+
+
+def record_places(data: bytes) -> list[int]:
+    """Where each record of a whole chunk begins, and where the last one ends; raises one of `DAMAGE`."""
+    length = len(data)
+    places: list[int] = []
+    add = places.append
+    size_at = _LENGTH.unpack_from
+    at = 0
+    while at < length:
+        add(at)
+        at += RECORD.size + size_at(data, at + 1)[0]
+    if at != length:
+        raise ValueError("a record goes on behind the end of the chunk")
+    add(at)
+    return places
+
+
+def scan_chunks(
+    data: bytes,
+    begins: npt.NDArray[np.int64],
+    ends: npt.NDArray[np.int64],
+    register: Callable[[records.McapRecord], object],
+) -> ChunkMessages:
+    """The messages of some chunks, as `split_chunk` finds them; all their schemas and channels are registered first.
+
+    Parameters
+    ----------
+    data : bytes
+        The contents of all chunks.
+    begins, ends : array of int
+        Where each record begins and ends.
+    register : callable
+        Gets each schema and channel.
+
+    Raises
+    ------
+    One of `DAMAGE`.
+    """
+    # For the head of the last message, whatever its length.
+    padded = np.frombuffer(data + bytes(_HEAD.itemsize), np.uint8)
+    opcodes = padded[begins]
+    is_message = opcodes == _MESSAGE_OPCODE
+    if not is_message.all():
+        for other in np.flatnonzero(~is_message).tolist():
+            content = data[int(begins[other]) + RECORD.size : int(ends[other])]
+            if record := parse_record(int(opcodes[other]), content):
+                register(record)
+        begins, ends = begins[is_message], ends[is_message]
+    if (ends - begins < _MESSAGE_RECORD.size).any():
+        raise ValueError("a message is too short")
+    heads = np.ndarray((len(data) + 1,), _HEAD, padded, strides=(1,))[begins]
+    return ChunkMessages(heads["channel"], heads["received"], begins + _MESSAGE_RECORD.size, ends)

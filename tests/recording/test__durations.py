@@ -4,19 +4,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tfbus import SECOND
-from tfbus.recording._delays import Delays
+from tfbus.recording._durations import Durations
 
 delays = st.lists(st.integers(-(10**15), 10**15), min_size=1, max_size=300)
 
 
-@given(parts=st.lists(delays, min_size=1, max_size=3))
-def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(parts: list[list[int]]) -> None:
+@given(parts=st.lists(delays, min_size=1, max_size=3), singles=st.lists(st.integers(-(10**15), 10**15), max_size=3))
+def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(
+    parts: list[list[int]], singles: list[int]
+) -> None:
     counted = []
     for part in parts:
-        each = Delays()
+        each = Durations()
         each.add(np.array(part))
+        for duration in singles:
+            each.add_one(duration)
+        part += singles
         counted.append(each)
-    spread = Delays.joined(counted).spread()
+    spread = Durations.joined(counted).spread()
     assert spread is not None
     whole = sorted(delay for part in parts for delay in part)
     assert spread.mean == pytest.approx(sum(whole) / len(whole) / SECOND, rel=1e-9, abs=1e-9)
@@ -27,9 +32,18 @@ def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(parts: 
 
 
 def test_zero_is_exact_and_nothing_has_no_spread() -> None:
-    zero = Delays()
+    zero = Durations()
     zero.add(np.zeros(3, np.int64))
     spread = zero.spread()
     assert spread is not None
     assert (spread.mean, spread.p99, spread.max) == (0.0, 0.0, 0.0)
-    assert Delays().spread() is None
+    assert Durations().spread() is None
+
+
+def test_thousands_that_come_one_by_one_are_all_counted() -> None:
+    durations = Durations()
+    for duration in range(1, 2_501):
+        durations.add_one(duration * SECOND)
+    spread = durations.spread()
+    assert spread is not None
+    assert (spread.mean, spread.max) == (1_250.5, 2_500.0)

@@ -1,0 +1,72 @@
+from collections.abc import Callable
+
+import anyio
+import anyio.lowlevel
+import pytest
+from support.asking import settle
+
+from tfbus._aio.wake_up import WakeUp
+
+pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
+
+
+class Waiting:
+    """A task that waits, and how that ended."""
+
+    def __init__(self) -> None:
+        self.woken = WakeUp()
+        self.ended = ""
+
+    async def run(self) -> None:
+        try:
+            await self.woken
+        except BaseException:
+            self.ended = "cancelled"
+            raise
+        self.ended = "woken"
+
+
+async def test_the_task_goes_on_once_the_wait_is_ended_and_not_before() -> None:
+    waiting = Waiting()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(waiting.run)
+        await settle()
+        assert not waiting.ended
+        waiting.woken.end()
+        # Again, before the task has run and after it.
+        waiting.woken.end()
+        await settle()
+        assert waiting.ended == "woken"
+        waiting.woken.end()
+
+
+async def test_a_wait_that_was_ended_before_is_none() -> None:
+    waiting = Waiting()
+    waiting.woken.end()
+    await waiting.run()
+    assert waiting.ended == "woken"
+
+
+async def test_a_cancelled_wait_may_be_ended() -> None:
+    waiting = Waiting()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(waiting.run)
+        await settle()
+        tasks.cancel_scope.cancel()
+    assert waiting.ended == "cancelled"
+    waiting.woken.end()
+    await settle()
+
+
+@pytest.mark.parametrize("end_first", [True, False])
+async def test_ended_and_cancelled_in_one_turn_the_task_ends_once(end_first: bool) -> None:
+    waiting = Waiting()
+    with anyio.fail_after(30.0):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(waiting.run)
+            await settle()
+            steps: list[Callable[[], object]] = [waiting.woken.end, tasks.cancel_scope.cancel]
+            for step in steps if end_first else reversed(steps):
+                step()
+    assert waiting.ended in ("woken", "cancelled")
+    await anyio.lowlevel.checkpoint()

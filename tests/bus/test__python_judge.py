@@ -1,0 +1,107 @@
+"""What both kernels judge plain, and the stamps that they note."""
+
+import math
+from types import ModuleType
+from typing import Any
+
+import pytest
+from support.both_kernels import COMPILED, needs_both, sample_class
+
+from tfbus.bus import _python_judge
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tree import _python_kernel
+
+on_both = pytest.mark.parametrize(
+    "kernel", [pytest.param(_python_judge, id="python"), pytest.param(COMPILED, id="compiled", marks=needs_both)]
+)
+
+
+def edges(kernel: Any) -> dict[str, Any]:
+    """Frames a and b on 'map', from 'me', at 10."""
+    made = {}
+    for child in "ab":
+        made[child] = kernel.Edge()
+        made[child].parent, made[child].trusted, made[child].newest = "map", "me", 10
+    return made
+
+
+def sample(kernel: ModuleType, **changes: Any) -> Any:
+    fields: dict[str, Any] = {"parent": "map", "child": "a", "stamp": 20, "x": 1.0, "authority": "me", "static": False}
+    fields.update(changes)
+    made = sample_class(_python_kernel if kernel is _python_judge else kernel)()
+    row = (fields["x"], 2.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    made._fields = fields["parent"], fields["child"], fields["stamp"], row, fields["authority"], fields["static"]
+    return made
+
+
+@on_both
+def test_a_batch_that_continues_known_edges_is_plain_and_its_newest_stamps_are_noted(kernel: Any) -> None:
+    known = edges(kernel)
+    known["b"].newest = None
+    batch = (sample(kernel), sample(kernel, stamp=15), sample(kernel, child="b", stamp=-5), sample(kernel, stamp=30))
+    assert kernel.judge(known, batch, 30, 9.0)
+    assert [edge.newest for edge in known.values()] == [30, -5]
+    assert kernel.judge(known, (sample(kernel, stamp=7),), 30, math.inf)
+    assert known["a"].newest == 30
+    assert kernel.judge(known, (), 30, 9.0)
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("changes", "horizon", "square"),
+    [
+        ({"child": "new"}, STAMP_MAX, math.inf),
+        ({"parent": "other"}, STAMP_MAX, math.inf),
+        ({"authority": "you"}, STAMP_MAX, math.inf),
+        ({"static": True}, STAMP_MAX, math.inf),
+        ({"stamp": 41}, 40, math.inf),
+        ({"stamp": STAMP_MIN + 1}, STAMP_MIN, math.inf),
+        ({}, STAMP_MAX, 8.999),
+        ({"x": math.nan}, STAMP_MAX, math.inf),
+        ({"x": math.inf}, STAMP_MAX, 1e24),
+    ],
+)
+def test_one_sample_that_is_not_plain_leaves_every_edge_as_it_was(
+    kernel: Any, changes: dict[str, Any], horizon: int, square: float
+) -> None:
+    known = edges(kernel)
+    plain = sample(kernel, child="b", stamp=min(30, horizon))
+    for batch in ((plain, sample(kernel, **changes)), (sample(kernel, **changes), plain)):
+        assert not kernel.judge(known, batch, horizon, square)
+        assert [edge.newest for edge in known.values()] == [10, 10]
+
+
+@on_both
+def test_nobody_is_trusted_with_an_edge_that_trusts_nobody(kernel: Any) -> None:
+    known = edges(kernel)
+    known["a"].trusted = None
+    assert known["a"].trusted is None
+    assert not kernel.judge(known, (sample(kernel),), STAMP_MAX, math.inf)
+
+
+@on_both
+def test_a_batch_of_any_size_is_judged(kernel: Any) -> None:
+    known = edges(kernel)
+    assert kernel.judge(known, tuple(sample(kernel, stamp=stamp) for stamp in range(500)), STAMP_MAX, 9.0)
+    assert known["a"].newest == 499
+
+
+@needs_both
+def test_wrong_arguments_raise() -> None:
+    kernel: Any = COMPILED
+    edge = kernel.Edge()
+    for call in (
+        lambda: kernel.judge({}, [], 0, 0.0),
+        lambda: kernel.judge({}, (), 0),
+        lambda: kernel.judge({}, (), "0", 0.0),
+        lambda: kernel.judge({}, (), 0, "0"),
+        lambda: edge.parent,
+        lambda: setattr(edge, "parent", 5),
+        lambda: setattr(edge, "newest", "5"),
+        lambda: delattr(edge, "newest"),
+        lambda: delattr(edge, "trusted"),
+    ):
+        with pytest.raises((TypeError, AttributeError)):
+            call()
+    assert not kernel.judge({"a": 5}, (sample(kernel),), STAMP_MAX, math.inf)
+    assert not kernel.judge({}, (5,), STAMP_MAX, math.inf)

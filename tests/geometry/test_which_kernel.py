@@ -1,0 +1,53 @@
+import os
+import subprocess
+import sys
+
+import pytest
+from support.both_kernels import COMPILED, needs_both
+
+import tfbus
+
+SHOW = """
+from tfbus import TransformStamped
+from tfbus.geometry.which_kernel import kernel
+print(kernel, TransformStamped.__mro__[1].__module__)
+"""
+
+
+def run(wanted: str | None, script: str = SHOW) -> subprocess.CompletedProcess[str]:
+    """A Python with `TFBUS_KERNEL` as wanted."""
+    environment = {name: value for name, value in os.environ.items() if name != "TFBUS_KERNEL"}
+    if wanted is not None:
+        environment["TFBUS_KERNEL"] = wanted
+    return subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False, timeout=60
+    )
+
+
+def test_python_is_the_twin() -> None:
+    assert run("python").stdout.split() == ["python", "tfbus.geometry._python_sample"]
+
+
+@needs_both
+@pytest.mark.parametrize("wanted", [None, "", "compiled"])
+def test_the_compiled_kernel_runs_where_it_was_built(wanted: str | None) -> None:
+    assert run(wanted).stdout.split() == ["compiled", "tfbus._kernel"]
+
+
+def test_another_kernel_is_an_error_that_names_the_two() -> None:
+    assert "TFBUS_KERNEL must be 'python' or 'compiled', not 'rust'" in run("rust").stderr
+
+
+WITHOUT = "import sys; sys.modules['tfbus._kernel'] = None\n"
+
+
+def test_the_twin_runs_where_the_compiled_kernel_is_missing() -> None:
+    assert run(None, WITHOUT + SHOW).stdout.split() == ["python", "tfbus.geometry._python_sample"]
+
+
+def test_a_compiled_kernel_that_is_asked_for_must_be_there() -> None:
+    assert "tfbus._kernel halted" in run("compiled", WITHOUT + SHOW).stderr
+
+
+def test_this_process_runs_on_a_kernel_that_is_there() -> None:
+    assert tfbus.kernel == "python" or COMPILED is not None

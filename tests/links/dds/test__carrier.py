@@ -1,0 +1,131 @@
+from types import SimpleNamespace
+from typing import Any
+
+import anyio
+import pytest
+
+pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+from support.processes import until
+from support.samples import moving, static
+
+from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._outbox import Turn
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.dds._carrier import _MOVING, _STATIC, DdsCarrier, _nodes_of
+from tfbus.links.dds._domains import configuration, domain
+from tfbus.links.dds._types import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo, RawTFMessage
+from tfbus.links.ros._carrier import RosMessage
+from tfbus.links.ros._settings import settings_of
+from tfbus.tf_message import encode
+
+AS_A_CARRIER: type[Carrier] = DdsCarrier
+"""That it fits the protocol, mypy says."""
+
+CONFIG = configuration("localhost", (), None)
+
+pytestmark = pytest.mark.anyio
+
+
+class Node:
+    """A participant with a broadcaster, as a ROS 2 node has it."""
+
+    def __init__(self, number: int) -> None:
+        self._open = domain(number, CONFIG)
+        self._open.__enter__()
+        self.participant = DomainParticipant(number)
+        self.writers = {
+            name: DataWriter(self.participant, Topic(self.participant, f"rt/{name}", RawTFMessage), qos)
+            for name, qos in (("tf", _MOVING), ("tf_static", _STATIC))
+        }
+        self.info: Any = DataWriter(
+            self.participant, Topic(self.participant, "ros_discovery_info", ParticipantEntitiesInfo), _STATIC
+        )
+
+    @property
+    def id(self) -> str:
+        return self.participant.guid.hex
+
+    def say(self, payload: bytes, topic: str = "tf") -> None:
+        self.writers[topic].write(RawTFMessage.of(payload))
+
+    def tell_name(self, namespace: str, name: str) -> None:
+        gids: Any = [list(writer.guid.bytes) for writer in self.writers.values()]
+        writers: Any = list(map(Gid, gids))
+        nothing: Any = []
+        make: Any = NodeEntitiesInfo
+        nodes: Any = [make(namespace, name, nothing, writers)]
+        own: Any = list(self.participant.guid.bytes)
+        self.info.write(ParticipantEntitiesInfo(Gid(own), nodes))
+
+    def end(self) -> None:
+        for entity in (*self.writers.values(), self.info, self.participant):
+            entity.__del__()
+        self._open.__exit__(None, None, None)
+
+
+async def test_messages_come_with_the_name_of_their_node(domain_number: int) -> None:
+    items: list[Received] = []
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of({}))
+    await carrier.open(items.append, SendReport(print))
+    node = Node(domain_number)
+    payload = encode([moving("map", "base", 5)])
+    node.say(encode([static("map", "lidar")]), "tf_static")
+    await until(lambda: [item.content for item in items] == [Presence.JOINED])
+    node.tell_name("/robot1", "driver")
+    await until(lambda: len(items) == 2)
+    node.say(payload)
+    await until(lambda: len(items) == 3)
+    node.end()
+    await until(lambda: len(items) == 4)
+    await carrier.close()
+    first, second = items[1:3]
+    assert isinstance(first.content, RosMessage)
+    assert (first.content.static, first.content.authority, first.moving) == (True, "/robot1/driver", False)
+    assert second == Received(
+        items[0].sender, RosMessage(payload, static=False, authority="/robot1/driver"), len(payload), moving=True
+    )
+    assert items[3] == Received(items[0].sender, Presence.LEFT)
+
+
+@pytest.mark.thorough
+async def test_without_a_name_a_message_waits_only_a_while(domain_number: int) -> None:
+    items: list[Received] = []
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of({"send": False}))
+    await carrier.open(items.append, SendReport(print))
+    node = Node(domain_number)
+    node.say(encode([static("map", "lidar")]), "tf_static")
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carrier.run)
+        await until(lambda: len(items) == 2)
+        tasks.cancel_scope.cancel()
+    node.end()
+    await carrier.close()
+    assert items[1].content.authority == items[0].sender
+
+
+async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:
+    errors: list[Exception] = []
+    report = SendReport(errors.append)
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of({}))
+    await carrier.open(print, report)
+    writer = carrier._moving_writer
+    await carrier.close()
+    writer._ref = 0
+    carrier.send(Turn([OutgoingBatch(bytes(16), 1, [moving("map", "base", 1)])], {}))
+    assert (len(errors), report.messages) == (1, 0)
+
+
+async def test_a_carrier_that_never_opened_closes(domain_number: int) -> None:
+    await DdsCarrier(domain_number, CONFIG, settings_of({})).close()
+
+
+def test_the_nodes_of_a_participant_are_read_from_its_info() -> None:
+    one, two = (SimpleNamespace(data=[0] * 15 + [number]) for number in (1, 2))
+    node = SimpleNamespace(node_namespace="/", node_name="a", writer_gid_seq=[two])
+    info = SimpleNamespace(gid=one, node_entities_info_seq=[node])
+    assert _nodes_of(info) == ("0" * 31 + "1", [("/a", ["0" * 31 + "2"])])

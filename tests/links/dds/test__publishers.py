@@ -1,0 +1,81 @@
+import pytest
+from support.wires import size_of
+
+from tfbus.links.dds._publishers import MOST_WAITING, PATIENCE, Publishers
+
+
+class Hall:
+    """Publishers in a time of their own, and what they have delivered."""
+
+    def __init__(self) -> None:
+        self.time = 0.0
+        self.delivered: list[tuple[str, str, bytes, bool]] = []
+        self.publishers = Publishers(lambda *message: self.delivered.append(message), lambda: self.time)
+
+    def say(self, publisher: str, payload: bytes = b"x", static: bool = False) -> None:
+        self.publishers.message(publisher, "p", payload, static)
+
+
+def test_a_message_waits_for_the_name_of_its_node_and_later_ones_do_not() -> None:
+    hall = Hall()
+    hall.say("w1", b"1", static=True)
+    hall.say("w1", b"2")
+    hall.say("w2", b"3")
+    assert hall.delivered == []
+    hall.publishers.nodes("p", [("/a", ["w1", "other"]), ("/b", [])])
+    expected = [("p", "/a", b"1", True), ("p", "/a", b"2", False)]
+    assert hall.delivered == expected
+    hall.say("w1", b"4")
+    assert hall.delivered == [*expected, ("p", "/a", b"4", False)]
+
+
+def test_a_name_that_comes_before_the_first_message_is_known() -> None:
+    hall = Hall()
+    hall.publishers.nodes("p", [("/a", ["w1"])])
+    hall.say("w1")
+    assert hall.delivered == [("p", "/a", b"x", False)]
+
+
+def test_without_a_name_the_participant_is_named_after_a_while_and_stays_so() -> None:
+    hall = Hall()
+    hall.say("w1")
+    hall.time = PATIENCE - 0.01
+    hall.publishers.expire()
+    assert hall.delivered == []
+    hall.time = PATIENCE
+    hall.publishers.expire()
+    hall.publishers.nodes("p", [("/a", ["w1"])])
+    hall.say("w1")
+    assert hall.delivered == [("p", "p", b"x", False)] * 2
+
+
+def test_so_many_messages_wait_and_then_none_does() -> None:
+    hall = Hall()
+    for _ in range(MOST_WAITING):
+        hall.say("w1")
+    assert hall.delivered == []
+    hall.say("w1")
+    assert len(hall.delivered) == MOST_WAITING + 1
+
+
+def test_publishers_that_have_gone_are_forgotten_and_what_waits_is_delivered() -> None:
+    hall = Hall()
+    hall.say("w1")
+    hall.publishers.message("w2", "q", b"y", False)
+    hall.publishers.nodes("p", [])
+    hall.publishers.nodes("q", [("/b", ["w9"])])
+    hall.publishers.keep_only({"q"})
+    assert hall.delivered == [("p", "p", b"x", False)]
+    hall.publishers.nodes("q", [])
+    hall.publishers.keep_only(set())
+    assert hall.delivered[1:] == [("q", "q", b"y", False)]
+    assert size_of(hall.publishers) == 0
+
+
+@pytest.mark.thorough
+def test_the_memory_of_publishers_is_bounded() -> None:
+    hall = Hall()
+    for number in range(11_000):
+        hall.publishers.nodes(f"p{number}", [("/a", [f"w{number}"])])
+        hall.say(f"w{number}")
+    assert size_of(hall.publishers) == 20_000

@@ -1,0 +1,115 @@
+import json
+import struct
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.ros import ros1, ros1_of
+from support.samples import moving
+
+from tfbus import Transform, TransformStamped
+from tfbus.links.ros._transforms import as_mapping, decode_mapping, decode_ros1
+from tfbus.tf_message import MalformedMessageError
+
+SAMPLES = [
+    moving("map", "base", 5_000_000_007, 1.0),
+    TransformStamped("base", "a", 2**31 * 10**9 + 999_999_999, Transform((1.5, -2.0, 0.25), (0.5, -0.5, 0.5, -0.5))),
+]
+
+
+UNIT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def test_a_message_of_ros_1_gives_its_transforms() -> None:
+    decoded = decode_ros1(ros1(*map(ros1_of, SAMPLES)))
+    assert (decoded.samples, decoded.errors) == (SAMPLES, [])
+    assert decode_ros1(ros1()).samples == []
+
+
+@pytest.mark.parametrize(
+    ("transform", "reason"),
+    [
+        ((b"map", b"/", 1, 0, UNIT), "frame name"),
+        ((b"map", b"\xff", 1, 0, UNIT), "frame name"),
+        ((b"x" * 1025, b"a", 1, 0, UNIT), "frame name"),
+        ((b"a", b"//a", 1, 0, UNIT), "self transform"),
+        ((b"map", b"a", 1, 10**9, UNIT), "stamp"),
+        ((b"map", b"a", 1, 0, (*UNIT[:6], float("nan"))), "not finite"),
+    ],
+)
+def test_a_transform_that_is_not_valid_is_refused_and_the_next_one_is_there(transform: Any, reason: str) -> None:
+    decoded = decode_ros1(ros1(transform, (b"//map", b"/b", 2, 3, UNIT)))
+    assert decoded.samples == [None, moving("map", "b", 2_000_000_003)]
+    (error,) = decoded.errors
+    assert error.reason == reason
+    assert error.child in ("", "a", None)
+
+
+def test_no_bytes_raise_another_error_than_that_they_are_no_message() -> None:
+    whole = ros1(*map(ros1_of, SAMPLES))
+    for size in range(len(whole)):
+        with pytest.raises(MalformedMessageError, match="truncated"):
+            decode_ros1(whole[:size])
+    with pytest.raises(MalformedMessageError, match="oversized"):
+        decode_ros1(whole + b"\0")
+    with pytest.raises(MalformedMessageError, match="truncated"):
+        decode_ros1(struct.pack("<I", 2**32 - 1) + bytes(1_000))
+
+
+@given(st.binary(max_size=300))
+def test_garbage_is_a_message_or_malformed(garbage: bytes) -> None:
+    try:
+        decode_ros1(garbage)
+    except MalformedMessageError:
+        return
+
+
+def test_a_mapping_gives_the_transforms_that_it_was_made_of_in_the_names_of_either_ros() -> None:
+    rows = [as_mapping(sample) for sample in SAMPLES]
+    assert rows[0]["header"] == {"stamp": {"secs": 5, "nsecs": 7}, "frame_id": "map"}
+    assert decode_mapping(json.loads(json.dumps({"transforms": rows}))).samples == SAMPLES
+    for row in rows:
+        stamp = row["header"]["stamp"]
+        row["header"]["stamp"] = {"sec": stamp["secs"], "nanosec": stamp["nsecs"]}
+    assert decode_mapping({"transforms": rows}).samples == SAMPLES
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("header",), None),
+        (("header", "stamp"), {"sec": 1}),
+        (("header", "stamp"), {"sec": 1.5, "nanosec": 0}),
+        (("header", "stamp"), {"sec": True, "nanosec": 0}),
+        (("transform", "rotation"), {}),
+        (("transform", "translation", "x"), "1"),
+        (("transform", "translation", "x"), None),
+        (("transform",), 5),
+    ],
+)
+def test_a_mapping_without_the_fields_is_malformed(path: tuple[str, ...], value: object) -> None:
+    row = as_mapping(SAMPLES[0])
+    inner: Any = row
+    for name in path[:-1]:
+        inner = inner[name]
+    inner[path[-1]] = value
+    with pytest.raises(MalformedMessageError) as caught:
+        decode_mapping({"transforms": [row]})
+    assert caught.value.reason == "encoding"
+
+
+@pytest.mark.parametrize(
+    "message", [None, 5, [], {}, {"transforms": 5}, {"transforms": [5]}, "text", {"transforms": "x"}]
+)
+def test_what_is_no_mapping_of_transforms_is_malformed(message: Any) -> None:
+    with pytest.raises(MalformedMessageError, match="encoding"):
+        decode_mapping(message)
+
+
+def test_names_of_a_mapping_are_checked_as_those_of_bytes() -> None:
+    for name in (7, None, "x" * 1025, "\ud800"):
+        row = {**as_mapping(SAMPLES[0]), "child_frame_id": name}
+        decoded = decode_mapping({"transforms": [row]})
+        assert decoded.samples == [None]
+        assert [error.reason for error in decoded.errors] == ["frame name"]

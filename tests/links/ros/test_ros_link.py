@@ -1,0 +1,37 @@
+import pytest
+from support.processes import until
+from support.ros import ListCarrier
+from support.samples import moving, static
+
+from tfbus import Bus
+from tfbus.links._receive_queue import Received
+from tfbus.links.ros import RosLink, RosOptions
+from tfbus.links.ros._carrier import RosMessage
+from tfbus.tf_message import encode
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_a_link_to_ros_passes_on_both_ways_what_its_options_let_through() -> None:
+    options: RosOptions = {"frames": ["base", "lidar"], "capacity": 7, "max_frames": 1, "drop_lost": True}
+    carrier = ListCarrier(options)
+    heard: list[object] = []
+    with Bus() as bus:
+        async with RosLink(bus, "ros", carrier, **options) as link:
+            bus.publish([moving("map", "base", 1), moving("map", "other", 1), static("map", "lidar")])
+            bus.subscribe(heard.append)
+            for name in ("base", "lidar", "other"):
+                payload = encode([moving("map", name, 9)])
+                carrier._receive(Received("peer", RosMessage(payload, static=False, authority="/n"), len(payload)))
+            await until(lambda: link.statistics().received_messages == 3)
+        assert link.statistics().queue.capacity == 7
+    assert carrier.said == [(False, [("map", "base", 1)]), (True, [("map", "lidar", 0)])]
+    assert heard[1:] == [(moving("map", "base", 9, authority="/n"),)]
+    assert link.statistics().rejected == {"too many frames": 1}
+    assert carrier.closed
+
+
+def test_numbers_of_a_link_to_ros_are_checked() -> None:
+    for options in (RosOptions(capacity=0), RosOptions(max_frames=0)):
+        with pytest.raises(ValueError):
+            RosLink(Bus(), "ros", ListCarrier(), **options)

@@ -1,0 +1,168 @@
+import json
+from typing import Any
+
+import pytest
+
+pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
+
+import cbor2
+from support.processes import until
+from support.rosbridge import rosbridge_server
+from support.samples import moving, static
+from support.wires import latched
+
+from tfbus import Buffer, Bus, PeerJoined, PeerLost
+from tfbus.links.rosbridge import RosbridgeLink
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.mark.parametrize("encodings", [("cbor-raw", "cbor"), ("cbor",), ()])
+async def test_transforms_pass_both_ways_in_the_best_encoding_that_the_server_has(encodings: tuple[str, ...]) -> None:
+    async with rosbridge_server(encodings) as server:
+        server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
+        heard: list[Any] = []
+        with Bus() as bus:
+            bus.publish(static("map", "camera", 1.0, 4))
+            bus.subscribe(lambda batch: heard.extend(batch))
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: link.statistics().received_samples == 1)
+                assert link.peers == (server.url,)
+                await until(lambda: len(server.operations("publish")) == 1)
+                await server.say(moving("map", "base", 5))
+                await until(lambda: link.statistics().received_samples == 2)
+                bus.publish([moving("base", "arm", 6, 2.5), static("base", "imu", 3.0, 7)])
+                await until(lambda: len(server.operations("publish")) == 3)
+                assert server.operations("subscribe")[:2] == ["/tf_static", "/tf"]
+                best = encodings[0] if encodings else "cbor"
+                await until(lambda: set(server.clients[0].subscriptions.values()) == {best})
+                # The server has given back all three messages.
+                await until(lambda: link.statistics().duplicates >= 4)
+                assert link.statistics().rejected == {}
+        assert heard[1:3] == [
+            static("map", "lidar", 2.0, 3, "rosbridge"),
+            moving("map", "base", 5, authority="rosbridge"),
+        ]
+        assert len(heard) == 5, "what the server gives back is no news"
+        said = [request["msg"]["transforms"] for request in server.requests if request["op"] == "publish"]
+        # Static frames go before moving ones, as they are fewer and latched.
+        assert [[row["child_frame_id"] for row in rows] for rows in said] == [["camera"], ["camera", "imu"], ["arm"]]
+        assert sorted(server.operations("advertise")) == ["/tf", "/tf_static"]
+
+
+@pytest.mark.thorough
+async def test_after_a_break_the_link_is_back_with_its_static_frames_and_hears_those_of_ros() -> None:
+    async with rosbridge_server() as server:
+        server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
+        with Bus() as bus, bus.events() as events:
+            bus.publish(static("map", "camera"))
+            async with RosbridgeLink(bus, server.url, drop_lost=True) as link:
+                await until(lambda: len(latched(bus)) == 2)
+                await until(lambda: server.operations("publish") == ["/tf_static"])
+                await server.cut()
+                await until(lambda: link.peers == ())
+                assert set(latched(bus)) == {"camera"}
+                bus.publish(moving("map", "base", 5))
+                await until(lambda: link.peers != ())
+                await until(lambda: len(latched(bus)) == 2)
+                await until(lambda: server.operations("publish") == ["/tf_static"] * 2)
+                assert link.statistics().not_sent == {"not connected": 1}
+                bus.publish(moving("map", "base", 6))
+                await until(lambda: server.operations("publish")[-1] == "/tf")
+            told = [type(event) for event in iter(events.queue.get, None) if isinstance(event, PeerJoined | PeerLost)]
+        assert told == [PeerJoined, PeerLost, PeerJoined]
+
+
+async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: len(server.operations("subscribe")) == 2)
+                other = {"op": "publish", "topic": "/other", "msg": {}}
+                bad = {"op": "publish", "topic": "/tf", "msg": {"transforms": [{}]}}
+                raw = {"op": "publish", "topic": "/tf", "msg": {"bytes": b"\x05\0\0\0"}}
+                await server.say_anything("nonsense", b"\xff", "[" * 10_000, json.dumps(other), json.dumps(bad))
+                await server.say_anything(cbor2.dumps(raw), json.dumps({"op": "status", "msg": "hm"}))
+                await server.say(moving("map", "base", 5))
+                await until(lambda: link.statistics().received_samples == 1)
+                assert link.statistics().rejected == {"encoding": 4, "topic": 1, "truncated": 1}
+
+
+@pytest.mark.thorough
+async def test_a_server_that_sends_huge_messages_is_cut_off_and_asked_again() -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: len(server.operations("subscribe")) == 2)
+                await server.say_anything(bytes(100_000_000))
+                await until(lambda: len(server.operations("subscribe")) == 4)
+                await server.say(moving("map", "base", 5))
+                await until(lambda: link.statistics().received_samples == 1)
+
+
+@pytest.mark.thorough
+async def test_while_a_lookup_waits_the_static_frames_are_asked_for_again() -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus, Buffer(bus) as buffer:
+            async with RosbridgeLink(bus, server.url):
+                await until(lambda: len(server.operations("subscribe")) == 2)
+                # It had come before this link did.
+                server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
+                found = await buffer.lookup("map", "lidar", timeout=10)
+        assert found.transform.translation == (2.0, 0.0, 0.0)
+        assert server.operations("unsubscribe") == ["/tf_static"]
+
+
+@pytest.mark.thorough
+async def test_a_server_that_takes_nothing_costs_the_oldest_moving_samples_and_no_static_one() -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: len(server.operations("advertise")) == 2)
+                for stamp in range(1_500):
+                    bus.publish(moving("map", "base", stamp))
+                    # Each in a message of its own.
+                    link._endpoint.send()
+                bus.publish(static("map", "lidar"))
+                await until(lambda: "/tf_static" in server.operations("publish"))
+                await until(lambda: server.operations("publish").count("/tf") == 1_000)
+                assert link.statistics().not_sent == {"congested": 500}
+                stamps = [
+                    request["msg"]["transforms"][0]["header"]["stamp"]["nsecs"]
+                    for request in server.requests
+                    if request["op"] == "publish" and request["topic"] == "/tf"
+                ]
+                assert stamps == list(range(500, 1_500))
+
+
+async def test_a_link_that_only_listens_announces_nothing() -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            bus.publish(static("map", "camera"))
+            async with RosbridgeLink(bus, server.url, send=False, tf="/r/tf", tf_static="/r/tf_static"):
+                await until(lambda: len(server.requests) == 2)
+        assert server.operations("subscribe") == ["/r/tf_static", "/r/tf"]
+        assert len(server.requests) == 2
+
+
+async def test_what_was_published_before_the_end_still_goes_out() -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url):
+                bus.publish([moving("map", "base", 5), static("map", "camera")])
+            await until(lambda: sorted(server.operations("publish")) == ["/tf", "/tf_static"])
+            await until(lambda: server.clients == [])
+
+
+@pytest.mark.parametrize(
+    ("url", "error"), [("localhost:9090", ValueError), (9090, TypeError), ("ws://a:9090", ValueError)]
+)
+def test_arguments_that_are_not_valid_are_refused(url: Any, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        RosbridgeLink(Bus(), url, tf="")
+
+
+async def test_a_server_that_is_not_there_is_an_os_error() -> None:
+    with Bus() as bus, pytest.raises(OSError):
+        async with RosbridgeLink(bus, "ws://127.0.0.1:1"):
+            raise AssertionError

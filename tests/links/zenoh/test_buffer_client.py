@@ -1,0 +1,149 @@
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import anyio
+import pytest
+from support.processes import until
+from support.samples import moving, static
+
+from tfbus import (
+    LATEST,
+    Buffer,
+    Bus,
+    DisconnectedError,
+    FutureExtrapolationError,
+    Hold,
+    LookupTimeoutError,
+    PastExtrapolationError,
+    RemoteLookupError,
+    UnknownFrameError,
+)
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
+
+pytestmark = pytest.mark.anyio
+
+
+@asynccontextmanager
+async def asked(address: str, domain: str, **options: Any) -> AsyncIterator[tuple[Bus, BufferServer, BufferClient]]:
+    """A bus whose buffer is served, its server, and a client that has met it."""
+    with Bus(max_ahead=None) as bus, Buffer(bus, keep=None) as buffer:
+        async with (
+            BufferServer(buffer, domain, robot="r1", listen=address, **options) as server,
+            BufferClient(domain, robot="r1", connect=address) as client,
+        ):
+            yield bus, server, client
+
+
+@pytest.mark.every_loop
+async def test_a_lookup_is_answered_at_once_or_waits_there_until_it_can_be(address: str, domain: str) -> None:
+    async with asked(address, domain) as (bus, server, client):
+        bus.publish([static("base", "lidar", x=2.0), moving("map", "base", 5, x=1.0), moving("map", "base", 9, x=5.0)])
+        found = await client.lookup("map", "lidar")
+        assert (found.parent, found.child, found.stamp, found.transform.translation) == ("map", "lidar", 9, (7, 0, 0))
+        assert (await client.lookup("map", "base", 6)).transform.translation == (2, 0, 0)
+        held = await client.lookup("map", "base", 12, extrapolate=Hold(1.0))
+        assert (held.transform.translation, held.extrapolated_by) == ((5, 0, 0), 3)
+        travelled = await client.lookup("base", "base", 9, source_at=5, fixed="map")
+        assert travelled.transform.translation == (-4, 0, 0)
+        answers = []
+
+        async def wait() -> None:
+            answers.append(await client.lookup("map", "base", 20))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(wait)
+            await until(lambda: server.statistics().waiting == 1)
+            bus.publish(moving("map", "base", 20, x=8.0))
+        assert answers[0].transform.translation == (8, 0, 0)
+        counts = server.statistics()
+        assert (counts.waiting, counts.answered, counts.failed, counts.cancelled, counts.refused) == (0, 5, 0, 0, {})
+
+
+async def test_each_error_is_that_of_the_other_buffer_with_its_facts(address: str, domain: str) -> None:
+    async with asked(address, domain) as (bus, server, client):
+        bus.publish([moving("map", "base", 5, authority="odometry"), moving("world", "other", 5)])
+        with pytest.raises(PastExtrapolationError) as past:
+            await client.lookup("map", "base", 4)
+        assert (past.value.child, past.value.stamp, past.value.oldest) == ("base", 4, 5)
+        assert past.value.authority == "odometry"
+        with pytest.raises(LookupTimeoutError) as late:
+            await client.lookup("map", "base", 6, timeout=0.0)
+        assert (late.value.timeout, late.value.target, late.value.source) == (0.0, "map", "base")
+        assert isinstance(late.value.__cause__, FutureExtrapolationError)
+        assert late.value.__cause__.newest == 5
+        for source, kind in (("bse", UnknownFrameError), ("other", DisconnectedError)):
+            with pytest.raises(LookupTimeoutError) as missing:
+                await client.lookup("map", source, timeout=0.0)
+            assert isinstance(missing.value.__cause__, kind)
+        with pytest.raises(TypeError, match="fixed"):
+            await client.lookup("map", "base", source_at=3)
+        with pytest.raises(TypeError, match="from_seconds"):
+            await client.lookup("map", "base", 1.5)  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="timeout"):
+            await client.lookup("map", "base", timeout=-1.0)
+        assert server.statistics().failed == 5
+
+
+async def test_the_end_of_an_asker_ends_its_waiters_there(address: str, domain: str) -> None:
+    async with asked(address, domain) as (_bus, server, client):
+        async with anyio.create_task_group() as tasks:
+            for _ in range(3):
+                tasks.start_soon(client.lookup, "map", "base")
+            await until(lambda: server.statistics().waiting == 3)
+            tasks.cancel_scope.cancel()
+        await until(lambda: server.statistics().waiting == 0)
+        assert server.statistics().cancelled == 3
+        async with anyio.create_task_group() as tasks:
+            async with BufferClient(domain, robot="r1", connect=address) as other:
+
+                async def fail() -> None:
+                    with pytest.raises(RemoteLookupError):
+                        await other.lookup("map", "base")
+
+                tasks.start_soon(fail)
+                await until(lambda: server.statistics().waiting == 1)
+            await until(lambda: server.statistics().cancelled == 4)
+
+
+async def test_a_server_that_goes_ends_the_lookups_and_one_that_never_was_is_told_of(address: str, domain: str) -> None:
+    reasons = []
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with (
+            ZenohLink(bus, domain, listen=address, robot="r1") as link,
+            BufferClient(domain, robot="r1", connect=address) as client,
+            BufferClient(domain, connect=address) as nobody,
+        ):
+            with pytest.raises(RemoteLookupError) as absent:
+                await nobody.lookup("map", "base", timeout=0.2)
+            assert (absent.value.reason, absent.value.domain, absent.value.robot) == ("absent", domain, None)
+
+            async def ask() -> None:
+                with pytest.raises(RemoteLookupError) as lost:
+                    await client.lookup("map", "base")
+                reasons.append(lost.value.reason)
+
+            async with anyio.create_task_group() as tasks, BufferServer(buffer, robot="r1", link=link) as server:
+                tasks.start_soon(ask)
+                await until(lambda: server.statistics().waiting == 1)
+            assert reasons == ["lost"]
+
+
+async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: str) -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with (
+            BufferServer(buffer, domain, listen=address) as server,
+            ZenohLink(bus, domain, connect=address) as link,
+        ):
+            client = BufferClient(link=link, capacity=1)
+            async with client, anyio.create_task_group() as tasks:
+                tasks.start_soon(client.lookup, "map", "base", LATEST)
+                await until(lambda: server.statistics().waiting == 1)
+                with pytest.raises(RuntimeError, match="1 lookups wait"):
+                    await client.lookup("map", "base")
+                tasks.cancel_scope.cancel()
+            with pytest.raises(RuntimeError, match="entered once"):
+                await client.__aenter__()
+    with Bus() as bus, pytest.raises(RuntimeError, match="not entered"):
+        async with BufferClient(link=ZenohLink(bus, domain)):
+            raise AssertionError("it has no session")

@@ -1,0 +1,146 @@
+"""A server that speaks as much of the rosbridge protocol as links do, and does what a test tells it."""
+
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from typing import Any
+
+import anyio
+import anyio.abc
+import cbor2
+from wsproto import ConnectionType, WSConnection
+from wsproto.events import (
+    AcceptConnection,
+    BytesMessage,
+    CloseConnection,
+    Event,
+    Ping,
+    RejectConnection,
+    Request,
+    TextMessage,
+)
+from wsproto.utilities import LocalProtocolError
+
+from tfbus import TransformStamped
+from tfbus.links.ros._transforms import as_mapping, decode_mapping
+from tfbus.tf_message import encode
+
+_GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError, LocalProtocolError)
+
+
+class Client:
+    """One connection of the server."""
+
+    def __init__(self, stream: anyio.abc.SocketStream) -> None:
+        self.stream = stream
+        self.connection = WSConnection(ConnectionType.SERVER)
+        self.subscriptions: dict[str, str] = {}
+        self.sending = anyio.Lock()
+
+    async def send(self, event: Event) -> None:
+        data = self.connection.send(event)
+        async with self.sending:
+            await self.stream.send(data)
+
+
+class RosbridgeServer:
+    """Serves one topic tree: what a client publishes goes to all that have subscribed, itself included.
+
+    Parameters
+    ----------
+    encodings : collection of str
+        Those that it knows; it answers in JSON to others.
+    """
+
+    def __init__(self, encodings: tuple[str, ...] = ("cbor-raw", "cbor")) -> None:
+        self.encodings = encodings
+        self.clients: list[Client] = []
+        self.requests: list[dict[str, Any]] = []
+        self.latched: dict[str, tuple[TransformStamped, ...]] = {}
+        self.port = 0
+        self.silent = False
+
+    @property
+    def url(self) -> str:
+        return f"ws://127.0.0.1:{self.port}"
+
+    def operations(self, name: str) -> list[str]:
+        """The topics of all requests of a kind."""
+        return [request["topic"] for request in self.requests if request["op"] == name]
+
+    async def say(self, *samples: TransformStamped, topic: str = "/tf") -> None:
+        """Publish as a node of ROS 2 does."""
+        for client in list(self.clients):
+            if topic in client.subscriptions:
+                await client.send(self.encoded(topic, samples, client.subscriptions[topic]))
+
+    def encoded(self, topic: str, samples: tuple[TransformStamped, ...], encoding: str) -> Event:
+        envelope: dict[str, Any] = {"op": "publish", "topic": topic}
+        fields = {"transforms": list(map(as_mapping, samples))}
+        if encoding == "cbor-raw" and encoding in self.encodings:
+            return BytesMessage(cbor2.dumps({**envelope, "msg": {"secs": 1, "nsecs": 2, "bytes": encode(samples)}}))
+        if encoding == "cbor" and encoding in self.encodings:
+            return BytesMessage(cbor2.dumps({**envelope, "msg": fields}))
+        return TextMessage(json.dumps({**envelope, "msg": fields}))
+
+    async def say_anything(self, *contents: str | bytes) -> None:
+        for client in list(self.clients):
+            for content in contents:
+                # A client may leave because of it.
+                with suppress(*_GONE):
+                    await client.send(TextMessage(content) if isinstance(content, str) else BytesMessage(content))
+
+    async def cut(self) -> None:
+        """Break all connections."""
+        for client in list(self.clients):
+            await anyio.aclose_forcefully(client.stream)
+
+    async def handle(self, stream: anyio.abc.SocketStream) -> None:
+        client = Client(stream)
+        self.clients.append(client)
+        try:
+            async with stream:
+                while True:
+                    client.connection.receive_data(await stream.receive())
+                    text = ""
+                    for event in client.connection.events():
+                        if self.silent:
+                            continue
+                        if isinstance(event, Request):
+                            refused = event.target == "/refused"
+                            await client.send(RejectConnection(status_code=404) if refused else AcceptConnection())
+                        elif isinstance(event, Ping | CloseConnection):
+                            await client.send(event.response())
+                        elif isinstance(event, TextMessage):
+                            text += event.data
+                            if event.message_finished:
+                                await self.answer(client, json.loads(text))
+                                text = ""
+        except _GONE:
+            pass
+        finally:
+            self.clients.remove(client)
+
+    async def answer(self, client: Client, request: dict[str, Any]) -> None:
+        self.requests.append(request)
+        topic = request["topic"]
+        if request["op"] == "subscribe":
+            client.subscriptions[topic] = request["compression"]
+            if topic in self.latched:
+                await client.send(self.encoded(topic, self.latched[topic], request["compression"]))
+        elif request["op"] == "unsubscribe":
+            del client.subscriptions[topic]
+        elif request["op"] == "publish":
+            samples = [sample for sample in decode_mapping(request["msg"]).samples if sample is not None]
+            await self.say(*samples, topic=topic)
+
+
+@asynccontextmanager
+async def rosbridge_server(encodings: tuple[str, ...] = ("cbor-raw", "cbor")) -> AsyncIterator[RosbridgeServer]:
+    """Such a server, listening at the loopback."""
+    server = RosbridgeServer(encodings)
+    async with await anyio.create_tcp_listener(local_host="127.0.0.1") as listener, anyio.create_task_group() as tasks:
+        server.port = listener.extra(anyio.abc.SocketAttribute.local_port)
+        tasks.start_soon(listener.serve, server.handle)
+        yield server
+        tasks.cancel_scope.cancel()

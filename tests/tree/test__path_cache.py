@@ -1,0 +1,48 @@
+from threading import Lock
+
+from support.histories import moving_edge
+
+from tfbus import Transform
+from tfbus.tree._path_cache import PathCache
+from tfbus.tree.path import Path, find_path
+
+
+def path() -> Path:
+    return find_path({"b": moving_edge("a", "b", [(0, Transform())])}, "a", "b", None)
+
+
+def test_a_path_is_found_again_until_all_are_forgotten() -> None:
+    cache, kept = PathCache(Lock()), path()
+    cache.keep("a", "b", kept)
+    assert cache.find("a", "b") is kept
+    assert (cache.find("b", "a"), cache.find("a", "c"), len(cache)) == (None, None, 1)
+    answer = cache.answer("a", "b", 0)
+    assert answer is not None
+    assert answer.transform == Transform()
+    cache.clear()
+    assert (cache.find("a", "b"), cache.answer("a", "b", 0), len(cache)) == (None, None, 0)
+
+
+def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() -> None:
+    cache, kept = PathCache(Lock()), path()
+    cache.keep("a", "wanted", kept)
+    for number in range(30_000):
+        cache.keep("a", str(number), kept)
+        assert len(cache) <= 10_000
+        if number % 1_000 == 0:
+            assert cache.find("a", "wanted") is kept
+    assert cache.find("a", "0") is None
+    assert cache.find("a", "29999") is kept
+    assert [cache.holds("a", name) for name in ("0", "26000", "29999", "wanted")] == [False, True, True, True]
+    assert not cache.holds("b", "wanted")
+
+
+class Name(str):
+    __slots__ = ()
+
+
+def test_names_that_are_no_plain_strings_are_not_kept() -> None:
+    cache = PathCache(Lock())
+    cache.keep(Name("a"), "b", path())
+    cache.keep("a", Name("b"), path())
+    assert len(cache) == 0

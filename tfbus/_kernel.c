@@ -1,0 +1,1913 @@
+/* The compiled kernel: samples, the history of an edge, a path, the plain answer and the plain commit.
+ *
+ * Its definition is the Python twin: tfbus/tree/_python_kernel.py and tfbus/geometry/_python_sample.py. Both give the
+ * same bits, so every sum below is added in the order of tfbus/geometry/rows.py, and the compiler must not fuse a
+ * multiplication with an addition (-ffp-contract=off). Whatever is not plain is handed back: None, False or a count
+ * says so, and Python decides. There is no policy and no text of a transform error here.
+ *
+ * No function that touches a history runs Python code, allocates an object that the garbage collector tracks or lets
+ * go of the interpreter's lock in between, so that other threads see each call as one step. `Held.rows` alone works
+ * without that lock, on blocks that nobody changes while it is a reader of them.
+ */
+#ifndef Py_LIMITED_API
+#define Py_LIMITED_API 0x030b0000
+#endif
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <structmember.h>
+
+#include <math.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#if defined(_MSC_VER)
+#pragma fp_contract(off)
+#elif defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#endif
+
+#define OBJECT(pointer) ((PyObject *)(pointer))
+#define FAST(function) ((PyCFunction)(void (*)(void))(function))
+
+enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quaternion x, y, z, w */
+#define ROW_SIZE (WIDTH * sizeof(double))
+#define SAMPLE_SIZE (sizeof(int64_t) + ROW_SIZE)
+#define EXACT_GAP ((uint64_t)1 << 53) /* ns; beyond, a difference of stamps is no exact float, and Python divides */
+
+static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
+static PyObject *empty_string;
+
+/* Rows ------------------------------------------------------------------------------------------------------------ */
+
+static PyObject *
+boxed_row(const double *row)
+{
+    PyObject *boxed = PyTuple_New(WIDTH);
+    if (boxed == NULL) {
+        return NULL;
+    }
+    for (int i = 0; i < WIDTH; i++) {
+        PyObject *number = PyFloat_FromDouble(row[i]);
+        if (number == NULL || PyTuple_SetItem(boxed, i, number) < 0) {
+            Py_DECREF(boxed);
+            return NULL;
+        }
+    }
+    return boxed;
+}
+
+static int
+read_row(PyObject *boxed, double *row)
+{
+    if (!PyTuple_Check(boxed) || PyTuple_Size(boxed) != WIDTH) {
+        PyErr_SetString(PyExc_TypeError, "a row is a tuple of seven floats");
+        return -1;
+    }
+    for (int i = 0; i < WIDTH; i++) {
+        row[i] = PyFloat_AsDouble(PyTuple_GetItem(boxed, i));
+        if (row[i] == -1.0 && PyErr_Occurred()) {
+            return -1;
+        }
+    }
+    return 0;
+}
+
+static int
+read_stamp(PyObject *number, int64_t *stamp)
+{
+    long long value = PyLong_AsLongLong(number);
+    if (value == -1 && PyErr_Occurred()) {
+        return -1;
+    }
+    *stamp = value;
+    return 0;
+}
+
+/* A plain str, so that comparing and hashing it runs no Python code; a new reference. */
+static PyObject *
+plain_string(PyObject *value)
+{
+    if (PyUnicode_CheckExact(value)) {
+        Py_INCREF(value);
+        return value;
+    }
+    if (!PyUnicode_Check(value)) {
+        PyErr_SetString(PyExc_TypeError, "a name must be a str");
+        return NULL;
+    }
+    return PyUnicode_FromObject(value);
+}
+
+/* The row of a @ b: tfbus.geometry.rows.compose. `out` may be `b`. */
+static void
+compose(const double *a, const double *b, double *out)
+{
+    const double ai = a[3], aj = a[4], ak = a[5], aw = a[6];
+    const double x = b[0], y = b[1], z = b[2], bi = b[3], bj = b[4], bk = b[5], bw = b[6];
+    const double tx = 2.0 * (aj * z - ak * y);
+    const double ty = 2.0 * (ak * x - ai * z);
+    const double tz = 2.0 * (ai * y - aj * x);
+    out[0] = a[0] + (x + aw * tx + aj * tz - ak * ty);
+    out[1] = a[1] + (y + aw * ty + ak * tx - ai * tz);
+    out[2] = a[2] + (z + aw * tz + ai * ty - aj * tx);
+    out[3] = aw * bi + ai * bw + aj * bk - ak * bj;
+    out[4] = aw * bj - ai * bk + aj * bw + ak * bi;
+    out[5] = aw * bk + ai * bj - aj * bi + ak * bw;
+    out[6] = aw * bw - ai * bi - aj * bj - ak * bk;
+}
+
+/* The row of the inverse: tfbus.geometry.rows.invert. */
+static void
+invert(const double *a, double *out)
+{
+    const double x = a[0], y = a[1], z = a[2], qx = -a[3], qy = -a[4], qz = -a[5], qw = a[6];
+    const double tx = 2.0 * (qy * z - qz * y);
+    const double ty = 2.0 * (qz * x - qx * z);
+    const double tz = 2.0 * (qx * y - qy * x);
+    out[0] = -(x + qw * tx + qy * tz - qz * ty);
+    out[1] = -(y + qw * ty + qz * tx - qx * tz);
+    out[2] = -(z + qw * tz + qx * ty - qy * tx);
+    out[3] = qx;
+    out[4] = qy;
+    out[5] = qz;
+    out[6] = qw;
+}
+
+/* Sample: the base of TransformStamped ----------------------------------------------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *parent, *child, *authority; /* plain str; NULL until `_fields` was set */
+    PyObject *fields;                     /* the six fields as a tuple, once somebody has read it */
+    int64_t stamp;
+    double row[WIDTH];
+    char is_static;
+} Sample;
+
+static int
+sample_is_set(const Sample *self)
+{
+    if (self->authority == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "_fields");
+        return 0;
+    }
+    return 1;
+}
+
+static PyObject *
+sample_row(Sample *self, void *Py_UNUSED(closure))
+{
+    if (!sample_is_set(self)) {
+        return NULL;
+    }
+    if (self->fields != NULL) {
+        PyObject *row = PyTuple_GetItem(self->fields, 3);
+        Py_XINCREF(row);
+        return row;
+    }
+    return boxed_row(self->row);
+}
+
+static PyObject *
+sample_fields(Sample *self, void *Py_UNUSED(closure))
+{
+    if (!sample_is_set(self)) {
+        return NULL;
+    }
+    if (self->fields == NULL) {
+        PyObject *row = boxed_row(self->row);
+        PyObject *stamp = PyLong_FromLongLong(self->stamp);
+        if (row != NULL && stamp != NULL) {
+            PyObject *is_static = self->is_static ? Py_True : Py_False;
+            self->fields = PyTuple_Pack(6, self->parent, self->child, stamp, row, self->authority, is_static);
+        }
+        Py_XDECREF(row);
+        Py_XDECREF(stamp);
+    }
+    Py_XINCREF(self->fields);
+    return self->fields;
+}
+
+static int
+sample_set_fields(Sample *self, PyObject *fields, void *Py_UNUSED(closure))
+{
+    if (fields == NULL || !PyTuple_Check(fields) || PyTuple_Size(fields) != 6) {
+        PyErr_SetString(PyExc_TypeError, "the fields are parent, child, stamp, row, authority and static");
+        return -1;
+    }
+    int64_t stamp;
+    double row[WIDTH];
+    int is_static = PyObject_IsTrue(PyTuple_GetItem(fields, 5));
+    if (is_static < 0 || read_stamp(PyTuple_GetItem(fields, 2), &stamp) < 0
+        || read_row(PyTuple_GetItem(fields, 3), row) < 0) {
+        return -1;
+    }
+    PyObject *parent = plain_string(PyTuple_GetItem(fields, 0));
+    PyObject *child = parent == NULL ? NULL : plain_string(PyTuple_GetItem(fields, 1));
+    PyObject *authority = child == NULL ? NULL : plain_string(PyTuple_GetItem(fields, 4));
+    if (authority == NULL) {
+        Py_XDECREF(parent);
+        Py_XDECREF(child);
+        return -1;
+    }
+    PyObject *old[] = {self->parent, self->child, self->authority, self->fields};
+    self->parent = parent;
+    self->child = child;
+    self->authority = authority;
+    self->fields = NULL;
+    self->stamp = stamp;
+    memcpy(self->row, row, ROW_SIZE);
+    self->is_static = (char)is_static;
+    for (int i = 0; i < 4; i++) {
+        Py_XDECREF(old[i]);
+    }
+    return 0;
+}
+
+static PyObject *
+sample_stamp(Sample *self, void *Py_UNUSED(closure))
+{
+    return sample_is_set(self) ? PyLong_FromLongLong(self->stamp) : NULL;
+}
+
+static PyObject *
+sample_static(Sample *self, void *Py_UNUSED(closure))
+{
+    return sample_is_set(self) ? PyBool_FromLong(self->is_static) : NULL;
+}
+
+static void
+sample_dealloc(Sample *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    Py_XDECREF(self->parent);
+    Py_XDECREF(self->child);
+    Py_XDECREF(self->authority);
+    Py_XDECREF(self->fields);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyMemberDef sample_members[] = {
+    {"parent", T_OBJECT_EX, offsetof(Sample, parent), READONLY,
+     PyDoc_STR("The frame that the transform maps into; the target, in an answer.")},
+    {"child", T_OBJECT_EX, offsetof(Sample, child), READONLY,
+     PyDoc_STR("The frame that the transform maps from; the source, in an answer.")},
+    {"authority", T_OBJECT_EX, offsetof(Sample, authority), READONLY, PyDoc_STR("The sender; empty in an answer.")},
+    {NULL}
+};
+
+static PyGetSetDef sample_getset[] = {
+    {"_fields", (getter)sample_fields, (setter)sample_set_fields,
+     PyDoc_STR("Parent, child, stamp, row, authority and static."), NULL},
+    {"_row", (getter)sample_row, NULL, PyDoc_STR("The transform as seven floats."), NULL},
+    {"stamp", (getter)sample_stamp, NULL, PyDoc_STR("Nanoseconds; never `LATEST`."), NULL},
+    {"static", (getter)sample_static, NULL, PyDoc_STR("Whether it holds at every stamp."), NULL},
+    {NULL}
+};
+
+static PyType_Slot sample_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The fields of a stamped transform; they become objects when they are read.")},
+    {Py_tp_dealloc, sample_dealloc},
+    {Py_tp_members, sample_members},
+    {Py_tp_getset, sample_getset},
+    {0, NULL}
+};
+
+static PyType_Spec sample_spec = {
+    "tfbus._kernel.Sample", sizeof(Sample), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, sample_slots
+};
+
+/* Block: the memory of a history ----------------------------------------------------------------------------------- */
+
+/* The stamps of all samples, then their rows. A reader may read the samples that there were when it came: while a block
+ * has readers, its history only adds behind them, and takes another block for every other change. */
+typedef struct {
+    PyObject_VAR_HEAD
+    Py_ssize_t readers; /* how many read it besides its history */
+} Block;
+
+static int64_t *
+block_stamps(const Block *block)
+{
+    return (int64_t *)((char *)block + sizeof(Block));
+}
+
+static double *
+block_rows(const Block *block)
+{
+    return (double *)(block_stamps(block) + Py_SIZE((PyObject *)block));
+}
+
+static Py_ssize_t
+block_capacity(const Block *block)
+{
+    return Py_SIZE((PyObject *)block);
+}
+
+static int
+block_getbuffer(Block *self, Py_buffer *view, int flags)
+{
+    const Py_ssize_t size = block_capacity(self) * (Py_ssize_t)SAMPLE_SIZE;
+    if (PyBuffer_FillInfo(view, (PyObject *)self, block_stamps(self), size, 1, flags) < 0) {
+        return -1;
+    }
+    self->readers++;
+    return 0;
+}
+
+static void
+block_releasebuffer(Block *self, Py_buffer *Py_UNUSED(view))
+{
+    self->readers--;
+}
+
+static void
+block_dealloc(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyType_Slot block_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The samples of a history as a read-only buffer.")},
+    {Py_tp_dealloc, block_dealloc},
+    {Py_bf_getbuffer, block_getbuffer},
+    {Py_bf_releasebuffer, block_releasebuffer},
+    {0, NULL}
+};
+
+static PyType_Spec block_spec = {
+    "tfbus._kernel.Block", sizeof(Block), (int)SAMPLE_SIZE,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_DISALLOW_INSTANTIATION | Py_TPFLAGS_IMMUTABLETYPE, block_slots
+};
+
+/* History ---------------------------------------------------------------------------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *parent, *authority; /* plain str: those of the newest sample */
+    Block *block;                 /* NULL until there is a sample */
+    Py_ssize_t start, end;        /* the samples in the window */
+    int64_t keep;                 /* ns; -1 for ever */
+    char mixed;                   /* whether the samples name several parents */
+} History;
+
+/* The stamp before which samples have left the window. */
+static int64_t
+horizon_at(const History *self, int64_t newest)
+{
+    if (self->keep < 0 || newest < INT64_MIN + self->keep) {
+        return INT64_MIN;
+    }
+    return newest - self->keep;
+}
+
+/* The first of `count` sorted stamps that is not less than `at`. */
+static Py_ssize_t
+lower_bound(const int64_t *stamps, Py_ssize_t count, int64_t at)
+{
+    Py_ssize_t low = 0;
+    if (count > 16 && stamps[0] < at && at < stamps[count - 1]) {
+        /* Samples mostly come at a steady rate: look where the stamp would then be. */
+        const double part = (double)((uint64_t)at - (uint64_t)stamps[0]);
+        const double whole = (double)((uint64_t)stamps[count - 1] - (uint64_t)stamps[0]);
+        const Py_ssize_t guess = (Py_ssize_t)(part / whole * (double)(count - 1));
+        const Py_ssize_t before = guess - 2, behind = guess + 3;
+        if (behind < count && stamps[behind] >= at) {
+            count = behind + 1;
+        }
+        if (before > 0 && stamps[before] < at) {
+            low = before + 1;
+            count -= low;
+        }
+    }
+    /* Without a branch that depends on the stamps, because no processor can foresee it. */
+    while (count > 1) {
+        const Py_ssize_t half = count >> 1;
+        low += stamps[low + half - 1] < at ? half : 0;
+        count -= half;
+    }
+    return low + (count == 1 && stamps[low] < at);
+}
+
+/* Put the samples in the window into a block of its own, at the front, with room for `more`, and some beyond. */
+static int
+history_rehouse(History *self, Py_ssize_t more)
+{
+    const Py_ssize_t most = PY_SSIZE_T_MAX / (Py_ssize_t)SAMPLE_SIZE / 4;
+    const Py_ssize_t count = self->end - self->start;
+    if (count > most || more > most) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    Block *block = (Block *)PyType_GenericAlloc(BlockType, count + more + (count + more) / 8 + 7);
+    if (block == NULL) {
+        return -1;
+    }
+    if (count > 0) {
+        memcpy(block_stamps(block), block_stamps(self->block) + self->start, count * sizeof(int64_t));
+        memcpy(block_rows(block), block_rows(self->block) + WIDTH * self->start, count * ROW_SIZE);
+    }
+    Block *old = self->block;
+    self->block = block;
+    self->start = 0;
+    self->end = count;
+    Py_XDECREF(OBJECT(old));
+    return 0;
+}
+
+/* Make room for some samples behind the last. */
+static int
+history_reserve(History *self, Py_ssize_t more)
+{
+    if (self->block != NULL && more <= block_capacity(self->block) - self->end) {
+        return 0;
+    }
+    const Py_ssize_t count = self->end - self->start;
+    /* In place, if nobody else reads the block and the move pays off. */
+    if (self->block != NULL && self->block->readers == 0 && self->start > count / 8
+        && more <= block_capacity(self->block) - count && block_capacity(self->block) <= 2 * count + 16) {
+        memmove(block_stamps(self->block), block_stamps(self->block) + self->start, count * sizeof(int64_t));
+        memmove(block_rows(self->block), block_rows(self->block) + WIDTH * self->start, count * ROW_SIZE);
+        self->start = 0;
+        self->end = count;
+        return 0;
+    }
+    return history_rehouse(self, more);
+}
+
+static int
+history_push(History *self, int64_t stamp, const double *row)
+{
+    if (history_reserve(self, 1) < 0) {
+        return -1;
+    }
+    block_stamps(self->block)[self->end] = stamp;
+    memcpy(block_rows(self->block) + WIDTH * self->end, row, ROW_SIZE);
+    self->end++;
+    return 0;
+}
+
+/* Forget what has left the window. */
+static void
+history_slide(History *self)
+{
+    const int64_t *stamps = block_stamps(self->block);
+    const int64_t horizon = horizon_at(self, stamps[self->end - 1]);
+    while (stamps[self->start] < horizon) {
+        self->start++;
+    }
+}
+
+static int
+same_string(PyObject *a, PyObject *b)
+{
+    return a == b || (a != NULL && b != NULL && PyUnicode_Compare(a, b) == 0);
+}
+
+/* Whether a sample only continues a history. All strings are plain ones. */
+static int
+history_continues(const History *self, PyObject *parent, int64_t stamp, PyObject *authority)
+{
+    return self->end > self->start && !self->mixed && stamp > block_stamps(self->block)[self->end - 1]
+        && same_string(parent, self->parent) && same_string(authority, self->authority);
+}
+
+static int
+history_init(History *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *parent, *keep;
+    int64_t window = -1;
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "History takes no keyword arguments");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "UO:History", &parent, &keep)) {
+        return -1;
+    }
+    if (keep != Py_None && read_stamp(keep, &window) < 0) {
+        return -1;
+    }
+    if ((parent = plain_string(parent)) == NULL) {
+        return -1;
+    }
+    PyObject *old[] = {self->parent, self->authority, (PyObject *)self->block};
+    self->parent = parent;
+    Py_INCREF(empty_string);
+    self->authority = empty_string;
+    self->block = NULL;
+    self->start = self->end = 0;
+    self->keep = window;
+    self->mixed = 0;
+    for (int i = 0; i < 3; i++) {
+        Py_XDECREF(old[i]);
+    }
+    return 0;
+}
+
+static PyObject *
+history_append(History *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t stamp;
+    double row[WIDTH];
+    if (count != 4) {
+        PyErr_SetString(PyExc_TypeError, "append takes parent, stamp, row and authority");
+        return NULL;
+    }
+    if (!PyUnicode_CheckExact(args[0]) || !PyUnicode_CheckExact(args[3])) {
+        Py_RETURN_FALSE;
+    }
+    if (read_stamp(args[1], &stamp) < 0 || read_row(args[2], row) < 0) {
+        return NULL;
+    }
+    if (!history_continues(self, args[0], stamp, args[3])) {
+        Py_RETURN_FALSE;
+    }
+    if (history_push(self, stamp, row) < 0) {
+        return NULL;
+    }
+    history_slide(self);
+    Py_RETURN_TRUE;
+}
+
+static PyObject *
+history_push_method(History *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t stamp;
+    double row[WIDTH];
+    if (count != 2) {
+        PyErr_SetString(PyExc_TypeError, "push takes a stamp and a row");
+        return NULL;
+    }
+    if (read_stamp(args[0], &stamp) < 0 || read_row(args[1], row) < 0) {
+        return NULL;
+    }
+    if (self->end > self->start && stamp <= block_stamps(self->block)[self->end - 1]) {
+        PyErr_SetString(PyExc_ValueError, "a pushed sample must be newer than all others");
+        return NULL;
+    }
+    if (history_push(self, stamp, row) < 0) {
+        return NULL;
+    }
+    history_slide(self);
+    Py_RETURN_NONE;
+}
+
+/* push_many(stamps, rows): int64 of shape (n,) and float64 of shape (n, 7), both contiguous. */
+static PyObject *
+history_push_many(History *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer stamps, rows;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "push_many takes stamps and rows");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &stamps, PyBUF_SIMPLE) < 0) {
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[1], &rows, PyBUF_SIMPLE) < 0) {
+        PyBuffer_Release(&stamps);
+        return NULL;
+    }
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps.len / size;
+    int done = 0;
+    if (stamps.len % size != 0 || rows.len % (Py_ssize_t)ROW_SIZE != 0
+        || rows.len / (Py_ssize_t)ROW_SIZE != count) {
+        PyErr_SetString(PyExc_ValueError, "each stamp needs a row of seven floats");
+    } else if (count == 0) {
+        done = 1;
+    } else if (history_reserve(self, count) == 0) {
+        int64_t *own = block_stamps(self->block) + self->end;
+        Py_ssize_t i = self->end == self->start ? 1 : 0;
+        memcpy(own, stamps.buf, stamps.len);
+        while (i < count && own[i - 1] < own[i]) {
+            i++;
+        }
+        if (i < count) {
+            PyErr_SetString(PyExc_ValueError, "pushed samples must be newer than all others, and in order");
+        } else {
+            memcpy(block_rows(self->block) + WIDTH * self->end, rows.buf, rows.len);
+            self->end += count;
+            history_slide(self);
+            done = 1;
+        }
+    }
+    PyBuffer_Release(&rows);
+    PyBuffer_Release(&stamps);
+    if (!done) {
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
+static PyObject *
+history_find(History *self, PyObject *number)
+{
+    int64_t stamp;
+    if (read_stamp(number, &stamp) < 0) {
+        return NULL;
+    }
+    if (self->block == NULL) {
+        return PyLong_FromLong(0);
+    }
+    return PyLong_FromSsize_t(lower_bound(block_stamps(self->block) + self->start, self->end - self->start, stamp));
+}
+
+static int
+check_index(const History *self, Py_ssize_t index)
+{
+    if (index < 0 || index >= self->end - self->start) {
+        PyErr_SetString(PyExc_IndexError, "no sample has this index");
+        return -1;
+    }
+    return 0;
+}
+
+static PyObject *
+history_stamp(History *self, PyObject *number)
+{
+    const Py_ssize_t index = PyLong_AsSsize_t(number);
+    if ((index == -1 && PyErr_Occurred()) || check_index(self, index) < 0) {
+        return NULL;
+    }
+    return PyLong_FromLongLong(block_stamps(self->block)[self->start + index]);
+}
+
+static PyObject *
+history_sample(History *self, PyObject *number)
+{
+    const Py_ssize_t index = PyLong_AsSsize_t(number);
+    if ((index == -1 && PyErr_Occurred()) || check_index(self, index) < 0) {
+        return NULL;
+    }
+    PyObject *stamp = PyLong_FromLongLong(block_stamps(self->block)[self->start + index]);
+    PyObject *row = stamp == NULL ? NULL : boxed_row(block_rows(self->block) + WIDTH * (self->start + index));
+    PyObject *both = row == NULL ? NULL : PyTuple_Pack(2, stamp, row);
+    Py_XDECREF(stamp);
+    Py_XDECREF(row);
+    return both;
+}
+
+static PyObject *
+history_put(History *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t stamp;
+    double row[WIDTH];
+    if (count != 3) {
+        PyErr_SetString(PyExc_TypeError, "put takes an index, a stamp and a row");
+        return NULL;
+    }
+    const Py_ssize_t index = PyLong_AsSsize_t(args[0]);
+    if (index == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (read_stamp(args[1], &stamp) < 0 || read_row(args[2], row) < 0
+        || check_index(self, index) < 0) {
+        return NULL;
+    }
+    const int replaces = block_stamps(self->block)[self->start + index] == stamp;
+    if (!replaces && history_reserve(self, 1) < 0) {
+        return NULL;
+    }
+    if (self->block->readers > 0 && history_rehouse(self, 1) < 0) {
+        return NULL;
+    }
+    const Py_ssize_t place = self->start + index, behind = self->end - place;
+    int64_t *stamps = block_stamps(self->block) + place;
+    double *rows = block_rows(self->block) + WIDTH * place;
+    if (!replaces) {
+        memmove(stamps + 1, stamps, behind * sizeof(int64_t));
+        memmove(rows + WIDTH, rows, behind * ROW_SIZE);
+        self->end++;
+        stamps[0] = stamp;
+    }
+    memcpy(rows, row, ROW_SIZE);
+    Py_RETURN_NONE;
+}
+
+static PyObject *
+history_clear(History *self, PyObject *Py_UNUSED(ignored))
+{
+    Block *old = self->block;
+    self->block = NULL;
+    self->start = self->end = 0;
+    Py_XDECREF(OBJECT(old));
+    Py_RETURN_NONE;
+}
+
+static PyObject *
+history_take(History *self, PyObject *other)
+{
+    if (!PyObject_TypeCheck(other, HistoryType)) {
+        PyErr_SetString(PyExc_TypeError, "take takes a History");
+        return NULL;
+    }
+    const History *from = (const History *)other;
+    if (other == (PyObject *)self) {
+        Py_RETURN_NONE;
+    }
+    Block *old = self->block;
+    const Py_ssize_t start = self->start, end = self->end;
+    Py_XINCREF(OBJECT(from->block));
+    self->block = from->block;
+    self->start = from->start;
+    self->end = from->end;
+    if (history_rehouse(self, 1) < 0) {
+        Py_XDECREF(OBJECT(self->block));
+        self->block = old;
+        self->start = start;
+        self->end = end;
+        return NULL;
+    }
+    Py_XDECREF(OBJECT(old));
+    Py_RETURN_NONE;
+}
+
+/* columns(first, end, wanted): a view of the block, where the stamps begin (bytes), the same view, where the rows begin,
+ * the number of floats a row, and the number of samples. As nothing is copied, the unwanted samples are not left out. */
+static PyObject *
+history_columns(History *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 2 && nargs != 3) {
+        PyErr_SetString(PyExc_TypeError, "columns takes the first index, the end and the wanted stamps");
+        return NULL;
+    }
+    Py_ssize_t first = PyLong_AsSsize_t(args[0]), end = PyLong_AsSsize_t(args[1]);
+    if ((first == -1 || end == -1) && PyErr_Occurred()) {
+        return NULL;
+    }
+    const Py_ssize_t count = self->end - self->start;
+    end = end < count ? end : count;
+    if (first < 0 || first >= end) {
+        return Py_BuildValue("ynynin", "", (Py_ssize_t)0, "", (Py_ssize_t)0, WIDTH, (Py_ssize_t)0);
+    }
+    Block *block = self->block;
+    const Py_ssize_t at = self->start + first;
+    const Py_ssize_t rows = (Py_ssize_t)sizeof(int64_t) * block_capacity(block) + (Py_ssize_t)ROW_SIZE * at;
+    /* Making the view may run Python code, by the garbage collector. */
+    Py_INCREF(OBJECT(block));
+    block->readers++;
+    PyObject *view = PyMemoryView_FromObject(OBJECT(block));
+    block->readers--;
+    Py_DECREF(OBJECT(block));
+    if (view == NULL) {
+        return NULL;
+    }
+    PyObject *found = Py_BuildValue("OnOnin", view, (Py_ssize_t)sizeof(int64_t) * at, view, rows, WIDTH, end - first);
+    Py_DECREF(view);
+    return found;
+}
+
+static PyObject *
+history_oldest(History *self, void *Py_UNUSED(closure))
+{
+    if (self->end == self->start) {
+        Py_RETURN_NONE;
+    }
+    return PyLong_FromLongLong(block_stamps(self->block)[self->start]);
+}
+
+static PyObject *
+history_newest(History *self, void *Py_UNUSED(closure))
+{
+    if (self->end == self->start) {
+        Py_RETURN_NONE;
+    }
+    return PyLong_FromLongLong(block_stamps(self->block)[self->end - 1]);
+}
+
+static PyObject *
+history_count(History *self, void *Py_UNUSED(closure))
+{
+    return PyLong_FromSsize_t(self->end - self->start);
+}
+
+static PyObject *
+history_horizon(History *self, void *Py_UNUSED(closure))
+{
+    if (self->end == self->start) {
+        return PyLong_FromLongLong(INT64_MIN);
+    }
+    return PyLong_FromLongLong(horizon_at(self, block_stamps(self->block)[self->end - 1]));
+}
+
+static PyObject *
+history_keep(History *self, void *Py_UNUSED(closure))
+{
+    if (self->keep < 0) {
+        Py_RETURN_NONE;
+    }
+    return PyLong_FromLongLong(self->keep);
+}
+
+static int
+history_set_keep(History *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    int64_t keep = -1;
+    if (value == NULL || (value != Py_None && read_stamp(value, &keep) < 0)) {
+        if (value == NULL) {
+            PyErr_SetString(PyExc_AttributeError, "keep");
+        }
+        return -1;
+    }
+    if (keep < 0 && value != Py_None) {
+        keep = 0;
+    }
+    self->keep = keep;
+    if (self->end > self->start) {
+        history_slide(self);
+    }
+    return 0;
+}
+
+/* `closure` is the offset of the string. */
+static PyObject *
+history_string(PyObject *self, void *closure)
+{
+    PyObject *value = *(PyObject **)((char *)self + (size_t)closure);
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "the history was not initialised");
+        return NULL;
+    }
+    Py_INCREF(value);
+    return value;
+}
+
+static int
+history_set_string(PyObject *self, PyObject *value, void *closure)
+{
+    PyObject **place = (PyObject **)((char *)self + (size_t)closure);
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "the history always has a parent and an authority");
+        return -1;
+    }
+    if ((value = plain_string(value)) == NULL) {
+        return -1;
+    }
+    PyObject *old = *place;
+    *place = value;
+    Py_XDECREF(OBJECT(old));
+    return 0;
+}
+
+static void
+history_dealloc(History *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    Py_XDECREF(self->parent);
+    Py_XDECREF(self->authority);
+    Py_XDECREF(OBJECT(self->block));
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyObject *history_row(History *self, PyObject *number);
+
+static PyMethodDef history_methods[] = {
+    {"append", FAST(history_append), METH_FASTCALL,
+     PyDoc_STR("append(parent, stamp, row, authority): store a sample that continues the history; else do nothing.")},
+    {"push", FAST(history_push_method), METH_FASTCALL, PyDoc_STR("push(stamp, row): store the newest sample.")},
+    {"push_many", FAST(history_push_many), METH_FASTCALL,
+     PyDoc_STR("push_many(stamps, rows): store the newest samples, from contiguous arrays of shape (n,) and (n, 7).")},
+    {"put", FAST(history_put), METH_FASTCALL,
+     PyDoc_STR("put(index, stamp, row): store a sample before another, or in its place if the stamps are equal.")},
+    {"find", (PyCFunction)history_find, METH_O, PyDoc_STR("find(stamp): the index of the first sample not before it.")},
+    {"stamp", (PyCFunction)history_stamp, METH_O, PyDoc_STR("stamp(index): the stamp of a sample.")},
+    {"sample", (PyCFunction)history_sample, METH_O, PyDoc_STR("sample(index): the stamp and the row of a sample.")},
+    {"row", (PyCFunction)history_row, METH_O, PyDoc_STR("row(at): the row at a stamp; None if it is not plain.")},
+    {"clear", (PyCFunction)history_clear, METH_NOARGS, PyDoc_STR("Forget all samples.")},
+    {"take", (PyCFunction)history_take, METH_O, PyDoc_STR("take(other): hold a copy of the samples of another.")},
+    {"columns", FAST(history_columns), METH_FASTCALL,
+     PyDoc_STR("columns(first, end, wanted=None): the memory of some samples, which nothing changes while it is held.")},
+    {NULL}
+};
+
+static PyGetSetDef history_getset[] = {
+    {"parent", history_string, history_set_string, PyDoc_STR("Of the newest sample."),
+     (void *)offsetof(History, parent)},
+    {"authority", history_string, history_set_string, PyDoc_STR("Of the newest sample."),
+     (void *)offsetof(History, authority)},
+    {"keep", (getter)history_keep, (setter)history_set_keep, PyDoc_STR("Length of the window in ns, or None."), NULL},
+    {"count", (getter)history_count, NULL, PyDoc_STR("The number of samples in the window."), NULL},
+    {"oldest", (getter)history_oldest, NULL, PyDoc_STR("The oldest stamp in the window, or None."), NULL},
+    {"newest", (getter)history_newest, NULL, PyDoc_STR("The newest stamp, or None."), NULL},
+    {"horizon", (getter)history_horizon, NULL, PyDoc_STR("Samples before this stamp have left the window."), NULL},
+    {NULL}
+};
+
+static PyMemberDef history_members[] = {
+    {"mixed", T_BOOL, offsetof(History, mixed), 0, PyDoc_STR("Whether the samples name several parents.")},
+    {NULL}
+};
+
+static PyType_Slot history_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The moving samples of one edge in its window, in the order of their stamps.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, history_init},
+    {Py_tp_dealloc, history_dealloc},
+    {Py_tp_methods, history_methods},
+    {Py_tp_members, history_members},
+    {Py_tp_getset, history_getset},
+    {0, NULL}
+};
+
+static PyType_Spec history_spec = {
+    "tfbus._kernel.History", sizeof(History), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, history_slots
+};
+
+/* Interpolation ---------------------------------------------------------------------------------------------------- */
+
+/* The samples of an edge, as they were at one moment. */
+typedef struct {
+    const int64_t *stamps;
+    const double *rows;
+    Py_ssize_t count;
+} Samples;
+
+/* The two samples round a stamp, prepared: tfbus.geometry.rows.interpolate up to the fraction. */
+typedef struct {
+    int64_t before, after; /* a stamp belongs here if before < stamp <= after; before = after for none */
+    const double *a, *b;
+    double gap, angle, scale;
+    char turns, flipped;
+} Segment;
+
+typedef enum { ANSWERED, MISSING, NOT_PLAIN } Status;
+
+static Samples
+samples_of(const History *edge)
+{
+    Samples samples = {NULL, NULL, edge->end - edge->start};
+    if (samples.count > 0) {
+        samples.stamps = block_stamps(edge->block) + edge->start;
+        samples.rows = block_rows(edge->block) + WIDTH * edge->start;
+    }
+    return samples;
+}
+
+/* The row at a stamp. `segment` is the one that was used last, and becomes the one that is used. */
+static Status
+edge_at(const Samples *samples, int64_t at, Segment *segment, double *out)
+{
+    if (at > segment->after || at <= segment->before) {
+        if (samples->count == 0 || at < samples->stamps[0] || at > samples->stamps[samples->count - 1]) {
+            return MISSING;
+        }
+        const Py_ssize_t i = lower_bound(samples->stamps, samples->count, at);
+        const double *b = samples->rows + WIDTH * i;
+        if (i == 0) {
+            memcpy(out, b, ROW_SIZE);
+            return ANSWERED;
+        }
+        const double *a = b - WIDTH;
+        const int64_t before = samples->stamps[i - 1], after = samples->stamps[i];
+        const uint64_t gap = (uint64_t)after - (uint64_t)before;
+        if (gap > EXACT_GAP && after != at) {
+            return NOT_PLAIN;
+        }
+        segment->a = a;
+        segment->b = b;
+        segment->gap = (double)gap;
+        const double dot = a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6];
+        segment->flipped = dot < 0.0;
+        segment->turns = -1.0 < dot && dot < 1.0;
+        if (segment->turns && after != at) {
+            segment->angle = acos(fabs(dot));
+            segment->scale = 1.0 / sin(segment->angle);
+        }
+        if (after == at) {
+            memcpy(out, b, ROW_SIZE);
+            segment->before = segment->after = at;
+            return ANSWERED;
+        }
+        segment->before = before;
+        segment->after = after;
+    }
+    const double *a = segment->a, *b = segment->b;
+    if (at == segment->after) {
+        memcpy(out, b, ROW_SIZE);
+        return ANSWERED;
+    }
+    const double fraction = (double)((uint64_t)at - (uint64_t)segment->before) / segment->gap;
+    double keep = 1.0 - fraction, turn = fraction;
+    if (segment->turns) {
+        keep = sin(segment->angle - fraction * segment->angle) * segment->scale;
+        turn = sin(fraction * segment->angle) * segment->scale;
+    }
+    if (segment->flipped) {
+        turn = -turn;
+    }
+    for (int i = 0; i < 3; i++) {
+        out[i] = a[i] + fraction * (b[i] - a[i]);
+    }
+    for (int i = 3; i < WIDTH; i++) {
+        out[i] = keep * a[i] + turn * b[i];
+    }
+    return ANSWERED;
+}
+
+static PyObject *
+history_row(History *self, PyObject *number)
+{
+    int overflow;
+    double row[WIDTH];
+    const long long at = PyLong_AsLongLongAndOverflow(number, &overflow);
+    if (at == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    const Samples samples = samples_of(self);
+    Segment segment = {.before = INT64_MIN, .after = INT64_MIN};
+    if (overflow || self->mixed || edge_at(&samples, at, &segment, row) != ANSWERED) {
+        Py_RETURN_NONE;
+    }
+    return boxed_row(row);
+}
+
+/* Chain: the edges between two frames ------------------------------------------------------------------------------ */
+
+typedef struct {
+    History *edge; /* borrowed; NULL for a run of static edges, which is one row */
+    double row[WIDTH];
+} Step;
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *sides[2];   /* the steps from the source up and from the target up, as tuples, which own the edges */
+    Step *steps;          /* the same in a row */
+    Py_ssize_t up, down;  /* the number of each */
+    Py_ssize_t moving;    /* how many are edges */
+} Chain;
+
+static int
+chain_clear(Chain *self)
+{
+    Step *steps = self->steps;
+    self->steps = NULL;
+    self->up = self->down = self->moving = 0;
+    PyMem_Free(steps);
+    Py_CLEAR(self->sides[0]);
+    Py_CLEAR(self->sides[1]);
+    return 0;
+}
+
+static int
+chain_init(Chain *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *sides[2];
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "Chain takes no keyword arguments");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
+        return -1;
+    }
+    const Py_ssize_t up = PyTuple_Size(sides[0]), down = PyTuple_Size(sides[1]);
+    Step *steps = PyMem_Calloc((size_t)(up + down + 1), sizeof(Step));
+    if (steps == NULL) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    Py_ssize_t moving = 0;
+    for (Py_ssize_t i = 0; i < up + down; i++) {
+        PyObject *step = i < up ? PyTuple_GetItem(sides[0], i) : PyTuple_GetItem(sides[1], i - up);
+        if (PyObject_TypeCheck(step, HistoryType)) {
+            steps[i].edge = (History *)step;
+            moving++;
+        } else if (read_row(step, steps[i].row) < 0) {
+            PyMem_Free(steps);
+            return -1;
+        }
+    }
+    Py_INCREF(sides[0]);
+    Py_INCREF(sides[1]);
+    chain_clear(self);
+    self->sides[0] = sides[0];
+    self->sides[1] = sides[1];
+    self->steps = steps;
+    self->up = up;
+    self->down = down;
+    self->moving = moving;
+    return 0;
+}
+
+/* Source in target at a stamp, from what each step holds; `samples` and `segments` have one place a step. */
+static Status
+climb(const Step *steps, const Samples *samples, Segment *segments, Py_ssize_t count, int64_t at, double *out)
+{
+    for (Py_ssize_t i = 0; i < count; i++) {
+        double row[WIDTH];
+        const double *here = steps[i].row;
+        if (steps[i].edge != NULL) {
+            const Status status = edge_at(samples + i, at, segments + i, row);
+            if (status != ANSWERED) {
+                return status;
+            }
+            here = row;
+        }
+        if (i == 0) {
+            memcpy(out, here, ROW_SIZE);
+        } else {
+            compose(here, out, out);
+        }
+    }
+    if (count == 0) {
+        memset(out, 0, ROW_SIZE);
+        out[WIDTH - 1] = 1.0;
+    }
+    return ANSWERED;
+}
+
+static Status
+chain_climb(const Chain *self, const Samples *samples, Segment *segments, int64_t at, double *out)
+{
+    Status status = climb(self->steps, samples, segments, self->up, at, out);
+    if (status == ANSWERED && self->down > 0) {
+        double below[WIDTH], inverse[WIDTH];
+        const Py_ssize_t up = self->up;
+        status = climb(self->steps + up, samples + up, segments + up, self->down, at, below);
+        if (status == ANSWERED) {
+            invert(below, inverse);
+            compose(inverse, out, out);
+        }
+    }
+    return status;
+}
+
+/* Note the samples of each edge as they are now, and that no segment was used yet; false if an edge is not plain. */
+static int
+chain_look(const Chain *self, Samples *samples, Segment *segments)
+{
+    for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
+        const History *edge = self->steps[i].edge;
+        if (edge != NULL) {
+            if (edge->mixed) {
+                return 0;
+            }
+            samples[i] = samples_of(edge);
+            segments[i].before = segments[i].after = INT64_MIN;
+        }
+    }
+    return 1;
+}
+
+enum { SHORT = 24 }; /* steps that fit on the stack */
+
+static Status
+chain_at(const Chain *self, int64_t at, double *out)
+{
+    Samples samples[SHORT], *all_samples = samples;
+    Segment segments[SHORT], *all_segments = segments;
+    const Py_ssize_t count = self->up + self->down;
+    Status status = NOT_PLAIN;
+    if (count > SHORT) {
+        all_samples = PyMem_Malloc((size_t)count * sizeof(Samples));
+        all_segments = PyMem_Malloc((size_t)count * sizeof(Segment));
+    }
+    if (all_samples != NULL && all_segments != NULL && chain_look(self, all_samples, all_segments)) {
+        status = chain_climb(self, all_samples, all_segments, at, out);
+    }
+    if (count > SHORT) {
+        PyMem_Free(all_samples);
+        PyMem_Free(all_segments);
+    }
+    return status;
+}
+
+/* Whether every edge has samples and something moves; then `stamp` is the newest one that all have reached. */
+static int
+chain_newest(const Chain *self, int64_t *stamp)
+{
+    int64_t common = INT64_MAX;
+    for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
+        const History *edge = self->steps[i].edge;
+        if (edge == NULL) {
+            continue;
+        }
+        if (edge->end == edge->start) {
+            return 0;
+        }
+        const int64_t newest = block_stamps(edge->block)[edge->end - 1];
+        if (newest < common) {
+            common = newest;
+        }
+    }
+    *stamp = common;
+    return self->moving > 0;
+}
+
+static PyObject *
+chain_row(Chain *self, PyObject *number)
+{
+    int overflow;
+    double row[WIDTH];
+    const long long at = PyLong_AsLongLongAndOverflow(number, &overflow);
+    if (at == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (overflow || chain_at(self, at, row) != ANSWERED) {
+        Py_RETURN_NONE;
+    }
+    return boxed_row(row);
+}
+
+static PyObject *
+chain_latest(Chain *self, PyObject *Py_UNUSED(ignored))
+{
+    int64_t stamp;
+    if (!chain_newest(self, &stamp)) {
+        Py_RETURN_NONE;
+    }
+    return PyLong_FromLongLong(stamp);
+}
+
+/* Held: the samples of a chain as they were at one moment, for many answers ----------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    Chain *chain;
+    Samples *samples;  /* one place a step, as in the chain */
+    Segment *segments;
+    Block **blocks;    /* those of which it is a reader, or NULL */
+    Py_ssize_t count;
+    char busy;         /* whether a thread is at work on the segments */
+} Held;
+
+/* The answers at `count` stamps as seven columns; NaN where there is none. The first such place, -1 for none, or -2 if
+ * an answer is not plain. */
+static Py_ssize_t
+fill_columns(const Chain *self, const Samples *samples, Segment *segments, const char *stamps, Py_ssize_t count,
+             double *columns)
+{
+    Py_ssize_t first_missing = -1;
+    for (Py_ssize_t i = 0; i < count; i++) {
+        int64_t at;
+        double row[WIDTH];
+        memcpy(&at, stamps + i * sizeof(int64_t), sizeof(int64_t));
+        const Status status = chain_climb(self, samples, segments, at, row);
+        if (status == NOT_PLAIN) {
+            return -2;
+        }
+        if (status == MISSING) {
+            if (first_missing < 0) {
+                first_missing = i;
+            }
+            for (int k = 0; k < WIDTH; k++) {
+                row[k] = NAN;
+            }
+        }
+        for (int k = 0; k < WIDTH; k++) {
+            columns[k * count + i] = row[k];
+        }
+    }
+    return first_missing;
+}
+
+static PyObject *
+held_rows(Held *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer stamps, columns;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "rows takes stamps and columns");
+        return NULL;
+    }
+    if (self->busy) {
+        PyErr_SetString(PyExc_RuntimeError, "another thread reads these samples");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &stamps, PyBUF_SIMPLE) < 0) {
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[1], &columns, PyBUF_WRITABLE) < 0) {
+        PyBuffer_Release(&stamps);
+        return NULL;
+    }
+    PyObject *result = NULL;
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps.len / size;
+    if (columns.len != count * (Py_ssize_t)ROW_SIZE || stamps.len % size != 0
+        || (uintptr_t)columns.buf % sizeof(double) != 0) {
+        PyErr_SetString(PyExc_ValueError, "columns must have room for seven aligned floats a stamp");
+    } else {
+        Py_ssize_t missing;
+        self->busy = 1;
+        Py_INCREF(OBJECT(self));
+        /* Nobody changes what is held: see Block. Letting go of the interpreter costs more than a few stamps. */
+        if (count < 256) {
+            missing = fill_columns(self->chain, self->samples, self->segments, stamps.buf, count, columns.buf);
+        } else {
+            Py_BEGIN_ALLOW_THREADS
+            missing = fill_columns(self->chain, self->samples, self->segments, stamps.buf, count, columns.buf);
+            Py_END_ALLOW_THREADS
+        }
+        self->busy = 0;
+        Py_DECREF(OBJECT(self));
+        if (missing == -2) {
+            Py_INCREF(Py_None);
+            result = Py_None;
+        } else {
+            result = PyLong_FromSsize_t(missing);
+        }
+    }
+    PyBuffer_Release(&columns);
+    PyBuffer_Release(&stamps);
+    return result;
+}
+
+static int
+held_traverse(Held *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->chain);
+    return 0;
+}
+
+static void
+held_dealloc(Held *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    for (Py_ssize_t i = 0; i < self->count; i++) {
+        if (self->blocks[i] != NULL) {
+            self->blocks[i]->readers--;
+            Py_DECREF(OBJECT(self->blocks[i]));
+        }
+    }
+    PyMem_Free(self->samples);
+    PyMem_Free(self->segments);
+    PyMem_Free(self->blocks);
+    Py_XDECREF(OBJECT(self->chain));
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyMethodDef held_methods[] = {
+    {"rows", FAST(held_rows), METH_FASTCALL,
+     PyDoc_STR("rows(stamps, columns): fill columns of shape (7, n), NaN without an answer; the first such place, -1 if "
+               "there is none, None if an answer is not plain.")},
+    {NULL}
+};
+
+static PyType_Slot held_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The samples of a chain as they were at one moment.")},
+    {Py_tp_dealloc, held_dealloc},
+    {Py_tp_traverse, held_traverse},
+    {Py_tp_methods, held_methods},
+    {0, NULL}
+};
+
+static PyType_Spec held_spec = {
+    "tfbus._kernel.Held", sizeof(Held), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_DISALLOW_INSTANTIATION | Py_TPFLAGS_IMMUTABLETYPE, held_slots
+};
+
+static PyObject *
+chain_hold(Chain *self, PyObject *Py_UNUSED(ignored))
+{
+    const Py_ssize_t steps = self->up + self->down;
+    Held *held = (Held *)PyType_GenericAlloc(HeldType, 0);
+    if (held == NULL) {
+        return NULL;
+    }
+    held->samples = PyMem_Calloc((size_t)steps + 1, sizeof(Samples));
+    held->segments = PyMem_Calloc((size_t)steps + 1, sizeof(Segment));
+    held->blocks = PyMem_Calloc((size_t)steps + 1, sizeof(Block *));
+    if (held->samples == NULL || held->segments == NULL || held->blocks == NULL) {
+        Py_DECREF(OBJECT(held));
+        return PyErr_NoMemory();
+    }
+    Py_INCREF(OBJECT(self));
+    held->chain = self;
+    if (!chain_look(self, held->samples, held->segments)) {
+        Py_DECREF(OBJECT(held));
+        Py_RETURN_NONE;
+    }
+    for (Py_ssize_t i = 0; i < steps; i++) {
+        Block *block = self->steps[i].edge == NULL ? NULL : self->steps[i].edge->block;
+        if (block != NULL) {
+            Py_INCREF(OBJECT(block));
+            block->readers++;
+            held->blocks[i] = block;
+        }
+    }
+    held->count = steps;
+    return OBJECT(held);
+}
+
+static int
+chain_traverse(Chain *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->sides[0]);
+    Py_VISIT(self->sides[1]);
+    return 0;
+}
+
+static void
+chain_dealloc(Chain *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    chain_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyMethodDef chain_methods[] = {
+    {"row", (PyCFunction)chain_row, METH_O, PyDoc_STR("row(at): source in target at a stamp; None if it is not plain.")},
+    {"latest", (PyCFunction)chain_latest, METH_NOARGS,
+     PyDoc_STR("The newest stamp that all edges have reached; None if one has no samples, or nothing moves.")},
+    {"hold", (PyCFunction)chain_hold, METH_NOARGS,
+     PyDoc_STR("The samples of all edges as they are now, for many answers; None if they are not plain.")},
+    {NULL}
+};
+
+static PyMemberDef chain_members[] = {
+    {"up", T_OBJECT_EX, offsetof(Chain, sides[0]), READONLY, PyDoc_STR("The steps from the source up.")},
+    {"down", T_OBJECT_EX, offsetof(Chain, sides[1]), READONLY, PyDoc_STR("The steps from the target up.")},
+    {NULL}
+};
+
+static PyType_Slot chain_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The edges between two frames, and one row for each run of static ones.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, chain_init},
+    {Py_tp_dealloc, chain_dealloc},
+    {Py_tp_traverse, chain_traverse},
+    {Py_tp_clear, chain_clear},
+    {Py_tp_methods, chain_methods},
+    {Py_tp_members, chain_members},
+    {0, NULL}
+};
+
+static PyType_Spec chain_spec = {
+    "tfbus._kernel.Chain", sizeof(Chain), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, chain_slots
+};
+
+/* Paths: the plain answer ------------------------------------------------------------------------------------------ */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *recent;        /* {target: {source: Chain}} */
+    PyObject *lock_is_held;  /* the method of the tree's lock that says so */
+    PyObject *latest;        /* the sentinel */
+    PyObject *kind;          /* the class of an answer, made of Sample */
+} Paths;
+
+static int
+paths_traverse(Paths *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->recent);
+    Py_VISIT(self->lock_is_held);
+    Py_VISIT(self->latest);
+    Py_VISIT(self->kind);
+    return 0;
+}
+
+static int
+paths_clear(Paths *self)
+{
+    Py_CLEAR(self->recent);
+    Py_CLEAR(self->lock_is_held);
+    Py_CLEAR(self->latest);
+    Py_CLEAR(self->kind);
+    return 0;
+}
+
+static void
+paths_dealloc(Paths *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    paths_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static int
+paths_init(Paths *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *lock, *latest, *kind;
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "Paths takes no keyword arguments");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "OOO!:Paths", &lock, &latest, &PyType_Type, &kind)) {
+        return -1;
+    }
+    if (!PyType_IsSubtype((PyTypeObject *)kind, SampleType)) {
+        PyErr_SetString(PyExc_TypeError, "answers must be samples");
+        return -1;
+    }
+    PyObject *is_held = PyObject_GetAttrString(lock, "locked");
+    PyObject *recent = is_held == NULL ? NULL : PyDict_New();
+    if (recent == NULL) {
+        Py_XDECREF(is_held);
+        return -1;
+    }
+    paths_clear(self);
+    self->recent = recent;
+    self->lock_is_held = is_held;
+    Py_INCREF(latest);
+    self->latest = latest;
+    Py_INCREF(kind);
+    self->kind = kind;
+    return 0;
+}
+
+/* None where Python has to look closer. */
+static PyObject *
+paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
+{
+    int64_t at;
+    double row[WIDTH];
+    if (count != 3) {
+        PyErr_SetString(PyExc_TypeError, "answer takes target, source and at");
+        return NULL;
+    }
+    PyObject *target = args[0], *source = args[1];
+    if (self->recent == NULL || !PyUnicode_CheckExact(target) || !PyUnicode_CheckExact(source)) {
+        Py_RETURN_NONE;
+    }
+    /* Whoever holds the lock may be in the middle of a change. */
+    PyObject *held = PyObject_CallNoArgs(self->lock_is_held);
+    if (held != Py_False) {
+        if (held == NULL) {
+            return NULL;
+        }
+        Py_DECREF(held);
+        Py_RETURN_NONE;
+    }
+    Py_DECREF(held);
+    PyObject *by_source = PyDict_GetItemWithError(self->recent, target);
+    PyObject *chain = by_source == NULL ? NULL : PyDict_GetItemWithError(by_source, source);
+    if (chain == NULL || !PyObject_TypeCheck(chain, ChainType)) {
+        if (PyErr_Occurred()) {
+            return NULL;
+        }
+        Py_RETURN_NONE;
+    }
+    const Chain *path = (const Chain *)chain;
+    if (args[2] == self->latest) {
+        if (!chain_newest(path, &at)) {
+            Py_RETURN_NONE;
+        }
+    } else {
+        int overflow;
+        if (path->moving == 0 || !PyLong_CheckExact(args[2])) {
+            Py_RETURN_NONE;
+        }
+        at = PyLong_AsLongLongAndOverflow(args[2], &overflow);
+        if (overflow) {
+            Py_RETURN_NONE;
+        }
+    }
+    if (chain_at(path, at, row) != ANSWERED) {
+        Py_RETURN_NONE;
+    }
+    Sample *sample = (Sample *)PyType_GenericAlloc((PyTypeObject *)self->kind, 0);
+    if (sample == NULL) {
+        return NULL;
+    }
+    Py_INCREF(target);
+    Py_INCREF(source);
+    Py_INCREF(empty_string);
+    sample->parent = target;
+    sample->child = source;
+    sample->authority = empty_string;
+    sample->stamp = at;
+    memcpy(sample->row, row, ROW_SIZE);
+    return (PyObject *)sample;
+}
+
+static PyObject *
+paths_recent(Paths *self, void *Py_UNUSED(closure))
+{
+    if (self->recent == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "recent");
+        return NULL;
+    }
+    Py_INCREF(self->recent);
+    return self->recent;
+}
+
+static int
+paths_set_recent(Paths *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    if (value == NULL || !PyDict_CheckExact(value)) {
+        PyErr_SetString(PyExc_TypeError, "recent must be a dict");
+        return -1;
+    }
+    PyObject *old = self->recent;
+    Py_INCREF(value);
+    self->recent = value;
+    Py_XDECREF(OBJECT(old));
+    return 0;
+}
+
+static PyMethodDef paths_methods[] = {
+    {"answer", FAST(paths_answer), METH_FASTCALL,
+     PyDoc_STR("answer(target, source, at): the plain answer; None if Python has to look closer.")},
+    {NULL}
+};
+
+static PyGetSetDef paths_getset[] = {
+    {"recent", (getter)paths_recent, (setter)paths_set_recent, PyDoc_STR("{target: {source: Chain}}"), NULL},
+    {NULL}
+};
+
+static PyType_Slot paths_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The paths that were asked for lately, and their plain answers.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, paths_init},
+    {Py_tp_dealloc, paths_dealloc},
+    {Py_tp_traverse, paths_traverse},
+    {Py_tp_clear, paths_clear},
+    {Py_tp_methods, paths_methods},
+    {Py_tp_getset, paths_getset},
+    {0, NULL}
+};
+
+static PyType_Spec paths_spec = {
+    "tfbus._kernel.Paths", sizeof(Paths), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, paths_slots
+};
+
+/* The plain commit -------------------------------------------------------------------------------------------------- */
+
+enum { FEW = 64 }; /* samples whose histories fit on the stack */
+
+/* commit(frames, batch, first): store samples from the index `first` on, up to the first that is not plain; its index.
+ * Out of memory, all histories are as before. */
+static PyObject *
+commit(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 3 || !PyDict_Check(args[0]) || !PyTuple_CheckExact(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a tuple of samples and an index");
+        return NULL;
+    }
+    const Py_ssize_t first = PyLong_AsSsize_t(args[2]), size = PyTuple_Size(args[1]);
+    if (first == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    if (first < 0 || first >= size) {
+        return PyLong_FromSsize_t(size);
+    }
+    History *few[FEW], **histories = few;
+    if (size - first > FEW && (histories = PyMem_Malloc((size_t)(size - first) * sizeof(History *))) == NULL) {
+        return PyErr_NoMemory();
+    }
+    Py_ssize_t stored = 0;
+    int failed = 0;
+    while (first + stored < size) {
+        PyObject *item = PyTuple_GetItem(args[1], first + stored);
+        const Sample *sample = (const Sample *)item;
+        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static) {
+            break;
+        }
+        PyObject *known = PyDict_GetItemWithError(args[0], sample->child);
+        if (known == NULL || !PyObject_TypeCheck(known, HistoryType)) {
+            failed = PyErr_Occurred() != NULL;
+            break;
+        }
+        History *history = (History *)known;
+        if (!history_continues(history, sample->parent, sample->stamp, sample->authority)) {
+            break;
+        }
+        if (history_push(history, sample->stamp, sample->row) < 0) {
+            failed = 1;
+            break;
+        }
+        histories[stored++] = history;
+    }
+    for (Py_ssize_t i = 0; i < stored; i++) {
+        if (failed) {
+            histories[i]->end--;
+        } else {
+            history_slide(histories[i]);
+        }
+    }
+    if (histories != few) {
+        PyMem_Free(histories);
+    }
+    return failed ? NULL : PyLong_FromSsize_t(first + stored);
+}
+
+/* Edge: the newest edge of a frame on a bus, and the plain judgement of a batch --------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *parent;  /* plain str */
+    PyObject *trusted; /* plain str, or NULL for nobody */
+    int64_t newest;
+    char has_newest;
+} Edge;
+
+static PyObject *
+edge_parent(Edge *self, void *Py_UNUSED(closure))
+{
+    if (self->parent == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "parent");
+        return NULL;
+    }
+    Py_INCREF(self->parent);
+    return self->parent;
+}
+
+static PyObject *
+edge_trusted(Edge *self, void *Py_UNUSED(closure))
+{
+    PyObject *trusted = self->trusted == NULL ? Py_None : self->trusted;
+    Py_INCREF(trusted);
+    return trusted;
+}
+
+static PyObject *
+edge_newest(Edge *self, void *Py_UNUSED(closure))
+{
+    if (!self->has_newest) {
+        Py_RETURN_NONE;
+    }
+    return PyLong_FromLongLong(self->newest);
+}
+
+/* `closure` is the offset of the string; None is NULL. */
+static int
+edge_set_string(PyObject *self, PyObject *value, void *closure)
+{
+    PyObject **place = (PyObject **)((char *)self + (size_t)closure);
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "an edge keeps all its fields");
+        return -1;
+    }
+    if (value == Py_None && place == &((Edge *)self)->trusted) {
+        value = NULL;
+    } else if ((value = plain_string(value)) == NULL) {
+        return -1;
+    }
+    PyObject *old = *place;
+    *place = value;
+    Py_XDECREF(old);
+    return 0;
+}
+
+static int
+edge_set_newest(Edge *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "an edge keeps all its fields");
+        return -1;
+    }
+    if (value != Py_None && read_stamp(value, &self->newest) < 0) {
+        return -1;
+    }
+    self->has_newest = value != Py_None;
+    return 0;
+}
+
+static void
+edge_dealloc(Edge *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    Py_XDECREF(self->parent);
+    Py_XDECREF(self->trusted);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyGetSetDef edge_getset[] = {
+    {"parent", (getter)edge_parent, edge_set_string, PyDoc_STR("The newest parent."), (void *)offsetof(Edge, parent)},
+    {"trusted", (getter)edge_trusted, edge_set_string,
+     PyDoc_STR("The authority whose moving samples under this parent need no judgement, or None."),
+     (void *)offsetof(Edge, trusted)},
+    {"newest", (getter)edge_newest, (setter)edge_set_newest, PyDoc_STR("The newest stamp, or None."), NULL},
+    {NULL}
+};
+
+static PyType_Slot edge_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The part of a frame's newest edge by which its samples are judged.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_dealloc, edge_dealloc},
+    {Py_tp_getset, edge_getset},
+    {0, NULL}
+};
+
+static PyType_Spec edge_spec = {
+    "tfbus._kernel.Edge", sizeof(Edge), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, edge_slots
+};
+
+/* judge(edges, batch, horizon, square): whether all samples continue known edges, none is newer than the horizon and no
+ * translation longer than the root of `square`; then their stamps are noted, else nothing. */
+static PyObject *
+judge(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    int64_t horizon;
+    if (nargs != 4 || !PyDict_Check(args[0]) || !PyTuple_CheckExact(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "judge takes a dict of edges, a tuple of samples, a stamp and a float");
+        return NULL;
+    }
+    const double square = PyFloat_AsDouble(args[3]);
+    if (read_stamp(args[2], &horizon) < 0 || (square == -1.0 && PyErr_Occurred())) {
+        return NULL;
+    }
+    const Py_ssize_t size = PyTuple_Size(args[1]);
+    Edge *few[FEW], **edges = few;
+    if (size > FEW && (edges = PyMem_Malloc((size_t)size * sizeof(Edge *))) == NULL) {
+        return PyErr_NoMemory();
+    }
+    Py_ssize_t judged = 0;
+    for (; judged < size; judged++) {
+        PyObject *item = PyTuple_GetItem(args[1], judged);
+        const Sample *sample = (const Sample *)item;
+        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static
+            || sample->stamp > horizon) {
+            break;
+        }
+        const double *row = sample->row;
+        /* Not `>`, which is false for NaN. */
+        if (!(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] <= square)) {
+            break;
+        }
+        PyObject *known = PyDict_GetItemWithError(args[0], sample->child);
+        if (known == NULL || !PyObject_TypeCheck(known, EdgeType)) {
+            break;
+        }
+        edges[judged] = (Edge *)known;
+        if (!same_string(sample->parent, edges[judged]->parent)
+            || !same_string(sample->authority, edges[judged]->trusted)) {
+            break;
+        }
+    }
+    const int plain = judged == size;
+    for (Py_ssize_t i = 0; plain && i < size; i++) {
+        const int64_t stamp = ((const Sample *)PyTuple_GetItem(args[1], i))->stamp;
+        if (!edges[i]->has_newest || stamp > edges[i]->newest) {
+            edges[i]->newest = stamp;
+            edges[i]->has_newest = 1;
+        }
+    }
+    if (edges != few) {
+        PyMem_Free(edges);
+    }
+    if (!plain && PyErr_Occurred()) {
+        return NULL;
+    }
+    return PyBool_FromLong(plain);
+}
+
+/* The module -------------------------------------------------------------------------------------------------------- */
+
+static PyMethodDef module_methods[] = {
+    {"commit", FAST(commit), METH_FASTCALL,
+     PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
+               "index.")},
+    {"judge", FAST(judge), METH_FASTCALL,
+     PyDoc_STR("judge(edges, batch, horizon, square): whether the whole batch is plain; then its stamps are noted.")},
+    {NULL}
+};
+
+static int
+add_type(PyObject *module, const char *name, PyType_Spec *spec, PyTypeObject **type)
+{
+    if (*type == NULL && (*type = (PyTypeObject *)PyType_FromSpec(spec)) == NULL) {
+        return -1;
+    }
+    return PyModule_AddObjectRef(module, name, (PyObject *)*type);
+}
+
+static int
+module_exec(PyObject *module)
+{
+    /* The types are shared by the whole process, as are those of numpy. */
+    if (PyInterpreterState_GetID(PyInterpreterState_Get()) != 0) {
+        PyErr_SetString(PyExc_ImportError, "the compiled kernel of tfbus runs in the main interpreter only");
+        return -1;
+    }
+    if (empty_string == NULL && (empty_string = PyUnicode_InternFromString("")) == NULL) {
+        return -1;
+    }
+    if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
+        || add_type(module, "Block", &block_spec, &BlockType) < 0
+        || add_type(module, "History", &history_spec, &HistoryType) < 0
+        || add_type(module, "Chain", &chain_spec, &ChainType) < 0
+        || add_type(module, "Held", &held_spec, &HeldType) < 0
+        || add_type(module, "Paths", &paths_spec, &PathsType) < 0
+        || add_type(module, "Edge", &edge_spec, &EdgeType) < 0) {
+        return -1;
+    }
+    return 0;
+}
+
+static PyModuleDef_Slot module_slots[] = {{Py_mod_exec, module_exec}, {0, NULL}};
+
+static struct PyModuleDef module_definition = {
+    PyModuleDef_HEAD_INIT, "tfbus._kernel", PyDoc_STR("The compiled kernel of tfbus."), 0, module_methods, module_slots,
+    NULL, NULL, NULL
+};
+
+PyMODINIT_FUNC
+PyInit__kernel(void)
+{
+    return PyModuleDef_Init(&module_definition);
+}

@@ -1,0 +1,37 @@
+"""Where a command finds ROS, and the link to it."""
+
+import re
+from contextlib import AbstractAsyncContextManager
+
+from tfbus.bus.bus import Bus
+from tfbus.cli.arguments import UsageError
+
+_DDS = re.compile(r"dds(?::(\d{1,3}))?")
+_WEBSOCKET = re.compile(r"wss?://.*")
+
+
+def is_ros(place: str) -> bool:
+    """Whether a place is one of ROS rather than a domain."""
+    return bool(_DDS.fullmatch(place) or _WEBSOCKET.fullmatch(place))
+
+
+def ros_link(bus: Bus, place: str) -> AbstractAsyncContextManager[object]:
+    """The link to a place: ``dds``, ``dds:42`` or ``ws://host:9090``.
+
+    Raises
+    ------
+    UsageError
+        If it is none of these, or an extra is missing.
+    """
+    try:
+        if found := _DDS.fullmatch(place):
+            from tfbus.links.dds import DdsLink
+
+            return DdsLink(bus, None if found[1] is None else int(found[1]))
+        if _WEBSOCKET.fullmatch(place):
+            from tfbus.links.rosbridge import RosbridgeLink
+
+            return RosbridgeLink(bus, place)
+    except (ImportError, ValueError) as error:
+        raise UsageError(str(error)) from None
+    raise UsageError(f"{place!r} is no place of ROS: write dds, dds:42 for ROS_DOMAIN_ID 42, or ws://host:9090")

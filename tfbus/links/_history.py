@@ -1,0 +1,180 @@
+"""The last seconds of moving frames, for a link that joins late and wants to look back.
+
+It asks each peer once, in chunks of whole frames in the order of their names. What the peer sends live meanwhile waits,
+so that the samples of each frame come in order. The answers have the number of the newest sample of each frame, so what
+was both told and sent live is news only once.
+"""
+
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from tfbus.bus.bus import Bus
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
+from tfbus.links._outbox import Outbox
+from tfbus.links._relay import Relay
+from tfbus.links._state import StateStep
+from tfbus.stamps import from_seconds
+from tfbus.tree.history import FrameHistory
+
+CHUNK = 2_000
+"""So many samples are told at once, or those of one frame if they are more."""
+MOST_OF_FRAME = 2_000
+"""So many samples of one frame are told, the newest."""
+LONGEST_HISTORY = 3_600.0
+"""s."""
+MOST_HELD = 1_000
+"""So many live messages of one peer wait for what it tells; then it is not asked for more."""
+PATIENCE = 5.0
+"""s; so long they wait for one answer."""
+MOST_REMEMBERED = 10_000
+"""So many peers are remembered as asked."""
+
+
+class HistoryTeller:
+    """Tells from the buffers of a bus what a link has brought in the last seconds.
+
+    Parameters
+    ----------
+    bus : Bus
+    relay : Relay
+        That of the bus.
+    outbox : Outbox
+        That of the link.
+    """
+
+    def __init__(self, bus: Bus, relay: Relay, outbox: Outbox) -> None:
+        self._bus = bus
+        self._relay = relay
+        self._state = outbox.state
+        self._sorted: tuple[int, list[str]] = (-1, [])
+
+    def chunk(self, seconds: float, after: str) -> tuple[list[OutgoingBatch], StateStep]:
+        """The samples of the frames whose names come after `after`; the step is final if those are all frames."""
+        if self._sorted[0] != self._state.number:
+            self._sorted = self._state.number, sorted(self._state.moving())
+        frames = self._sorted[1]
+        told: list[OutgoingBatch] = []
+        count = 0
+        for place in range(bisect_right(frames, after), len(frames)):
+            number = self._relay.newest_number(frames[place])
+            samples = [] if number is None else self._recent(frames[place], seconds)
+            if number is None or not samples:
+                continue
+            if told and count + len(samples) > CHUNK:
+                return told, StateStep(0, 0, 0, final=False)
+            told.append(OutgoingBatch(*number, samples))
+            count += len(samples)
+        return told, StateStep(0, 0, 0)
+
+    def _recent(self, frame: str, seconds: float) -> list[TransformStamped]:
+        """The newest samples of a frame, of the buffer that holds the longest history of it."""
+        held = (live.forest.frames.get(frame) for live in self._bus._buffers)
+        histories = [history for history in held if history is not None and history.oldest is not None]
+        if not histories:
+            return []
+        history = min(histories, key=_oldest)
+        newest = history.newest
+        assert newest is not None
+        low = newest - from_seconds(seconds)
+        samples = history.samples_between(low, newest)
+        start = max(len(samples) - MOST_OF_FRAME, 0)
+        stamps, rows = samples.stamps[start:].tolist(), samples.rows[start:].tolist()
+        parents, authorities = samples.parents, samples.authorities
+        recent = []
+        for place, (stamp, row) in enumerate(zip(stamps, rows, strict=True), start):
+            if stamp >= low:
+                sample = TransformStamped.__new__(TransformStamped)
+                parent = history.parent if parents is None else parents[place]
+                authority = history.authority if authorities is None else authorities[place]
+                sample._fields = parent, frame, stamp, tuple(row), authority, False
+                recent.append(sample)
+        return recent
+
+
+def _oldest(history: FrameHistory) -> int:
+    return 0 if history.oldest is None else history.oldest
+
+
+@dataclass(slots=True)
+class _Open:
+    due: float
+    after: str = ""
+    held: list[ReceivedMessage] = field(default_factory=list)
+
+
+class HistoryAsker:
+    """Asks each peer once for its last seconds, and holds back what it sends live meanwhile.
+
+    Parameters
+    ----------
+    seconds : float
+    ask : callable
+        Asks a peer for so many seconds of the frames after a name.
+    now : callable
+        Returns a monotonic time in s.
+    """
+
+    def __init__(self, seconds: float, ask: Callable[[str, float, str], object], now: Callable[[], float]) -> None:
+        self._seconds = seconds
+        self._ask = ask
+        self._now = now
+        self._asked: dict[str, None] = {}
+        self._open: dict[str, _Open] = {}
+
+    def joined(self, peer: str) -> None:
+        """Ask a peer, if it was not asked before."""
+        if peer not in self._asked:
+            self._asked[peer] = None
+            if len(self._asked) > MOST_REMEMBERED:
+                del self._asked[next(iter(self._asked))]
+            self._open[peer] = _Open(self._now() + PATIENCE)
+            self._ask(peer, self._seconds, "")
+
+    def holds(self, peer: str, message: ReceivedMessage) -> bool:
+        """Hold a live message back; returns whether that is so."""
+        waiting = self._open.get(peer)
+        if waiting is None or len(waiting.held) >= MOST_HELD:
+            return False
+        waiting.held.append(message)
+        return True
+
+    def goes_on(self, peer: str, message: ReceivedMessage | None) -> bool:
+        """Take an answer, and ask for more if there is more; returns whether there is."""
+        waiting = self._open.get(peer)
+        if waiting is None or message is None or message.step is None or message.step.final:
+            return False
+        last = max(_children(message), default="")
+        if last <= waiting.after or len(waiting.held) >= MOST_HELD:
+            return False
+        waiting.after = last
+        waiting.due = self._now() + PATIENCE
+        self._ask(peer, self._seconds, last)
+        return True
+
+    def is_open(self, peer: str) -> bool:
+        """Whether an answer of a peer is awaited."""
+        return peer in self._open
+
+    def end(self, peer: str) -> list[ReceivedMessage]:
+        """Await no answer of a peer any more; returns what was held back."""
+        waiting = self._open.pop(peer, None)
+        return [] if waiting is None else waiting.held
+
+    def overdue(self) -> list[str]:
+        """The peers whose answers have not come in time."""
+        now = self._now()
+        return [peer for peer, waiting in self._open.items() if waiting.due <= now]
+
+    def next_due(self) -> float | None:
+        """The time at which `overdue` is to be called next; None while no answer is awaited."""
+        return min((waiting.due for waiting in self._open.values()), default=None)
+
+
+def _children(message: ReceivedMessage) -> Iterable[str]:
+    for entry in message.entries:
+        if isinstance(entry, ReceivedBatch):
+            for sample in entry.samples:
+                yield sample._fields[1]

@@ -1,0 +1,204 @@
+"""The carrier of links over DDS."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from functools import partial
+from threading import Lock, Thread
+from typing import Any
+
+import anyio
+import anyio.to_thread
+from cyclonedds.core import DDSException, Entity, Listener
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.internal import InvalidSample
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.dds._domains import domain
+from tfbus.links.dds._publishers import PATIENCE, Publishers
+from tfbus.links.dds._types import ParticipantEntitiesInfo, RawTFMessage
+from tfbus.links.ros._carrier import RosCarrier, RosMessage
+from tfbus.links.ros._settings import RosSettings
+from tfbus.tf_message import encode
+
+_CLOSING_TIME = 1.0
+_DEPTH = 100
+_AT_ONCE = 100
+# A writer never waits for a reader that is frozen: the event loop would.
+_RELIABLE = (
+    Policy.Reliability.Reliable(duration(seconds=0)),
+    Policy.IgnoreLocal.Participant,
+    Policy.DataRepresentation(use_cdrv0_representation=True),
+)
+_MOVING = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH))
+_STATIC = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
+# Each publisher has its own last message.
+_STATICS = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(_DEPTH))
+
+
+class DdsCarrier(RosCarrier):
+    """Reads and writes the topics of a DDS domain; see `RosCarrier`.
+
+    Parameters
+    ----------
+    number : int
+        The domain.
+    config : str
+        Of Cyclone DDS.
+    settings : RosSettings
+    """
+
+    def __init__(self, number: int, config: str, settings: RosSettings) -> None:
+        super().__init__(f"dds:{number}", settings)
+        self._number = number
+        self._config = config
+        self._lock = Lock()
+        self._open = ExitStack()
+        self._publishers = Publishers(self._deliver)
+        self._writers: dict[int, tuple[str, str]] = {}
+        self._matched: dict[int, frozenset[str]] = {}
+        self._present: frozenset[str] = frozenset()
+        self._moving_writer: DataWriter[RawTFMessage]
+        self._static_writer: DataWriter[RawTFMessage]
+
+    async def _connect(self) -> None:
+        await anyio.to_thread.run_sync(self._join)
+
+    def _join(self) -> None:
+        try:
+            self._open.enter_context(domain(self._number, self._config))
+            participant = DomainParticipant(self._number)
+            self._open.callback(_delete, participant)
+            topics = {
+                name: Topic(participant, f"rt{name}", RawTFMessage)
+                for name in (*self.settings.tf, *self.settings.tf_static)
+            }
+            if self.settings.send:
+                self._moving_writer = DataWriter(participant, topics[self.settings.tf[0]], _MOVING)
+                self._static_writer = DataWriter(participant, topics[self.settings.tf_static[0]], _STATIC)
+                for writer in (self._moving_writer, self._static_writer):
+                    self._open.callback(_delete, writer)
+            if self.settings.authority is None:
+                info = Topic(participant, "ros_discovery_info", ParticipantEntitiesInfo)
+                self._read(participant, info, _STATICS, self._take_nodes, None)
+            for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
+                static = number < len(self.settings.tf_static)
+                self._read(
+                    participant,
+                    topics[name],
+                    _STATICS if static else _MOVING,
+                    partial(self._take, static),
+                    partial(self._match, number),
+                )
+        except DDSException as error:
+            raise OSError(f"cannot join the DDS domain {self._number}: {error}") from None
+
+    def _read(
+        self,
+        participant: DomainParticipant,
+        topic: Topic[Any],
+        qos: Qos,
+        take: Callable[[DataReader[Any]], object],
+        match: Callable[[DataReader[Any]], None] | None,
+    ) -> None:
+        reader = DataReader(participant, topic, qos)
+        listener = Listener(on_data_available=lambda _: take(reader))
+        if match is not None:
+            listener.set_on_subscription_matched(lambda _, __: match(reader))
+        self._open.callback(_delete, reader)
+        # Only now, because a listener is called with no reader before the library knows the one that it makes.
+        reader.set_listener(listener)
+        self._open.callback(reader.set_listener, None)
+        if match is not None:
+            match(reader)
+        take(reader)
+
+    async def run(self) -> None:
+        """Let no message wait for the name of its node for ever."""
+        while True:
+            await anyio.sleep(PATIENCE / 2)
+            self._publishers.expire()
+
+    async def close(self) -> None:
+        """Leave the domain, or give up waiting for that."""
+        closing = Thread(target=self._open.close, name="tfbus dds close", daemon=True)
+        closing.start()
+        with anyio.move_on_after(_CLOSING_TIME, shield=True):
+            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
+
+    def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
+        try:
+            (self._static_writer if static else self._moving_writer).write(RawTFMessage.of(encode(samples)))
+        except DDSException as error:
+            self._report.failed(error)
+            return False
+        return True
+
+    # What follows is called by the library, in its own threads, which print whatever is raised.
+
+    def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> None:
+        while True:
+            messages: list[Any] = reader.take(N=_AT_ONCE)
+            for message in messages:
+                if isinstance(message, InvalidSample):
+                    # It tells of a writer that has gone.
+                    continue
+                handle = message.sample_info.publication_handle
+                publisher, participant = self._writers.get(handle) or self._find(reader, handle)
+                if self.settings.authority is None:
+                    self._publishers.message(publisher, participant, message.payload, static)
+                else:
+                    self._deliver(participant, "", message.payload, static)
+            if len(messages) < _AT_ONCE:
+                return
+
+    def _find(self, reader: DataReader[RawTFMessage], handle: int) -> tuple[str, str]:
+        publication = reader.get_matched_publication_data(handle)
+        if publication is None:
+            # It has gone since.
+            return "", ""
+        self._writers[handle] = found = publication.key.hex, publication.participant_key.hex
+        return found
+
+    def _take_nodes(self, reader: DataReader[ParticipantEntitiesInfo]) -> None:
+        messages: list[Any] = reader.take(N=_AT_ONCE)
+        for message in messages:
+            if not isinstance(message, InvalidSample):
+                self._publishers.nodes(*_nodes_of(message))
+
+    def _match(self, number: int, reader: DataReader[RawTFMessage]) -> None:
+        with self._lock:
+            self._writers.clear()
+            publications = map(reader.get_matched_publication_data, reader.get_matched_publications())
+            self._matched[number] = frozenset(each.participant_key.hex for each in publications if each is not None)
+            present = frozenset().union(*self._matched.values())
+            self._publishers.keep_only(set(present))
+            for participant in sorted(present - self._present):
+                self._receive(Received(participant, Presence.JOINED))
+            for participant in sorted(self._present - present):
+                self._receive(Received(participant, Presence.LEFT))
+            self._present = present
+
+    def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
+        self._receive(Received(participant, RosMessage(payload, static, authority), len(payload), moving=not static))
+
+
+def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:
+    """The id of a participant, and its nodes, each with its publishers."""
+    return bytes(info.gid.data).hex(), [
+        (
+            f"{node.node_namespace.rstrip('/')}/{node.node_name}",
+            [bytes(publisher.data).hex() for publisher in node.writer_gid_seq],
+        )
+        for node in info.node_entities_info_seq
+    ]
+
+
+def _delete(entity: Entity) -> None:
+    # The library deletes an entity when nothing refers to it any more, and its listener does.
+    entity.__del__()

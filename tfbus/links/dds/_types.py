@@ -1,0 +1,118 @@
+"""The types of ROS 2 that go over DDS, by the names that ROS 2 gives them.
+
+A ``TFMessage`` stays bytes: `tfbus.tf_message` reads and writes them many times faster than the library does. What is
+declared here is what DDS tells others of the type.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, bounded_str, float64, int32, sequence, uint8, uint32
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    """``builtin_interfaces/msg/Time``."""
+
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    """``std_msgs/msg/Header``."""
+
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
+    """``geometry_msgs/msg/Vector3``."""
+
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
+    """``geometry_msgs/msg/Quaternion``."""
+
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+class Transform(IdlStruct, typename="geometry_msgs::msg::dds_::Transform_"):
+    """``geometry_msgs/msg/Transform``."""
+
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass
+class TransformStamped(IdlStruct, typename="geometry_msgs::msg::dds_::TransformStamped_"):
+    """``geometry_msgs/msg/TransformStamped``."""
+
+    header: Header
+    child_frame_id: str
+    transform: Transform
+
+
+@dataclass
+class RawTFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
+    """``tf2_msgs/msg/TFMessage`` as its bytes, in CDR with the header."""
+
+    transforms: sequence[TransformStamped]
+    payload = b""
+
+    @classmethod
+    def of(cls, payload: bytes) -> Self:
+        """The message of some bytes."""
+        nothing: Any = []
+        message = cls(nothing)
+        message.payload = payload
+        return message
+
+    def serialize(self, *_: Any, **__: Any) -> bytes:
+        """The bytes."""
+        return self.payload
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
+        """The message of the bytes that have come."""
+        return cls.of(bytes(data))
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
+        """What comes of a writer that has gone."""
+        return cls.of(b"")
+
+
+@dataclass
+class Gid(IdlStruct, typename="rmw_dds_common::msg::dds_::Gid_"):
+    """``rmw_dds_common/msg/Gid``: the id of a participant or of a writer, as DDS has it."""
+
+    data: array[uint8, 16]
+
+
+@dataclass
+class NodeEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::NodeEntitiesInfo_"):
+    """``rmw_dds_common/msg/NodeEntitiesInfo``: one node, its subscriptions and its publishers."""
+
+    node_namespace: bounded_str[256]
+    node_name: bounded_str[256]
+    reader_gid_seq: sequence[Gid]
+    writer_gid_seq: sequence[Gid]
+
+
+@dataclass
+class ParticipantEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"):
+    """``rmw_dds_common/msg/ParticipantEntitiesInfo``: all nodes of one participant."""
+
+    gid: Gid
+    node_entities_info_seq: sequence[NodeEntitiesInfo]

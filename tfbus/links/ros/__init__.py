@@ -1,0 +1,9 @@
+"""What links to ROS share: topics, names, and that nothing in ROS tells who a message comes from.
+
+`RosLink` is the base of the links that `tfbus.links.dds`, `tfbus.links.rosbridge` and `tfbus.links.rmw_zenoh` give.
+"""
+
+from tfbus.links.ros._settings import RosOptions
+from tfbus.links.ros.ros_link import RosLink
+
+__all__ = ["RosLink", "RosOptions"]

@@ -1,0 +1,152 @@
+"""The half of a carrier that all links to ROS share: what goes to which topic, and what comes from there.
+
+A publisher of ROS keeps its last message on ``/tf_static`` for late joiners. So each message that goes there holds all
+static frames that this link sends. ROS has no message that removes a frame: a static one is missing in the next
+message, which late joiners get, and of a moving one nobody is told.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._carrier import SendReport
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
+from tfbus.links._outbox import Turn
+from tfbus.links._provenance import ReceivedTransform
+from tfbus.links._receive_queue import Received
+from tfbus.links.ros._settings import RosSettings
+from tfbus.tf_message import Decoded, decode, refusal
+
+MOST_TRANSFORMS = 1_000
+"""So many moving transforms go into one message."""
+
+
+@dataclass(frozen=True, slots=True)
+class RosMessage:
+    """One message from a topic, as it came.
+
+    Attributes
+    ----------
+    payload : Any
+        Bytes of CDR; a carrier with other messages decodes them itself.
+    static : bool
+        Whether the topic is one of static frames.
+    authority : str
+        The node that has published it, or what is known of it.
+    """
+
+    payload: Any
+    static: bool
+    authority: str
+
+
+class RosCarrier:
+    """A carrier to ROS, see `tfbus.links._carrier.Carrier`; a subclass connects, publishes and closes.
+
+    Parameters
+    ----------
+    id : str
+        The name of this end.
+    settings : RosSettings
+    """
+
+    def __init__(self, id: str, settings: RosSettings) -> None:  # noqa: A002 - the protocol calls it so
+        self.id = id
+        self.settings = settings
+        self._receive: Callable[[Received], object]
+        self._report: SendReport
+        self._statics: dict[str, TransformStamped] = {}
+
+    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
+        """Connect; raises `OSError` if there is no connection."""
+        self._receive, self._report = receive, report
+        await self._connect()
+
+    def send(self, turn: Turn) -> None:
+        """Publish the moving frames of a turn, and all static ones if any of them has changed."""
+        if not self.settings.send:
+            return
+        moving: list[TransformStamped] = []
+        for entry in turn.entries:
+            if isinstance(entry, OutgoingBatch):
+                moving += filter(None, (self._outgoing(sample) for sample in entry.samples if not sample.static))
+            elif entry.frame not in self._statics and self.settings.names.is_local(entry.frame):
+                error = ValueError(f"ROS cannot be told that the moving frame {entry.frame!r} was removed")
+                self._report.refused("removal", error)
+        for first in range(0, len(moving), MOST_TRANSFORMS):
+            self._put(moving[first : first + MOST_TRANSFORMS], static=False)
+        changed = False
+        for frame, change in turn.statics.items():
+            sample = self._outgoing(change.samples[0]) if isinstance(change, OutgoingBatch) else None
+            if sample is not None:
+                self._statics[frame] = sample
+                changed = True
+            elif self._statics.pop(frame, None) is not None:
+                changed = True
+        if changed:
+            self._put(list(self._statics.values()), static=True)
+
+    def read(self, content: RosMessage) -> ReceivedMessage:
+        """The samples of a message, without leading slashes, with their names on the bus."""
+        decoded = self._decode(content.payload)
+        errors = decoded.errors
+        samples: list[ReceivedTransform] = []
+        authority = content.authority if self.settings.authority is None else self.settings.authority
+        for error in errors:
+            error.authority = authority
+        for sample in decoded.samples:
+            if sample is None:
+                continue
+            sample._fields = *sample._fields[:4], authority, content.static
+            try:
+                self.settings.names.put_on_bus(sample)
+            except InvalidTransformError as error:
+                errors.append(error.with_traceback(None))
+            else:
+                samples.append(sample)
+        entries: list[Any] = [ReceivedBatch(samples, {authority})] if samples else []
+        return ReceivedMessage(entries, errors=errors)
+
+    async def run(self) -> None:
+        """Do nothing that takes time."""
+
+    async def close(self) -> None:
+        """Disconnect."""
+        raise NotImplementedError
+
+    async def _connect(self) -> None:
+        """Connect, and subscribe; raises `OSError` if there is no connection."""
+        raise NotImplementedError
+
+    def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
+        """Publish one message, without blocking; returns whether the network took it, and reports it if not."""
+        raise NotImplementedError
+
+    def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
+        """The transforms of a message; raises `MalformedMessageError`."""
+        return decode(payload, kind=ReceivedTransform, bare_names=True)
+
+    def _publish_statics(self) -> None:
+        """Publish the static frames once more, for whoever has come or come back."""
+        if self._statics:
+            self._put(list(self._statics.values()), static=True)
+
+    def _put(self, samples: Sequence[TransformStamped], static: bool) -> None:
+        if self._publish(samples, static):
+            self._report.sent(len(samples))
+
+    def _outgoing(self, sample: TransformStamped) -> TransformStamped | None:
+        """A sample with its names in ROS; None if it is another robot's, or a message cannot hold it."""
+        if not self.settings.names.is_local(sample.child):
+            return None
+        error = refusal(sample)
+        if error is None:
+            try:
+                return self.settings.names.localise(sample)
+            except InvalidTransformError as no_name:
+                error = no_name.with_traceback(None)
+        self._report.refused(error.reason, error)
+        return None

@@ -1,0 +1,64 @@
+"""The settings that all links to ROS share."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TypedDict
+
+from tfbus.links.ros._names import FrameNames, as_topics
+
+
+class RosOptions(TypedDict, total=False):
+    """The arguments that all links to ROS share; `RosLink` describes them."""
+
+    tf: str | Iterable[str]
+    tf_static: str | Iterable[str]
+    prefix: str | None
+    shared: Iterable[str]
+    frames: Iterable[str] | None
+    send: bool
+    authority: str | None
+    drop_lost: bool
+    max_frames: int
+    capacity: int
+
+
+@dataclass(frozen=True, slots=True)
+class RosSettings:
+    """What a carrier to ROS has to know of them.
+
+    Attributes
+    ----------
+    tf, tf_static : tuple of str
+        The topics that are heard; what goes out goes to the first.
+    names : FrameNames
+    send : bool
+        Whether anything goes out.
+    authority : str or None
+        That of all samples that come in; None for the node that has published them, where it is known.
+    """
+
+    tf: tuple[str, ...] = ("/tf",)
+    tf_static: tuple[str, ...] = ("/tf_static",)
+    names: FrameNames = FrameNames()  # noqa: RUF009 - it never changes
+    send: bool = True
+    authority: str | None = None
+
+
+def settings_of(options: RosOptions) -> RosSettings:
+    """The settings that some options make.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If an option is not valid.
+    """
+    authority = options.get("authority")
+    if authority is not None and not isinstance(authority, str):
+        raise TypeError(f"authority must be a str, not {authority!r}")
+    return RosSettings(
+        as_topics(options.get("tf", "/tf"), "tf"),
+        as_topics(options.get("tf_static", "/tf_static"), "tf_static"),
+        FrameNames(options.get("prefix"), options.get("shared", ())),
+        bool(options.get("send", True)),
+        authority,
+    )

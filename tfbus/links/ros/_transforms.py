@@ -1,0 +1,137 @@
+"""The transforms of messages that are no CDR: those of ROS 1, and those of JSON and CBOR.
+
+A message of ROS 1 is ``tf2_msgs/TFMessage``: the number of transforms, then for each ``uint32 seq, sec, nsec``, two
+strings of a length and UTF-8, and seven ``float64``; everything is little endian, and nothing is aligned.
+"""
+
+import struct
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform import Transform
+from tfbus.links._provenance import ReceivedTransform
+from tfbus.stamps import SECOND
+from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError
+
+_COUNT = struct.Struct("<I")
+_HEAD = struct.Struct("<4xII")
+_NUMBERS = struct.Struct("<7d")
+_SHORTEST = 4 + 8 + 2 * 4 + 56
+
+_Parts = tuple[object, object, int, int, tuple[Any, ...]]
+"""Parent, child, seconds, nanoseconds, and x, y, z and the quaternion (x, y, z, w)."""
+
+
+def decode_ros1(payload: bytes) -> Decoded[ReceivedTransform]:
+    """The transforms of a message of ROS 1.
+
+    Raises
+    ------
+    MalformedMessageError
+        If the payload is no such message.
+    """
+    return _decoded(_parts_of_ros1(payload))
+
+
+def decode_mapping(message: object) -> Decoded[ReceivedTransform]:
+    """The transforms of a message as mappings, by the names that ROS 1 or ROS 2 give to its fields.
+
+    Raises
+    ------
+    MalformedMessageError
+        If it is no such message.
+    """
+    try:
+        return _decoded(_parts_of_mapping(message))
+    except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise MalformedMessageError("encoding", f"it has not the fields of a TFMessage: {error!r}"[:200]) from None
+
+
+def as_mapping(sample: TransformStamped) -> dict[str, Any]:
+    """A transform as a mapping, with a stamp that ROS 1 and ROS 2 read."""
+    parent, child, stamp, (x, y, z, qx, qy, qz, qw), _, _ = sample._fields
+    seconds, nanoseconds = divmod(stamp, SECOND)
+    return {
+        "header": {"stamp": {"secs": seconds, "nsecs": nanoseconds}, "frame_id": parent},
+        "child_frame_id": child,
+        "transform": {"translation": {"x": x, "y": y, "z": z}, "rotation": {"x": qx, "y": qy, "z": qz, "w": qw}},
+    }
+
+
+def _parts_of_ros1(payload: bytes) -> Iterator[_Parts]:
+    try:
+        (count,) = _COUNT.unpack_from(payload)
+        if count * _SHORTEST > len(payload):
+            raise MalformedMessageError("truncated", f"{len(payload)} bytes cannot hold {count} transforms")
+        at = 4
+        for _ in range(count):
+            seconds, nanoseconds = _HEAD.unpack_from(payload, at)
+            at += _HEAD.size
+            names = []
+            for _ in range(2):
+                (length,) = _COUNT.unpack_from(payload, at)
+                names.append(payload[at + 4 : at + 4 + length])
+                at += 4 + length
+            numbers = _NUMBERS.unpack_from(payload, at)
+            at += _NUMBERS.size
+            yield *map(_text, names), seconds, nanoseconds, numbers
+    except struct.error:
+        raise MalformedMessageError("truncated", f"{len(payload)} bytes end inside of a transform") from None
+    if at != len(payload):
+        raise MalformedMessageError("oversized", f"{len(payload) - at} bytes behind the last transform")
+
+
+def _text(name: bytes) -> str | None:
+    try:
+        return name.decode()
+    except UnicodeDecodeError:
+        return None
+
+
+def _parts_of_mapping(message: Any) -> Iterator[_Parts]:
+    for each in message["transforms"]:
+        header, transform = each["header"], each["transform"]
+        stamp = header["stamp"]
+        seconds, nanoseconds = _either(stamp, "sec", "secs"), _either(stamp, "nanosec", "nsecs")
+        numbers = *(transform["translation"][axis] for axis in "xyz"), *(transform["rotation"][axis] for axis in "xyzw")
+        yield header["frame_id"], each["child_frame_id"], seconds, nanoseconds, numbers
+
+
+def _either(stamp: Mapping[str, Any], name: str, of_ros1: str) -> int:
+    value = stamp[name if name in stamp else of_ros1]
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name} is no integer but {value!r}")
+    return value
+
+
+def _decoded(parts: Iterator[_Parts]) -> Decoded[ReceivedTransform]:
+    samples: list[ReceivedTransform | None] = []
+    errors: list[InvalidTransformError] = []
+    for parent, child, seconds, nanoseconds, numbers in parts:
+        bare = [_bare(name) for name in (parent, child)]
+        try:
+            if None in bare:
+                raise InvalidTransformError(
+                    f"a frame name must be UTF-8 of at most {MAX_NAME} bytes", reason="frame name"
+                )
+            if not 0 <= nanoseconds < SECOND:
+                raise InvalidTransformError(f"a stamp has less than 1e9 nanosec, got {nanoseconds}", reason="stamp")
+            transform = Transform(numbers[:3], numbers[3:])
+            samples.append(ReceivedTransform(str(bare[0]), str(bare[1]), seconds * SECOND + nanoseconds, transform))
+        except InvalidTransformError as error:
+            error.parent, error.child = bare
+            errors.append(error.with_traceback(None))
+            samples.append(None)
+    return Decoded(samples, errors)
+
+
+def _bare(name: object) -> str | None:
+    """A name without leading slashes; None if it is too long or no text."""
+    if not isinstance(name, str):
+        return None
+    try:
+        return name.lstrip("/") if len(name.encode()) <= MAX_NAME else None
+    except UnicodeEncodeError:
+        return None

@@ -1,0 +1,222 @@
+"""The carrier of links through rosbridge."""
+
+import random
+from collections import deque
+from collections.abc import Callable, Sequence
+from time import monotonic
+from typing import Any
+from uuid import uuid4
+
+import anyio
+
+from tfbus._aio.task_groups import close_task_group
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._provenance import ReceivedTransform
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.ros._carrier import RosCarrier, RosMessage
+from tfbus.links.ros._settings import RosSettings
+from tfbus.links.rosbridge._protocol import (
+    Incoming,
+    advertise,
+    decode_content,
+    publish,
+    read,
+    subscribe,
+    unsubscribe,
+)
+from tfbus.links.rosbridge._websocket import WebSocket
+from tfbus.tf_message import Decoded, MalformedMessageError
+
+MAX_SIZE = 2**22
+"""The largest message that is received, in bytes."""
+MOST_QUEUED = 1_000
+"""So many messages wait for a slow server; then the oldest are dropped."""
+ENCODINGS = ("cbor-raw", "cbor", "none")
+CONNECT_TIME = 5.0
+SILENCE = 10.0
+"""s; a server that does not even answer a ping for so long is gone."""
+FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
+"""s between two attempts to connect."""
+_CLOSING_TIME = 1.0
+_MISS_PERIODS = (1.0, 2.0, 4.0, 8.0, 16.0)
+"""s; while a lookup waits, the static frames are asked for again so often, and then after the last of these."""
+
+
+class RosbridgeCarrier(RosCarrier):
+    """Talks with a rosbridge server; see `RosCarrier`.
+
+    Parameters
+    ----------
+    url : str
+    settings : RosSettings
+    lookup_waits : callable
+        Whether a lookup on the bus waits for something.
+    """
+
+    def __init__(self, url: str, settings: RosSettings, lookup_waits: Callable[[], bool] = lambda: False) -> None:
+        super().__init__(f"rosbridge:{uuid4().hex}", settings)
+        self._url = url
+        self._lookup_waits = lookup_waits
+        self._socket: WebSocket | None = None
+        self._encoding = 0
+        self._moving: deque[tuple[str, int]] = deque()
+        self._changed_statics: str | None = None
+        self._requests: deque[str] = deque()
+        self._woken = anyio.Event()
+
+    async def _connect(self) -> None:
+        self._socket = await WebSocket.connect(self._url, MAX_SIZE, CONNECT_TIME)
+        self._encoding = 0
+        self._moving.clear()
+        self._requests.clear()
+        # First of all: what is latched may come only once, and moving frames come again.
+        for topic in (*self.settings.tf_static, *self.settings.tf):
+            self._request(subscribe(topic, ENCODINGS[0]))
+        if self.settings.send:
+            self._request(advertise(self.settings.tf_static[0], static=True))
+            self._request(advertise(self.settings.tf[0], static=False))
+            self._publish_statics()
+        self._receive(Received(self._url, Presence.JOINED))
+
+    async def run(self) -> None:
+        """Talk with the server, and connect again whenever it has gone."""
+        while True:
+            if self._socket is not None:
+                await self._talk(self._socket)
+            await self._come_back()
+
+    async def close(self) -> None:
+        """Send what is left, and close."""
+        socket, self._socket = self._socket, None
+        if socket is None:
+            return
+        with anyio.move_on_after(_CLOSING_TIME, shield=True):
+            try:
+                await self._send_all(socket)
+            except OSError:
+                pass
+            finally:
+                await socket.close()
+
+    def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
+        if static:
+            self._changed_statics = publish(self.settings.tf_static[0], samples)
+        elif self._socket is None:
+            error = ConnectionError(f"{self._url} is not connected")
+            self._report.refused("not connected", error, len(samples))
+            return False
+        else:
+            if len(self._moving) >= MOST_QUEUED:
+                _, dropped = self._moving.popleft()
+                self._report.refused("congested", OSError(f"{self._url} is too slow for what is published"), dropped)
+            self._moving.append((publish(self.settings.tf[0], samples), len(samples)))
+        self._woken.set()
+        return True
+
+    def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
+        return decode_content(payload)
+
+    async def _talk(self, socket: WebSocket) -> None:
+        """Send and receive until the server is gone."""
+        tasks = anyio.create_task_group()
+        await tasks.__aenter__()
+        for work in (self._read_all, self._write_all, self._keep_alive):
+            tasks.start_soon(self._until_gone, work, socket, tasks.cancel_scope)
+        tasks.start_soon(self._ask_again)
+        await close_task_group(tasks)
+        # Not when the link ends: then there is still something to send.
+        self._socket = None
+        self._receive(Received(self._url, Presence.LEFT))
+        await socket.close()
+
+    async def _until_gone(self, work: Callable[[WebSocket], Any], socket: WebSocket, scope: anyio.CancelScope) -> None:
+        try:
+            await work(socket)
+        except OSError as error:
+            self._report.failed(ConnectionError(f"{self._url}: {error}"))
+            scope.cancel()
+
+    async def _come_back(self) -> None:
+        pause = FIRST_PAUSE
+        while self._socket is None:
+            # Not all clients of a server come back in the same instant.
+            await anyio.sleep(pause * random.uniform(0.5, 1.0))
+            pause = min(2 * pause, LONGEST_PAUSE)
+            try:
+                await self._connect()
+            except OSError as error:
+                self._report.failed(ConnectionError(f"{self._url}: {error}"))
+
+    async def _read_all(self, socket: WebSocket) -> None:
+        while True:
+            message = await socket.receive()
+            try:
+                self._take(read(message), len(message))
+            except MalformedMessageError as error:
+                self._receive(Received(self._url, error))
+
+    def _take(self, incoming: Incoming, size: int) -> None:
+        if not incoming.topic:
+            self._report.failed(ConnectionError(f"{self._url} says: {incoming.content}"))
+            return
+        static = incoming.topic in self.settings.tf_static
+        if not static and incoming.topic not in self.settings.tf:
+            raise MalformedMessageError("topic", f"a message on {incoming.topic[:100]!r}, which nobody asked for")
+        if ENCODINGS.index(incoming.encoding) > self._encoding:
+            self._ask_for_next_encoding()
+        content = RosMessage(incoming.content, static, "rosbridge")
+        self._receive(Received(self._url, content, size, moving=not static))
+
+    def _ask_for_next_encoding(self) -> None:
+        """The server has answered in JSON, so it may know CBOR by an older name."""
+        self._encoding += 1
+        if self._encoding < len(ENCODINGS) - 1:
+            for topic in (*self.settings.tf_static, *self.settings.tf):
+                self._request(unsubscribe(topic))
+                self._request(subscribe(topic, ENCODINGS[self._encoding]))
+
+    async def _write_all(self, socket: WebSocket) -> None:
+        while True:
+            self._woken = anyio.Event()
+            await self._send_all(socket)
+            await self._woken.wait()
+
+    async def _send_all(self, socket: WebSocket) -> None:
+        while True:
+            if self._requests:
+                await socket.send(self._requests.popleft())
+            elif self._changed_statics is not None:
+                text, self._changed_statics = self._changed_statics, None
+                await socket.send(text)
+            elif self._moving:
+                await socket.send(self._moving.popleft()[0])
+            else:
+                return
+
+    async def _keep_alive(self, socket: WebSocket) -> None:
+        while True:
+            await anyio.sleep(SILENCE / 4)
+            if monotonic() - socket.heard > SILENCE:
+                raise ConnectionResetError(f"nothing has come for {SILENCE:g} s")
+            await socket.ping()
+
+    async def _ask_again(self) -> None:
+        """Subscribe to the static frames once more while a lookup waits.
+
+        A rosbridge of ROS 2 gives latched messages to no later subscriber if it has asked ROS for that topic before
+        there was a publisher.
+        """
+        misses = 0
+        while True:
+            await anyio.sleep(_MISS_PERIODS[min(misses, len(_MISS_PERIODS) - 1)])
+            if not self._lookup_waits():
+                misses = 0
+                continue
+            misses += 1
+            for topic in self.settings.tf_static:
+                self._request(unsubscribe(topic))
+                self._request(subscribe(topic, ENCODINGS[min(self._encoding, len(ENCODINGS) - 1)]))
+
+    def _request(self, text: str) -> None:
+        self._requests.append(text)
+        self._woken.set()

@@ -1,0 +1,172 @@
+"""`WebSocket`, a client's end of a websocket that takes no message beyond a size."""
+
+import ssl
+from time import monotonic
+from typing import Self
+from urllib.parse import SplitResult, urlsplit
+
+import anyio
+import anyio.abc
+from wsproto import ConnectionType, WSConnection
+from wsproto.events import (
+    AcceptConnection,
+    BytesMessage,
+    CloseConnection,
+    Event,
+    Ping,
+    RejectConnection,
+    Request,
+    TextMessage,
+)
+from wsproto.utilities import ProtocolError
+
+_AT_ONCE = 2**16
+_GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError)
+_PORTS = {"ws": 9090, "wss": 443}
+
+
+def check_url(url: str) -> SplitResult:
+    """The parts of the URL of a websocket.
+
+    Raises
+    ------
+    ValueError
+        If it is no such URL.
+    """
+    parts = urlsplit(url)
+    try:
+        valid = parts.scheme in _PORTS and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        valid = False
+    if not valid:
+        raise ValueError(f"{url!r} is no URL of a websocket, such as ws://localhost:9090")
+    return parts
+
+
+class WebSocket:
+    """An open websocket (RFC 6455); one task may receive while others send.
+
+    Parameters
+    ----------
+    stream : anyio.abc.ByteStream
+    max_size : int
+        The largest message that is received, in bytes or characters.
+
+    Attributes
+    ----------
+    heard : float
+        The monotonic time in s when the last bytes came.
+    """
+
+    def __init__(self, stream: anyio.abc.ByteStream, max_size: int) -> None:
+        self._stream = stream
+        self._max_size = max_size
+        self._connection = WSConnection(ConnectionType.CLIENT)
+        self._received: list[Event] = []
+        self._sending = anyio.Lock()
+        self.heard = monotonic()
+
+    @classmethod
+    async def connect(cls, url: str, max_size: int, timeout: float) -> Self:
+        """Open a websocket.
+
+        Raises
+        ------
+        OSError
+            If nobody answers there, not within so many seconds, or the answer is no websocket.
+        """
+        parts = check_url(url)
+        host, port = parts.hostname or "", parts.port or _PORTS[parts.scheme]
+        stream: anyio.abc.ByteStream | None = None
+        opened = False
+        try:
+            with anyio.fail_after(timeout):
+                if parts.scheme == "wss":
+                    context = ssl.create_default_context()
+                    stream = await anyio.connect_tcp(host, port, ssl_context=context, tls_standard_compatible=False)
+                else:
+                    stream = await anyio.connect_tcp(host, port)
+                socket = cls(stream, max_size)
+                target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
+                await socket._send(Request(host=parts.netloc.rpartition("@")[2], target=target))
+                answer = await socket._next_event()
+                if not isinstance(answer, AcceptConnection):
+                    status = f", status {answer.status_code}" if isinstance(answer, RejectConnection) else ""
+                    raise ConnectionRefusedError(f"{url} is no websocket{status}")
+                opened = True
+                return socket
+        except TimeoutError:
+            raise TimeoutError(f"{url} does not answer within {timeout:g} s") from None
+        finally:
+            if stream is not None and not opened:
+                await anyio.aclose_forcefully(stream)
+
+    async def receive(self) -> str | bytes:
+        """The next message.
+
+        Raises
+        ------
+        OSError
+            If the other end has closed, is gone, sends a message that is too large, or what is no websocket.
+        """
+        texts: list[str] = []
+        pieces: list[bytes] = []
+        size = 0
+        while True:
+            event = await self._next_event()
+            if isinstance(event, TextMessage | BytesMessage):
+                size += len(event.data)
+                if size > self._max_size:
+                    raise ConnectionAbortedError(f"a message of more than {self._max_size} bytes")
+                if isinstance(event, TextMessage):
+                    texts.append(event.data)
+                else:
+                    pieces.append(bytes(event.data))
+                if event.message_finished:
+                    return "".join(texts) if isinstance(event, TextMessage) else b"".join(pieces)
+            elif isinstance(event, Ping):
+                await self._send(event.response())
+            elif isinstance(event, CloseConnection):
+                raise ConnectionResetError(f"the other end has closed: {event.reason or event.code}")
+
+    async def send(self, text: str) -> None:
+        """Send a message; raises `OSError` if the other end is gone."""
+        await self._send(TextMessage(text))
+
+    async def ping(self) -> None:
+        """Have the other end answer, which `heard` tells; raises `OSError` if it is gone."""
+        await self._send(Ping(b""))
+
+    async def close(self) -> None:
+        """Close, without waiting for the other end."""
+        try:
+            await self._send(CloseConnection(1000))
+        except OSError:
+            pass
+        finally:
+            await anyio.aclose_forcefully(self._stream)
+
+    async def _next_event(self) -> Event:
+        while not self._received:
+            try:
+                data: bytes | None = await self._stream.receive(_AT_ONCE)
+            except _GONE:
+                raise ConnectionResetError("the connection is gone") from None
+            self.heard = monotonic()
+            try:
+                self._connection.receive_data(data)
+                self._received = list(self._connection.events())
+            except ProtocolError as error:
+                raise ConnectionAbortedError(f"it is no websocket: {error}") from None
+        return self._received.pop(0)
+
+    async def _send(self, event: Event) -> None:
+        try:
+            data = self._connection.send(event)
+        except ProtocolError as error:
+            raise ConnectionResetError(f"the websocket is closed: {error}") from None
+        async with self._sending:
+            try:
+                await self._stream.send(data)
+            except _GONE:
+                raise ConnectionResetError("the connection is gone") from None

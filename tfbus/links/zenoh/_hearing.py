@@ -1,0 +1,91 @@
+"""The times at which a link asks its peers whether they hear it.
+
+After connections have broken and come back, zenoh sometimes keeps one of which one end has lost all that the other end
+has declared: its presence, subscriptions and queries. That end hears nobody there. The other end hears it, and knows
+nothing of this unless it asks.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from random import Random
+
+FIRST_PAUSE = 1.0
+LONGEST_PAUSE = 10.0
+"""s between two questions to one peer: at first, and then."""
+SECOND_PAUSE = 0.5
+"""s; after an answer that the link is not heard, for its presence may be on its way."""
+DEAF = 2
+"""So many such answers in a row mean that it will not come."""
+MOST_SILENT = 3
+"""A peer that answers nothing is taken for deaf so often; it may have no right to answer."""
+
+
+@dataclass(slots=True)
+class _Check:
+    due: float
+    pause: float = FIRST_PAUSE
+    unheard: int = 0
+    silent: int = 0
+
+
+class Hearing:
+    """Decides which peers to ask when, and judges their answers.
+
+    Parameters
+    ----------
+    now : callable
+        Returns a monotonic time in s.
+    random : Random, optional
+    """
+
+    def __init__(self, now: Callable[[], float], random: Random | None = None) -> None:
+        self._now = now
+        self._random = Random() if random is None else random
+        self._checks: dict[str, _Check] = {}
+
+    def joined(self, peer: str) -> None:
+        """A peer is there, or has come back."""
+        self._checks[peer] = _Check(self._now() + self._jitter(FIRST_PAUSE))
+
+    def left(self, peer: str) -> None:
+        """A peer is lost."""
+        self._checks.pop(peer, None)
+
+    def take_due(self) -> list[str]:
+        """The peers to ask now."""
+        now = self._now()
+        due = [peer for peer, check in self._checks.items() if check.due <= now]
+        for peer in due:
+            check = self._checks[peer]
+            check.pause = min(2 * check.pause, LONGEST_PAUSE)
+            check.due = now + self._jitter(check.pause)
+        return due
+
+    def is_deaf(self, peer: str, hears: bool) -> bool:
+        """Note a peer's answer; returns whether it does not hear this link, and will not by itself."""
+        check = self._checks.get(peer)
+        if check is None:
+            return False
+        check.unheard = 0 if hears else check.unheard + 1
+        if hears:
+            return False
+        check.pause = FIRST_PAUSE
+        check.due = self._now() + self._jitter(SECOND_PAUSE)
+        if check.unheard < DEAF:
+            return False
+        # Time for what is done about it.
+        check.unheard = 0
+        check.due = self._now() + self._jitter(2 * FIRST_PAUSE)
+        return True
+
+    def is_silent(self, peer: str) -> bool:
+        """Note that a peer has not answered; returns whether it is taken for deaf."""
+        check = self._checks.get(peer)
+        if check is None or check.silent >= MOST_SILENT:
+            return False
+        deaf = self.is_deaf(peer, hears=False)
+        check.silent += deaf
+        return deaf
+
+    def _jitter(self, seconds: float) -> float:
+        return seconds * self._random.uniform(0.8, 1.2)

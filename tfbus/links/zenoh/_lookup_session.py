@@ -1,0 +1,152 @@
+"""The zenoh session of a buffer server or of a buffer client: that of a link, or one of its own.
+
+Where *robot* is ``~`` without one, the keys are::
+
+    tfbus/domain/robot/lookup            a queryable of each server: questions and cancellations
+    tfbus/domain/robot/@lookup/server    a liveliness token of each server
+    tfbus/domain/robot/@asking/asker     a liveliness token of each asker
+"""
+
+import weakref
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+import anyio
+import anyio.to_thread
+import zenoh
+
+from tfbus.links.zenoh._keys import NO_ROBOT, check_domain, check_robot
+from tfbus.links.zenoh._session import as_os_error, close_session, directly
+from tfbus.links.zenoh._settings import Addresses, settings
+from tfbus.links.zenoh.zenoh_link import ZenohLink
+
+_CLOSING_TIME = 1.0
+
+
+class LookupSession:
+    """A session, and the keys of one robot's lookups.
+
+    Parameters
+    ----------
+    domain : str
+    robot : str or None
+    link : ZenohLink or None
+        The link whose session is used; its domain, then, and no further settings.
+    listen, connect, config, lease
+        As those of a `ZenohLink`.
+
+    Attributes
+    ----------
+    domain : str
+    robot : str or None
+    """
+
+    def __init__(
+        self,
+        domain: str | None,
+        robot: str | None,
+        link: ZenohLink | None,
+        listen: Addresses | None,
+        connect: Addresses | None,
+        config: Mapping[str, Any] | None,
+        lease: float,
+    ) -> None:
+        if link is not None and not (domain is listen is connect is config is None):
+            raise TypeError("domain, listen, connect and config are those of the link")
+        if link is None:
+            self.domain = check_domain("tf" if domain is None else domain)
+            self._config = settings(listen, connect, config, lease)
+        else:
+            self.domain = link.domain
+        self.robot = robot
+        self._link = link
+        self._base = f"tfbus/{self.domain}/{NO_ROBOT if robot is None else check_robot(robot)}"
+        self._session: zenoh.Session | None = None
+        self._declared: list[Any] = []
+        self._close_at_exit: weakref.finalize[..., LookupSession] | None = None
+
+    def key(self, *parts: str) -> str:
+        """A key of the robot's lookups."""
+        return "/".join((self._base, *parts))
+
+    async def open(self) -> None:
+        """Open the session.
+
+        Raises
+        ------
+        OSError
+            If it cannot listen where it should, or as a client reaches nobody.
+        RuntimeError
+            If the link is not entered.
+        """
+        if self._link is not None:
+            self._session = self._link._zenoh_session()
+            return
+        try:
+            self._session = await anyio.to_thread.run_sync(zenoh.open, self._config)
+        except zenoh.ZError as error:
+            raise as_os_error(error) from error
+        # A program may exit without the end of its server.
+        self._close_at_exit = weakref.finalize(self, close_session, self._session)
+
+    def answer(self, receive: Callable[[zenoh.Query], object], server: str) -> None:
+        """Have questions received in zenoh's threads, and announce a server."""
+        session = self._opened()
+        self._declared += [
+            session.declare_queryable(self.key("lookup"), directly(receive), complete=True),
+            session.liveliness().declare_token(self.key("@lookup", server)),
+        ]
+
+    def announce_asker(self, asker: str) -> None:
+        """Announce an asker, whose questions end when it goes."""
+        self._declared.append(self._opened().liveliness().declare_token(self.key("@asking", asker)))
+
+    def follow(self, kind: str, note: Callable[[str, bool], object]) -> None:
+        """Have `note` called in zenoh's threads with the id of each server or asker that comes (True) or goes."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            note(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT)
+
+        key = self.key(kind, "*")
+        self._declared.append(self._opened().liveliness().declare_subscriber(key, directly(receive), history=True))
+
+    def ask(self, payload: bytes, take: Callable[[bytes | None], object], timeout: float, to_all: bool = False) -> None:
+        """Send a question; `take` is called in zenoh's threads with the answer, or at the end with None."""
+
+        def take_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                take(reply.ok.payload.to_bytes())
+
+        self._opened().get(
+            self.key("lookup"),
+            zenoh.handlers.Callback(take_reply, lambda: take(None), indirect=False),
+            target=zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING,
+            payload=payload,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+        )
+
+    async def close(self) -> None:
+        """End what was declared, and the session if it is not the link's."""
+        declared, self._declared = self._declared, []
+        session, self._session = self._session, None
+        if self._close_at_exit is not None:
+            self._close_at_exit.detach()
+        with anyio.move_on_after(_CLOSING_TIME, shield=True):
+            await anyio.to_thread.run_sync(_end, declared, abandon_on_cancel=True)
+            if self._link is None:
+                await anyio.to_thread.run_sync(close_session, session, abandon_on_cancel=True)
+
+    def _opened(self) -> zenoh.Session:
+        assert self._session is not None
+        return self._session
+
+
+def _end(declared: list[Any]) -> None:
+    for one in declared:
+        # The link may have ended before, and its session with it.
+        with suppress(zenoh.ZError):
+            one.undeclare()

@@ -1,0 +1,281 @@
+"""The server of a buffer: other processes ask it, and wait for the answers, instead of hearing all that it holds."""
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from contextlib import suppress
+from time import monotonic
+from types import TracebackType
+from typing import Any, Self
+from uuid import uuid4
+
+import anyio
+import anyio.abc
+import anyio.to_thread
+import zenoh
+
+from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.task_groups import close_task_group
+from tfbus.buffer.buffer import Buffer
+from tfbus.bus.sample_queue import check_capacity
+from tfbus.errors import MAY_COME, RemoteLookupError, TransformError
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._remote_lookup import (
+    MAX_BYTES,
+    Cancellation,
+    RemoteQuestion,
+    as_timeout,
+    read_question,
+    write_answer,
+)
+from tfbus.links.zenoh._lookup_session import LookupSession
+from tfbus.links.zenoh._settings import Addresses
+from tfbus.links.zenoh.zenoh_link import ZenohLink
+from tfbus.statistics import BufferServerStatistics, QueueStatistics
+from tfbus.tree.policy import Hold
+
+LONGEST_WAIT = 10.0
+"""s; then the asker is told what is missing, and asks again if it still wants to know."""
+
+
+class BufferServer:
+    """Answers lookups of other processes from a buffer: ``async with BufferServer(buffer, robot="r17")``.
+
+    A lookup waits here as any lookup of the buffer does; a `BufferClient` asks. It is what a BufferServer is in tf2.
+
+    Parameters
+    ----------
+    buffer : Buffer
+    domain : str, optional
+        As that of a `ZenohLink`; by default ``"tf"``, or that of `link`.
+    robot : str, optional
+        The robot whose buffer this is; askers name it.
+    link : ZenohLink, optional
+        An entered link whose session is used. By default, the server has a session of its own.
+    listen, connect, config, lease
+        As those of a `ZenohLink`, for a session of its own.
+    capacity : int
+        How many lookups may wait at once; beyond that they are refused.
+    rate : float
+        How many lookups are taken in a second, and at once; beyond that they are refused.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If an argument is out of range or of another type, or `link` comes with a domain or addresses.
+    OSError
+        On entering, if it cannot listen where it should, or as a client reaches nobody.
+    RuntimeError
+        On entering a second time, or while the link is not entered.
+
+    Notes
+    -----
+    A lookup ends when its asker is cancelled or goes. Where one robot has several servers, one of them answers. Anyone
+    who can reach the server can ask it.
+    """
+
+    def __init__(
+        self,
+        buffer: Buffer,
+        domain: str | None = None,
+        *,
+        robot: str | None = None,
+        link: ZenohLink | None = None,
+        listen: Addresses | None = None,
+        connect: Addresses | None = None,
+        config: Mapping[str, Any] | None = None,
+        lease: float = 2.0,
+        capacity: int = 1_000,
+        rate: float = 10_000.0,
+    ) -> None:
+        check_capacity(capacity)
+        # Not a number is not greater either.
+        if not rate > 0:
+            raise ValueError(f"a rate must be greater than zero, got {rate!r} Hz")
+        self._buffer = buffer
+        self._session = LookupSession(domain, robot, link, listen, connect, config, lease)
+        self._capacity = capacity
+        self._rate = rate
+        self._allowance = rate
+        self._refilled = monotonic()
+        self._entered = False
+        self._received: deque[zenoh.Query | str] = deque()
+        self._dropped = 0
+        self._came = anyio.Event()
+        self._waker = LoopWaker(lambda: self._came.set())
+        self._waiting: dict[tuple[str, int], anyio.CancelScope] = {}
+        self._replies: deque[tuple[zenoh.Query, bytes]] = deque()
+        self._replied = anyio.Event()
+        self._counts: Counter[str] = Counter()
+        self._tasks: anyio.abc.TaskGroup | None = None
+
+    def statistics(self) -> BufferServerStatistics:
+        """All counters, as they are now."""
+        counts = self._counts
+        return BufferServerStatistics(
+            waiting=len(self._waiting),
+            answered=counts["answered"],
+            failed=counts["failed"],
+            cancelled=counts["cancelled"],
+            refused={reason: counts[reason] for reason in ("busy", "malformed") if counts[reason]},
+            queue=QueueStatistics("lookups", "drop_newest", self._capacity, len(self._received), self._dropped),
+        )
+
+    async def __aenter__(self) -> Self:
+        if self._entered:
+            raise RuntimeError("a buffer server is entered once: make another one")
+        self._entered = True
+        self._waker.bind()
+        await self._session.open()
+        self._tasks = await anyio.create_task_group().__aenter__()
+        self._tasks.start_soon(self._send_replies)
+        self._tasks.start_soon(self._take_all, self._tasks)
+        self._session.follow("@asking", self._note_asker)
+        self._session.answer(self._receive, uuid4().hex)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        assert self._tasks is not None
+        tasks, self._tasks = self._tasks, None
+        tasks.cancel_scope.cancel()
+        try:
+            await close_task_group(tasks)
+        finally:
+            self._received.clear()
+            await self._session.close()
+
+    def _receive(self, query: zenoh.Query) -> None:
+        if len(self._received) >= self._capacity:
+            self._dropped += 1
+            query.drop()
+            return
+        self._received.append(query)
+        self._wake()
+
+    def _note_asker(self, asker: str, present: bool) -> None:
+        if not present:
+            self._received.append(asker)
+            self._wake()
+
+    def _wake(self) -> None:
+        # The event loop may have ended without the end of the server, as in a crash.
+        with suppress(RuntimeError):
+            self._waker.wake()
+
+    async def _take_all(self, tasks: anyio.abc.TaskGroup) -> None:
+        while True:
+            self._came = anyio.Event()
+            while self._received:
+                received = self._received.popleft()
+                if isinstance(received, str):
+                    for key in [key for key in self._waiting if key[0] == received]:
+                        self._cancel(key)
+                else:
+                    self._take(received, tasks)
+            await self._came.wait()
+
+    def _take(self, query: zenoh.Query, tasks: anyio.abc.TaskGroup) -> None:
+        try:
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            question = read_question(payload)
+        except ValueError as error:
+            self._refuse(query, "malformed", f"the question cannot be read: {str(error)[: MAX_BYTES // 100]}")
+            return
+        key = question.asker, question.number
+        if isinstance(question, Cancellation):
+            self._cancel(key)
+            query.drop()
+        elif key in self._waiting:
+            self._refuse(query, "malformed", "the number of the question was used before")
+        elif len(self._waiting) >= self._capacity:
+            self._refuse(query, "busy", f"{self._capacity} lookups wait there, and no more may")
+        elif not self._admit():
+            self._refuse(query, "busy", f"more than {self._rate:g} lookups come in a second")
+        else:
+            try:
+                answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
+            except MAY_COME:
+                self._waiting[key] = scope = anyio.CancelScope()
+                tasks.start_soon(self._wait, query, question, key, scope)
+                return
+            except (TransformError, TypeError, ValueError) as error:
+                answer = error
+            self._answer(query, answer)
+
+    def _admit(self) -> bool:
+        now = monotonic()
+        self._allowance = min(self._rate, self._allowance + (now - self._refilled) * self._rate)
+        self._refilled = now
+        if self._allowance < 1 and self._rate >= 1:
+            return False
+        self._allowance -= 1
+        return True
+
+    def _cancel(self, key: tuple[str, int]) -> None:
+        scope = self._waiting.pop(key, None)
+        if scope is not None:
+            self._counts["cancelled"] += 1
+            scope.cancel()
+
+    async def _wait(
+        self, query: zenoh.Query, question: RemoteQuestion, key: tuple[str, int], scope: anyio.CancelScope
+    ) -> None:
+        answer: TransformStamped | Exception | None = None
+        with scope:
+            try:
+                timeout = as_timeout(question.timeout, LONGEST_WAIT)
+                answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
+            except (TransformError, TypeError, ValueError) as error:
+                answer = error
+            finally:
+                self._waiting.pop(key, None)
+        if answer is None:
+            query.drop()
+        else:
+            self._answer(query, answer)
+
+    def _answer(self, query: zenoh.Query, answer: TransformStamped | Exception) -> None:
+        self._counts["failed" if isinstance(answer, Exception) else "answered"] += 1
+        self._reply(query, write_answer(answer))
+
+    def _refuse(self, query: zenoh.Query, reason: str, detail: str) -> None:
+        self._counts[reason] += 1
+        error = RemoteLookupError(domain=self._session.domain, robot=self._session.robot, reason=reason, detail=detail)
+        self._reply(query, write_answer(error))
+
+    def _reply(self, query: zenoh.Query, answer: bytes) -> None:
+        self._replies.append((query, answer))
+        self._replied.set()
+
+    async def _send_replies(self) -> None:
+        while True:
+            self._replied = anyio.Event()
+            while self._replies:
+                batch = list(self._replies)
+                self._replies.clear()
+                # zenoh waits for an asker that is frozen.
+                await anyio.to_thread.run_sync(_send, batch)
+            await self._replied.wait()
+
+
+def _arguments(question: RemoteQuestion) -> dict[str, Any]:
+    return {
+        "target": question.target,
+        "source": question.source,
+        "at": question.at,
+        "max_age": question.max_age,
+        "source_at": question.source_at,
+        "fixed": question.fixed,
+        "tolerance": question.tolerance,
+        "max_gap": question.max_gap,
+        "extrapolate": None if question.hold is None else Hold(question.hold),
+    }
+
+
+def _send(batch: list[tuple[zenoh.Query, bytes]]) -> None:
+    for query, answer in batch:
+        # An asker that has gone needs no answer.
+        with suppress(zenoh.ZError):
+            query.reply(query.key_expr, answer, express=True)
+        query.drop()
