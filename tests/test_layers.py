@@ -46,7 +46,7 @@ EXTRAS = {
     "cbor2": ("links.rosbridge",),
     "cyclonedds": ("links.dds",),
     "cyclopts": ("cli",),
-    "foxglove": ("links.foxglove",),
+    "foxglove": ("links.foxglove", "recording.formats"),
     "lz4": ("recording.formats",),
     "matplotlib": ("plot",),
     "mcap": ("recording.formats",),
@@ -60,7 +60,7 @@ EXTRAS = {
     "urdf_parser_py": ("robot",),
     "viser": ("view",),
     "wsproto": ("links.rosbridge",),
-    "zenoh": ("links.zenoh",),
+    "zenoh": ("links.rmw_zenoh", "links.zenoh"),
     "zstandard": ("recording.formats",),
 }
 NEVER_LOADED = {*EXTRAS, "hypothesis", "starlette", "uvicorn"}

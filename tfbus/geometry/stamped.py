@@ -93,6 +93,11 @@ class TransformStamped(Sample):
         self._fields = parent, child, stamp, transform._row, authority, bool(static)
 
     @property
+    def frame(self) -> str:
+        """The frame in which the pose of `child` is expressed: `parent`, as other stamped data call it."""
+        return self.parent
+
+    @property
     def transform(self) -> Transform:
         """Maps `child` coordinates into `parent`."""
         return from_row(self._row)

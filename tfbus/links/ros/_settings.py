@@ -1,10 +1,13 @@
 """The settings that all links to ROS share."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TypedDict
 
 from tfbus.links.ros._names import FrameNames, as_topics
+
+_LAST_DOMAIN = 232
 
 
 class RosOptions(TypedDict, total=False):
@@ -62,3 +65,23 @@ def settings_of(options: RosOptions) -> RosSettings:
         bool(options.get("send", True)),
         authority,
     )
+
+
+def as_domain(domain: int | None) -> int:
+    """A domain of ROS 2, by default that of the variable ``ROS_DOMAIN_ID``, or else 0.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If it is out of range, or no number.
+    """
+    if domain is None:
+        text = os.environ.get("ROS_DOMAIN_ID") or "0"
+        if not text.isdecimal():
+            raise ValueError(f"the variable ROS_DOMAIN_ID must be a number, got {text!r}")
+        domain = int(text)
+    if isinstance(domain, bool) or not isinstance(domain, int):
+        raise TypeError(f"a domain must be an int, not {domain!r}")
+    if not 0 <= domain <= _LAST_DOMAIN:
+        raise ValueError(f"a domain must be from 0 to {_LAST_DOMAIN}, got {domain}")
+    return domain
