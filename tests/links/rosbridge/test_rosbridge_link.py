@@ -145,6 +145,17 @@ async def test_a_link_that_only_listens_announces_nothing() -> None:
         assert len(server.requests) == 2
 
 
+async def test_positions_of_joints_go_to_who_takes_them() -> None:
+    async with rosbridge_server() as server:
+        taken: list[Any] = []
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url, joint_states=lambda *state: taken.append(state)):
+                await until(lambda: "/joint_states" in server.operations("subscribe"))
+                message = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": [0.5]}
+                await server.say_anything(json.dumps({"op": "publish", "topic": "/joint_states", "msg": message}))
+                await until(lambda: taken == [({"a": 0.5}, 5)])
+
+
 async def test_what_was_published_before_the_end_still_goes_out() -> None:
     async with rosbridge_server() as server:
         with Bus() as bus:

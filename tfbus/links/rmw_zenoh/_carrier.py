@@ -15,8 +15,10 @@ import zenoh.ext
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Received
 from tfbus.links.rmw_zenoh._wire import (
+    JOINT_TYPE,
     Attachment,
     endpoint_token,
+    joints_token,
     node_token,
     pack,
     publisher_of,
@@ -24,7 +26,7 @@ from tfbus.links.rmw_zenoh._wire import (
     topic_key,
 )
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
-from tfbus.links.ros._settings import RosSettings
+from tfbus.links.ros.settings import RosSettings
 from tfbus.tf_message import MalformedMessageError, encode
 
 MAX_SIZE = 2**22
@@ -80,6 +82,11 @@ class RmwZenohCarrier(RosCarrier):
             else:
                 self._declared.append(self._subscriber(session, topic, static))
             self._token(endpoint_token(self._domain, name, number, self._node, topic, static, publishes))
+
+        for number, topic in enumerate(self.settings.joint_topic, len(topics) + 1):
+            key = topic_expression(self._domain, topic, JOINT_TYPE)
+            self._declared.append(session.declare_subscriber(key, self._take_joints))
+            self._token(joints_token(self._domain, name, number, self._node, topic))
 
     def _token(self, key: str) -> None:
         assert self._session is not None
@@ -146,10 +153,16 @@ class RmwZenohCarrier(RosCarrier):
         attachment = sample.attachment
         if attachment is not None and publisher_of(bytes(attachment)) in self._ids.values():
             return
-        payload = bytes(sample.payload)
-        if len(payload) > MAX_SIZE:
-            error = MalformedMessageError("oversized", f"{len(payload)} bytes, more than {MAX_SIZE}")
+        self._pass_on(RosMessage(bytes(sample.payload), static, _AUTHORITY))
+
+    def _take_joints(self, sample: zenoh.Sample) -> None:
+        """Take positions of joints, in zenoh's threads."""
+        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, joints=True))
+
+    def _pass_on(self, message: RosMessage) -> None:
+        size = len(message.payload)
+        if size > MAX_SIZE:
+            error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
             self._receive(Received(_AUTHORITY, error))
-            return
-        message = RosMessage(payload, static, _AUTHORITY)
-        self._receive(Received(_AUTHORITY, message, len(payload), moving=not static))
+        else:
+            self._receive(Received(_AUTHORITY, message, size, moving=not message.static))

@@ -11,6 +11,9 @@ from typing import Final, NamedTuple
 TYPE: Final = "tf2_msgs::msg::dds_::TFMessage_"
 HASH: Final = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 """Of ``tf2_msgs/msg/TFMessage``, by REP 2016."""
+JOINT_TYPE: Final = "sensor_msgs::msg::dds_::JointState_"
+JOINT_HASH: Final = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+"""Of ``sensor_msgs/msg/JointState``."""
 NODE_ID: Final = 0
 
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -48,9 +51,9 @@ def topic_key(domain: int, topic: str) -> str:
     return f"{domain}/{topic.strip('/')}/{TYPE}/{HASH}"
 
 
-def topic_expression(domain: int, topic: str) -> str:
+def topic_expression(domain: int, topic: str, kind: str = TYPE) -> str:
     """The keys at which messages come: ROS 2 Humble has no hash."""
-    return f"{domain}/{topic.strip('/')}/{TYPE}/*"
+    return f"{domain}/{topic.strip('/')}/{kind}/*"
 
 
 def node_token(domain: int, session: str, node: str) -> str:
@@ -63,3 +66,9 @@ def endpoint_token(domain: int, session: str, number: int, node: str, topic: str
     kind, qos = "MP" if publishes else "MS", _STATIC_QOS if static else _MOVING_QOS
     name = topic.replace("/", "%")
     return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/{kind}/%/%/{node}/{name}/{TYPE}/{HASH}/{qos}"
+
+
+def joints_token(domain: int, session: str, number: int, node: str, topic: str) -> str:
+    """The liveliness token of a subscription to positions of joints."""
+    name, kind = topic.replace("/", "%"), f"{JOINT_TYPE}/{JOINT_HASH}"
+    return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/MS/%/%/{node}/{name}/{kind}/{_MOVING_QOS}"
