@@ -46,7 +46,7 @@ EXTRAS = {
     "cbor2": ("links.rosbridge",),
     "cyclonedds": ("links.dds",),
     "cyclopts": ("cli",),
-    "foxglove": ("links.foxglove",),
+    "foxglove": ("links.foxglove", "recording.formats"),
     "lz4": ("recording.formats",),
     "matplotlib": ("plot",),
     "mcap": ("recording.formats",),

@@ -11,9 +11,11 @@ from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli._ros import ros_link
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.clock import Clock, SimulatedClock
 from tfbus.errors import pip_install
 from tfbus.geometry.stamped import TransformStamped
 
@@ -72,8 +74,15 @@ class LinkOptions:
         """What is joined, for people."""
         return f"ROS at {' and '.join(self.ros)}" if self.ros else f"domain {self.domain!r}"
 
-    def run(self, program: Callable[[Bus], Awaitable[T]]) -> T:
+    def run(self, program: Callable[[Bus], Awaitable[T]], *, clock: Clock | None = None) -> T:
         """Run a program on a bus that has joined the domain, until its end or Ctrl-C.
+
+        Parameters
+        ----------
+        program : async callable
+        clock : Clock, optional
+            The clock of the bus. The time of a `SimulatedClock` is told to the domain; a `ReplayClock` follows the time
+            that is told there.
 
         Returns
         -------
@@ -88,7 +97,7 @@ class LinkOptions:
         """
 
         async def join_and_run() -> T:
-            with Bus() as bus:
+            with Bus(clock) as bus:
                 async with self.join(bus):
                     return await program(bus)
 
@@ -125,6 +134,8 @@ class LinkOptions:
                 connect=self.connect or None,
                 robot=self.robot,
                 robots=self.robots or None,
+                clock=bus.clock if isinstance(bus.clock, ReplayClock) else None,
+                tell_clock=isinstance(bus.clock, SimulatedClock),
             )
         ):
             yield
