@@ -12,9 +12,9 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
-from tfbus import Bus, PeerJoined, PeerLost
+from tfbus import Bus, PeerJoined, PeerLost, SimulatedClock
 from tfbus.links.dds import DdsLink
-from tfbus.links.dds._types import Header, RawJointState, Time
+from tfbus.links.dds._types import Header, RawClock, RawJointState, Time
 
 pytestmark = pytest.mark.anyio
 
@@ -91,6 +91,23 @@ async def test_positions_of_joints_go_to_who_takes_them(domain_number: int) -> N
             writer.__del__()
             participant.__del__()
     assert taken[0] == ({"a": 0.5, "b": 1.5}, 5)
+
+
+@pytest.mark.thorough
+async def test_a_simulated_clock_follows_the_time_of_ros(domain_number: int) -> None:
+    make: Any = RawClock
+    stamp: Any = Time(100, 5)
+    clock = SimulatedClock()
+    with Bus(clock) as bus:
+        async with DdsLink(bus, domain_number, clock=clock):
+            participant = DomainParticipant(domain_number)
+            writer = DataWriter(participant, Topic(participant, "rt/clock", RawClock))
+            with anyio.fail_after(20):
+                while clock.now() != 100_000_000_005:
+                    writer.write(make(stamp))
+                    await anyio.sleep(0.05)
+            writer.__del__()
+            participant.__del__()
 
 
 @pytest.mark.parametrize(

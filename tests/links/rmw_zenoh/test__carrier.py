@@ -41,10 +41,14 @@ def test_messages_come_in_but_those_that_this_carrier_has_sent_itself() -> None:
     ]
 
 
-def test_positions_of_joints_come_in() -> None:
+def test_positions_of_joints_and_the_time_come_in() -> None:
     made, items = carrier()
     made._take_joints(sample(b"state", None))
-    assert [(item.content.payload, item.content.joints, item.moving) for item in items] == [(b"state", True, True)]
+    made._take_clock(sample(b"time", None))
+    assert [(item.content.payload, item.content.joints, item.content.clock, item.moving) for item in items] == [
+        (b"state", True, False, True),
+        (b"time", False, True, True),
+    ]
 
 
 def test_a_message_that_is_too_large_is_refused() -> None:

@@ -3,6 +3,7 @@ from typing import Any
 import pytest
 from support.samples import moving
 
+from tfbus import SimulatedClock
 from tfbus.links.ros.settings import RosSettings, settings_of
 
 
@@ -26,6 +27,8 @@ def test_options_become_settings() -> None:
 def test_the_topic_of_joints_is_heard_only_if_somebody_takes_them() -> None:
     assert settings_of({}).joint_topic == settings_of({"joint_topic": "/j"}).joint_topic == ()
     assert settings_of({"joint_states": print}).joint_topic == ("/joint_states",)
+    assert settings_of({}).clock_topic == ()
+    assert settings_of({"clock": SimulatedClock()}).clock_topic == ("/clock",)
     settings = settings_of({"joint_states": print, "joint_topic": "arm/j"})
     assert (settings.joint_topic, settings.joint_states) == (("/arm/j",), print)
 

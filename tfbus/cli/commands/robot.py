@@ -97,7 +97,7 @@ def robot(
 
     async def follow_ros(bus: Bus) -> None:
         publisher = RobotStatePublisher(bus, model, prefix, AUTHORITY, invalid="drop")
-        say(f"publishing the frames of {model.name!r} as /joint_states says, {link.place}, until Ctrl-C")
+        say(f"publishing the frames of {model.name!r} as /joint_states of {link.place} says, until Ctrl-C")
         async with AsyncExitStack() as stack:
             for place in link.ros:
                 # A link for the positions only: the frames pass by the others.

@@ -118,6 +118,26 @@ class RawJointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
 
 
 @dataclass
+class RawClock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
+    """``rosgraph_msgs/msg/Clock``, which becomes its bytes when it comes."""
+
+    clock: Time
+    payload = b""
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
+        """The message of the bytes that have come."""
+        message = cls.__new__(cls)
+        message.payload = bytes(data)
+        return message
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
+        """What comes of a writer that has gone."""
+        return cls.deserialize(b"")
+
+
+@dataclass
 class Gid(IdlStruct, typename="rmw_dds_common::msg::dds_::Gid_"):
     """``rmw_dds_common/msg/Gid``: the id of a participant or of a writer, as DDS has it."""
 

@@ -15,11 +15,14 @@ import zenoh.ext
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Received
 from tfbus.links.rmw_zenoh._wire import (
+    CLOCK_HASH,
+    CLOCK_TYPE,
+    JOINT_HASH,
     JOINT_TYPE,
     Attachment,
     endpoint_token,
-    joints_token,
     node_token,
+    other_token,
     pack,
     publisher_of,
     topic_expression,
@@ -83,10 +86,13 @@ class RmwZenohCarrier(RosCarrier):
                 self._declared.append(self._subscriber(session, topic, static))
             self._token(endpoint_token(self._domain, name, number, self._node, topic, static, publishes))
 
-        for number, topic in enumerate(self.settings.joint_topic, len(topics) + 1):
-            key = topic_expression(self._domain, topic, JOINT_TYPE)
-            self._declared.append(session.declare_subscriber(key, self._take_joints))
-            self._token(joints_token(self._domain, name, number, self._node, topic))
+        others = (
+            *((topic, JOINT_TYPE, JOINT_HASH, self._take_joints) for topic in self.settings.joint_topic),
+            *((topic, CLOCK_TYPE, CLOCK_HASH, self._take_clock) for topic in self.settings.clock_topic),
+        )
+        for number, (topic, kind, digest, take) in enumerate(others, len(topics) + 1):
+            self._declared.append(session.declare_subscriber(topic_expression(self._domain, topic, kind), take))
+            self._token(other_token(self._domain, name, number, self._node, topic, kind, digest))
 
     def _token(self, key: str) -> None:
         assert self._session is not None
@@ -158,6 +164,10 @@ class RmwZenohCarrier(RosCarrier):
     def _take_joints(self, sample: zenoh.Sample) -> None:
         """Take positions of joints, in zenoh's threads."""
         self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, joints=True))
+
+    def _take_clock(self, sample: zenoh.Sample) -> None:
+        """Take the time, in zenoh's threads."""
+        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, clock=True))
 
     def _pass_on(self, message: RosMessage) -> None:
         size = len(message.payload)

@@ -14,6 +14,9 @@ HASH: Final = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d0
 JOINT_TYPE: Final = "sensor_msgs::msg::dds_::JointState_"
 JOINT_HASH: Final = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
 """Of ``sensor_msgs/msg/JointState``."""
+CLOCK_TYPE: Final = "rosgraph_msgs::msg::dds_::Clock_"
+CLOCK_HASH: Final = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"
+"""Of ``rosgraph_msgs/msg/Clock``."""
 NODE_ID: Final = 0
 
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -68,7 +71,7 @@ def endpoint_token(domain: int, session: str, number: int, node: str, topic: str
     return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/{kind}/%/%/{node}/{name}/{TYPE}/{HASH}/{qos}"
 
 
-def joints_token(domain: int, session: str, number: int, node: str, topic: str) -> str:
-    """The liveliness token of a subscription to positions of joints."""
-    name, kind = topic.replace("/", "%"), f"{JOINT_TYPE}/{JOINT_HASH}"
-    return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/MS/%/%/{node}/{name}/{kind}/{_MOVING_QOS}"
+def other_token(domain: int, session: str, number: int, node: str, topic: str, kind: str, digest: str) -> str:
+    """The liveliness token of a subscription to messages of another type, with the hash of that."""
+    name = topic.replace("/", "%")
+    return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/MS/%/%/{node}/{name}/{kind}/{digest}/{_MOVING_QOS}"

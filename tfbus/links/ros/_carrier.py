@@ -17,6 +17,7 @@ from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._outbox import Turn
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Received
+from tfbus.links.ros._clock_message import decode_clock
 from tfbus.links.ros.settings import RosSettings
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, decode, refusal
@@ -37,14 +38,15 @@ class RosMessage:
         Whether the topic is one of static frames.
     authority : str
         The node that has published it, or what is known of it.
-    joints : bool
-        Whether it has positions of joints rather than transforms.
+    joints, clock : bool
+        Whether it has positions of joints, or the time, rather than transforms.
     """
 
     payload: Any
     static: bool
     authority: str
     joints: bool = False
+    clock: bool = False
 
 
 class RosCarrier:
@@ -94,7 +96,9 @@ class RosCarrier:
             self._put(list(self._statics.values()), static=True)
 
     def read(self, content: RosMessage) -> ReceivedMessage:
-        """The samples of a message, without leading slashes, with their names on the bus; hands positions on."""
+        """The samples of a message by their names on the bus, or the time; positions of joints are handed on."""
+        if content.clock:
+            return ReceivedMessage([], time=decode_clock(content.payload))
         if content.joints:
             stamp, positions = self._decode_joints(content.payload)
             if self.settings.joint_states is not None:

@@ -37,6 +37,9 @@ class RosLink(Link):
         `RobotStatePublisher.publish` of a robot. What it raises is counted in `LinkStatistics.rejected`.
     joint_topic : str
         The topic of these, by default ``/joint_states``.
+    clock : SimulatedClock, optional
+        Follows ``/clock``, the time of a simulation: it advances, and jumps where that time jumps; one jump back is one
+        reset. Give the clock of the bus.
     drop_lost : bool
         Whether the frames of a lost peer leave the bus, those that it was the last to publish.
     max_frames : int
@@ -73,4 +76,5 @@ class RosLink(Link):
             drop_lost=options.get("drop_lost", False),
             max_frames=options.get("max_frames", 10_000),
             capacity=options.get("capacity", 10_000),
+            clock=options.get("clock"),
         )

@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypedDict
 
+from tfbus.clock import SimulatedClock
+from tfbus.links._clock_follower import HearsTime
 from tfbus.links.ros._names import FrameNames, as_topics
 
 _LAST_DOMAIN = 232
@@ -26,6 +28,7 @@ class RosOptions(TypedDict, total=False):
     authority: str | None
     joint_states: JointStates | None
     joint_topic: str
+    clock: SimulatedClock | HearsTime | None
     drop_lost: bool
     max_frames: int
     capacity: int
@@ -48,6 +51,8 @@ class RosSettings:
         Takes the positions of joints that come in.
     joint_topic : tuple of str
         The topic of these, if somebody takes them.
+    clock_topic : tuple of str
+        The topic of the time, if a clock follows it.
     """
 
     tf: tuple[str, ...] = ("/tf",)
@@ -57,6 +62,7 @@ class RosSettings:
     authority: str | None = None
     joint_states: JointStates | None = None
     joint_topic: tuple[str, ...] = ()
+    clock_topic: tuple[str, ...] = ()
 
 
 def settings_of(options: RosOptions) -> RosSettings:
@@ -81,6 +87,7 @@ def settings_of(options: RosOptions) -> RosSettings:
         authority,
         joint_states,
         () if joint_states is None else as_topics(options.get("joint_topic", "/joint_states"), "joint_topic"),
+        () if options.get("clock") is None else ("/clock",),
     )
 
 

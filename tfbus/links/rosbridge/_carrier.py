@@ -16,6 +16,7 @@ from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.links.rosbridge._protocol import (
+    CLOCK_TYPE,
     JOINT_TYPE,
     Incoming,
     advertise,
@@ -76,6 +77,8 @@ class RosbridgeCarrier(RosCarrier):
             self._request(subscribe(topic, ENCODINGS[0]))
         for topic in self.settings.joint_topic:
             self._request(subscribe(topic, ENCODINGS[0], JOINT_TYPE))
+        for topic in self.settings.clock_topic:
+            self._request(subscribe(topic, ENCODINGS[0], CLOCK_TYPE))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
             self._request(advertise(self.settings.tf[0], static=False))
@@ -166,9 +169,10 @@ class RosbridgeCarrier(RosCarrier):
         if not incoming.topic:
             self._report.failed(ConnectionError(f"{self._url} says: {incoming.content}"))
             return
-        if incoming.topic in self.settings.joint_topic:
-            joints = RosMessage(incoming.content, static=False, authority="", joints=True)
-            self._receive(Received(self._url, joints, size, moving=True))
+        joints, clock = (incoming.topic in topics for topics in (self.settings.joint_topic, self.settings.clock_topic))
+        if joints or clock:
+            other = RosMessage(incoming.content, static=False, authority="", joints=joints, clock=clock)
+            self._receive(Received(self._url, other, size, moving=True))
             return
         static = incoming.topic in self.settings.tf_static
         if not static and incoming.topic not in self.settings.tf:

@@ -19,6 +19,7 @@ from tfbus.tf_message import Decoded, MalformedMessageError, decode
 TYPE: Final = "tf2_msgs/TFMessage"
 """ROS 2 takes this name too."""
 JOINT_TYPE: Final = "sensor_msgs/JointState"
+CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 QUEUE: Final = 100
 _DOUBLES: Final = 86
 """The tag of little endian float64 (RFC 8746)."""
