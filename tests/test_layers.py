@@ -54,7 +54,7 @@ EXTRAS = {
     "pyarrow": ("cli",),
     "rich": ("cli", "view"),
     "rosbags": ("recording.formats",),
-    "ruamel": ("recording.formats",),
+    "ruamel": ("recording",),
     "scipy": ("geometry",),
     "trimesh": ("view",),
     "urdf_parser_py": ("robot",),
