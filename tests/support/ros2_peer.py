@@ -13,12 +13,12 @@ from collections import Counter
 from typing import Any
 
 import rclpy
-import tf2_ros
-from geometry_msgs.msg import TransformStamped
+import tf2_ros  # type: ignore[import-not-found]
+from geometry_msgs.msg import TransformStamped  # type: ignore[import-not-found]
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.time import Time
-from tf2_msgs.msg import TFMessage
+from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
 
 RATE = 100
 

@@ -2,6 +2,7 @@
 
 import re
 from contextlib import AbstractAsyncContextManager
+from typing import Any
 
 from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import UsageError
@@ -16,8 +17,15 @@ def is_ros(place: str) -> bool:
     return any(kind.fullmatch(place) for kind in (_DDS, _ZENOH, _WEBSOCKET))
 
 
-def ros_link(bus: Bus, place: str) -> AbstractAsyncContextManager[object]:
+def ros_link(bus: Bus, place: str, **options: Any) -> AbstractAsyncContextManager[object]:
     """The link to a place: ``dds``, ``dds:42``, ``zenoh:host:7447`` or ``ws://host:9090``.
+
+    Parameters
+    ----------
+    bus : Bus
+    place : str
+    **options
+        Those that all links to ROS share.
 
     Raises
     ------
@@ -28,15 +36,15 @@ def ros_link(bus: Bus, place: str) -> AbstractAsyncContextManager[object]:
         if found := _DDS.fullmatch(place):
             from tfbus.links.dds import DdsLink
 
-            return DdsLink(bus, None if found[1] is None else int(found[1]))
+            return DdsLink(bus, None if found[1] is None else int(found[1]), **options)
         if found := _ZENOH.fullmatch(place):
             from tfbus.links.rmw_zenoh import RmwZenohLink
 
-            return RmwZenohLink(bus, f"tcp/{found[1]}")
+            return RmwZenohLink(bus, f"tcp/{found[1]}", **options)
         if _WEBSOCKET.fullmatch(place):
             from tfbus.links.rosbridge import RosbridgeLink
 
-            return RosbridgeLink(bus, place)
+            return RosbridgeLink(bus, place, **options)
     except (ImportError, ValueError) as error:
         raise UsageError(str(error)) from None
     raise UsageError(

@@ -112,11 +112,12 @@ class LinkOptions:
         UsageError
             If an option is not valid, an address cannot be listened at or reached, or the extra is missing.
         """
+        follower = bus.clock if isinstance(bus.clock, ReplayClock) else None
         if self.ros:
             async with AsyncExitStack() as stack:
                 for place in self.ros:
                     try:
-                        await stack.enter_async_context(ros_link(bus, place))
+                        await stack.enter_async_context(ros_link(bus, place, clock=follower))
                     except OSError as error:
                         why = os.strerror(error.errno) if error.errno else error
                         raise UsageError(f"cannot join ROS at {place}: {why}") from None
@@ -134,7 +135,7 @@ class LinkOptions:
                 connect=self.connect or None,
                 robot=self.robot,
                 robots=self.robots or None,
-                clock=bus.clock if isinstance(bus.clock, ReplayClock) else None,
+                clock=follower,
                 tell_clock=isinstance(bus.clock, SimulatedClock),
             )
         ):

@@ -2,10 +2,14 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from tfbus.links.rmw_zenoh._wire import (
+    CLOCK_HASH,
     HASH,
+    JOINT_HASH,
+    JOINT_TYPE,
     Attachment,
     endpoint_token,
     node_token,
+    other_token,
     pack,
     publisher_of,
     topic_expression,
@@ -14,7 +18,10 @@ from tfbus.links.rmw_zenoh._wire import (
 
 
 def test_the_hash_is_that_of_the_type() -> None:
-    assert get_typestore(Stores.ROS2_JAZZY).hash_rihs01("tf2_msgs/msg/TFMessage") == HASH
+    hash_of = get_typestore(Stores.ROS2_JAZZY).hash_rihs01
+    assert hash_of("tf2_msgs/msg/TFMessage") == HASH
+    assert hash_of("sensor_msgs/msg/JointState") == JOINT_HASH
+    assert hash_of("rosgraph_msgs/msg/Clock") == CLOCK_HASH
 
 
 def test_keys_and_tokens_are_those_of_rmw_zenoh() -> None:
@@ -24,6 +31,9 @@ def test_keys_and_tokens_are_those_of_rmw_zenoh() -> None:
     assert topic_expression(7, "/tf") == f"7/tf/{kind}/*"
     assert node_token(7, "ab12", "tfbus") == "@ros2_lv/7/ab12/0/0/NN/%/%/tfbus"
     common = f"{kind}/{HASH}"
+    assert topic_expression(7, "/j", JOINT_TYPE) == "7/j/sensor_msgs::msg::dds_::JointState_/*"
+    joints = other_token(7, "ab12", 5, "tfbus", "/a/j", JOINT_TYPE, JOINT_HASH)
+    assert joints == f"@ros2_lv/7/ab12/0/5/MS/%/%/tfbus/%a%j/{JOINT_TYPE}/{JOINT_HASH}/::,100:,:,:,,"
     moving = endpoint_token(7, "ab12", 3, "tfbus", "/tf", static=False, publishes=False)
     assert moving == f"@ros2_lv/7/ab12/0/3/MS/%/%/tfbus/%tf/{common}/::,100:,:,:,,"
     static = endpoint_token(7, "ab12", 4, "tfbus", "/r/tf_static", static=True, publishes=True)

@@ -12,12 +12,15 @@ from typing import Any
 import anyio
 import anyio.to_thread
 import pytest
+import zenoh
+from support.joint_messages import joint_state
 from support.processes import free_ports, until
 from support.samples import moving, static
 from support.wires import latched
 
 from tfbus import Bus
 from tfbus.links.rmw_zenoh import RmwZenohLink
+from tfbus.links.rmw_zenoh._wire import JOINT_HASH, JOINT_TYPE
 from tfbus.links.zenoh import ZenohRouter
 
 pytestmark = pytest.mark.anyio
@@ -97,6 +100,21 @@ async def test_a_node_of_another_program_and_a_link_hear_each_other() -> None:
     arms = lines[1]["arms"]
     assert len(arms) > 100
     assert all(later - earlier == 1.0 for earlier, later in pairwise(arms))
+
+
+@pytest.mark.thorough
+async def test_positions_of_joints_go_to_who_takes_them() -> None:
+    taken: list[Any] = []
+    async with router() as address:
+        with Bus() as bus:
+            async with RmwZenohLink(bus, address, DOMAIN, joint_states=lambda *state: taken.append(state)):
+                config = zenoh.Config()
+                config.insert_json5("mode", '"client"')
+                config.insert_json5("connect/endpoints", json.dumps([address]))
+                with zenoh.open(config) as session:
+                    key = f"{DOMAIN}/joint_states/{JOINT_TYPE}/{JOINT_HASH}"
+                    session.put(key, joint_state(5, {"a": 0.5}))
+                    await until(lambda: taken == [({"a": 0.5}, 5)])
 
 
 @pytest.mark.thorough

@@ -7,8 +7,8 @@ from typing import Unpack, get_args
 from tfbus.bus.bus import Bus
 from tfbus.links.dds._carrier import DdsCarrier
 from tfbus.links.dds._domains import Discovery, configuration
-from tfbus.links.ros._settings import RosOptions, as_domain, settings_of
 from tfbus.links.ros.ros_link import RosLink
+from tfbus.links.ros.settings import RosOptions, as_domain, settings_of
 
 
 class DdsLink(RosLink):

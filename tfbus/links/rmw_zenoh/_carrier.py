@@ -15,16 +15,21 @@ import zenoh.ext
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Received
 from tfbus.links.rmw_zenoh._wire import (
+    CLOCK_HASH,
+    CLOCK_TYPE,
+    JOINT_HASH,
+    JOINT_TYPE,
     Attachment,
     endpoint_token,
     node_token,
+    other_token,
     pack,
     publisher_of,
     topic_expression,
     topic_key,
 )
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
-from tfbus.links.ros._settings import RosSettings
+from tfbus.links.ros.settings import RosSettings
 from tfbus.tf_message import MalformedMessageError, encode
 
 MAX_SIZE = 2**22
@@ -80,6 +85,14 @@ class RmwZenohCarrier(RosCarrier):
             else:
                 self._declared.append(self._subscriber(session, topic, static))
             self._token(endpoint_token(self._domain, name, number, self._node, topic, static, publishes))
+
+        others = (
+            *((topic, JOINT_TYPE, JOINT_HASH, self._take_joints) for topic in self.settings.joint_topic),
+            *((topic, CLOCK_TYPE, CLOCK_HASH, self._take_clock) for topic in self.settings.clock_topic),
+        )
+        for number, (topic, kind, digest, take) in enumerate(others, len(topics) + 1):
+            self._declared.append(session.declare_subscriber(topic_expression(self._domain, topic, kind), take))
+            self._token(other_token(self._domain, name, number, self._node, topic, kind, digest))
 
     def _token(self, key: str) -> None:
         assert self._session is not None
@@ -146,10 +159,20 @@ class RmwZenohCarrier(RosCarrier):
         attachment = sample.attachment
         if attachment is not None and publisher_of(bytes(attachment)) in self._ids.values():
             return
-        payload = bytes(sample.payload)
-        if len(payload) > MAX_SIZE:
-            error = MalformedMessageError("oversized", f"{len(payload)} bytes, more than {MAX_SIZE}")
+        self._pass_on(RosMessage(bytes(sample.payload), static, _AUTHORITY))
+
+    def _take_joints(self, sample: zenoh.Sample) -> None:
+        """Take positions of joints, in zenoh's threads."""
+        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, joints=True))
+
+    def _take_clock(self, sample: zenoh.Sample) -> None:
+        """Take the time, in zenoh's threads."""
+        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, clock=True))
+
+    def _pass_on(self, message: RosMessage) -> None:
+        size = len(message.payload)
+        if size > MAX_SIZE:
+            error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
             self._receive(Received(_AUTHORITY, error))
-            return
-        message = RosMessage(payload, static, _AUTHORITY)
-        self._receive(Received(_AUTHORITY, message, len(payload), moving=not static))
+        else:
+            self._receive(Received(_AUTHORITY, message, size, moving=not message.static))

@@ -11,6 +11,12 @@ from typing import Final, NamedTuple
 TYPE: Final = "tf2_msgs::msg::dds_::TFMessage_"
 HASH: Final = "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 """Of ``tf2_msgs/msg/TFMessage``, by REP 2016."""
+JOINT_TYPE: Final = "sensor_msgs::msg::dds_::JointState_"
+JOINT_HASH: Final = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+"""Of ``sensor_msgs/msg/JointState``."""
+CLOCK_TYPE: Final = "rosgraph_msgs::msg::dds_::Clock_"
+CLOCK_HASH: Final = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"
+"""Of ``rosgraph_msgs/msg/Clock``."""
 NODE_ID: Final = 0
 
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -48,9 +54,9 @@ def topic_key(domain: int, topic: str) -> str:
     return f"{domain}/{topic.strip('/')}/{TYPE}/{HASH}"
 
 
-def topic_expression(domain: int, topic: str) -> str:
+def topic_expression(domain: int, topic: str, kind: str = TYPE) -> str:
     """The keys at which messages come: ROS 2 Humble has no hash."""
-    return f"{domain}/{topic.strip('/')}/{TYPE}/*"
+    return f"{domain}/{topic.strip('/')}/{kind}/*"
 
 
 def node_token(domain: int, session: str, node: str) -> str:
@@ -63,3 +69,9 @@ def endpoint_token(domain: int, session: str, number: int, node: str, topic: str
     kind, qos = "MP" if publishes else "MS", _STATIC_QOS if static else _MOVING_QOS
     name = topic.replace("/", "%")
     return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/{kind}/%/%/{node}/{name}/{TYPE}/{HASH}/{qos}"
+
+
+def other_token(domain: int, session: str, number: int, node: str, topic: str, kind: str, digest: str) -> str:
+    """The liveliness token of a subscription to messages of another type, with the hash of that."""
+    name = topic.replace("/", "%")
+    return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/MS/%/%/{node}/{name}/{kind}/{digest}/{_MOVING_QOS}"

@@ -9,8 +9,8 @@ import zenoh
 
 from tfbus.bus.bus import Bus
 from tfbus.links.rmw_zenoh._carrier import RmwZenohCarrier
-from tfbus.links.ros._settings import RosOptions, as_domain, settings_of
 from tfbus.links.ros.ros_link import RosLink
+from tfbus.links.ros.settings import RosOptions, as_domain, settings_of
 
 _NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 

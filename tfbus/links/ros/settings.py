@@ -1,13 +1,19 @@
 """The settings that all links to ROS share."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TypedDict
 
+from tfbus.clock import SimulatedClock
+from tfbus.links._clock_follower import HearsTime
 from tfbus.links.ros._names import FrameNames, as_topics
 
 _LAST_DOMAIN = 232
+
+
+JointStates = Callable[[Mapping[str, float], int], object]
+"""Takes the positions of joints by their names, in rad or m, and the stamp in ns."""
 
 
 class RosOptions(TypedDict, total=False):
@@ -20,6 +26,9 @@ class RosOptions(TypedDict, total=False):
     frames: Iterable[str] | None
     send: bool
     authority: str | None
+    joint_states: JointStates | None
+    joint_topic: str
+    clock: SimulatedClock | HearsTime | None
     drop_lost: bool
     max_frames: int
     capacity: int
@@ -38,6 +47,12 @@ class RosSettings:
         Whether anything goes out.
     authority : str or None
         That of all samples that come in; None for the node that has published them, where it is known.
+    joint_states : callable or None
+        Takes the positions of joints that come in.
+    joint_topic : tuple of str
+        The topic of these, if somebody takes them.
+    clock_topic : tuple of str
+        The topic of the time, if a clock follows it.
     """
 
     tf: tuple[str, ...] = ("/tf",)
@@ -45,6 +60,9 @@ class RosSettings:
     names: FrameNames = FrameNames()  # noqa: RUF009 - it never changes
     send: bool = True
     authority: str | None = None
+    joint_states: JointStates | None = None
+    joint_topic: tuple[str, ...] = ()
+    clock_topic: tuple[str, ...] = ()
 
 
 def settings_of(options: RosOptions) -> RosSettings:
@@ -58,12 +76,18 @@ def settings_of(options: RosOptions) -> RosSettings:
     authority = options.get("authority")
     if authority is not None and not isinstance(authority, str):
         raise TypeError(f"authority must be a str, not {authority!r}")
+    joint_states = options.get("joint_states")
+    if joint_states is not None and not callable(joint_states):
+        raise TypeError(f"joint_states must be callable, such as the publish of a robot, not {joint_states!r}")
     return RosSettings(
         as_topics(options.get("tf", "/tf"), "tf"),
         as_topics(options.get("tf_static", "/tf_static"), "tf_static"),
         FrameNames(options.get("prefix"), options.get("shared", ())),
         bool(options.get("send", True)),
         authority,
+        joint_states,
+        () if joint_states is None else as_topics(options.get("joint_topic", "/joint_states"), "joint_topic"),
+        () if options.get("clock") is None else ("/clock",),
     )
 
 
