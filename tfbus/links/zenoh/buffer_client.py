@@ -28,6 +28,7 @@ from tfbus.tree.policy import Hold, policy_of
 
 PATIENCE = 3.0
 """s; a client waits for so long for a server that it has not met, and for an answer that is late."""
+_MOST_SILENCES = 3
 _SETTLING = 0.5
 """s."""
 
@@ -166,11 +167,17 @@ class BufferClient:
             hold=None if extrapolate is None else extrapolate.max_age,
         )
         await anyio.lowlevel.checkpoint()
+        silences = 0
         while True:
             await self._meet(until)
             left = max(until - monotonic(), 0.0)
             try:
                 return await self._ask(question, min(left, LONGEST_WAIT))
+            except RemoteLookupError as error:
+                # zenoh drops questions and answers while the network is congested.
+                silences += 1
+                if error.reason != "silent" or silences > _MOST_SILENCES or monotonic() >= until:
+                    raise
             except LookupTimeoutError as error:
                 missing = error.__cause__
                 if monotonic() >= until or left <= LONGEST_WAIT:
