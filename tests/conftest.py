@@ -18,7 +18,8 @@ import os
 import shutil
 import signal
 import tempfile
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,6 +40,9 @@ BACKENDS = [
 ]
 DEFAULT_SUITE = "not thorough"
 """The expression of marks that pyproject.toml gives."""
+
+LIMIT, THOROUGH_LIMIT = 60.0, 280.0
+"""The longest that a test of each suite may take, in s."""
 
 EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("default", EXAMPLES, max_examples=15, derandomize=True)
@@ -100,6 +104,48 @@ def is_on_another_loop(item: pytest.Item) -> bool:
     parameters = item.callspec.params if hasattr(item, "callspec") else {}
     every_loop = item.get_closest_marker("every_loop") is not None
     return not every_loop and parameters.get("anyio_backend", ASYNCIO) != ASYNCIO
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    """End a test that hangs; one that does not return to Python is ended with its process, by faulthandler."""
+    if not hasattr(signal, "setitimer"):
+        yield
+        return
+    limit = LIMIT if item.get_closest_marker("thorough") is None else THOROUGH_LIMIT
+
+    def end(*_: object) -> None:
+        pytest.fail(f"it has not ended within {limit:g} s")
+
+    before = signal.signal(signal.SIGALRM, end)
+    signal.setitimer(signal.ITIMER_REAL, limit)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Generator[None, bool, bool]:
+    """Kill the processes that the tests of a file have left, when the last of them has ended."""
+    done = yield
+    if nextitem is None or nextitem.path != item.path:
+        for process in children_left():
+            os.kill(process, signal.SIGKILL)
+    return done
+
+
+def children_left() -> list[int]:
+    """The processes that this one has started, but for those of pytest and multiprocessing; on Linux only."""
+    found = []
+    for children in Path("/proc/self/task").glob("*/children"):
+        for process in children.read_text().split():
+            with suppress(OSError):
+                command = Path("/proc", process, "cmdline").read_bytes()
+                if command and not any(word in command for word in (b"execnet", b"resource_tracker", b"forkserver")):
+                    found.append(int(process))
+    return found
 
 
 @pytest.fixture(params=BACKENDS)

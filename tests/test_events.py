@@ -1,3 +1,4 @@
+import json
 import pickle
 from dataclasses import FrozenInstanceError
 from typing import get_args
@@ -98,3 +99,17 @@ def test_events_are_frozen_values(event: Event, text: str) -> None:
 def test_two_rejections_for_the_same_reason_are_equal_whatever_their_errors() -> None:
     first, second = (SampleRejected(AT, "cycle", "a", "b", "rogue", ValueError(text)) for text in ("one", "two"))
     assert first == second
+
+
+@pytest.mark.parametrize("event", [event for event, _ in ONE_OF_EACH])
+def test_an_event_is_plain_data_and_comes_back(event: Event) -> None:
+    data = json.loads(json.dumps(event.to_dict()))
+    assert data["type"] == type(event).__name__
+    back = type(event).from_dict(data)
+    if isinstance(event, SubscriberFailed):
+        # An error that is none of tfbus comes back as its text.
+        assert repr(back.error) == "Exception('OSError: full')"  # type: ignore[union-attr]
+    else:
+        assert back == event
+    if isinstance(event, SampleRejected) and isinstance(event.error, InvalidTransformError):
+        assert (repr(back.error), str(back)) == (repr(event.error), str(event))  # type: ignore[union-attr]

@@ -51,3 +51,10 @@ def test_the_json_of_a_bus_has_its_buffers_and_queues_by_name() -> None:
     assert described["queues"] == [
         {"kind": "stream", "overflow": "conflate", "capacity": 5, "pending": 4, "dropped": 3, "conflated": 0}
     ]
+
+
+@pytest.mark.parametrize("statistics", ONE_OF_EACH, ids=lambda statistics: type(statistics).__name__)
+def test_statistics_are_plain_data_and_come_back(statistics: Any) -> None:
+    data = json.loads(json.dumps(statistics.to_dict()))
+    assert data["type"] == type(statistics).__name__
+    assert type(statistics).from_dict(data) == statistics

@@ -168,6 +168,7 @@ class SimulatedClock:
         self._stamp_sleepers: dict[_StampSleeper, None] = {}
         self._order = count()
         self._callbacks: dict[int, JumpCallback] = {}
+        self._listeners: dict[int, Callable[[int], object]] = {}
         self._advancing = False
 
     def now(self) -> int:
@@ -244,6 +245,12 @@ class SimulatedClock:
         self._callbacks[key] = callback
         return Registration(lambda: self._callbacks.pop(key, None))
 
+    def on_move(self, callback: Callable[[int], object]) -> Registration:
+        """Call `callback` with each new stamp, after every step of `advance` and after `set`."""
+        key = next(self._order)
+        self._listeners[key] = callback
+        return Registration(lambda: self._listeners.pop(key, None))
+
     async def advance(self, seconds: float) -> None:
         """Move the clock forward by a duration in s, and run the timed tasks that become due.
 
@@ -294,11 +301,18 @@ class SimulatedClock:
                 sleeper.timer = self._start_timer(self._elapsed + sleeper.stamp - after, sleeper.event.set)
         for callback in tuple(self._callbacks.values()):
             callback(before, after)
+        self._tell_move()
 
     def _move_to(self, elapsed: int) -> None:
         if elapsed > self._elapsed:
             self._now += elapsed - self._elapsed
             self._elapsed = elapsed
+            if self._listeners:
+                self._tell_move()
+
+    def _tell_move(self) -> None:
+        for listener in tuple(self._listeners.values()):
+            listener(self._now)
 
     async def _sleep_until_elapsed(self, elapsed: int) -> None:
         if elapsed <= self._elapsed:

@@ -7,11 +7,13 @@ and so do `FrameStale` and `FrameLive`. After a `ClockReset` the first sample of
 
 from dataclasses import dataclass, field
 
+from tfbus.errors import TransformError
+from tfbus.plain import PlainData
 from tfbus.stamps import format_duration, format_stamp
 
 
 @dataclass(frozen=True, slots=True)
-class FrameAdded:
+class FrameAdded(PlainData):
     """A frame has a parent, because its first sample arrived or because it had one when the event stream was opened."""
 
     stamp: int
@@ -26,7 +28,7 @@ class FrameAdded:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameRemoved:
+class FrameRemoved(PlainData):
     """A frame was removed: the bus and its buffers have forgotten its parent and its samples."""
 
     stamp: int
@@ -37,7 +39,7 @@ class FrameRemoved:
 
 
 @dataclass(frozen=True, slots=True)
-class Reparented:
+class Reparented(PlainData):
     """The newest sample of a frame names another parent than the newest sample before it."""
 
     stamp: int
@@ -52,7 +54,7 @@ class Reparented:
 
 
 @dataclass(frozen=True, slots=True)
-class KindChanged:
+class KindChanged(PlainData):
     """A moving frame became static, or a static frame moving; `static` is the new kind."""
 
     stamp: int
@@ -66,7 +68,7 @@ class KindChanged:
 
 
 @dataclass(frozen=True, slots=True)
-class AuthorityConflict:
+class AuthorityConflict(PlainData):
     """A sample of a frame came from `authority`, the sample before it from `other`."""
 
     stamp: int
@@ -80,7 +82,7 @@ class AuthorityConflict:
 
 
 @dataclass(frozen=True, slots=True)
-class SampleRejected:
+class SampleRejected(PlainData):
     """The bus rejected a sample, by raising an error or by dropping the sample.
 
     An event stream gives it once for each frame, authority and reason, until the frame is removed or added or the clock
@@ -103,7 +105,7 @@ class SampleRejected:
     frame: str | None
     parent: str | None
     authority: str | None
-    error: Exception = field(compare=False)
+    error: TransformError | Exception = field(compare=False)
 
     def __str__(self) -> str:
         sender = "" if self.authority is None else f" from {self.authority!r}"
@@ -111,7 +113,7 @@ class SampleRejected:
 
 
 @dataclass(frozen=True, slots=True)
-class PastLoop:
+class PastLoop(PlainData):
     """Late samples form a loop of parents at a past stamp; the newest parents form none.
 
     An event stream gives it once for each frame, parent and authority, as it does `SampleRejected`; the ``looped`` of
@@ -145,7 +147,7 @@ class PastLoop:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameStale:
+class FrameStale(PlainData):
     """The newest sample of a moving frame is older than the event stream's `stale_after`.
 
     Attributes
@@ -171,7 +173,7 @@ class FrameStale:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameLive:
+class FrameLive(PlainData):
     """A stale frame has a newer sample.
 
     Attributes
@@ -194,7 +196,7 @@ class FrameLive:
 
 
 @dataclass(frozen=True, slots=True)
-class StampAhead:
+class StampAhead(PlainData):
     """The newest sample of a frame is ahead of the clock by more than the `max_ahead` of the bus.
 
     Until the clock has reached it, samples with right stamps are older than the newest one, and they expire once they
@@ -224,7 +226,7 @@ class StampAhead:
 
 
 @dataclass(frozen=True, slots=True)
-class ClockReset:
+class ClockReset(PlainData):
     """The clock jumped back from `before` to `stamp` (ns), and the bus forgot every moving frame.
 
     With ``on_conflict="reject"`` each of these frames stays with its first authority until it is removed.
@@ -238,19 +240,19 @@ class ClockReset:
 
 
 @dataclass(frozen=True, slots=True)
-class SubscriberFailed:
+class SubscriberFailed(PlainData):
     """A subscriber's callback raised an `Exception`; `subscriber` is the callback's name."""
 
     stamp: int
     subscriber: str
-    error: Exception
+    error: TransformError | Exception
 
     def __str__(self) -> str:
         return _line(self.stamp, f"the subscriber {self.subscriber} raised {self.error!r}")
 
 
 @dataclass(frozen=True, slots=True)
-class PeerJoined:
+class PeerJoined(PlainData):
     """A link found another bus.
 
     Attributes
@@ -272,7 +274,7 @@ class PeerJoined:
 
 
 @dataclass(frozen=True, slots=True)
-class PeerLost:
+class PeerLost(PlainData):
     """A link lost another bus: its process or its link ended, or it no longer responds.
 
     Attributes
@@ -299,7 +301,7 @@ class PeerLost:
 
 
 @dataclass(frozen=True, slots=True)
-class PeerRejected:
+class PeerRejected(PlainData):
     """A link rejected a message or a sample of another bus; announced once for each peer and reason.
 
     Attributes
@@ -318,14 +320,14 @@ class PeerRejected:
     link: str
     peer: str
     reason: str
-    error: Exception = field(compare=False)
+    error: TransformError | Exception = field(compare=False)
 
     def __str__(self) -> str:
         return _line(self.stamp, f"peer {self.peer} on {self.link} sent what was refused: {self.error}")
 
 
 @dataclass(frozen=True, slots=True)
-class RecordingDropped:
+class RecordingDropped(PlainData):
     """A recorder begins to lose samples because the disk is too slow.
 
     It is announced again if the recorder catches up and then falls behind once more.
@@ -349,7 +351,7 @@ class RecordingDropped:
 
 
 @dataclass(frozen=True, slots=True)
-class RecordingFailed:
+class RecordingFailed(PlainData):
     """A recording ended early because of a write error; the file can be read up to there, and the program goes on.
 
     Attributes
@@ -364,7 +366,7 @@ class RecordingFailed:
 
     stamp: int
     path: str
-    error: Exception = field(compare=False)
+    error: TransformError | Exception = field(compare=False)
 
     def __str__(self) -> str:
         return _line(self.stamp, f"the recording {self.path} has ended early: {self.error}")

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 from numbers import Real
-from typing import Any, Final, SupportsIndex, TypeAlias
+from typing import Any, Final, SupportsIndex, TypeAlias, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +59,10 @@ class Latest(Enum):
 
 LATEST: Final = Latest.LATEST
 """In place of a stamp: the newest stamp that every moving edge on the path can answer."""
+
+
+AtLike: TypeAlias = StampLike | Latest
+"""The types of an instant that is asked for: those that `as_stamp` accepts, and `LATEST`."""
 
 
 def from_seconds(seconds: float, nanoseconds: SupportsIndex = 0) -> int:
@@ -135,6 +139,15 @@ def as_stamp(value: object) -> int:
     if not STAMP_MIN <= stamp <= STAMP_MAX:
         raise ValueError(f"stamp {stamp} does not fit 64-bit nanoseconds")
     return stamp
+
+
+@overload
+def as_at(value: AtLike) -> int | Latest: ...
+@overload
+def as_at(value: AtLike | None) -> int | Latest | None: ...
+def as_at(value: AtLike | None) -> int | Latest | None:
+    """As `as_stamp`, for an instant that is asked for: `LATEST` and None stay."""
+    return value if type(value) is int or value is None or isinstance(value, Latest) else as_stamp(value)
 
 
 def as_stamps(values: StampsLike) -> Stamps:

@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from tfbus.plain import PlainData
+
 
 @dataclass(frozen=True, slots=True)
-class BufferStatistics:
+class BufferStatistics(PlainData):
     """The samples of one buffer since it was attached, and its waiting lookups.
 
     ``offered == inserted + replaced + expired``
@@ -38,7 +40,7 @@ class BufferStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class QueueStatistics:
+class QueueStatistics(PlainData):
     """One bounded queue: of a stream, of events, or of samples from other threads.
 
     Every moving sample that was put into the queue was read, or is counted as pending, dropped or conflated.
@@ -69,7 +71,7 @@ class QueueStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class BusStatistics:
+class BusStatistics(PlainData):
     """One bus since it was made.
 
     Attributes
@@ -111,7 +113,7 @@ class BusStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkStatistics:
+class LinkStatistics(PlainData):
     """One link since it was entered.
 
     Attributes
@@ -148,7 +150,7 @@ class LinkStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class BufferServerStatistics:
+class BufferServerStatistics(PlainData):
     """One buffer server since it was entered.
 
     Attributes
@@ -174,7 +176,7 @@ class BufferServerStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class RecorderStatistics:
+class RecorderStatistics(PlainData):
     """One recorder since it was entered.
 
     The number of samples that the bus gave to it is
@@ -201,7 +203,7 @@ class RecorderStatistics:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotStatistics:
+class RobotStatistics(PlainData):
     """One robot state publisher since it was made.
 
     Attributes

@@ -933,3 +933,60 @@ async def test_a_lookup_ends_at_the_insertion_by_which_another_edge_loses_its_st
         _ = asked.answer
     assert (caught.value.child, caught.value.stamp, caught.value.oldest) == ("base", 5 * SECOND, 9 * SECOND)
     assert buffer.pending() == ()
+
+
+async def test_the_repr_is_one_line_with_frames_window_and_waiting_lookups() -> None:
+    with Bus(SimulatedClock()) as bus, Buffer(bus, keep=2.5) as buffer:
+        assert repr(buffer) == "<Buffer of 0 frames, keeps 2.5 s, 0 lookups waiting>"
+        bus.publish(moving("map", "base", 1))
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(buffer.lookup, "map", "base", 2)
+            await anyio.wait_all_tasks_blocked()
+            assert repr(buffer) == "<Buffer of 2 frames, keeps 2.5 s, 1 lookup waiting>"
+            assert repr(bus) == "<Bus of 1 child frame, 1 buffers, 0 streams>"
+            tasks.cancel_scope.cancel()
+    assert repr(buffer) == "<Buffer of 2 frames, keeps 2.5 s, closed>"
+    assert repr(bus) == "<Bus of 1 child frame, closed>"
+    with Bus() as bus, Buffer(bus, keep=None) as buffer:
+        assert "keeps everything" in repr(buffer)
+
+
+async def test_data_in_the_target_already_stay_as_they_are_if_the_frame_is_not_known() -> None:
+    point = PointStamped("camera", 5, (1.0, 2.0, 3.0))
+    latest = PointStamped("camera", LATEST, (1.0, 2.0, 3.0))
+    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+        for data in (point, latest):
+            assert buffer.transform_nowait(data, "camera") is data
+            assert await buffer.transform(data, "camera") is data
+        with pytest.raises(UnknownFrameError):
+            buffer.transform_nowait(point, "map")
+        with pytest.raises(UnknownFrameError):
+            buffer.transform_nowait(PointStamped("camera", 5, (1.0, 2.0, 3.0)), "camera", at=7, fixed="map")
+        # A lookup between frames is none of data.
+        with pytest.raises(UnknownFrameError):
+            buffer.lookup_nowait("camera", "camera", 5)
+        bus.publish(moving("map", "camera", 9))
+        assert buffer.transform_nowait(latest, "camera").stamp == 9
+
+
+async def test_whether_there_will_be_an_answer_can_be_awaited() -> None:
+    clock = SimulatedClock()
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        assert not await buffer.can_transform_within("map", "base", 0.0)
+        answers: dict[str, bool] = {}
+
+        async def ask(name: str, timeout: float | None, at: int = 2) -> None:
+            answers[name] = await buffer.can_transform_within("map", "base", timeout, at)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(ask, "in time", 2.0)
+            tasks.start_soon(ask, "too short", 0.5)
+            tasks.start_soon(ask, "for ever", None)
+            await clock.advance(1.0)
+            assert answers == {"too short": False}
+            bus.publish([moving("map", "base", 1), moving("map", "base", 3)])
+        assert answers == {"too short": False, "in time": True, "for ever": True}
+        # Waiting cannot help.
+        assert not await buffer.can_transform_within("map", "base", None, 0)
+    with pytest.raises(BusClosedError):
+        await buffer.can_transform_within("map", "base", None, 7)

@@ -12,6 +12,8 @@ from tfbus.cli.arguments import UsageError
         ("dds:42", True),
         ("ws://a:9090", True),
         ("wss://a", True),
+        ("zenoh:robot:7447", True),
+        ("zenoh:robot", False),
         ("tf", False),
         ("dds/a", False),
         ("adds", False),
@@ -26,6 +28,12 @@ def test_a_place_becomes_a_link(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     assert [getattr(ros_link(Bus(), place), "domain", None) for place in ("dds", "dds:42")] == [0, 42]
+
+
+def test_a_router_becomes_a_link(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    monkeypatch.setenv("ROS_DOMAIN_ID", "5")
+    assert getattr(ros_link(Bus(), "zenoh:robot:7447"), "domain", None) == 5
 
 
 def test_a_websocket_becomes_a_link() -> None:

@@ -132,6 +132,6 @@ def test_a_live_tree_that_is_higher_than_the_terminal_says_how_many_frames_do_no
         display.show(wide, 0)
     shown = terminal.getvalue()
     # Ten lines, four of which fit above the cursor's; one of them says so.
-    assert "… and 7 frames more than fit" in shown
+    assert "… and 7 lines more than fit" in shown
     assert ("f1" in shown, "f2" in shown) == (True, True)
     assert "f3" not in shown

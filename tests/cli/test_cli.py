@@ -2,8 +2,10 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -11,12 +13,12 @@ from pathlib import Path
 import pytest
 from support.commands import Command, check_wrong_call
 from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS
+from support.programs import PATIENCE, TFBUS, Program, start_tfbus
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
 from tfbus import kernel
-from tfbus.cli.application import application
+from tfbus.cli.application import COMMANDS, application
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import LinkOptions
 
@@ -36,6 +38,10 @@ URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
         ("foxglove", ("--port INT", *LINK)),
         ("info", ("FILE", "--json", "--wide", "--namespaces")),
         ("listen", ("--rate FLOAT", *LINK)),
+        (
+            "monitor",
+            ("TARGET", "SOURCE", "--window FLOAT", "--rate FLOAT", "--once", "--duration FLOAT", "--json", *LINK),
+        ),
         ("play", ("FILE", "--rate FLOAT", "--loop", "--from TIME", "--to TIME", "--topic STR...", *LINK)),
         ("plot", ("FILE", "FRAMES", "--output", "--path", "--3d", "--gaps", "--text", "--compare PATH")),
         ("query", ("FILE", "TARGET", "SOURCE", "--at TIME", "--every SECONDS", "--tum", "--csv", "--json")),
@@ -91,8 +97,7 @@ def test_the_version_is_that_of_the_package_with_the_kernel_that_runs(tfbus: Com
 def test_the_help_of_all_lists_the_commands(tfbus: Command) -> None:
     done = tfbus("--help")
     assert (done.returncode, done.stderr) == (0, "")
-    commands = "bridge broadcast check compare convert demo echo foxglove info listen play plot query record robot router static"
-    assert re.findall(r"│ ([a-z]+) ", done.stdout) == [*commands.split(), "tree", "view"]
+    assert re.findall(r"│ ([a-z]+) ", done.stdout) == sorted(COMMANDS)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +125,7 @@ def test_a_usage_error_is_one_line_on_standard_error_and_status_2(
 
 
 def test_several_errors_at_once_are_a_line_each(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise ExceptionGroup("two tasks", [UsageError("one"), UsageError("two")])
 
     monkeypatch.setattr(LinkOptions, "run", fail)
@@ -129,7 +134,7 @@ def test_several_errors_at_once_are_a_line_each(tfbus: Command, monkeypatch: pyt
 
 
 def test_ctrl_c_is_status_130_and_silent(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(LinkOptions, "run", interrupt)
@@ -217,3 +222,26 @@ def test_every_command_has_a_module_of_its_name() -> None:
     folder = Path(sys.modules["tfbus.cli.commands"].__path__[0])
     modules = {path.stem for path in folder.glob("*.py")} - {"__init__"}
     assert {name for name in application(None) if not name.startswith("-")} == modules
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_silently_whenever_it_comes(number: signal.Signals) -> None:
+    statuses = set()
+    for step in range(16):
+        with start_tfbus("tree", "--domain", new_domain()) as tree:
+            # Python itself shows a traceback of its own start: until then, nothing of tfbus has been loaded.
+            time.sleep(0.3 + 0.05 * step)
+            statuses.add(tree.end(number))
+        assert tree.errors.text.replace("waiting for transforms", "").count("\n") <= 1
+        assert "Traceback" not in tree.errors.text
+    assert statuses <= {-number, 128 + number}
+
+
+@pytest.mark.thorough
+def test_where_ctrl_c_is_ignored_a_termination_ends_it() -> None:
+    script = 'trap "" INT; exec "$0" tree --domain "$1"'
+    with Program("sh", "-c", script, TFBUS, new_domain()) as tree:
+        tree.errors.expect("waiting")
+        tree.process.send_signal(signal.SIGINT)
+        assert tree.end(signal.SIGTERM) == -signal.SIGTERM

@@ -101,3 +101,15 @@ def test_a_quaternion_near_unit_norm_is_normalised_and_keeps_its_sign() -> None:
 def test_an_invalid_quaternion_is_refused_with_the_name_of_the_field(bad: Any) -> None:
     with pytest.raises(InvalidTransformError, match=r"^quaternion "):
         QuaternionStamped("map", 0, bad)
+
+
+@pytest.mark.parametrize(("static", "moves"), [(True, False), (True, True), (False, False)])
+def test_a_transform_is_moved_as_the_pose_of_its_child(static: bool, moves: bool) -> None:
+    quarter = Transform.from_axis_angle((0, 0, 1), np.pi / 2)
+    by = TransformStamped("map", "base", 9, Transform((1.0, 0.0, 0.0)) @ quarter, static=not moves)
+    moved = do_transform(TransformStamped("base", "tool", 5, Transform((2.0, 0.0, 0.0)), "arm", static), by)
+    assert (moved.parent, moved.child, moved.stamp, moved.authority) == ("map", "tool", 9, "arm")
+    assert moved.static is (static and not moves)
+    assert moved.transform.is_close(Transform((1.0, 2.0, 0.0)) @ quarter)
+    with pytest.raises(ValueError, match="in frame 'base'"):
+        do_transform(TransformStamped("base", "tool", 5, Transform()), moved)

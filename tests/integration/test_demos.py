@@ -305,6 +305,13 @@ def test_the_demo_of_drivers_in_threads_loses_nothing_and_keeps_each_drivers_ord
 
 
 @pytest.mark.thorough
+def test_the_demo_of_ros_finds_the_wall_where_the_robot_saw_it() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    # The laser is 0.2 m before the base, and sees the wall 4 m away.
+    assert output_of("ros_bridge.py") == [f"hit {0.2 + 4.0:.2f} m before the place of the robot, in odom"]
+
+
+@pytest.mark.thorough
 def test_the_demo_of_events_tells_the_story_of_the_tool() -> None:
     lines = output_of("events_and_ownership.py")
     (refused,) = (line for line in lines if line.startswith("refused"))

@@ -21,7 +21,11 @@ REFERENCE = sorted((GUIDE / "reference").glob("*.rst"))
 PUBLIC = [
     "tfbus",
     "tfbus.data",
+    "tfbus.links.dds",
     "tfbus.links.foxglove",
+    "tfbus.links.rmw_zenoh",
+    "tfbus.links.ros",
+    "tfbus.links.rosbridge",
     "tfbus.links.zenoh",
     "tfbus.plot",
     "tfbus.recording",

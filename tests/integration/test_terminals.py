@@ -44,14 +44,15 @@ def test_the_tree_of_a_domain_fits_with_frame_rate_and_age(urdf: Path, width: in
         once = lines_on_a_terminal(width, "tree", *options)
         watched = lines_on_a_terminal(width, "tree", "--watch", *options, seconds=1.5)
         echoed = lines_on_a_terminal(width, "echo", *pair_of(urdf), *options, seconds=0.5)
-    for lines in (once, watched, echoed):
+        monitored = lines_on_a_terminal(width, "monitor", "--once", "--duration", "1.5", *options)
+    for lines in (once, watched, echoed, monitored):
         check(lines, width)
     moving = [line for line in once if " Hz" in line]
     assert moving
     assert all("age" in line or "ahead" in line for line in moving)
     if urdf == pr2.URDF:
         assert len(once) > 82
-        assert any("frames more than fit" in line for line in watched)
+        assert any("lines more than fit" in line for line in watched)
 
 
 def pair_of(urdf: Path) -> tuple[str, str]:

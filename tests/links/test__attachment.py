@@ -76,10 +76,15 @@ def reason_of(data: bytes) -> str:
 # Both ways.
 
 
-@given(number=NUMBERS, entries=entries_of_any_kind, step=st.none() | STEPS)
+TIMES = st.none() | st.integers(-(2**63), 2**63 - 1)
+
+
+@given(number=NUMBERS, entries=entries_of_any_kind, step=st.none() | STEPS, time=TIMES)
 @settings(max_examples=40)
-def test_unpacking_gives_back_what_was_packed(number: int, entries: list[Entry], step: StateStep | None) -> None:
-    assert unpack(pack(number, entries, step)) == Attachment(number, tuple(entries), step)
+def test_unpacking_gives_back_what_was_packed(
+    number: int, entries: list[Entry], step: StateStep | None, time: int | None
+) -> None:
+    assert unpack(pack(number, entries, step, time)) == Attachment(number, tuple(entries), step, time)
 
 
 def test_an_attachment_is_laid_out_as_its_module_says() -> None:
@@ -92,6 +97,10 @@ def test_an_attachment_is_laid_out_as_its_module_says() -> None:
         header(1, 0, 1, number=5, claim=(2, 6, 7, 8, 9)) + bytes(16) + entry(3, 0, 1, 0) + b"b"
     )
     assert pack(5, [], StateStep(6, 7, 0, final=False)) == header(number=5, claim=(1, 6, 7, 0, 0))
+    # The fourth byte says that there is a time.
+    assert pack(5, [], time=-7) == header(number=5)[:3] + b"\1" + header(number=5)[4:] + struct.pack("<q", -7)
+    assert reason_of(header()[:3] + b"\2" + header()[4:] + bytes(16)) == "attachment"
+    assert reason_of(header()[:3] + b"\1" + header()[4:] + bytes(7)) == "attachment"
     assert pack(5, entries) == (
         header(2, 2, 3, number=5)
         + ONE

@@ -166,3 +166,68 @@ def test_a_link_claims_its_state_ever_less_often_while_nothing_happens() -> None
     assert [round(time - sent, 6) for time in claims(until=sent + 7.5)] == [CLAIM_PERIOD, 3.0, 7.0]
     for made in (end, other):
         made.leave()
+
+
+class Heard:
+    """Notes the times that an endpoint hears, among what its bus publishes and removes."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.found: list[int | str] = []
+        bus.subscribe(lambda batch: self.found.extend(sample.child for sample in batch))
+
+    def hear(self, stamp: int) -> None:
+        self.found.append(stamp)
+
+
+def test_the_time_of_a_clock_goes_before_what_is_published_at_it_and_a_jump_behind_what_was_before() -> None:
+    domain = Domain()
+    bus, other = Bus(SimulatedClock()), Bus(SimulatedClock())
+    heard = Heard(other)
+    end = domain.join(bus)
+    hearing = domain.join(other, follower=heard)
+    domain.settle()
+    end.endpoint.tell_time(5)
+    bus.publish(moving("map", "a", 1))
+    end.endpoint.tell_time(6)
+    end.endpoint.send()
+    bus.publish(moving("map", "b", 1))
+    end.endpoint.tell_time(2)
+    bus.publish(moving("map", "c", 1))
+    end.endpoint.send()
+    domain.settle()
+    assert heard.found == [6, "a", 6, "b", 2, "c"]
+    heard.found.clear()
+    # Nothing but a time; and whoever comes later is told.
+    end.endpoint.tell_time(9)
+    end.endpoint.send()
+    domain.settle()
+    late = Heard(Bus(SimulatedClock()))
+    last = domain.join(Bus(SimulatedClock()), follower=late)
+    domain.settle()
+    end.endpoint.send()
+    domain.settle()
+    assert set(heard.found) == {9}
+    assert set(late.found) == {9}
+    for made in (end, hearing, last):
+        made.leave()
+
+
+def test_one_clock_is_followed_until_its_peer_is_lost() -> None:
+    domain = Domain()
+    heard = Heard(Bus(SimulatedClock()))
+    ends = [domain.join(Bus(SimulatedClock())) for _ in range(2)]
+    hearing = domain.join(Bus(SimulatedClock()), follower=heard)
+    domain.settle()
+    for number, end in enumerate(ends):
+        end.endpoint.tell_time(10 + number)
+        end.endpoint.send()
+        domain.settle()
+    assert set(heard.found) == {10}
+    assert hearing.endpoint.peers.rejected == {"second clock": 1}
+    hearing.receive(ends[0].id, Presence.LEFT)
+    ends[1].endpoint.tell_time(12)
+    ends[1].endpoint.send()
+    domain.settle()
+    assert heard.found[-1] == 12
+    for made in (*ends, hearing):
+        made.leave()

@@ -330,3 +330,26 @@ def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
         for _ in range(3):
             carrier.receive(message)
         assert link.statistics().queue.pending == 3
+
+
+async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own() -> None:
+    clock = SimulatedClock()
+    followers: list[int] = []
+    with Bus(clock) as bus, pytest.raises(TypeError, match="needs a SimulatedClock"):
+        Link(Bus(), "world", LoggedCarrier(), tell_clock=True)
+    clock.on_move(followers.append)
+    carrier = LoggedCarrier()
+    told: list[int | None] = []
+    carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
+    carrier.read = lambda content: ReceivedMessage([], time=content)  # type: ignore[method-assign, arg-type]
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier, clock=clock, tell_clock=True):
+            carrier.receive(Received("robot", Presence.JOINED))
+            carrier.receive(Received("robot", 1_000))
+            await until(lambda: clock.now() == 1_000)
+            carrier.receive(Received("robot", 1_500))
+            await until(lambda: clock.now() == 1_500)
+            await until(lambda: told[-1] == 1_500)
+    assert followers == [1_000, 1_500]
+    await clock.advance(1.0)
+    assert max(filter(None, told)) == 1_500

@@ -3,10 +3,12 @@ import struct
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import SMALL, Line, batches_in, messages_in, write_mcap
@@ -222,6 +224,43 @@ def test_foxglove_transforms_become_those_of_ros(tmp_path: Path) -> None:
     convert([source], tmp_path / "same.mcap")
     with open_recording(tmp_path / "same.mcap") as recording:
         assert [topic.type for topic in recording.topics] == ["foxglove.FrameTransforms"]
+
+
+def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    done = convert([SMALL], path, schema="foxglove")
+    assert done.problems == {}
+    assert raw(path) == raw(SMALL)
+    with open_recording(path) as recording:
+        assert {(each.type, each.read) for each in recording.topics if each.name in ("/tf", "/tf_static")} == {
+            ("foxglove.FrameTransforms", True)
+        }
+    # The official decoder, with the definition in the file.
+    with path.open("rb") as file:
+        decoded = [
+            message for *_, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+        ]
+    for (_, _, transforms), message in zip(raw(SMALL), decoded, strict=True):
+        assert [(each.parent_frame_id.encode(), each.child_frame_id.encode()) for each in message.transforms] == [
+            (each.parent, each.child) for each in transforms
+        ]
+        for each, found in zip(transforms, message.transforms, strict=True):
+            numbers = [getattr(found.translation, axis) for axis in "xyz"] + [
+                getattr(found.rotation, axis) for axis in "xyzw"
+            ]
+            np.testing.assert_equal(numbers, struct.unpack("<7d", each.numbers))
+            assert (found.timestamp.seconds, found.timestamp.nanos) == (each.seconds, each.nanoseconds)
+    convert([path], tmp_path / "back.bag")
+    assert raw(tmp_path / "back.bag") == raw(SMALL)
+
+
+def test_foxglove_s_schema_is_for_mcap_and_keeps_authorities(tmp_path: Path, source: Path) -> None:
+    with pytest.raises(ValueError, match=r"must end in \.mcap"):
+        convert([source], tmp_path / "run.bag", schema="foxglove")
+    with pytest.raises(ValueError, match="'ros' or 'foxglove'"):
+        convert([source], tmp_path / "run.mcap", schema="json")  # type: ignore[arg-type]
+    convert([source], tmp_path / "run.mcap", schema="foxglove")
+    assert batches_in(tmp_path / "run.mcap") == batches_in(source)
 
 
 def test_new_names_are_checked() -> None:

@@ -1,21 +1,14 @@
 import math
-import struct
 from collections import Counter
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_typestore
+from support.joint_messages import KIND, joint_state
 from support.recorded import real, write_mcap
 
 from tfbus import Joint, RecordingError, RobotModel, Transform
 from tfbus.recording import load, load_joint_states
-from tfbus.recording.joint_states import decode_joint_state
-from tfbus.tf_message import MalformedMessageError
 
-TYPES = get_typestore(Stores.ROS2_HUMBLE)
-KIND = "sensor_msgs/msg/JointState"
 ARM = RobotModel(
     "arm",
     ["base", "upper", "tool"],
@@ -24,19 +17,6 @@ ARM = RobotModel(
         Joint("mount", "fixed", "upper", "tool", Transform((2.0, 0.0, 0.0))),
     ],
 )
-
-
-def joint_state(stamp: int, positions: dict[str, float]) -> bytes:
-    """The message in CDR, by `rosbags`."""
-    import numpy as np
-
-    kinds = TYPES.types
-    header = kinds["std_msgs/msg/Header"](
-        stamp=kinds["builtin_interfaces/msg/Time"](stamp // 10**9, stamp % 10**9), frame_id="x"
-    )
-    none = np.array([])
-    message = kinds[KIND](header, list(positions), np.array(list(positions.values())), none, none)
-    return bytes(TYPES.serialize_cdr(message, KIND))
 
 
 def write(path: Path, *payloads: bytes, topic: str = "/joint_states", schema: str = KIND) -> Path:
@@ -72,32 +52,6 @@ def test_a_recording_without_positions_is_refused_and_says_where_there_are_some(
         load_joint_states(path, ARM)
     assert raised.value.reason == "no such topic"
     assert load_joint_states(path, ARM, "arm/joint_states").inserted == 1
-
-
-@pytest.mark.parametrize("names", [[], ["a"], ["a", "bcd", "efghijk"]])
-def test_both_encodings_are_those_of_rosbags(names: list[str]) -> None:
-    positions = {name: float(at) + 0.5 for at, name in enumerate(names)}
-    cdr = joint_state(1_500_000_001, positions)
-    assert decode_joint_state(cdr, ros1=False) == (1_500_000_001, positions)
-    assert decode_joint_state(bytes(TYPES.cdr_to_ros1(cdr, KIND)), ros1=True) == (1_500_000_001, positions)
-
-
-@pytest.mark.parametrize("ros1", [True, False])
-@given(data=st.data())
-def test_any_bytes_are_positions_or_malformed(ros1: bool, data: st.DataObject) -> None:
-    payload = bytearray(joint_state(1, {"shoulder": 0.5, "elbow": 1.0}))
-    for place in data.draw(st.lists(st.integers(0, len(payload) - 1), max_size=3)):
-        payload[place] = data.draw(st.integers(0, 255))
-    try:
-        decode_joint_state(bytes(payload[: data.draw(st.integers(0, len(payload)))]), ros1)
-    except MalformedMessageError as error:
-        assert error.reason
-
-
-def test_a_count_that_no_message_can_hold_is_refused_at_once() -> None:
-    payload = b"\0\1\0\0" + struct.pack("<iII", 1, 2, 1) + b"\0" * 4 + struct.pack("<I", 2**31)
-    with pytest.raises(MalformedMessageError, match="cannot hold 2147483648 names"):
-        decode_joint_state(payload, ros1=False)
 
 
 def test_the_transforms_of_a_real_robot_are_those_that_its_state_publisher_sent() -> None:

@@ -687,3 +687,82 @@ async def test_recorded_stamps_are_not_compared_with_the_clock(tmp_path: Path) -
         bus = Bus(clock, reject_ahead=True)
         await Player(bus, path, rate=math.inf).play()
         assert (bus.statistics().samples, bus.statistics().rejected) == (1, {})
+
+
+class Steered:
+    """A player on a real clock with messages at 0, 100, 101 and 200 s, and what was heard of it."""
+
+    def __init__(self, bus: Bus, path: Path) -> None:
+        self.player = Player(bus, path)
+        self.heard: list[int] = []
+        bus.subscribe(lambda batch: self.heard.extend((sample.stamp - START) // SECOND for sample in batch))
+
+    async def until(self, count: int) -> list[int]:
+        with anyio.fail_after(PATIENCE):
+            while len(self.heard) < count:  # noqa: ASYNC110 - on the real clock
+                await anyio.sleep(0.001)
+        return self.heard
+
+
+@pytest.mark.every_loop
+@pytest.mark.parametrize("simulated", [True, False])
+async def test_a_paused_player_steps_from_message_to_message(tmp_path: Path, simulated: bool) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive([0, 100, 101, 200]))
+    with Bus(SimulatedClock() if simulated else None) as bus:
+        steered = Steered(bus, path)
+        player = steered.player
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(player.play)
+            assert await steered.until(1) == [0]
+            player.pause()
+            assert player.paused
+            player.step()
+            assert await steered.until(2) == [0, 100]
+            player.step()
+            player.step()
+            assert await steered.until(4) == [0, 100, 101, 200]
+        assert player.position == START + 200 * SECOND
+        if simulated:
+            assert bus.clock.now() == START + 200 * SECOND
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+async def test_resuming_and_another_rate_go_on_from_where_it_is(tmp_path: Path, simulated: bool) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive([0, 100, 400, 500]))
+    with Bus(SimulatedClock() if simulated else None) as bus:
+        steered = Steered(bus, path)
+        player = steered.player
+        player.pause()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(player.play)
+            # The second message is due after 100 s at this rate.
+            player.resume()
+            assert await steered.until(1) == [0]
+            player.rate = 1_000.0
+            assert await steered.until(2) == [0, 100]
+            player.pause()
+            player.rate = 0.001
+            player.rate = AS_FAST_AS_POSSIBLE
+            player.resume()
+            assert await steered.until(4) == [0, 100, 400, 500]
+    with pytest.raises(ValueError, match="greater than zero"):
+        player.rate = 0.0
+
+
+async def test_a_pause_that_comes_when_a_message_is_due_holds_it_back(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive([0, 100]))
+    with Bus(SimulatedClock()) as bus:
+        steered = Steered(bus, path)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(steered.player.play)
+            await steered.until(1)
+            for _ in range(30):
+                # Just when the next step of the clock is due.
+                await anyio.sleep(0.02)
+                steered.player.pause()
+                await settle()
+                before = bus.clock.now()
+                await settle()
+                assert (steered.heard, bus.clock.now()) == ([0], before)
+                steered.player.resume()
+            tasks.cancel_scope.cancel()

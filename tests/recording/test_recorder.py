@@ -602,3 +602,8 @@ def test_under_plain_asyncio_a_recorder_cancelled_while_opening_leaves_nothing_b
             return data
 
     assert list(make_reader(BytesIO(asyncio.run(main()))).iter_messages()) == []
+
+
+def test_the_repr_is_one_line_with_file_and_samples(tmp_path: Path) -> None:
+    recorder = Recorder(Bus(), tmp_path / "run.mcap")
+    assert repr(recorder) == f"<Recorder of {str(tmp_path / 'run.mcap')!r}: 0 samples>"

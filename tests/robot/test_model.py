@@ -350,3 +350,9 @@ def test_a_pr2_makes_one_tree_of_its_83_frames() -> None:
     tree.insert_many(model.transforms(model.zeros(), 5))
     assert set(tree.frames()) == set(model.links)
     assert all(tree.can_transform("base_footprint", link, 5) for link in model.links)
+
+
+def test_the_repr_is_one_line_with_links_and_moving_joints() -> None:
+    joints = (Joint("wrist", "revolute", "base", "hand"), Joint("glue", "fixed", "hand", "led"))
+    model = RobotModel("arm", ("base", "hand", "led"), joints)
+    assert repr(model) == "<RobotModel 'arm': 3 links below 'base', 1 moving joints>"

@@ -57,7 +57,7 @@ class Command:
             By default a `SimulatedClock` that begins at `START` and goes on by itself.
         """
 
-        def run_beside(options: LinkOptions, program: Callable[[Bus], Awaitable[Any]]) -> Any:
+        def run_beside(options: LinkOptions, program: Callable[[Bus], Awaitable[Any]], **_: Any) -> Any:
             results = anyio.run(_run_beside, program, others, clock, backend=options.backend)
             if not results:
                 raise KeyboardInterrupt

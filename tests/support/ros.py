@@ -10,7 +10,7 @@ from tfbus.links._endpoint import Endpoint
 from tfbus.links._receive_queue import Received
 from tfbus.links.ros import RosOptions
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
-from tfbus.links.ros._settings import settings_of
+from tfbus.links.ros.settings import settings_of
 from tfbus.tf_message import encode
 
 Said = tuple[bool, list[tuple[str, str, int]]]

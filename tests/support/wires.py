@@ -7,6 +7,7 @@ from typing import Any
 
 from tfbus import Bus, SimulatedClock, TransformStamped
 from tfbus.links._carrier import SendReport
+from tfbus.links._clock_follower import HearsTime
 from tfbus.links._endpoint import LONGEST_CLAIM_PERIOD, Endpoint
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
@@ -49,7 +50,7 @@ class WireCarrier:
         """A wire needs no opening."""
 
     def send(self, turn: Turn) -> None:
-        for message in self._writer.write(turn.entries, turn.step):
+        for message in self._writer.write(turn.entries, turn.step, turn.time):
             self._put(message)
 
     def read(self, content: Any) -> ReceivedMessage:
@@ -90,6 +91,7 @@ class End:
         max_frames: int = 10_000,
         drop_lost: bool = False,
         history: float | None = None,
+        follower: HearsTime | None = None,
     ) -> None:
         self.id = name
         self.bus = bus
@@ -106,6 +108,7 @@ class End:
             max_frames=max_frames,
             now=lambda: domain.time,
             history=history,
+            follower=follower,
         )
         self.relay = relay_of(bus)
         self.endpoint.attach()
@@ -147,9 +150,10 @@ class Domain:
         max_frames: int = 10_000,
         drop_lost: bool = False,
         history: float | None = None,
+        follower: HearsTime | None = None,
     ) -> End:
         """A new end."""
-        new = End(f"{id(self)} {next(self._names)}", bus, self, frames, max_frames, drop_lost, history)
+        new = End(f"{id(self)} {next(self._names)}", bus, self, frames, max_frames, drop_lost, history, follower)
         for other in self.ends:
             self.meet(other, new)
         self.ends.append(new)
@@ -192,6 +196,12 @@ class Domain:
         for end in self.ends:
             end.endpoint.reconcile()
         return bool(due)
+
+    def settle(self) -> None:
+        """Deliver everything that is on its way, in order."""
+        while waiting := [wire for wire in self.wires.values() if wire.packets]:
+            for wire in waiting:
+                wire.deliver()
 
     def claim(self) -> None:
         """Have all ends claim their states."""

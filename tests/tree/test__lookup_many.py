@@ -726,3 +726,25 @@ def test_each_frame_of_deskew_must_be_known(count: int, names: tuple[str, str, s
 def test_points_without_stamps_cannot_be_deskewed() -> None:
     with pytest.raises(ValueError, match="no stamps"):
         along(straight).deskew(scan(np.zeros((2, 3)), None), "cart", "odom")
+
+
+def test_the_answers_have_the_stamps_that_were_asked_and_slices_and_masks_keep_them() -> None:
+    tree = tree_of(*over("map", "base", range(101)), keep=None)
+    for stamps in (np.array([30, 10, 20]), np.arange(100, dtype=np.int64)):
+        found = tree.lookup_many("map", "base", stamps)
+        assert found.stamps is not None
+        assert found.stamps.tolist() == stamps.tolist()
+        for chosen in (slice(1, 3), stamps > 15, [2, 0]):
+            part = found[chosen]
+            assert part.stamps is not None
+            assert part.stamps.tolist() == stamps[chosen].tolist()
+        # The caller may change what it gave.
+        before = stamps.tolist()
+        stamps[:] = 7
+        assert found.stamps.tolist() == before
+    dates = np.array([5, 6], "M8[ns]")
+    found = tree.lookup_many("map", "base", dates, out_of_range="nan", tolerance=1e-9)
+    assert (found.stamps is not None, found.gap is not None) == (True, True)
+    travelled = tree.lookup_many("map", "base", [3, 4], source_at=np.datetime64(5, "ns"), fixed="map")
+    assert travelled.stamps is not None
+    assert travelled.stamps.tolist() == [3, 4]

@@ -1,5 +1,6 @@
 """What an explanation says is held against the lookups that it explains; its text against the text that people read."""
 
+import json
 import pickle
 from collections.abc import Iterable
 from contextlib import suppress
@@ -460,3 +461,15 @@ def test_latest_has_an_answer_only_after_the_missing_sample_of_every_edge_with_a
                 assert not later.can_transform(target, source, **question)
             elif lacking and not_before is None:
                 assert later.can_transform(target, source, **question)
+
+
+def test_an_explanation_is_plain_data_and_comes_back() -> None:
+    for found in (
+        robot().explain("map", "gripper"),
+        robot().explain("map", "gripper", from_seconds(12.45)),
+        robot().explain("mapp", "base_lnk"),
+    ):
+        back = Explanation.from_dict(json.loads(json.dumps(found.to_dict())))
+        assert str(back) == str(found)
+        assert back.edges[:2] == found.edges[:2] or not found.answerable
+        assert [type(error) for error in back.errors] == [type(error) for error in found.errors]

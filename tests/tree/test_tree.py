@@ -617,3 +617,9 @@ def test_a_frame_that_was_the_parent_of_its_present_parent_answers_with_both_edg
         assert x_of(tree, "robot", "cart", 25) == 0.0
         tree.lookup("cart", "robot")
     assert tree.looped == 0
+
+
+def test_the_repr_is_one_line_with_frames_samples_and_span() -> None:
+    assert repr(TransformTree()) == "<TransformTree of 0 frames, 0 samples>"
+    tree = tree_of(*over("map", "base", [SECOND, 2 * SECOND]), static("base", "lidar"))
+    assert repr(tree) == "<TransformTree of 3 frames, 3 samples, 1.000 s to 2.000 s>"

@@ -2,10 +2,11 @@
 
 `diagnose` tells what in a tree cannot be right; an `Examiner` is fed with samples as they arrive, and so also sees what
 a tree does not keep, such as duplicates and stamps that go back. `compare` gives the absolute and the relative pose
-error of a frame between two trees, as the benchmarks for SLAM define them.
+error of a frame between two trees, as the benchmarks for SLAM define them. `Arrivals` measures rates and delays.
 """
 
 from tfbus.analysis.alignment import Alignment
+from tfbus.analysis.arrivals import Arrival, Arrivals
 from tfbus.analysis.compare import Comparison, compare
 from tfbus.analysis.diagnose import diagnose
 from tfbus.analysis.examiner import Examiner
@@ -15,6 +16,8 @@ from tfbus.analysis.pose_errors import PoseErrors, Statistics
 
 __all__ = [
     "Alignment",
+    "Arrival",
+    "Arrivals",
     "Comparison",
     "Examiner",
     "Finding",

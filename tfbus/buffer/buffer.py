@@ -4,16 +4,18 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 from typing import Any, SupportsIndex, TypeVar
 
+import anyio.lowlevel
+
 from tfbus.buffer._local_names import LocalNames
 from tfbus.buffer._waiting_lookup import Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
 from tfbus.data import Stamped, do_transform
 from tfbus.errors import ExtrapolationError, TransformLookupError
-from tfbus.frames import as_prefix
+from tfbus.frames import as_prefix, is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
 from tfbus.registration import Registration
-from tfbus.stamps import LATEST, Latest
+from tfbus.stamps import LATEST, AtLike, as_at
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
@@ -21,7 +23,7 @@ from tfbus.tree.html import legend, to_html
 from tfbus.tree.lookup import answer
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.question import Question, question_of
-from tfbus.tree.rendering import describe
+from tfbus.tree.rendering import counted, describe
 from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.waiting.waiting_index import PendingLookup
@@ -111,10 +113,10 @@ class Buffer:
         self,
         target: str,
         source: str,
-        at: int | Latest = LATEST,
+        at: AtLike = LATEST,
         *,
         max_age: float | None = None,
-        source_at: int | Latest | None = None,
+        source_at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -138,7 +140,7 @@ class Buffer:
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
         """
-        bounds = None if max_age is None else self._lookups.bounds(max_age, at, source_at)
+        bounds = None if max_age is None else self._lookups.bounds(max_age, as_at(at), as_at(source_at))
         names = self._local_names
         policy = None
         if tolerance == 0.0 and max_gap is None and extrapolate is None:
@@ -164,11 +166,11 @@ class Buffer:
         self,
         target: str,
         source: str,
-        at: int | Latest = LATEST,
+        at: AtLike = LATEST,
         *,
         timeout: float | None = None,
         max_age: float | None = None,
-        source_at: int | Latest | None = None,
+        source_at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -222,7 +224,7 @@ class Buffer:
             If a stamp is a float, or `max_age` comes without a `LATEST`.
         """
         policy = policy_of(tolerance, max_gap, extrapolate)
-        question = Question(target, source, at, source_at, fixed, max_age, policy)
+        question = Question(target, source, as_at(at), as_at(source_at), fixed, max_age, policy)
         return await self._lookups.lookup(self._on_bus(question), timeout)
 
     async def _lookup_among(self, questions: Sequence[Question]) -> None:
@@ -241,7 +243,7 @@ class Buffer:
         *,
         timeout: float | None = None,
         max_age: float | None = None,
-        at: int | Latest | None = None,
+        at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -254,6 +256,7 @@ class Buffer:
         data : any type of `tfbus.data` but LaserScan, or a type registered with `do_transform`
             With `frame` and `stamp`; the stamp may be `LATEST`.
         target : str
+            Data that are in it already, while the buffer does not know it, stay as they are.
         timeout, max_age : float, optional
             As `lookup`.
         at : int or LATEST, optional
@@ -276,7 +279,10 @@ class Buffer:
         TransformError
             As `lookup`.
         """
-        question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        if self._is_in_place(question):
+            await anyio.lowlevel.checkpoint()
+            return data
         return do_transform(data, await self._lookups.lookup(self._on_bus(question), timeout))
 
     def transform_nowait(
@@ -285,7 +291,7 @@ class Buffer:
         target: str,
         *,
         max_age: float | None = None,
-        at: int | Latest | None = None,
+        at: AtLike | None = None,
         fixed: str | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
@@ -300,10 +306,40 @@ class Buffer:
         TypeError
             As `transform`.
         """
-        question = question_of(data, target, at, fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        question = question_of(data, target, as_at(at), fixed, max_age, policy_of(tolerance, max_gap, extrapolate))
+        if self._is_in_place(question):
+            return data
         return do_transform(data, self._lookups.lookup_nowait(self._on_bus(question)))
 
-    def can_transform(self, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> bool:
+    async def can_transform_within(
+        self, target: str, source: str, timeout: float | None, at: AtLike = LATEST, **question: Any
+    ) -> bool:
+        """Whether `lookup` with the same arguments has an answer within a time; tf2's ``can_transform`` with a timeout.
+
+        Parameters
+        ----------
+        target, source, at, question
+            As `lookup`.
+        timeout : float or None
+            In s, on the bus's clock; None to wait as long as it takes.
+
+        Returns
+        -------
+        bool
+            False once the time is up, or at once if waiting cannot help.
+
+        Raises
+        ------
+        BusClosedError, ClockResetError, TypeError
+            As `lookup`.
+        """
+        try:
+            await self.lookup(target, source, at, timeout=timeout, **question)
+        except TransformLookupError:
+            return False
+        return True
+
+    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
         """Whether `lookup_nowait` with the same arguments has an answer now."""
         try:
             self.lookup_nowait(target, source, at, **question)
@@ -378,7 +414,7 @@ class Buffer:
         self,
         target: str,
         source: str,
-        at: int | Latest = LATEST,
+        at: AtLike = LATEST,
         *,
         max_age: float | None = None,
         tolerance: float = 0.0,
@@ -389,8 +425,9 @@ class Buffer:
 
         See `TransformTree.explain`; ages are counted from the clock's now.
         """
-        asked = self._on_bus(Question(target, source, at))
-        bounds = None if max_age is None else self._lookups.bounds(max_age, at, None)
+        instant = as_at(at)
+        asked = self._on_bus(Question(target, source, instant))
+        bounds = None if max_age is None else self._lookups.bounds(max_age, instant, None)
         found = self.tree.explain(
             asked.target,
             asked.source,
@@ -431,6 +468,11 @@ class Buffer:
         self._live.end("the buffer is closed")
         self._live.call_end_callbacks()
 
+    def __repr__(self) -> str:
+        keep = "everything" if self.tree.keep is None else f"{self.tree.keep:g} s"
+        state = "closed" if self._live.end_reason is not None else f"{counted(len(self.pending()), 'lookup')} waiting"
+        return f"<Buffer of {counted(len(self.tree.frames()), 'frame')}, keeps {keep}, {state}>"
+
     def __reduce_ex__(self, protocol: SupportsIndex) -> str | tuple[Any, ...]:
         raise TypeError("a buffer belongs to its bus and cannot be copied or pickled: use buffer.tree.copy()")
 
@@ -444,6 +486,13 @@ class Buffer:
         if self._local_names is None:
             return edges
         return sorted(map(self._local_names.edge, edges), key=lambda edge: edge.child)
+
+    def _is_in_place(self, question: Question) -> bool:
+        """Whether data are in the target frame already, and stay as they are because the buffer does not know it."""
+        target = question.target
+        if target != question.source or question.fixed is not None or not is_frame(target):
+            return False
+        return self._on_bus(question).target not in self.tree
 
     def _on_bus(self, question: Question) -> Question:
         """A question with the names of the bus."""

@@ -9,6 +9,7 @@ from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.frames import as_prefix
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.stamps import StampLike
 
 
 class TransformBroadcaster:
@@ -54,7 +55,7 @@ class TransformBroadcaster:
         self._prefix = as_prefix(prefix, shared)
         self._invalid = as_invalid(invalid)
 
-    def send(self, parent: str, child: str, transform: Transform, at: int | None = None) -> None:
+    def send(self, parent: str, child: str, transform: Transform, at: StampLike | None = None) -> None:
         """Publish where `child` is, seen from `parent`.
 
         Parameters
@@ -75,7 +76,9 @@ class TransformBroadcaster:
             parent, child = self._on_bus(parent), self._on_bus(child)
         self.bus.publish(TransformStamped(parent, child, self._stamp(at), transform, self.authority), self._invalid)
 
-    def send_all(self, samples: Iterable[TransformStamped | tuple[str, str, Transform]], at: int | None = None) -> None:
+    def send_all(
+        self, samples: Iterable[TransformStamped | tuple[str, str, Transform]], at: StampLike | None = None
+    ) -> None:
         """Publish several at once; they are seen all or not at all.
 
         Parameters
@@ -140,10 +143,10 @@ class TransformBroadcaster:
         """The name of a frame on the bus."""
         return name if self._prefix is None else self._prefix.on_bus(name)
 
-    def _stamp(self, at: int | None) -> int:
+    def _stamp(self, at: StampLike | None) -> StampLike:
         return self.bus.clock.now() if at is None else at
 
-    def _sample(self, sample: TransformStamped | tuple[str, str, Transform], stamp: int) -> TransformStamped:
+    def _sample(self, sample: TransformStamped | tuple[str, str, Transform], stamp: StampLike) -> TransformStamped:
         if isinstance(sample, TransformStamped):
             parent, child = self._on_bus(sample.parent), self._on_bus(sample.child)
             return sample.replace(parent=parent, child=child, authority=self.authority)

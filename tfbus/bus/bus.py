@@ -359,6 +359,11 @@ class Bus:
             ahead=self._topology.ahead,
         )
 
+    def __repr__(self) -> str:
+        state = f"{len(self._buffers)} buffers, {len(self._streams)} streams"
+        frames = len(self._topology)
+        return f"<Bus of {frames:,} child frame{'' if frames == 1 else 's'}, {'closed' if self._closed else state}>"
+
     def close(self) -> None:
         """End every stream and every waiting lookup; buffers go on answering what they can.
 

@@ -29,12 +29,12 @@ _STYLES = {"rate": "cyan", "age": "green", "span": "dim", "authority": "magenta"
 
 
 class TreeDisplay:
-    """Shows a tree once, or again and again: in place on a terminal, otherwise one below the other.
+    """Shows lines once, or again and again: in place on a terminal, otherwise one below the other.
 
     Parameters
     ----------
     live : bool
-        Whether the tree is shown more than once.
+        Whether they are shown more than once.
     """
 
     def __init__(self, live: bool) -> None:
@@ -45,8 +45,11 @@ class TreeDisplay:
             self._live = Live(console=self._console, auto_refresh=False, redirect_stderr=sys.stderr.isatty())
 
     def show(self, edges: Sequence[Edge], now: int) -> None:
-        """Draw the edges; ages are counted from `now`, in ns."""
-        lines = tree_lines(edges, now, self._console.options.ascii_only, terminal_width())
+        """Draw the tree of the edges; ages are counted from `now`, in ns."""
+        self.show_lines(tree_lines(edges, now, self._console.options.ascii_only, terminal_width()))
+
+    def show_lines(self, lines: Sequence[Text]) -> None:
+        """Show lines that fit the width of the terminal."""
         if self._live is not None:
             # The last line of the terminal is the cursor's.
             self._live.update(Group(*_fitting(lines, self._console.height - 1)), refresh=True)
@@ -143,7 +146,7 @@ def _fitting(lines: Sequence[Text], height: int) -> Sequence[Text]:
     if len(lines) <= height:
         return lines
     kept = max(0, height - 1)
-    return [*lines[:kept], Text(f"… and {len(lines) - kept:,} frames more than fit", "yellow", no_wrap=True)]
+    return [*lines[:kept], Text(f"… and {len(lines) - kept:,} lines more than fit", "yellow", no_wrap=True)]
 
 
 def _style(fact: str, edge: Edge, now: int) -> str:

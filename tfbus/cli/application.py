@@ -33,6 +33,8 @@ COMMANDS = {
     "info": "Print the contents of a recording: its topics, its frames with parents, rates, gaps and delays, and its "
     "senders.",
     "listen": "Print a point of the tutorial's laser in the frame of the base, again and again, until Ctrl-C.",
+    "monitor": "Measure the rate, the delay, the jitter and the losses of each frame and sender of a domain, until "
+    "Ctrl-C.",
     "play": "Publish a recording on a domain with its original stamps and timing, static transforms first.",
     "plot": "Plot the transforms of some frames from a recording over time: FILE TARGET SOURCE...",
     "query": "Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.",

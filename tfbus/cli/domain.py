@@ -11,9 +11,11 @@ from cyclopts import Parameter
 
 from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli._ros import ros_link
 from tfbus.cli.arguments import Backend, UsageError
 from tfbus.cli.output import say
+from tfbus.clock import Clock, SimulatedClock
 from tfbus.errors import pip_install
 from tfbus.geometry.stamped import TransformStamped
 
@@ -53,8 +55,8 @@ class LinkOptions:
     robots
         Hear only these robots, such as r1 or r*; may be given several times.
     ros
-        Join ROS in place of a domain: dds for ROS 2, dds:42 if its ROS_DOMAIN_ID is 42, or ws://host:9090 for a
-        rosbridge server of ROS 1 or ROS 2; may be given several times.
+        Join ROS in place of a domain: dds for ROS 2, dds:42 if its ROS_DOMAIN_ID is 42, zenoh:host:7447 for a router
+        of rmw_zenoh, or ws://host:9090 for a rosbridge server of ROS 1 or ROS 2; may be given several times.
     backend
         The event loop to run on.
     """
@@ -72,8 +74,15 @@ class LinkOptions:
         """What is joined, for people."""
         return f"ROS at {' and '.join(self.ros)}" if self.ros else f"domain {self.domain!r}"
 
-    def run(self, program: Callable[[Bus], Awaitable[T]]) -> T:
+    def run(self, program: Callable[[Bus], Awaitable[T]], *, clock: Clock | None = None) -> T:
         """Run a program on a bus that has joined the domain, until its end or Ctrl-C.
+
+        Parameters
+        ----------
+        program : async callable
+        clock : Clock, optional
+            The clock of the bus. The time of a `SimulatedClock` is told to the domain; a `ReplayClock` follows the time
+            that is told there.
 
         Returns
         -------
@@ -88,7 +97,7 @@ class LinkOptions:
         """
 
         async def join_and_run() -> T:
-            with Bus() as bus:
+            with Bus(clock) as bus:
                 async with self.join(bus):
                     return await program(bus)
 
@@ -103,11 +112,12 @@ class LinkOptions:
         UsageError
             If an option is not valid, an address cannot be listened at or reached, or the extra is missing.
         """
+        follower = bus.clock if isinstance(bus.clock, ReplayClock) else None
         if self.ros:
             async with AsyncExitStack() as stack:
                 for place in self.ros:
                     try:
-                        await stack.enter_async_context(ros_link(bus, place))
+                        await stack.enter_async_context(ros_link(bus, place, clock=follower))
                     except OSError as error:
                         why = os.strerror(error.errno) if error.errno else error
                         raise UsageError(f"cannot join ROS at {place}: {why}") from None
@@ -125,6 +135,8 @@ class LinkOptions:
                 connect=self.connect or None,
                 robot=self.robot,
                 robots=self.robots or None,
+                clock=follower,
+                tell_clock=isinstance(bus.clock, SimulatedClock),
             )
         ):
             yield

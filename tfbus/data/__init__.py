@@ -6,6 +6,7 @@
 
 from tfbus.data.clouds import PointCloud
 from tfbus.data.dispatch import Stamped, check_registered, do_transform
+from tfbus.data.messages import from_message, to_message
 from tfbus.data.points import PointStamped, Polygon, PoseStamped, QuaternionStamped, Vector3Stamped
 from tfbus.data.scans import LaserScan
 from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchStamped
@@ -24,4 +25,6 @@ __all__ = [
     "WrenchStamped",
     "check_registered",
     "do_transform",
+    "from_message",
+    "to_message",
 ]

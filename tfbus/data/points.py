@@ -151,3 +151,10 @@ def _(data: PoseStamped, transform: TransformStamped) -> PoseStamped:
 @do_transform.register
 def _(data: Polygon, transform: TransformStamped) -> Polygon:
     return Polygon(*moved_header(data, transform), transform.transform.apply(data.points))
+
+
+@do_transform.register
+def _(data: TransformStamped, transform: TransformStamped) -> TransformStamped:
+    target, stamp = moved_header(data, transform)
+    static = data.static and transform.static
+    return TransformStamped(target, data.child, stamp, transform.transform @ data.transform, data.authority, static)

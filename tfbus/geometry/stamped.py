@@ -9,7 +9,7 @@ from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.geometry.which_kernel import kernel
 from tfbus.plain import from_fields
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_stamp, format_duration, format_stamp
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp
 
 if kernel == "python":
     from tfbus.geometry._python_sample import Sample
@@ -53,7 +53,7 @@ class TransformStamped(Sample):
         self,
         parent: str,
         child: str,
-        stamp: int,
+        stamp: StampLike,
         transform: Transform,
         authority: str = "",
         static: bool = False,
@@ -91,6 +91,11 @@ class TransformStamped(Sample):
                 str(error), reason="stamp", parent=parent, child=child, authority=authority
             ) from None
         self._fields = parent, child, stamp, transform._row, authority, bool(static)
+
+    @property
+    def frame(self) -> str:
+        """The frame in which the pose of `child` is expressed: `parent`, as other stamped data call it."""
+        return self.parent
 
     @property
     def transform(self) -> Transform:

@@ -318,6 +318,11 @@ def from_columns(columns: Floats, policy_use: Integers | None = None, stamps: In
     return transforms
 
 
+def with_stamps(transforms: TransformArray, stamps: Integers) -> TransformArray:
+    """The same transforms with a copy of these stamps, in ns; there is one for each."""
+    return from_columns(transforms._columns, transforms._policy_use, stamps.copy())
+
+
 def move(columns: Columns, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:
     """Map points by coordinate, each with its own transform."""
     x, y, z = rotate(columns[3:], x, y, z)

@@ -1,8 +1,9 @@
 """Links join a bus to the buses of other processes, and to other worlds such as ROS.
 
-Each kind of link has a room of its own and needs an extra of its own: ``tfbus.links.zenoh`` is the first. All of them
-are a `Link` over a carrier, the protocol of `tfbus.links._carrier`: the link knows the bus, its peers and what passed
-already; the carrier knows one network and its messages.
+Each kind of link has a room of its own and needs an extra of its own: ``tfbus.links.zenoh`` joins buses to buses,
+``tfbus.links.dds``, ``tfbus.links.rosbridge`` and ``tfbus.links.rmw_zenoh`` join them to ROS. All of them are a `Link`
+over a carrier, the protocol of `tfbus.links._carrier`: the link knows the bus, its peers and what passed already; the
+carrier knows one network and its messages.
 """
 
 from tfbus.links.link import Link

@@ -4,8 +4,9 @@ ROS's TFMessage has no fields for these. A message holds the samples of several 
 attachment says how many samples belong to which batch, in the order in which batches and removals happened. Little
 endian::
 
-    version u8, claim u8, origins u8, 0 u8, authorities u16, entries u32, number u64
+    version u8, claim u8, origins u8, times u8, authorities u16, entries u32, number u64
     since u64, state u64, digest u64, message u64: a `StateStep`; claim is 0 without one, 1, or 2 for the final step
+    times        0 or 1: i64, the time of the sender's clock in ns
     origins      16 bytes each
     authorities  length u16, UTF-8
     entries      kind u8, origin u8, runs u16, sequence u64, and then
@@ -31,10 +32,11 @@ ORIGIN_BYTES = 16
 MAX_BYTES = 2**20
 MAX_ENTRIES = 10_000
 
-_HEADER = struct.Struct("<BBBxHIQQQQQ")
+_HEADER = struct.Struct("<BBBBHIQQQQQ")
 _ENTRY = struct.Struct("<BBHQ")
 _RUN = struct.Struct("<HHI")
 _LENGTH = struct.Struct("<H")
+_TIME = struct.Struct("<q")
 _BATCH, _REMOVAL, _LOSS, _MOVING = 0, 1, 2, 3
 _NO_STEP, _STEP, _FINAL_STEP = 0, 1, 2
 _NO_ORIGIN = bytes(ORIGIN_BYTES)
@@ -74,6 +76,7 @@ class Attachment:
     number: int
     entries: tuple[Entry, ...]
     step: StateStep | None = None
+    time: int | None = None
 
     def tags(self) -> Iterator[tuple[str, bool]]:
         """Authority and static flag of each sample of the message."""
@@ -82,7 +85,7 @@ class Attachment:
         return chain.from_iterable(repeat((authority, static), count) for authority, static, count in runs)
 
 
-def pack(number: int, entries: Sequence[Entry], step: StateStep | None = None) -> bytes:
+def pack(number: int, entries: Sequence[Entry], step: StateStep | None = None, time: int | None = None) -> bytes:
     """The bytes of an attachment.
 
     Raises
@@ -116,7 +119,10 @@ def pack(number: int, entries: Sequence[Entry], step: StateStep | None = None) -
     if step is not None:
         claim = _FINAL_STEP if step.final else _STEP
         claimed = step.since, step.number, step.digest, step.message
-    head = bytearray(_pack(_HEADER, VERSION, claim, len(origins), len(authorities), len(entries), number, *claimed))
+    counts = len(origins), time is not None, len(authorities), len(entries)
+    head = bytearray(_pack(_HEADER, VERSION, claim, *counts, number, *claimed))
+    if time is not None:
+        head += _pack(_TIME, time)
     for origin_bytes in origins:
         head += origin_bytes
     for authority in authorities:
@@ -150,10 +156,17 @@ def unpack(data: bytes) -> Attachment:
 
 
 def _unpack(data: bytes) -> Attachment:
-    _, claim, origin_count, authority_count, entry_count, number, *claimed = _HEADER.unpack_from(data)
+    _, claim, origin_count, time_count, authority_count, entry_count, number, *claimed = _HEADER.unpack_from(data)
     if entry_count > MAX_ENTRIES:
         raise MalformedMessageError("oversized", f"the attachment has {entry_count} entries, more than {MAX_ENTRIES}")
-    at = _HEADER.size + ORIGIN_BYTES * origin_count
+    at = _HEADER.size
+    time = None
+    if time_count:
+        if time_count > 1:
+            raise IndexError
+        (time,) = _TIME.unpack_from(data, at)
+        at += _TIME.size
+    at += ORIGIN_BYTES * origin_count
     origins = [data[at - ORIGIN_BYTES * (k + 1) : at - ORIGIN_BYTES * k] for k in reversed(range(origin_count))]
     authorities = []
     for _ in range(authority_count):
@@ -183,7 +196,7 @@ def _unpack(data: bytes) -> Attachment:
     # Slicing past the end raises nothing, so the end is checked.
     if at != len(data):
         raise IndexError
-    return Attachment(number, tuple(entries), _step(claim, *claimed))
+    return Attachment(number, tuple(entries), _step(claim, *claimed), time)
 
 
 def _step(claim: int, since: int, state: int, digest: int, message: int) -> StateStep | None:

@@ -11,6 +11,7 @@ from tfbus.bus.once_logger import OnceLogger
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import Asker
 from tfbus.links._carrier import AskableCarrier, Carrier, HistoryCarrier
+from tfbus.links._clock_follower import HearsTime
 from tfbus.links._history import HistoryAsker, HistoryTeller
 from tfbus.links._inbox import Inbox, ReceivedMessage
 from tfbus.links._outbox import Outbox
@@ -49,6 +50,8 @@ class Endpoint:
         Called when `reconcile` has to be called earlier than it said before.
     history : float or None
         How many seconds of the past each new peer is asked for.
+    follower : HearsTime, optional
+        Hears the time of the first peer that tells one, until that peer is lost.
 
     Attributes
     ----------
@@ -70,6 +73,7 @@ class Endpoint:
         now: Callable[[], float] = monotonic,
         wake: Callable[[], object] = lambda: None,
         history: float | None = None,
+        follower: HearsTime | None = None,
     ) -> None:
         self._bus = bus
         self._name = name
@@ -78,6 +82,8 @@ class Endpoint:
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._relay = relay_of(bus)
         self._askable = carrier if isinstance(carrier, AskableCarrier) else None
+        self._follower = follower
+        self._followed: str | None = None
         self._now = now
         self._claimed_at = -CLAIM_PERIOD
         self._claim_period = CLAIM_PERIOD
@@ -118,10 +124,17 @@ class Endpoint:
     def send(self) -> None:
         """Hand to the carrier all that has gathered in the outbox, if there is anything."""
         turn = self.outbox.flush()
-        if turn.entries or turn.statics:
+        if turn.entries or turn.statics or turn.time is not None:
             self._carrier.send(turn)
             self._claimed_at = self._now()
             self._claim_period = CLAIM_PERIOD
+
+    def tell_time(self, stamp: int) -> None:
+        """Tell peers the time of this bus's clock, in ns, with all that is published from now on."""
+        if self.outbox.time is not None and stamp < self.outbox.time:
+            # What was published before the jump is of the time before it.
+            self.send()
+        self.outbox.tell_time(stamp)
 
     def next_question(self) -> float | None:
         """The time at which the next peer is to be asked; None while nothing is missing."""
@@ -168,6 +181,8 @@ class Endpoint:
                 self._take_history(item.sender, content)
             else:
                 message = self._carrier.read(content)
+                if message.time is not None:
+                    self._hear_time(item.sender, message.time)
                 if self._history is None or not self._history.holds(item.sender, message):
                     self._end_history(item.sender)
                     self._take_live(item.sender, message)
@@ -204,6 +219,17 @@ class Endpoint:
             for message in self._history.end(sender):
                 self._take_live(sender, message)
 
+    def _hear_time(self, sender: str, stamp: int) -> None:
+        if self._follower is None or self.peers.find(sender) is None:
+            return
+        if self._followed is None:
+            self._followed = sender
+        if sender == self._followed:
+            self._follower.hear(stamp)
+        else:
+            error = ValueError(f"this bus follows the clock of peer {self._followed}")
+            self.peers.reject(sender, "second clock", error)
+
     def _answer(self, question: Question) -> None:
         if self._askable is None:
             return
@@ -238,12 +264,16 @@ class Endpoint:
             peer.present = True
             if self._reconciler is not None:
                 self._reconciler.joined(peer)
+            if self.outbox.time is not None:
+                self.outbox.tell_time(self.outbox.time)
             if self._history is not None:
                 self._history.joined(sender)
             self._bus._announce(PeerJoined(self._bus.clock.now(), self._name, sender))
 
     def _peer_left(self, sender: str) -> None:
         self._end_history(sender)
+        if sender == self._followed:
+            self._followed = None
         peer = self.peers.forget(sender)
         if peer is not None:
             if self._reconciler is not None:

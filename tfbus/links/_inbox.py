@@ -61,12 +61,15 @@ class ReceivedMessage:
         One for each sample that was refused; `entries` has the others.
     step : StateStep or None
         What the message claims to tell of the peer's state, if it claims that.
+    time : int or None
+        The time of the sender's clock, in ns, if it tells that.
     """
 
     entries: list[ReceivedBatch | RemovedFrame | MovingFrame]
     number: int = 0
     errors: list[InvalidTransformError] = field(default_factory=list)
     step: StateStep | None = None
+    time: int | None = None
 
 
 class Inbox:

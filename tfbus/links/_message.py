@@ -48,14 +48,20 @@ class MessageWriter:
     def __init__(self, report: SendReport) -> None:
         self._report = report
         self._number = 0
+        self._time: int | None = None
 
-    def write(self, entries: Sequence[_Entry], step: StateStep | None = None) -> list[Message]:
-        """The messages that hold all entries in order, and the step that they are; batches stay whole."""
+    def write(self, entries: Sequence[_Entry], step: StateStep | None = None, time: int | None = None) -> list[Message]:
+        """The messages that hold all entries in order, and the step that they are; batches stay whole.
+
+        A time of the clock, in ns, is in these messages and in all later ones, until there is another one.
+        """
+        if time is not None:
+            self._time = time
         if step is None:
             return self._write(entries)
         if sum(map(_size, entries)) < FULL_MESSAGE:
             try:
-                message = _message(entries, self._number + 1, step._replace(message=self._number + 1))
+                message = _message(entries, self._number + 1, step._replace(message=self._number + 1), self._time)
             except ValueError:
                 # Written below once more, without what cannot be sent.
                 pass
@@ -66,7 +72,7 @@ class MessageWriter:
 
     def claim(self, step: StateStep) -> Message:
         """A message without a number and without entries, which claims a state."""
-        return _message([], 0, step._replace(message=self._number))
+        return _message([], 0, step._replace(message=self._number), self._time)
 
     def _write(self, entries: Sequence[_Entry]) -> list[Message]:
         messages: list[Message] = []
@@ -83,7 +89,7 @@ class MessageWriter:
     def _messages(self, entries: list[_Entry]) -> list[Message]:
         """One message of all entries if possible, else several; what cannot be sent is left out and reported."""
         try:
-            message = _message(entries, self._number + 1)
+            message = _message(entries, self._number + 1, time=self._time)
         except ValueError as error:
             failure: Exception = error
         else:
@@ -143,7 +149,7 @@ def read_message(payload: bytes, attachment: bytes) -> ReceivedMessage:
     unpacked = unpack(attachment)
     decoded = decode(payload, unpacked.tags(), ReceivedTransform)
     entries = list(_received_entries(unpacked.entries, decoded.samples))
-    return ReceivedMessage(entries, unpacked.number, decoded.errors, unpacked.step)
+    return ReceivedMessage(entries, unpacked.number, decoded.errors, unpacked.step, unpacked.time)
 
 
 def _received_entries(
@@ -160,7 +166,7 @@ def _received_entries(
         start = end
 
 
-def _message(entries: Sequence[_Entry], number: int, step: StateStep | None = None) -> Message:
+def _message(entries: Sequence[_Entry], number: int, step: StateStep | None = None, time: int | None = None) -> Message:
     """A message of all entries; raises `ValueError` if one message cannot hold them."""
     samples: list[TransformStamped] = []
     for entry in entries:
@@ -168,7 +174,7 @@ def _message(entries: Sequence[_Entry], number: int, step: StateStep | None = No
             samples += entry.samples
     payload = encode(samples)
     published = [_published(entry) if isinstance(entry, OutgoingBatch) else entry for entry in entries]
-    attachment = pack(number, published, step)
+    attachment = pack(number, published, step, time)
     size = len(payload) + len(attachment)
     if size > MAX_BYTES:
         raise ValueError(f"a message of {len(samples)} samples has {size} bytes, more than {MAX_BYTES}")

@@ -23,11 +23,14 @@ class Turn:
         tombstone, or None if the frame is not to be kept any more.
     step : StateStep or None
         What the entries change of the link's state; for carriers whose peers ask for it.
+    time : int or None
+        The time of the clock that the link tells, in ns, if it has to be told. A turn may have nothing else.
     """
 
     entries: list[OutgoingBatch | RemovedFrame]
     statics: dict[str, OutgoingBatch | RemovedFrame | None]
     step: StateStep | None = None
+    time: int | None = None
 
 
 class Outbox:
@@ -65,6 +68,8 @@ class Outbox:
         self._changes: dict[str, OutgoingBatch | RemovedFrame | None] = {}
         self._told = 0
         self._silent = False
+        self._time: int | None = None
+        self._time_waits = False
         self.pending = 0
         self.state = LinkState()
 
@@ -105,9 +110,21 @@ class Outbox:
         if kept or brought or not echo:
             self._notify()
 
+    @property
+    def time(self) -> int | None:
+        """The newest time that was told, in ns."""
+        return self._time
+
+    def tell_time(self, stamp: int) -> None:
+        """Tell the time of a clock, in ns, with what is sent next."""
+        self._time = stamp
+        self._time_waits = True
+        self._notify()
+
     def flush(self) -> Turn:
         """Remove and return all that has gathered."""
-        turn = Turn(self._entries, self._changes, self.step())
+        turn = Turn(self._entries, self._changes, self.step(), self._time if self._time_waits else None)
+        self._time_waits = False
         self._entries, self._changes, self.pending = [], {}, 0
         self._told, self._silent = self.state.number, False
         return turn

@@ -14,8 +14,10 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
 from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import check_capacity
+from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
 from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._clock_follower import ClockFollower, HearsTime
 from tfbus.links._endpoint import Endpoint
 from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._receive_queue import Received, ReceiveQueue
@@ -52,6 +54,11 @@ class Link:
         How many live messages may wait for the event loop; beyond that the oldest are dropped and counted.
     history : float, optional
         Ask each new peer once for the last so many seconds of its moving frames, if the carrier can.
+    clock : SimulatedClock, optional
+        Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
+        time is followed until it is lost; the time of others is refused and counted.
+    tell_clock : bool
+        Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
 
     Attributes
     ----------
@@ -82,7 +89,11 @@ class Link:
         max_frames: int = 10_000,
         capacity: int = 10_000,
         history: float | None = None,
+        clock: SimulatedClock | HearsTime | None = None,
+        tell_clock: bool = False,
     ) -> None:
+        if tell_clock and not isinstance(bus.clock, SimulatedClock):
+            raise TypeError(f"to tell the time, the bus needs a SimulatedClock, not {bus.clock!r}")
         if isinstance(frames, str):
             raise TypeError(f"frames must be several names, not {frames!r}")
         check_capacity(capacity)
@@ -94,6 +105,8 @@ class Link:
         self._name = name
         self._carrier = carrier
         self._log = OnceLogger(logging.getLogger("tfbus"))
+        follower = ClockFollower(clock) if isinstance(clock, SimulatedClock) else clock
+        self._follower = follower if isinstance(follower, ClockFollower) else None
         self._endpoint = Endpoint(
             bus,
             name,
@@ -104,7 +117,10 @@ class Link:
             max_frames=max_frames,
             wake=self._stir,
             history=history,
+            follower=follower,
         )
+        self._told_clock = bus.clock if tell_clock and isinstance(bus.clock, SimulatedClock) else None
+        self._moves: Registration | None = None
         self._stirred: anyio.Event | None = None
         self._send_report = SendReport(self._warn_not_sent)
         self._receive_queue = ReceiveQueue(capacity)
@@ -119,6 +135,11 @@ class Link:
     def peers(self) -> tuple[str, ...]:
         """The ids of the other ends that are there, sorted."""
         return self._endpoint.peers.present
+
+    def __repr__(self) -> str:
+        count = len(self.peers)
+        state = f"{count} peer{'' if count == 1 else 's'}" if self._attached else "not joined"
+        return f"<{type(self).__name__} {self._name!r}: {state}>"
 
     def statistics(self) -> LinkStatistics:
         """All counters, as they are now."""
@@ -156,6 +177,11 @@ class Link:
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._carrier.run)
         self._tasks.start_soon(self._keep_agreed)
+        if self._follower is not None:
+            self._tasks.start_soon(self._follower.run)
+        if self._told_clock is not None:
+            self._moves = self._told_clock.on_move(self._endpoint.tell_time)
+            self._endpoint.tell_time(self._told_clock.now())
         # Items that came before the link was attached are still in the queue.
         self._received.wake()
         return self
@@ -166,6 +192,8 @@ class Link:
         assert self._tasks is not None
         assert self._jumps is not None
         self._jumps.close()
+        if self._moves is not None:
+            self._moves.close()
         self._attached = False
         self._endpoint.detach()
         self._endpoint.send()

@@ -11,11 +11,21 @@ from itertools import groupby
 from json import dumps
 from operator import itemgetter
 from pathlib import Path
+from typing import Literal
 
 from tfbus.errors import RecordingError, pip_install
 from tfbus.recording.edits import Edits
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
-from tfbus.recording.formats._copies import BagCopy, CannotWriteError, Copy, McapCopy, SqliteCopy, transform_channel
+from tfbus.recording.formats._copies import (
+    BagCopy,
+    CannotWriteError,
+    Copy,
+    FoxgloveCopy,
+    McapCopy,
+    SqliteCopy,
+    transform_channel,
+    write_transforms,
+)
 from tfbus.recording.formats._decoder import ChannelDecoder
 from tfbus.recording.formats._raw_transforms import (
     COMPRESSED,
@@ -23,8 +33,6 @@ from tfbus.recording.formats._raw_transforms import (
     bounded,
     holds_transforms,
     parser_of,
-    write_cdr,
-    write_ros1,
 )
 from tfbus.recording.formats._storage import AUTHORITIES, Channel, Storage, StoredMessage, Wanted
 from tfbus.recording.formats._unfold import UnfoldError, unfold
@@ -85,6 +93,7 @@ def convert(
     topics: Collection[str] | None = None,
     edits: Edits | None = None,
     overwrite: bool = False,
+    schema: Literal["ros", "foxglove"] = "ros",
     progress: Callable[[int], object] | None = None,
 ) -> Conversion:
     """Write recordings to a new one, all messages in the order of their log times.
@@ -107,6 +116,9 @@ def convert(
         What is changed in the transforms.
     overwrite : bool
         Whether to replace an existing file.
+    schema : {"ros", "foxglove"}
+        The schema of transforms: ROS' ``TFMessage``, where they are not Foxglove's already and nothing changes them; or
+        Foxglove's ``FrameTransforms`` in Protocol Buffers, for MCAP only.
     progress : callable, optional
         Called with 1 for each message that is read.
 
@@ -119,7 +131,7 @@ def convert(
     RecordingError
         If an input cannot be read, or the packages are missing.
     ValueError
-        If the output has another ending, or is one of the inputs.
+        If the output has another ending, or is one of the inputs; if `schema` is another, or does not fit the ending.
     FileExistsError
         If the output is there already.
     OSError
@@ -129,6 +141,12 @@ def convert(
     make = _COPIES.get(target.suffix)
     if make is None:
         raise ValueError(f"the output must end in {', '.join(_COPIES)}, not {target.name!r}")
+    if schema not in ("ros", "foxglove"):
+        raise ValueError(f"the schema must be 'ros' or 'foxglove', not {schema!r}")
+    if schema == "foxglove":
+        if make is not McapCopy:
+            raise ValueError(f"only MCAP holds Foxglove's schema: the output must end in .mcap, not {target.name!r}")
+        make = FoxgloveCopy
     if any(target.exists() and Path(path).exists() and target.samefile(path) for path in inputs):
         raise ValueError(f"{target} is an input as well")
     if target.exists() and not overwrite:
@@ -142,7 +160,8 @@ def convert(
         try:
             copy = make(part, target.name)
         except ImportError as error:
-            problem = f"to write it, tfbus needs some packages more: {pip_install('bag')} ({error})"
+            extras = "bag,foxglove" if schema == "foxglove" else "bag"
+            problem = f"to write it, tfbus needs some packages more: {pip_install(extras)} ({error})"
             raise RecordingError(problem, path=str(target), reason="missing extra") from error
         stack.callback(part.unlink, missing_ok=True)
         stack.callback(copy.close)
@@ -227,8 +246,8 @@ class _Run:
             self._copy.write(channel, received, payload)
         elif kept or not transforms:
             runs = tuple((name, len(list(run))) for name, run in groupby(authority for _, authority in kept))
-            encode = write_cdr if self._copy.encoding == "cdr" else write_ros1
-            self._copy.write(self._output(channel, runs), received, encode([each for each, _ in kept]))
+            message = write_transforms([each for each, _ in kept], self._copy.encoding)
+            self._copy.write(self._output(channel, runs), received, message)
         else:
             return
         self.result.messages += 1

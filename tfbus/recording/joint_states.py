@@ -1,18 +1,16 @@
 """`load_joint_states`, the tree of a robot from the positions of its joints, for recordings without transforms."""
 
 import os
-import struct
 from collections import Counter
 from pathlib import Path
 
 from tfbus.errors import InvalidTransformError, RecordingError
-from tfbus.recording.formats._bounds import MAX_MESSAGE
 from tfbus.recording.formats._raw_transforms import bounded
 from tfbus.recording.formats._storage import Channel
 from tfbus.recording.load import Problems
 from tfbus.recording.recording import open_storage
+from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.robot.model import RobotModel
-from tfbus.stamps import SECOND
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.tree import TransformTree
 
@@ -72,7 +70,7 @@ def load_joint_states(
                 continue
             read += 1
             try:
-                stamp, positions = decode_joint_state(payload, ros1=channel.encoding == "ros1")
+                stamp, positions = decode_joint_state(bounded(payload), ros1=channel.encoding == "ros1")
             except MalformedMessageError as error:
                 counted[error.reason] += 1
                 continue
@@ -97,57 +95,3 @@ def load_joint_states(
 
 def _is_wanted(channel: Channel, name: str) -> bool:
     return channel.topic.removeprefix("/") == name and channel.type in _TYPES and channel.encoding in ("cdr", "ros1")
-
-
-def decode_joint_state(payload: bytes, ros1: bool) -> tuple[int, dict[str, float]]:
-    """The stamp in ns, and the position of each joint in rad or m, of a ``sensor_msgs/JointState``.
-
-    Raises
-    ------
-    MalformedMessageError
-        If the payload ends too early, or has fewer positions than names.
-    """
-    data = bounded(payload)
-    # CDR counts its alignment from the end of its header; a header of ROS 1 begins with the number of the message.
-    body = data if ros1 else data[4:]
-    order = "<" if ros1 or data[1:2] == b"\1" else ">"
-    size = struct.Struct(f"{order}I")
-    at = 4 if ros1 else 0
-
-    def align(unit: int) -> None:
-        nonlocal at
-        at += 0 if ros1 else -at % unit
-
-    def number() -> int:
-        nonlocal at
-        align(4)
-        (value,) = size.unpack_from(body, at)
-        at += 4
-        return int(value)
-
-    def text() -> str:
-        nonlocal at
-        length = number()
-        part = body[at : at + length]
-        if len(part) < length:
-            raise MalformedMessageError("truncated", f"{len(payload)} bytes end inside of a string")
-        at += length
-        return part.rstrip(b"\0").decode(errors="replace")
-
-    try:
-        seconds, nanoseconds = struct.unpack_from(f"{order}{'I' if ros1 else 'i'}I", body, at)
-        at += 8
-        text()
-        count = number()
-        if count * 4 > min(len(body), MAX_MESSAGE):
-            raise MalformedMessageError("truncated", f"{len(payload)} bytes cannot hold {count} names")
-        names = [text() for _ in range(count)]
-        positions = number()
-        if positions < count:
-            raise MalformedMessageError("positions", f"there are {count} names, and {positions} positions")
-        if positions:
-            align(8)
-        values = struct.unpack_from(f"{order}{count}d", body, at)
-    except struct.error:
-        raise MalformedMessageError("truncated", f"{len(payload)} bytes are too few") from None
-    return seconds * SECOND + nanoseconds, dict(zip(names, values, strict=True))

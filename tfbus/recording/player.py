@@ -63,6 +63,8 @@ class Player:
         empty recording.
     position : int or None
         The log time of the last message that was played, in ns.
+    messages : int
+        Messages that were played.
     played : int
         Samples that were passed to the bus.
     passes : int
@@ -92,28 +94,29 @@ class Player:
         # Wrong ones raise here, and not in `play`.
         Selection(topics, prefix, namespaces)
         self._chosen: dict[str, Any] = {"topics": topics, "prefix": prefix, "namespaces": namespaces}
-        if not is_real(rate):
-            raise TypeError(f"a rate must be a number, not {rate!r}")
-        if not rate > 0:
-            raise ValueError(f"a rate must be greater than zero, got {rate!r}")
+        _check_rate(rate)
         self._since = None if since is None else as_stamp(since)
         self._until = None if until is None else as_stamp(until)
         if self._since is not None and self._until is not None and self._until < self._since:
             raise ValueError(f"the range must not end before it begins, at {since}, got {until}")
         self.bus = bus
         self.path = os.fspath(path)
-        self.rate = float(rate)
+        self._rate = float(rate)
         self.loop = loop
         self.start: int | None = None
         self.end: int | None = None
         self.position: int | None = None
         self.played = 0
+        self.messages = 0
         self.passes = 0
         self.bad: Counter[str] = Counter()
         self._simulated = bus.clock if isinstance(bus.clock, SimulatedClock) else None
         self._playing = False
         self._seek_target: int | None = None
-        self._pause: anyio.CancelScope | None = None
+        self._paused = False
+        self._steps = 0
+        self._waiting: anyio.CancelScope | None = None
+        self._playhead: int | None = None
         self._moving_frames: dict[str, None] = {}
         self._origin = 0
         self._origin_time = 0.0
@@ -149,8 +152,69 @@ class Player:
         The static transforms from before that time are played first.
         """
         self._seek_target = as_stamp(stamp)
-        if self._pause is not None:
-            self._pause.cancel()
+        self._stir()
+
+    @property
+    def rate(self) -> float:
+        """The pace, as a multiple of the recorded one; it may be changed while the recording is played.
+
+        Raises
+        ------
+        TypeError, ValueError
+            On setting, if it is not greater than zero.
+        """
+        return self._rate
+
+    @rate.setter
+    def rate(self, rate: float) -> None:
+        _check_rate(rate)
+        self._anchor()
+        self._rate = float(rate)
+        self._stir()
+
+    @property
+    def paused(self) -> bool:
+        """Whether the player is paused."""
+        return self._paused
+
+    def pause(self) -> None:
+        """Stand still until `resume` or `step`; on a `SimulatedClock`, time stands still as well."""
+        if not self._paused:
+            self._anchor()
+            self._paused = True
+            self._stir()
+
+    def resume(self) -> None:
+        """Go on after a pause."""
+        if self._paused:
+            self._paused = False
+            self._steps = 0
+            self._origin_time = anyio.current_time()
+            self._stir()
+
+    def step(self) -> None:
+        """Pause, and play the next message at once; called again before it is played, one message more."""
+        self.pause()
+        self._steps += 1
+        self._stir()
+
+    def _stir(self) -> None:
+        """Have the wait for the next message look again at what it waits for."""
+        if self._waiting is not None:
+            self._waiting.cancel()
+
+    def _anchor(self) -> None:
+        """Count the pace from this moment on."""
+        if not self._playing or self._paused or self._playhead is None:
+            return
+        now = anyio.current_time()
+        if self._rate != math.inf:
+            passed = from_seconds(min((now - self._origin_time) * self._rate, _MAX_STEP))
+            # Never behind what was played, and never before what is waited for.
+            self._origin = max(self._origin, min(self._origin + passed, self._playhead))
+        else:
+            self._origin = self._playhead
+        self._origin_time = now
 
     def _open(self) -> Recording:
         recording = open_recording(self.path, **self._chosen)
@@ -189,13 +253,18 @@ class Player:
                 if not started:
                     started = True
                     self._begin(message.received if since is None else since)
+                self._playhead = message.received
                 await self._wait_for(message.received)
                 if self._seek_target is not None:
                     return
                 self._publish(message)
+                if self._paused:
+                    # A step was taken.
+                    self._steps = max(0, self._steps - 1)
+                    self._origin = message.received
 
     def _begin(self, stamp: int) -> None:
-        self._origin = stamp
+        self._origin = self._playhead = stamp
         self._origin_time = anyio.current_time()
         if self._simulated is not None:
             if stamp != self._simulated.now():
@@ -212,26 +281,40 @@ class Player:
         if clock is None:
             await self._sleep_until_due(stamp)
             return
-        # In steps, so that timed tasks also run between two messages.
-        longest = from_seconds(min(max(_STEP * self.rate, _MIN_STEP), _MAX_STEP))
         while True:
+            # In steps, so that timed tasks also run between two messages.
+            longest = from_seconds(min(max(_STEP * self.rate, _MIN_STEP), _MAX_STEP))
             step = max(0, min(stamp - clock.now(), longest))
-            if self.rate != math.inf:
+            if self.rate != math.inf or self._paused:
                 await self._sleep_until_due(clock.now() + step)
             if self._seek_target is not None:
                 return
+            if self._paused:
+                # A step of the user goes to the message.
+                step = max(0, stamp - clock.now())
             await clock.advance(to_seconds(step))
             if self._seek_target is not None or clock.now() >= stamp:
                 return
 
     async def _sleep_until_due(self, stamp: int) -> None:
-        due = self._origin_time + to_seconds(stamp - self._origin) / self.rate
-        with anyio.CancelScope() as self._pause:
-            await anyio.sleep_until(due)
-        self._pause = None
+        await anyio.lowlevel.checkpoint()
+        # Only the state counts: a pause may come when the time is over, but this task has not gone on yet.
+        while self._seek_target is None:
+            if self._paused:
+                if self._steps:
+                    return
+                due = math.inf
+            else:
+                due = self._origin_time + to_seconds(stamp - self._origin) / self.rate
+                if due <= anyio.current_time():
+                    return
+            with anyio.CancelScope() as self._waiting:
+                await anyio.sleep_until(due)
+            self._waiting = None
 
     def _publish(self, message: RecordedMessage) -> None:
         self.position = message.received
+        self.messages += 1
         self.bad.update(error.reason for error in message.errors)
         if not message.batch:
             return
@@ -244,3 +327,10 @@ class Player:
                     self._moving_frames.pop(sample.child, None)
                 else:
                     self._moving_frames[sample.child] = None
+
+
+def _check_rate(rate: float) -> None:
+    if not is_real(rate):
+        raise TypeError(f"a rate must be a number, not {rate!r}")
+    if not rate > 0:
+        raise ValueError(f"a rate must be greater than zero, got {rate!r}")

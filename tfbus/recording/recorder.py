@@ -95,6 +95,10 @@ class Recorder:
         self._urgent: anyio.Event
         self._threads: anyio.CapacityLimiter
 
+    def __repr__(self) -> str:
+        state = f", ended early: {self.error}" if self.error is not None else ""
+        return f"<Recorder of {self.path!r}: {self.statistics().samples:,} samples{state}>"
+
     def statistics(self) -> RecorderStatistics:
         """All counters, as they are now."""
         output = self._output

@@ -11,6 +11,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import from_row
 from tfbus.robot._urdf import read_urdf
 from tfbus.robot.joint import Joint, Position, element
+from tfbus.stamps import StampLike
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +91,10 @@ class RobotModel:
         )
         set_field("_names", frozenset(named))
 
+    def __repr__(self) -> str:
+        moving = sum(joint.kind != "fixed" for joint in self.joints)
+        return f"<RobotModel {self.name!r}: {len(self.links)} links below {self.root!r}, {moving} moving joints>"
+
     @classmethod
     def from_urdf(cls, source: str | os.PathLike[str]) -> "RobotModel":
         """Read a URDF file, or its text.
@@ -116,7 +121,7 @@ class RobotModel:
         return cls(name, links, joints)
 
     def transforms(
-        self, positions: Mapping[str, Position], stamp: int, authority: str = "", prefix: str = ""
+        self, positions: Mapping[str, Position], stamp: StampLike, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
         """The transforms of all links, each in its parent.
 
@@ -150,7 +155,7 @@ class RobotModel:
             *self.moving_transforms(positions, stamp, authority, prefix),
         ]
 
-    def fixed_transforms(self, stamp: int, authority: str = "", prefix: str = "") -> list[TransformStamped]:
+    def fixed_transforms(self, stamp: StampLike, authority: str = "", prefix: str = "") -> list[TransformStamped]:
         """The static ones of `transforms`."""
         return [
             TransformStamped(prefix + joint.parent, prefix + joint.child, stamp, joint.origin, authority, static=True)
@@ -158,7 +163,7 @@ class RobotModel:
         ]
 
     def moving_transforms(
-        self, positions: Mapping[str, Position], stamp: int, authority: str = "", prefix: str = ""
+        self, positions: Mapping[str, Position], stamp: StampLike, authority: str = "", prefix: str = ""
     ) -> list[TransformStamped]:
         """The moving ones of `transforms`."""
         return [

@@ -13,6 +13,7 @@ from tfbus.bus.once_logger import OnceLogger
 from tfbus.frames import as_prefix
 from tfbus.robot.joint import Position
 from tfbus.robot.model import RobotModel
+from tfbus.stamps import StampLike
 from tfbus.statistics import RobotStatistics
 
 
@@ -63,7 +64,7 @@ class RobotStatePublisher:
         self._log = OnceLogger(logging.getLogger("tfbus"))
         bus.publish(model.fixed_transforms(bus.clock.now(), authority, prefix), invalid)
 
-    def publish(self, positions: Mapping[str, Position], stamp: int | None = None) -> None:
+    def publish(self, positions: Mapping[str, Position], stamp: StampLike | None = None) -> None:
         """Publish the transforms of the moving joints as one batch.
 
         Joints without a position of their own or of the joint that they mimic are left out. Unknown joints, and
@@ -94,7 +95,10 @@ class RobotStatePublisher:
             self._log.warning(("limits", violation.joint), "robot %r, %s", self.model.name, violation)
 
     def publish_state(
-        self, names: Sequence[str], positions: Sequence[float] | npt.NDArray[np.floating], stamp: int | None = None
+        self,
+        names: Sequence[str],
+        positions: Sequence[float] | npt.NDArray[np.floating],
+        stamp: StampLike | None = None,
     ) -> None:
         """Publish as `publish` does, with parallel sequences as in a ``JointState`` of ROS.
 

@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus.plain import PlainData
 from tfbus.stamps import LATEST, Latest, format_age, format_duration, format_stamp, to_seconds
 from tfbus.tree.extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import AT_A_TIME, Forest
@@ -21,7 +22,7 @@ from tfbus.tree.rendering import format_rate
 
 
 @dataclass(frozen=True, slots=True)
-class ExplainedEdge:
+class ExplainedEdge(PlainData):
     """The contribution of one edge to an answer.
 
     Attributes
@@ -63,7 +64,7 @@ class ExplainedEdge:
 
 
 @dataclass(frozen=True, slots=True)
-class Explanation:
+class Explanation(PlainData):
     """The path and the samples behind an answer, or the errors that block it. ``str`` gives a text of several lines.
 
     Attributes

@@ -13,7 +13,7 @@ from tfbus.errors import (
 )
 from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
-from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_stamp
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, AtLike, Latest, StampLike, as_at, as_stamp
 from tfbus.tree.extrapolation import Extrapolation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
@@ -35,7 +35,7 @@ class Bounds(NamedTuple):
     not_after: int
 
 
-def bounds_of(not_before: int | None, not_after: int | None) -> Bounds | None:
+def bounds_of(not_before: StampLike | None, not_after: StampLike | None) -> Bounds | None:
     """The bounds that two arguments make; None if they allow every stamp.
 
     Raises
@@ -55,8 +55,8 @@ def answer(
     forest: Forest,
     target: str,
     source: str,
-    at: At,
-    source_at: At | None,
+    at: AtLike,
+    source_at: AtLike | None,
     fixed: str | None,
     bounds: Bounds | None,
     policy: Policy | None,
@@ -183,8 +183,8 @@ def find_in_time_travel(
     forest: Forest,
     target: str,
     source: str,
-    at: At,
-    source_at: At | None,
+    at: AtLike,
+    source_at: AtLike | None,
     fixed: str | None,
     bounds: Bounds | None,
     extrapolation: Extrapolation | None = None,
@@ -194,6 +194,7 @@ def find_in_time_travel(
         raise TypeError(GO_TOGETHER)
     if source_at is not LATEST:
         source_at = as_stamp(source_at)
+    at = as_at(at)
     for name in (target, source, fixed):
         forest.check_known(name)
     try:

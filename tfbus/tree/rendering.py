@@ -32,6 +32,11 @@ def describe(edges: Sequence[Edge], now: int | None = None) -> str:
     )
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things in words: ``1 frame``, ``1,000 frames``."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def facts(edge: Edge, now: int) -> dict[str, str]:
     """The rate, age, span and authority of an edge as texts, as far as the edge has them."""
     known = {"rate": _rate(edge)}

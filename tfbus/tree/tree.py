@@ -6,17 +6,28 @@
 import math
 from collections.abc import Iterable
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
 from tfbus.data import PointCloud, TwistStamped
 from tfbus.errors import TransformLookupError
 from tfbus.geometry.bounds import MAX_TRANSLATION, as_max_translation, check_translations
 from tfbus.geometry.stamped import TransformStamped, as_batch
-from tfbus.geometry.transform_array import TransformArray
-from tfbus.stamps import LATEST, Latest, StampLike, Stamps, as_duration, as_stamp, as_stamps, from_seconds
+from tfbus.geometry.transform_array import TransformArray, with_stamps
+from tfbus.stamps import (
+    LATEST,
+    AtLike,
+    Latest,
+    StampLike,
+    Stamps,
+    StampsLike,
+    as_duration,
+    as_stamp,
+    as_stamps,
+    format_stamp,
+    from_seconds,
+)
 from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree._saved_frames import SavedFrame, samples_of, save_frame
 from tfbus.tree._velocity import twist
@@ -24,9 +35,9 @@ from tfbus.tree.explanation import Explanation, explain
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome
 from tfbus.tree.html import legend, to_html
-from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, At, answer, bounds_of
+from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, answer, bounds_of
 from tfbus.tree.policy import Hold, policy_of
-from tfbus.tree.rendering import describe, to_dot, to_yaml
+from tfbus.tree.rendering import counted, describe, to_dot, to_yaml
 
 
 class TransformTree:
@@ -126,12 +137,12 @@ class TransformTree:
         self,
         target: str,
         source: str,
-        at: At = LATEST,
+        at: AtLike = LATEST,
         *,
-        source_at: At | None = None,
+        source_at: AtLike | None = None,
         fixed: str | None = None,
-        not_before: int | None = None,
-        not_after: int | None = None,
+        not_before: StampLike | None = None,
+        not_after: StampLike | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -202,7 +213,7 @@ class TransformTree:
         bounds = bounds_of(not_before, not_after)
         return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
-    def can_transform(self, target: str, source: str, at: At = LATEST, **question: Any) -> bool:
+    def can_transform(self, target: str, source: str, at: AtLike = LATEST, **question: Any) -> bool:
         """Whether `lookup` with the same arguments has an answer now."""
         try:
             self.lookup(target, source, at, **question)
@@ -214,10 +225,10 @@ class TransformTree:
         self,
         target: str,
         source: str,
-        at: At = LATEST,
+        at: AtLike = LATEST,
         *,
-        not_before: int | None = None,
-        not_after: int | None = None,
+        not_before: StampLike | None = None,
+        not_after: StampLike | None = None,
         tolerance: float = 0.0,
         max_gap: float | None = None,
         extrapolate: Hold | None = None,
@@ -249,9 +260,9 @@ class TransformTree:
         self,
         target: str,
         source: str,
-        stamps: npt.ArrayLike,
+        stamps: StampsLike,
         *,
-        source_at: npt.ArrayLike | None = None,
+        source_at: StampLike | StampsLike | None = None,
         fixed: str | None = None,
         out_of_range: OutOfRange = "raise",
         tolerance: float = 0.0,
@@ -277,8 +288,8 @@ class TransformTree:
         Returns
         -------
         TransformArray
-            One transform for each stamp, in the order of `stamps`. With a policy, its `extrapolated_by` and `gap` say
-            how far each answer departs from its stamp.
+            One transform for each stamp, in the order of `stamps`, which it has as its own `stamps`. With a policy, its
+            `extrapolated_by` and `gap` say how far each answer departs from its stamp.
 
         Raises
         ------
@@ -297,7 +308,8 @@ class TransformTree:
             raise TypeError(GO_TOGETHER)
         source_stamps = None if source_at is None else _as_many(source_at, len(asked))
         policy = policy_of(tolerance, max_gap, extrapolate)
-        return lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
+        found = lookup_many(self._forest, target, source, asked, source_stamps, fixed, out_of_range, policy)
+        return with_stamps(found, asked)
 
     def deskew(self, cloud: PointCloud, target: str, fixed: str, *, out_of_range: OutOfRange = "raise") -> PointCloud:
         """A cloud from a moving sensor, corrected as if all points had been seen at the stamp of the cloud.
@@ -331,7 +343,9 @@ class TransformTree:
         """
         return deskew(self._forest, cloud, target, fixed, out_of_range)
 
-    def twist(self, frame: str, reference: str, at: At = LATEST, *, expressed_in: str | None = None) -> TwistStamped:
+    def twist(
+        self, frame: str, reference: str, at: AtLike = LATEST, *, expressed_in: str | None = None
+    ) -> TwistStamped:
         """The velocity of `frame` in `reference`: the derivative of the interpolation of `lookup`.
 
         Parameters
@@ -387,7 +401,7 @@ class TransformTree:
             path = self._forest.find_path(target, source, LATEST)
             return path.newest_common()[0] if path.moving else None
 
-    def chain(self, target: str, source: str, at: At = LATEST) -> list[str]:
+    def chain(self, target: str, source: str, at: AtLike = LATEST) -> list[str]:
         """The frames on the path, from target to source, both included.
 
         Raises
@@ -406,7 +420,7 @@ class TransformTree:
         """Every frame that a sample in the tree names, sorted."""
         return list(self._forest.known_frames())
 
-    def parent(self, frame: str, at: At = LATEST) -> str | None:
+    def parent(self, frame: str, at: AtLike = LATEST) -> str | None:
         """The frame's parent: at a stamp, or the newest one. None for a root.
 
         Raises
@@ -543,6 +557,13 @@ class TransformTree:
         """The tree as YAML with tf2's keys; stamps in s."""
         return to_yaml(self.edges())
 
+    def __repr__(self) -> str:
+        edges = self.edges()
+        stamps = [stamp for edge in edges for stamp in (edge.oldest, edge.newest) if stamp is not None]
+        span = f", {format_stamp(min(stamps))} to {format_stamp(max(stamps))}" if stamps else ""
+        samples = counted(sum(edge.samples for edge in edges), "sample")
+        return f"<TransformTree of {counted(len(self.frames()), 'frame')}, {samples}{span}>"
+
     def _repr_html_(self) -> str:
         """The tree as notebooks show it, with ages counted from the newest stamp in it."""
         edges = self.edges()
@@ -578,11 +599,11 @@ def window_of(keep: float | None) -> int | None:
     return None if seconds is None or seconds == math.inf else from_seconds(seconds)
 
 
-def _as_many(source_at: npt.ArrayLike, count: int) -> Stamps:
+def _as_many(source_at: StampLike | StampsLike, count: int) -> Stamps:
     """An array of `count` stamps, made of one stamp for all or of one each."""
-    if np.ndim(source_at) == 0:
+    if np.ndim(cast(Any, source_at)) == 0:
         return np.full(count, as_stamp(source_at))
-    stamps = as_stamps(source_at)
+    stamps = as_stamps(cast(Any, source_at))
     if len(stamps) != count:
         raise ValueError(f"source_at must be one stamp, or have shape ({count},) as stamps has, got {stamps.shape}")
     return stamps

@@ -249,3 +249,11 @@ def test_a_misspelt_joint_is_suggested_by_any_word_of_its_name(
 def test_a_joint_like_none_is_not_suggested(tfbus: Command) -> None:
     done = tfbus("robot", ARM, "gripper=1")
     assert done.stderr == "tfbus: 'arm' has no joint 'gripper'\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [(("--follow",), "give --ros"), (("shoulder=1", "--follow", "--ros", "dds"), "give none")],
+)
+def test_following_needs_ros_and_no_positions(tfbus: Command, words: tuple[str, ...], why: str) -> None:
+    check_wrong_call(tfbus("robot", "arm.urdf", *words), why)

@@ -20,7 +20,7 @@ from tfbus.links.dds._carrier import _MOVING, _STATIC, DdsCarrier, _nodes_of
 from tfbus.links.dds._domains import configuration, domain
 from tfbus.links.dds._types import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo, RawTFMessage
 from tfbus.links.ros._carrier import RosMessage
-from tfbus.links.ros._settings import settings_of
+from tfbus.links.ros.settings import settings_of
 from tfbus.tf_message import encode
 
 AS_A_CARRIER: type[Carrier] = DdsCarrier

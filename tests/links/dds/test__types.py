@@ -1,6 +1,7 @@
 from typing import Any
 
 import pytest
+from support.joint_messages import joint_state
 from support.samples import moving, static
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
@@ -8,6 +9,7 @@ pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 from tfbus.links.dds._types import (
     Header,
     Quaternion,
+    RawJointState,
     RawTFMessage,
     Time,
     Transform,
@@ -38,3 +40,12 @@ def test_a_message_keeps_its_bytes() -> None:
     assert message.serialize() == payload
     assert decode(message.payload).samples == [moving("map", "base", 5)]
     assert RawTFMessage.deserialize_key(b"").serialize() == b""
+
+
+def test_positions_of_joints_come_as_the_bytes_that_rosbags_reads() -> None:
+    payload = joint_state(5, {"a": 0.5, "b": 1.5})
+    declared: Any = RawJointState.__idl__
+    read = declared.deserialize(payload)
+    assert (read.name, read.position) == (["a", "b"], [0.5, 1.5])
+    assert RawJointState.deserialize(payload).payload == payload
+    assert RawJointState.deserialize_key(b"").payload == b""

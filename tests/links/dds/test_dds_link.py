@@ -8,8 +8,13 @@ from support.wires import latched
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
-from tfbus import Bus, PeerJoined, PeerLost
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+
+from tfbus import Bus, PeerJoined, PeerLost, SimulatedClock
 from tfbus.links.dds import DdsLink
+from tfbus.links.dds._types import Header, RawClock, RawJointState, Time
 
 pytestmark = pytest.mark.anyio
 
@@ -67,6 +72,42 @@ async def test_several_topics_are_heard_and_the_first_is_spoken_to(domain_number
             near.publish([moving("map", "near", 1), static("map", "lidar")])
             await until(lambda: there.statistics().received_samples == 2)
             assert here.statistics().received_samples == 0
+
+
+@pytest.mark.thorough
+async def test_positions_of_joints_go_to_who_takes_them(domain_number: int) -> None:
+    make: Any = RawJointState
+    stamp: Any = Time(0, 5)
+    state = make(Header(stamp, ""), ["a", "b"], [0.5, 1.5], [], [])
+    taken: list[Any] = []
+    with Bus() as bus:
+        async with DdsLink(bus, domain_number, joint_states=lambda *state: taken.append(state)):
+            participant = DomainParticipant(domain_number)
+            writer = DataWriter(participant, Topic(participant, "rt/joint_states", RawJointState))
+            with anyio.fail_after(20):
+                while not taken:
+                    writer.write(state)
+                    await anyio.sleep(0.05)
+            writer.__del__()
+            participant.__del__()
+    assert taken[0] == ({"a": 0.5, "b": 1.5}, 5)
+
+
+@pytest.mark.thorough
+async def test_a_simulated_clock_follows_the_time_of_ros(domain_number: int) -> None:
+    make: Any = RawClock
+    stamp: Any = Time(100, 5)
+    clock = SimulatedClock()
+    with Bus(clock) as bus:
+        async with DdsLink(bus, domain_number, clock=clock):
+            participant = DomainParticipant(domain_number)
+            writer = DataWriter(participant, Topic(participant, "rt/clock", RawClock))
+            with anyio.fail_after(20):
+                while clock.now() != 100_000_000_005:
+                    writer.write(make(stamp))
+                    await anyio.sleep(0.05)
+            writer.__del__()
+            participant.__del__()
 
 
 @pytest.mark.parametrize(

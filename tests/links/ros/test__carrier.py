@@ -1,11 +1,15 @@
+from collections.abc import Mapping
+
 import anyio
+from support.joint_messages import joint_state
 from support.ros import ListCarrier, RosEnd, named
 from support.samples import moving, static
 
 from tfbus import PeerRejected
 from tfbus.links._carrier import Carrier, SendReport
-from tfbus.links.ros._carrier import MOST_TRANSFORMS
-from tfbus.links.ros._settings import settings_of
+from tfbus.links._receive_queue import Received
+from tfbus.links.ros._carrier import MOST_TRANSFORMS, RosMessage
+from tfbus.links.ros.settings import settings_of
 from tfbus.tf_message import encode
 
 AS_A_CARRIER: type[Carrier] = ListCarrier
@@ -197,3 +201,19 @@ def test_no_cut_message_is_published_or_raises() -> None:
         end.hear_bytes(whole[:size])
     assert end.heard == []
     assert sum(end.endpoint.peers.rejected.values()) == len(whole) - 8
+
+
+def test_positions_of_joints_are_handed_on_and_what_comes_of_that_is_counted() -> None:
+    taken: list[tuple[Mapping[str, float], int]] = []
+
+    def take(positions: Mapping[str, float], stamp: int) -> None:
+        taken.append((positions, stamp))
+        if "broken" in positions:
+            raise ValueError(positions)
+
+    end = RosEnd(joint_states=take)
+    for payload in (joint_state(5, {"a": 0.5, "b": 1.5}), b"garbage", joint_state(6, {"broken": 1.0})):
+        end.endpoint.handle(Received("peer", RosMessage(payload, static=False, authority="", joints=True)))
+    assert taken == [({"a": 0.5, "b": 1.5}, 5), ({"broken": 1.0}, 6)]
+    assert end.endpoint.peers.rejected == {"truncated": 1, "not published": 1}
+    assert end.heard == []

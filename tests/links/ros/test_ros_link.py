@@ -1,9 +1,11 @@
+import struct
+
 import pytest
 from support.processes import until
 from support.ros import ListCarrier
 from support.samples import moving, static
 
-from tfbus import Bus
+from tfbus import Bus, SimulatedClock, from_seconds
 from tfbus.links._receive_queue import Received
 from tfbus.links.ros import RosLink, RosOptions
 from tfbus.links.ros._carrier import RosMessage
@@ -29,6 +31,26 @@ async def test_a_link_to_ros_passes_on_both_ways_what_its_options_let_through() 
     assert heard[1:] == [(moving("map", "base", 9, authority="/n"),)]
     assert link.statistics().rejected == {"too many frames": 1}
     assert carrier.closed
+
+
+async def test_a_simulated_clock_follows_the_time_of_ros_and_one_jump_back_is_one_reset() -> None:
+    clock = SimulatedClock()
+    options: RosOptions = {"clock": clock}
+    carrier = ListCarrier(options)
+
+    def tell(second: int) -> None:
+        payload = b"\0\1\0\0" + struct.pack("<iI", second, 5)
+        carrier._receive(
+            Received("clock", RosMessage(payload, static=False, authority="", clock=True), 12, moving=True)
+        )
+
+    with Bus(clock) as bus:
+        async with RosLink(bus, "ros", carrier, **options) as link:
+            for second in (100, 101, 50, 51):
+                tell(second)
+                await until(lambda second=second: clock.now() == from_seconds(second) + 5)  # type: ignore[misc]
+            assert bus.statistics().clock_resets == 1
+            assert link.statistics().rejected == {}
 
 
 def test_numbers_of_a_link_to_ros_are_checked() -> None:

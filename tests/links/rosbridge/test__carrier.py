@@ -8,7 +8,7 @@ from support.rosbridge import rosbridge_server
 
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.ros._settings import settings_of
+from tfbus.links.ros.settings import settings_of
 from tfbus.links.rosbridge import _carrier
 from tfbus.links.rosbridge._carrier import RosbridgeCarrier
 

@@ -1,9 +1,11 @@
 import json
+import struct
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.joint_messages import KIND, TYPES, joint_state
 from support.ros import ros1, ros1_of
 from support.samples import moving, static
 
@@ -11,7 +13,16 @@ pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
 import cbor2
 
-from tfbus.links.rosbridge._protocol import advertise, decode_content, publish, read, subscribe, unsubscribe
+from tfbus.links.rosbridge._protocol import (
+    JOINT_TYPE,
+    advertise,
+    decode_content,
+    decode_joints,
+    publish,
+    read,
+    subscribe,
+    unsubscribe,
+)
 from tfbus.tf_message import MalformedMessageError, encode
 
 
@@ -85,3 +96,26 @@ def test_garbage_is_a_message_or_malformed(garbage: str | bytes) -> None:
         decode_content(incoming.content)
     except MalformedMessageError:
         return
+
+
+def test_positions_of_joints_are_read_in_every_encoding() -> None:
+    cdr = joint_state(5, {"a": 0.5, "b": 1.5})
+    fields: dict[str, Any] = {"header": {"stamp": {"secs": 0, "nsecs": 5}}, "name": ["a", "b"], "position": [0.5, 1.5]}
+    tagged = {**fields, "position": cbor2.CBORTag(86, struct.pack("<2d", 0.5, 1.5))}
+    ros1 = bytes(TYPES.cdr_to_ros1(cdr, KIND))
+    numbered = struct.pack("<I", 256) + ros1[4:]
+    for content in (cdr, ros1, numbered, fields, cbor2.loads(cbor2.dumps(tagged))):
+        assert decode_joints(content) == (5, {"a": 0.5, "b": 1.5})
+    assert json.loads(subscribe("/j", "cbor", JOINT_TYPE))["type"] == "sensor_msgs/JointState"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [None, {}, {"header": {"stamp": {"sec": 1}}}, b"", {"name": 5}, {"header": {}, "name": [], "position": []}],
+)
+def test_what_holds_no_positions_is_malformed(content: Any) -> None:
+    with pytest.raises(MalformedMessageError):
+        decode_joints(content)
+    few = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": []}
+    with pytest.raises(MalformedMessageError, match="1 names, and 0 positions"):
+        decode_joints(few)

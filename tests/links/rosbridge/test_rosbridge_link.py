@@ -11,7 +11,7 @@ from support.rosbridge import rosbridge_server
 from support.samples import moving, static
 from support.wires import latched
 
-from tfbus import Buffer, Bus, PeerJoined, PeerLost
+from tfbus import Buffer, Bus, PeerJoined, PeerLost, SimulatedClock
 from tfbus.links.rosbridge import RosbridgeLink
 
 pytestmark = pytest.mark.anyio
@@ -143,6 +143,28 @@ async def test_a_link_that_only_listens_announces_nothing() -> None:
                 await until(lambda: len(server.requests) == 2)
         assert server.operations("subscribe") == ["/r/tf_static", "/r/tf"]
         assert len(server.requests) == 2
+
+
+async def test_positions_of_joints_go_to_who_takes_them() -> None:
+    async with rosbridge_server() as server:
+        taken: list[Any] = []
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url, joint_states=lambda *state: taken.append(state)):
+                await until(lambda: "/joint_states" in server.operations("subscribe"))
+                message = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": [0.5]}
+                await server.say_anything(json.dumps({"op": "publish", "topic": "/joint_states", "msg": message}))
+                await until(lambda: taken == [({"a": 0.5}, 5)])
+
+
+async def test_a_simulated_clock_follows_the_time_of_ros() -> None:
+    async with rosbridge_server() as server:
+        clock = SimulatedClock()
+        with Bus(clock) as bus:
+            async with RosbridgeLink(bus, server.url, clock=clock):
+                await until(lambda: "/clock" in server.operations("subscribe"))
+                message = {"clock": {"secs": 100, "nsecs": 5}}
+                await server.say_anything(json.dumps({"op": "publish", "topic": "/clock", "msg": message}))
+                await until(lambda: clock.now() == 100_000_000_005)
 
 
 async def test_what_was_published_before_the_end_still_goes_out() -> None:

@@ -23,9 +23,9 @@ def bridge(
 ) -> None:
     """Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.
 
-    Each of them is ROS or a domain of tfbus: dds, dds:42 for ROS 2 with ROS_DOMAIN_ID 42, ws://host:9090 for a
-    rosbridge server of ROS 1 or ROS 2, or the name of a domain; domain:dds is a domain of that name. Several bridges
-    in a ring pass each sample on once.
+    Each of them is ROS or a domain of tfbus: dds, dds:42 for ROS 2 with ROS_DOMAIN_ID 42, zenoh:host:7447 for a router
+    of rmw_zenoh, ws://host:9090 for a rosbridge server of ROS 1 or ROS 2, or the name of a domain; domain:dds is a
+    domain of that name. Several bridges in a ring pass each sample on once.
 
     Example: tfbus bridge tf dds
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -30,6 +30,7 @@ def convert(
     drop_static: Flag = False,
     static_to_yaml: Annotated[Path | None, Parameter(show_default=False)] = None,
     overwrite: Flag = False,
+    schema: Literal["ros", "foxglove"] = "ros",
 ) -> None:
     """Write recordings to a new one: in another format, a part of them, renamed, or several merged by their log times.
 
@@ -63,6 +64,8 @@ def convert(
         Write the last static transform of each frame to this file.
     overwrite
         Replace the new file if it exists.
+    schema
+        The schema of transforms: ROS' TFMessage, or Foxglove's FrameTransforms in Protocol Buffers, for .mcap only.
     """
     *inputs, output = (source, *further)
     if not inputs:
@@ -83,6 +86,7 @@ def convert(
                 topics=topics or None,
                 edits=edits,
                 overwrite=overwrite,
+                schema=schema,
                 progress=advance,
             )
     except FileExistsError:

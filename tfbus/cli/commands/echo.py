@@ -9,12 +9,13 @@ from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli._width import cells, terminal_width, wrapped
 from tfbus.cli.arguments import Duration, JsonFlag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
 from tfbus.cli.output import format_seconds, print_now, say
 from tfbus.clock import Clock, SystemClock
-from tfbus.errors import MAY_COME, InvalidTransformError, TransformLookupError
+from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import format_duration, to_seconds
@@ -80,7 +81,7 @@ def echo(
     if remote:
         link.run_remote(print_remote)
     else:
-        link.run(print_transforms)
+        link.run(print_transforms, clock=ReplayClock())
 
 
 async def _print_from(
@@ -102,6 +103,9 @@ async def _print_from(
             if cause != reported:
                 say(f"waiting for {source!r} in {target!r}: {missing}")
                 reported = cause
+        except ClockResetError:
+            # A replay has begun, or has begun again.
+            continue
         else:
             reported = None
             print_now(show(transform, clock.now()))

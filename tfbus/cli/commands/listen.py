@@ -3,6 +3,7 @@
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.cli import tutorial
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import fitted, print_now
@@ -26,4 +27,4 @@ def listen(*, rate: Rate = 1.0, link: LinkOptions = DEFAULT_LINK) -> None:
             await link.first_transform(bus)
             await tutorial.listen(buffer, rate, output=lambda line: print_now(fitted(line)))
 
-    link.run(print_points)
+    link.run(print_points, clock=ReplayClock())

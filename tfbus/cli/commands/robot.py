@@ -3,11 +3,13 @@
 import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack
 from pathlib import Path
 
 import anyio
 
 from tfbus.bus.bus import Bus
+from tfbus.cli._ros import ros_link
 from tfbus.cli._static_frames import publish_static
 from tfbus.cli._table import Column, table_lines
 from tfbus.cli._width import cells, narrow_guides, shorten, terminal_width
@@ -19,6 +21,7 @@ from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
 from tfbus.geometry.transform import Transform
 from tfbus.robot.joint import Joint, Position
 from tfbus.robot.model import RobotModel
+from tfbus.robot.state_publisher import RobotStatePublisher
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import Branch, branches
 
@@ -35,6 +38,7 @@ def robot(
     /,
     *position: str,
     tree: Flag = False,
+    follow: Flag = False,
     rate: Rate = 10.0,
     prefix: str = "",
     link: LinkOptions = DEFAULT_LINK,
@@ -56,6 +60,8 @@ def robot(
         x,y,z,qx,qy,qz,qw.
     tree
         Print the tree of frames with joints and positions, and exit.
+    follow
+        Take the positions from /joint_states of ROS, with --ros, as they come.
     rate
         How often moving joints are published, in Hz.
     prefix
@@ -63,6 +69,10 @@ def robot(
     """
     if "=" in file.name and not file.exists():
         raise UsageError(f"the URDF comes first: tfbus robot FILE {file}")
+    if follow and not link.ros:
+        raise UsageError("--follow takes positions from ROS: give --ros, such as --ros dds")
+    if follow and position:
+        raise UsageError("--follow takes positions from ROS: give none")
     model = _read_model(file)
     positions = {**model.zeros(), **_parse_positions(model, position)}
     try:
@@ -85,7 +95,17 @@ def robot(
             async for _ in bus.clock.ticks(rate):
                 bus.publish(model.moving_transforms(positions, bus.clock.now(), AUTHORITY, prefix), invalid="drop")
 
-    link.run(publish)
+    async def follow_ros(bus: Bus) -> None:
+        publisher = RobotStatePublisher(bus, model, prefix, AUTHORITY, invalid="drop")
+        say(f"publishing the frames of {model.name!r} as /joint_states of {link.place} says, until Ctrl-C")
+        async with AsyncExitStack() as stack:
+            for place in link.ros:
+                # A link for the positions only: the frames pass by the others.
+                positions_only = ros_link(bus, place, send=False, frames=(), joint_states=publisher.publish)
+                await stack.enter_async_context(positions_only)
+            await anyio.sleep_forever()
+
+    link.run(follow_ros if follow else publish)
 
 
 def tree_lines(

@@ -12,6 +12,7 @@ from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.bus.delays import Delays
 from tfbus.cli._graphviz import draw
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import print_now, printable, say, write_file
@@ -103,7 +104,7 @@ def tree(
                 for remark in remarks(buffer.tree.edges()):
                     say(remark)
 
-    link.run(show_tree)
+    link.run(show_tree, clock=ReplayClock())
 
 
 async def _listen_for_a_period(bus: Bus, tree: TransformTree) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from threading import Lock, Thread
-from typing import Any
+from typing import Any, Literal
 
 import anyio
 import anyio.to_thread
@@ -21,13 +21,15 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds._domains import domain
 from tfbus.links.dds._publishers import PATIENCE, Publishers
-from tfbus.links.dds._types import ParticipantEntitiesInfo, RawTFMessage
+from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawTFMessage
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
-from tfbus.links.ros._settings import RosSettings
+from tfbus.links.ros.settings import RosSettings
 from tfbus.tf_message import encode
 
 _CLOSING_TIME = 1.0
 _DEPTH = 100
+_OTHERS = "other topics"
+"""Whoever positions of joints and the time come from."""
 _AT_ONCE = 100
 # A writer never waits for a reader that is frozen: the event loop would.
 _RELIABLE = (
@@ -39,6 +41,8 @@ _MOVING = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(_D
 _STATIC = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
 # Each publisher has its own last message.
 _STATICS = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(_DEPTH))
+# Drivers of joints and simulations may be best effort.
+_ANY = Qos(Policy.Reliability.BestEffort, Policy.IgnoreLocal.Participant, Policy.History.KeepLast(_DEPTH))
 
 
 class DdsCarrier(RosCarrier):
@@ -86,6 +90,12 @@ class DdsCarrier(RosCarrier):
             if self.settings.authority is None:
                 info = Topic(participant, "ros_discovery_info", ParticipantEntitiesInfo)
                 self._read(participant, info, _STATICS, self._take_nodes, None)
+            for name in self.settings.joint_topic:
+                joints = Topic(participant, f"rt{name}", RawJointState)
+                self._read(participant, joints, _ANY, partial(self._take_other, "joints"), None)
+            for name in self.settings.clock_topic:
+                clock = Topic(participant, f"rt{name}", RawClock)
+                self._read(participant, clock, _ANY, partial(self._take_other, "clock"), None)
             for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
                 static = number < len(self.settings.tf_static)
                 self._read(
@@ -170,6 +180,14 @@ class DdsCarrier(RosCarrier):
         for message in messages:
             if not isinstance(message, InvalidSample):
                 self._publishers.nodes(*_nodes_of(message))
+
+    def _take_other(self, kind: Literal["joints", "clock"], reader: DataReader[Any]) -> None:
+        messages: list[Any] = reader.take(N=_AT_ONCE)
+        for message in messages:
+            if not isinstance(message, InvalidSample):
+                joints, clock = kind == "joints", kind == "clock"
+                content = RosMessage(message.payload, static=False, authority="", joints=joints, clock=clock)
+                self._receive(Received(_OTHERS, content, len(message.payload), moving=True))
 
     def _match(self, number: int, reader: DataReader[RawTFMessage]) -> None:
         with self._lock:

@@ -1,7 +1,7 @@
 """The types of ROS 2 that go over DDS, by the names that ROS 2 gives them.
 
-A ``TFMessage`` stays bytes: `tfbus.tf_message` reads and writes them many times faster than the library does. What is
-declared here is what DDS tells others of the type.
+What links send and hear stays bytes: `tfbus.tf_message` reads and writes them many times faster than the library does.
+What is declared here is what DDS tells others of the type.
 """
 
 from dataclasses import dataclass
@@ -91,6 +91,50 @@ class RawTFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
     def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
         """What comes of a writer that has gone."""
         return cls.of(b"")
+
+
+@dataclass
+class RawJointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
+    """``sensor_msgs/msg/JointState``, which becomes its bytes when it comes."""
+
+    header: Header
+    name: sequence[str]
+    position: sequence[float64]
+    velocity: sequence[float64]
+    effort: sequence[float64]
+    payload = b""
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
+        """The message of the bytes that have come."""
+        message = cls.__new__(cls)
+        message.payload = bytes(data)
+        return message
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
+        """What comes of a writer that has gone."""
+        return cls.deserialize(b"")
+
+
+@dataclass
+class RawClock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
+    """``rosgraph_msgs/msg/Clock``, which becomes its bytes when it comes."""
+
+    clock: Time
+    payload = b""
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
+        """The message of the bytes that have come."""
+        message = cls.__new__(cls)
+        message.payload = bytes(data)
+        return message
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
+        """What comes of a writer that has gone."""
+        return cls.deserialize(b"")
 
 
 @dataclass

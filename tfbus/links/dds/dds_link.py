@@ -7,10 +7,8 @@ from typing import Unpack, get_args
 from tfbus.bus.bus import Bus
 from tfbus.links.dds._carrier import DdsCarrier
 from tfbus.links.dds._domains import Discovery, configuration
-from tfbus.links.ros._settings import RosOptions, settings_of
 from tfbus.links.ros.ros_link import RosLink
-
-_LAST_DOMAIN = 232
+from tfbus.links.ros.settings import RosOptions, as_domain, settings_of
 
 
 class DdsLink(RosLink):
@@ -74,25 +72,12 @@ class DdsLink(RosLink):
     ) -> None:
         if isinstance(peers, str):
             raise TypeError(f"peers must be several machines, not {peers!r}")
-        self.domain = _as_domain(domain)
+        self.domain = as_domain(domain)
         config = config or os.environ.get("CYCLONEDDS_URI") or None
         carrier = DdsCarrier(
             self.domain, configuration(_as_discovery(discovery), tuple(peers), config), settings_of(options)
         )
         super().__init__(bus, carrier.id, carrier, **options)
-
-
-def _as_domain(domain: int | None) -> int:
-    if domain is None:
-        text = os.environ.get("ROS_DOMAIN_ID") or "0"
-        if not text.isdecimal():
-            raise ValueError(f"the variable ROS_DOMAIN_ID must be a number, got {text!r}")
-        domain = int(text)
-    if isinstance(domain, bool) or not isinstance(domain, int):
-        raise TypeError(f"a DDS domain must be an int, not {domain!r}")
-    if not 0 <= domain <= _LAST_DOMAIN:
-        raise ValueError(f"a DDS domain must be from 0 to {_LAST_DOMAIN}, got {domain}")
-    return domain
 
 
 def _as_discovery(discovery: Discovery | None) -> Discovery:

@@ -3,7 +3,7 @@
 `RosLink` is the base of the links that `tfbus.links.dds`, `tfbus.links.rosbridge` and `tfbus.links.rmw_zenoh` give.
 """
 
-from tfbus.links.ros._settings import RosOptions
 from tfbus.links.ros.ros_link import RosLink
+from tfbus.links.ros.settings import RosOptions
 
 __all__ = ["RosLink", "RosOptions"]

@@ -17,7 +17,9 @@ from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._outbox import Turn
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Received
-from tfbus.links.ros._settings import RosSettings
+from tfbus.links.ros._clock_message import decode_clock
+from tfbus.links.ros.settings import RosSettings
+from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, decode, refusal
 
 MOST_TRANSFORMS = 1_000
@@ -36,11 +38,15 @@ class RosMessage:
         Whether the topic is one of static frames.
     authority : str
         The node that has published it, or what is known of it.
+    joints, clock : bool
+        Whether it has positions of joints, or the time, rather than transforms.
     """
 
     payload: Any
     static: bool
     authority: str
+    joints: bool = False
+    clock: bool = False
 
 
 class RosCarrier:
@@ -90,7 +96,14 @@ class RosCarrier:
             self._put(list(self._statics.values()), static=True)
 
     def read(self, content: RosMessage) -> ReceivedMessage:
-        """The samples of a message, without leading slashes, with their names on the bus."""
+        """The samples of a message by their names on the bus, or the time; positions of joints are handed on."""
+        if content.clock:
+            return ReceivedMessage([], time=decode_clock(content.payload))
+        if content.joints:
+            stamp, positions = self._decode_joints(content.payload)
+            if self.settings.joint_states is not None:
+                self.settings.joint_states(positions, stamp)
+            return ReceivedMessage([])
         decoded = self._decode(content.payload)
         errors = decoded.errors
         samples: list[ReceivedTransform] = []
@@ -128,6 +141,10 @@ class RosCarrier:
     def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
         """The transforms of a message; raises `MalformedMessageError`."""
         return decode(payload, kind=ReceivedTransform, bare_names=True)
+
+    def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
+        """The stamp and the positions of joints of a message; raises `MalformedMessageError`."""
+        return decode_joint_state(payload, ros1=False)
 
     def _publish_statics(self) -> None:
         """Publish the static frames once more, for whoever has come or come back."""

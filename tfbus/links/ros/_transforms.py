@@ -60,6 +60,11 @@ def as_mapping(sample: TransformStamped) -> dict[str, Any]:
     }
 
 
+def stamp_of(stamp: Mapping[str, Any]) -> int:
+    """The stamp of a message as a mapping, in ns; `TypeError` or `KeyError` if it is none."""
+    return _either(stamp, "sec", "secs") * SECOND + _either(stamp, "nanosec", "nsecs")
+
+
 def _parts_of_ros1(payload: bytes) -> Iterator[_Parts]:
     try:
         (count,) = _COUNT.unpack_from(payload)

@@ -5,7 +5,7 @@ from typing import Unpack
 from tfbus.bus.bus import Bus
 from tfbus.links.link import Link
 from tfbus.links.ros._carrier import RosCarrier
-from tfbus.links.ros._settings import RosOptions
+from tfbus.links.ros.settings import RosOptions
 
 
 class RosLink(Link):
@@ -32,6 +32,14 @@ class RosLink(Link):
         Whether anything goes to ROS; else the link only listens.
     authority : str, optional
         The authority of all that comes from ROS; by default the node that has published it, where the link knows it.
+    joint_states : callable, optional
+        Takes the positions of joints that come from ROS, by their names in rad or m, and the stamp in ns: such as
+        `RobotStatePublisher.publish` of a robot. What it raises is counted in `LinkStatistics.rejected`.
+    joint_topic : str
+        The topic of these, by default ``/joint_states``.
+    clock : SimulatedClock, optional
+        Follows ``/clock``, the time of a simulation: it advances, and jumps where that time jumps; one jump back is one
+        reset. Give the clock of the bus.
     drop_lost : bool
         Whether the frames of a lost peer leave the bus, those that it was the last to publish.
     max_frames : int
@@ -68,4 +76,5 @@ class RosLink(Link):
             drop_lost=options.get("drop_lost", False),
             max_frames=options.get("max_frames", 10_000),
             capacity=options.get("capacity", 10_000),
+            clock=options.get("clock"),
         )

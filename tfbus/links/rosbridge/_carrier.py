@@ -14,11 +14,14 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
-from tfbus.links.ros._settings import RosSettings
+from tfbus.links.ros.settings import RosSettings
 from tfbus.links.rosbridge._protocol import (
+    CLOCK_TYPE,
+    JOINT_TYPE,
     Incoming,
     advertise,
     decode_content,
+    decode_joints,
     publish,
     read,
     subscribe,
@@ -72,6 +75,10 @@ class RosbridgeCarrier(RosCarrier):
         # First of all: what is latched may come only once, and moving frames come again.
         for topic in (*self.settings.tf_static, *self.settings.tf):
             self._request(subscribe(topic, ENCODINGS[0]))
+        for topic in self.settings.joint_topic:
+            self._request(subscribe(topic, ENCODINGS[0], JOINT_TYPE))
+        for topic in self.settings.clock_topic:
+            self._request(subscribe(topic, ENCODINGS[0], CLOCK_TYPE))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
             self._request(advertise(self.settings.tf[0], static=False))
@@ -116,6 +123,9 @@ class RosbridgeCarrier(RosCarrier):
     def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
         return decode_content(payload)
 
+    def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
+        return decode_joints(payload)
+
     async def _talk(self, socket: WebSocket) -> None:
         """Send and receive until the server is gone."""
         tasks = anyio.create_task_group()
@@ -158,6 +168,11 @@ class RosbridgeCarrier(RosCarrier):
     def _take(self, incoming: Incoming, size: int) -> None:
         if not incoming.topic:
             self._report.failed(ConnectionError(f"{self._url} says: {incoming.content}"))
+            return
+        joints, clock = (incoming.topic in topics for topics in (self.settings.joint_topic, self.settings.clock_topic))
+        if joints or clock:
+            other = RosMessage(incoming.content, static=False, authority="", joints=joints, clock=clock)
+            self._receive(Received(self._url, other, size, moving=True))
             return
         static = incoming.topic in self.settings.tf_static
         if not static and incoming.topic not in self.settings.tf:

@@ -12,12 +12,17 @@ import cbor2
 
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._provenance import ReceivedTransform
-from tfbus.links.ros._transforms import as_mapping, decode_mapping, decode_ros1
+from tfbus.links.ros._transforms import as_mapping, decode_mapping, decode_ros1, stamp_of
+from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode
 
 TYPE: Final = "tf2_msgs/TFMessage"
 """ROS 2 takes this name too."""
+JOINT_TYPE: Final = "sensor_msgs/JointState"
+CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 QUEUE: Final = 100
+_DOUBLES: Final = 86
+"""The tag of little endian float64 (RFC 8746)."""
 
 
 class Incoming(NamedTuple):
@@ -93,6 +98,35 @@ def decode_content(content: Any) -> Decoded[ReceivedTransform]:
             # 256 transforms of ROS 1 begin like that.
             return decode_ros1(content)
     return decode_ros1(content)
+
+
+def decode_joints(content: Any) -> tuple[int, dict[str, float]]:
+    """The stamp and the positions of joints of a message, in bytes of either ROS or as a mapping.
+
+    Raises
+    ------
+    MalformedMessageError
+        If it holds none.
+    """
+    if isinstance(content, bytes):
+        if content[:4] == b"\0\1\0\0":
+            try:
+                return decode_joint_state(content, ros1=False)
+            except MalformedMessageError:
+                # The message with the number 256 of ROS 1 begins like that.
+                return decode_joint_state(content, ros1=True)
+        return decode_joint_state(content, ros1=True)
+    try:
+        stamp, names, positions = stamp_of(content["header"]["stamp"]), content["name"], content["position"]
+        if isinstance(positions, cbor2.CBORTag) and positions.tag == _DOUBLES:
+            positions = memoryview(positions.value).cast("B").cast("d")
+        if len(positions) < len(names):
+            raise MalformedMessageError("positions", f"there are {len(names)} names, and {len(positions)} positions")
+        return stamp, {str(name): float(position) for name, position in zip(names, positions, strict=False)}
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, MalformedMessageError):
+            raise
+        raise MalformedMessageError("encoding", f"it has not the fields of a JointState: {error!r}"[:200]) from None
 
 
 def _request(operation: str, topic: str, **arguments: Any) -> str:

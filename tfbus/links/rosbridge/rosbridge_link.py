@@ -3,8 +3,8 @@
 from typing import Unpack
 
 from tfbus.bus.bus import Bus
-from tfbus.links.ros._settings import RosOptions, settings_of
 from tfbus.links.ros.ros_link import RosLink
+from tfbus.links.ros.settings import RosOptions, settings_of
 from tfbus.links.rosbridge._carrier import RosbridgeCarrier
 from tfbus.links.rosbridge._websocket import check_url
 

@@ -68,7 +68,7 @@ class ZenohCarrier:
     def send(self, turn: Turn) -> None:
         """Send live messages at once; while the network is congested, zenoh drops them."""
         self._newest.note(turn)
-        for message in self._writer.write(turn.entries, turn.step):
+        for message in self._writer.write(turn.entries, turn.step, turn.time):
             if self._put(message) and message.number:
                 self._report.sent(message.samples)
 

@@ -12,6 +12,8 @@ from uuid import uuid4
 import zenoh
 
 from tfbus.bus.bus import Bus
+from tfbus.clock import SimulatedClock
+from tfbus.links._clock_follower import HearsTime
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
@@ -63,6 +65,11 @@ class ZenohLink(Link):
         Ask each peer once, when it is met, for the last so many seconds of its moving frames, as far as buffers on its
         bus hold them: 2,000 samples of each frame at most. They are published before what it sends live, so lookups at
         stamps before the joining can be answered.
+    clock : SimulatedClock, optional
+        Follows the time that a peer tells: it advances, and jumps where that time jumps. The first peer that tells a
+        time is followed until it is lost; the time of others is refused and counted.
+    tell_clock : bool
+        Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
 
     Attributes
     ----------
@@ -112,6 +119,8 @@ class ZenohLink(Link):
         max_frames: int = 10_000,
         capacity: int = 10_000,
         history: float | None = None,
+        clock: SimulatedClock | HearsTime | None = None,
+        tell_clock: bool = False,
     ) -> None:
         if isinstance(robots, str):
             raise TypeError(f"robots must be several names, not {robots!r}")
@@ -149,6 +158,8 @@ class ZenohLink(Link):
             max_frames=max_frames,
             capacity=capacity,
             history=history,
+            clock=clock,
+            tell_clock=tell_clock,
         )
         self._zenoh = carrier
 

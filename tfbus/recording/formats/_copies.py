@@ -7,11 +7,19 @@ A payload is written as it is where the format can hold its encoding. Else it is
 import json
 import sqlite3
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
 from tfbus.recording.formats._channels import TYPE_HASH
+from tfbus.recording.formats._foxglove import (
+    FRAME_TRANSFORMS,
+    foxglove_channel,
+    transforms_schema,
+    write_protobuf,
+)
 from tfbus.recording.formats._mcap_output import SCHEMA
+from tfbus.recording.formats._raw_transforms import RawTransform, write_cdr, write_ros1
 from tfbus.recording.formats._storage import Channel
 from tfbus.recording.formats._types import MessageTypes
 
@@ -42,13 +50,13 @@ class Copy(Protocol):
     Attributes
     ----------
     encoding : str
-        The encoding of transforms in it: ``"cdr"`` or ``"ros1"``.
+        The encoding of transforms in it: ``"cdr"``, ``"ros1"`` or ``"protobuf"``.
     """
 
     encoding: str
 
     def holds(self, channel: Channel) -> bool:
-        """Whether payloads of a channel are written as they are."""
+        """Whether payloads with transforms of a channel are written as they are."""
         ...
 
     def write(self, channel: Channel, received: int, payload: bytes) -> None:
@@ -66,9 +74,19 @@ class Copy(Protocol):
 
 def transform_channel(source: Channel, encoding: str, metadata: dict[str, str]) -> Channel:
     """The channel for transforms of another channel, in the encoding of a copy."""
+    if encoding == "protobuf":
+        return foxglove_channel(source, metadata)
     if encoding == "cdr":
         return Channel(source.topic, TF_TYPE, "cdr", "ros2msg", SCHEMA.encode(), metadata)
     return Channel(source.topic, "tf2_msgs/TFMessage", "ros1", "", b"", metadata)
+
+
+def write_transforms(transforms: Sequence[RawTransform], encoding: str) -> bytes:
+    """A message of transforms in the encoding of a copy; raises `MalformedMessageError` if it cannot hold them."""
+    return _WRITERS[encoding](transforms)
+
+
+_WRITERS: Final = {"cdr": write_cdr, "ros1": write_ros1, "protobuf": write_protobuf}
 
 
 class McapCopy:
@@ -123,6 +141,21 @@ class McapCopy:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+class FoxgloveCopy(McapCopy):
+    """A `Copy` in MCAP with all transforms in Foxglove's schema."""
+
+    encoding = "protobuf"
+
+    def __init__(self, path: Path, name: str) -> None:
+        # Without the extra, before there is a file.
+        transforms_schema()
+        super().__init__(path, name)
+
+    def holds(self, channel: Channel) -> bool:
+        """Whether the channel has Foxglove's schema already."""
+        return channel.type == FRAME_TRANSFORMS and channel.encoding == "protobuf"
 
 
 class BagCopy:

@@ -3,7 +3,8 @@ from typing import Any
 import pytest
 from support.samples import moving
 
-from tfbus.links.ros._settings import RosSettings, settings_of
+from tfbus import SimulatedClock
+from tfbus.links.ros.settings import RosSettings, settings_of
 
 
 def test_without_options_the_settings_are_those_of_tf2() -> None:
@@ -23,10 +24,20 @@ def test_options_become_settings() -> None:
     assert settings.names.localise(moving("map", "r/a", 1)) == moving("map", "a", 1)
 
 
+def test_the_topic_of_joints_is_heard_only_if_somebody_takes_them() -> None:
+    assert settings_of({}).joint_topic == settings_of({"joint_topic": "/j"}).joint_topic == ()
+    assert settings_of({"joint_states": print}).joint_topic == ("/joint_states",)
+    assert settings_of({}).clock_topic == ()
+    assert settings_of({"clock": SimulatedClock()}).clock_topic == ("/clock",)
+    settings = settings_of({"joint_states": print, "joint_topic": "arm/j"})
+    assert (settings.joint_topic, settings.joint_states) == (("/arm/j",), print)
+
+
 @pytest.mark.parametrize(
     ("options", "error"),
     [
         ({"authority": 5}, TypeError),
+        ({"joint_states": "/joint_states"}, TypeError),
         ({"tf": ""}, ValueError),
         ({"tf_static": []}, ValueError),
         ({"prefix": "/r"}, ValueError),

@@ -1,0 +1,64 @@
+import json
+
+import pytest
+from support.commands import Command, check_wrong_call
+from support.samples import moving, static
+
+from tfbus import SECOND, Bus
+
+
+async def publish(bus: Bus) -> None:
+    """An arm at 10 Hz, 20 ms late, on a base at 2 Hz, and a camera that is static."""
+    bus.publish(static("arm", "camera", authority="urdf"))
+    async for tick in bus.clock.ticks(10.0):
+        now = bus.clock.now()
+        bus.publish(moving("base", "arm", now - SECOND // 50, authority="joints"))
+        if tick % 5 == 0:
+            bus.publish(moving("map", "base", now, authority="odometry"))
+
+
+def test_each_frame_and_sender_is_a_line(tfbus: Command) -> None:
+    done = tfbus.on_domain(publish, "monitor", "--once", "--duration", "3.04")
+    assert (done.returncode, done.stderr) == (0, "")
+    titles, arm, base, camera = done.stdout.splitlines()
+    assert titles.split("  ")[0] == "frame"
+    assert arm.split() == "arm joints 10.0 Hz 20 ms 20 ms 20 ms 0 ns 100 ms 0 0".split()  # noqa: SIM905 - as printed
+    assert base.split()[:4] == ["base", "odometry", "2.0", "Hz"]
+    assert camera.split() == ["camera", "urdf", "static"]
+
+
+def test_of_a_pair_the_way_and_its_slowest_frame_are_shown(tfbus: Command) -> None:
+    done = tfbus.on_domain(publish, "monitor", "map", "camera", "--once", "--duration", "3.04")
+    way, empty, *table = done.stdout.splitlines()
+    # The newest stamp of both moving frames is that of the base at 3 s.
+    assert way.startswith("map <- base <- arm <- camera: age ")
+    assert way.endswith(", the slowest is base")
+    assert empty == ""
+    assert [line.split()[0] for line in table] == ["frame", "arm", "base", "camera"]
+    done = tfbus.on_domain(publish, "monitor", "arm", "camera", "--once")
+    assert done.stdout.splitlines()[0] == "arm <- camera: static"
+    done = tfbus.on_domain(publish, "monitor", "map", "camra", "--once")
+    assert done.stdout.startswith("no transform: frame 'camra' is not known, did you mean 'camera'?\n\n")
+
+
+def test_it_is_printed_again_and_again_as_json_too(tfbus: Command) -> None:
+    async def publish_for_a_while(bus: Bus) -> None:
+        with bus.clock.move_on_after(2.05):
+            await publish(bus)
+
+    done = tfbus.on_domain(publish_for_a_while, "monitor", "map", "arm", "--json", "--window", "1")
+    assert done.returncode == 130
+    documents = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(documents) == 3
+    last = documents[-1]
+    assert (last["window"], last["chain"]["frames"], last["chain"]["slowest"]) == (1.0, ["map", "base", "arm"], "base")
+    assert [(frame["frame"], frame["rate"], frame["late"]) for frame in last["frames"]] == [
+        ("arm", pytest.approx(10.0), 0),
+        ("base", pytest.approx(2.0), 0),
+    ]
+    done = tfbus.on_domain(publish_for_a_while, "monitor", "--rate", "1")
+    assert done.stdout.count("frame ") == 3
+
+
+def test_half_a_pair_is_a_usage_error(tfbus: Command) -> None:
+    check_wrong_call(tfbus("monitor", "map"), "'map' has no SOURCE")

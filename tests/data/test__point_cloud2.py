@@ -1,0 +1,25 @@
+import numpy as np
+import pytest
+
+from tfbus import PointCloud
+from tfbus.data._point_cloud2 import layout_of, new_layout, read_cloud
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_layout_can_be_written_and_read_in_either_byte_order(dtype: type) -> None:
+    cloud = PointCloud("a", 5, np.arange(12, dtype=dtype).reshape(4, 3), fields={"i": np.arange(4, dtype=np.uint16)})
+    message = new_layout(cloud)
+    for big in (False, True):
+        like = {**message, "is_bigendian": big}
+        counts, data = layout_of(cloud, like)
+        again = read_cloud({**like, **counts, "data": data}, "b", 6)
+        assert (again.frame, again.stamp, counts["is_bigendian"]) == ("b", 6, big)
+        assert again.points.tolist() == cloud.points.tolist()
+        assert again.fields["i"].tolist() == [0, 1, 2, 3]
+
+
+def test_a_coordinate_is_one_number() -> None:
+    message = new_layout(PointCloud("a", 5, np.ones((1, 3))))
+    message["fields"][0]["count"] = 3
+    with pytest.raises(ValueError, match="one number each"):
+        read_cloud(message, "a", 5)

@@ -1,0 +1,319 @@
+import math
+from array import array
+from base64 import b64encode
+from copy import deepcopy
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tfbus import (
+    LATEST,
+    InvalidTransformError,
+    LaserScan,
+    PointCloud,
+    PointStamped,
+    Polygon,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    QuaternionStamped,
+    Transform,
+    TransformStamped,
+    TwistStamped,
+    Vector3Stamped,
+    WrenchStamped,
+    do_transform,
+)
+from tfbus.data import from_message, to_message
+
+STAMP = 5_000_000_007
+V, W = {"x": 1.0, "y": 2.0, "z": 3.0}, {"x": 4.0, "y": 5.0, "z": 6.0}
+Q = {"x": 0.5, "y": -0.5, "z": 0.5, "w": -0.5}
+POSE = {"position": V, "orientation": Q}
+TRANSFORM = Transform((1.0, 2.0, 3.0), (0.5, -0.5, 0.5, -0.5))
+
+SIMPLE: list[tuple[dict[str, Any], Any]] = [
+    ({"point": V}, PointStamped("map", STAMP, (1.0, 2.0, 3.0))),
+    ({"vector": V}, Vector3Stamped("map", STAMP, (1.0, 2.0, 3.0))),
+    ({"quaternion": Q}, QuaternionStamped("map", STAMP, (0.5, -0.5, 0.5, -0.5))),
+    ({"pose": POSE}, PoseStamped("map", STAMP, TRANSFORM)),
+    ({"twist": {"linear": V, "angular": W}}, TwistStamped("map", STAMP, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))),
+    ({"wrench": {"force": V, "torque": W}}, WrenchStamped("map", STAMP, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))),
+    (
+        {"child_frame_id": "base", "transform": {"translation": V, "rotation": Q}},
+        TransformStamped("map", "base", STAMP, TRANSFORM),
+    ),
+]
+
+
+def header(frame: str = "map", ros1: bool = False) -> dict[str, Any]:
+    stamp = {"secs": 5, "nsecs": 7} if ros1 else {"sec": 5, "nanosec": 7}
+    return {"stamp": stamp, "frame_id": frame, **({"seq": 3} if ros1 else {})}
+
+
+def as_object(value: Any) -> Any:
+    """The same fields as attributes."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{name: as_object(part) for name, part in value.items()})
+    return [as_object(part) for part in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize(("fields", "data"), SIMPLE, ids=[type(data).__name__ for _, data in SIMPLE])
+@pytest.mark.parametrize("ros1", [False, True])
+def test_messages_become_data_and_data_messages(fields: dict[str, Any], data: Any, ros1: bool) -> None:
+    message = {"header": header(ros1=ros1), **fields}
+    assert from_message(message) == from_message(as_object(message)) == data
+    if not ros1:
+        assert to_message(data) == message
+    blank = deepcopy(message)
+    blank["header"]["stamp"] = dict.fromkeys(blank["header"]["stamp"], 0)
+    blank["header"]["frame_id"] = ""
+    before = deepcopy(blank)
+    assert to_message(data, like=blank) == message
+    assert to_message(data, like=as_object(blank)) == as_object(message)
+    assert blank == before
+
+
+def test_leading_slashes_are_gone_and_a_stamp_of_zero_stays() -> None:
+    message = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": "//map"}, "point": V}
+    assert from_message(message) == PointStamped("map", 0, (1.0, 2.0, 3.0))
+    fields = {"header": header("/a"), "child_frame_id": "/b", "transform": {"translation": V, "rotation": Q}}
+    assert (from_message(fields).parent, from_message(fields).child) == ("a", "b")
+    with pytest.raises(InvalidTransformError):
+        from_message({"header": header(""), "point": V})
+
+
+def test_a_covariance_is_read_row_by_row_and_written_back() -> None:
+    rows = [float(number) for number in range(36)]
+    message = {"header": header(), "pose": {"pose": POSE, "covariance": rows}}
+    data = from_message(message)
+    assert isinstance(data, PoseWithCovarianceStamped)
+    assert data.pose == TRANSFORM
+    assert data.covariance.tolist() == np.arange(36.0).reshape(6, 6).tolist()
+    assert to_message(data, like={**message, "pose": {"pose": POSE, "covariance": [0.0] * 36}}) == message
+    typed = to_message(data, like={**message, "pose": {"pose": POSE, "covariance": np.zeros(36)}})
+    assert isinstance(typed["pose"]["covariance"], np.ndarray)
+
+
+def test_a_polygon_has_the_corners_of_its_message() -> None:
+    message = {"header": header(), "polygon": {"points": [V, W]}}
+    data = from_message(as_object(message))
+    assert isinstance(data, Polygon)
+    assert data.points.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    assert to_message(data) == message
+    one = {**message, "polygon": {"points": [{"x": 0.0, "y": 0.0, "z": 0.0}]}}
+    assert to_message(data, like=as_object(one)) == as_object(message)
+    none = as_object({**message, "polygon": {"points": []}})
+    with pytest.raises(ValueError, match="type of all points"):
+        to_message(data, like=none)
+    assert from_message(none).points.shape == (0, 3)
+
+
+def scan_fields(ranges: Any, intensities: Any) -> dict[str, Any]:
+    return {
+        "header": header("laser"),
+        "angle_min": -1.0,
+        "angle_max": 1.0,
+        "angle_increment": 1.0,
+        "time_increment": 0.5,
+        "scan_time": 2.0,
+        "range_min": 0.25,
+        "range_max": 8.0,
+        "ranges": ranges,
+        "intensities": intensities,
+    }
+
+
+def test_a_scan_has_its_points_at_their_angles_and_its_message_the_kind_of_arrays_of_the_other() -> None:
+    scan = from_message(as_object(scan_fields(array("f", [1.0, 2.0, 4.0]), array("f"))))
+    assert isinstance(scan, LaserScan)
+    assert (scan.frame, scan.stamp, scan.ranges.dtype, scan.intensities) == ("laser", STAMP, np.dtype(np.float32), None)
+    cosine, sine = math.cos(1.0), math.sin(1.0)
+    expected = [[cosine, -sine, 0.0], [2.0, 0.0, 0.0], [4 * cosine, 4 * sine, 0.0]]
+    assert np.allclose(scan.to_points().points, expected, atol=1e-6)
+    back = to_message(scan, like=as_object(scan_fields(array("f"), array("f"))))
+    assert back.ranges == array("f", [1.0, 2.0, 4.0])
+    assert to_message(scan, like=scan_fields([], []))["ranges"] == [1.0, 2.0, 4.0]
+    bare = LaserScan("laser", STAMP, np.ones(3), angle_min=-1.0, angle_increment=0.5)
+    assert to_message(bare)["angle_max"] == 0.0
+
+
+def cloud_fields(rows: Any, **changes: Any) -> dict[str, Any]:
+    """x, y, z as float32, four bytes of nothing, an intensity and a ring."""
+    fields = [
+        {"name": "x", "offset": 0, "datatype": 7, "count": 1},
+        {"name": "y", "offset": 4, "datatype": 7, "count": 1},
+        {"name": "z", "offset": 8, "datatype": 7, "count": 1},
+        {"name": "intensity", "offset": 16, "datatype": 8, "count": 1},
+        {"name": "ring", "offset": 24, "datatype": 4, "count": 0},
+        {"name": "pair", "offset": 26, "datatype": 2, "count": 2},
+    ]
+    shape = {"height": 1, "width": rows, "point_step": 32, "row_step": 32 * rows}
+    blank = {"header": header("lidar"), **shape, "fields": fields, "is_bigendian": False, "is_dense": True}
+    return {**blank, "data": b"", **changes}
+
+
+KIND = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "pair"],
+        "formats": ["<f4", "<f4", "<f4", "<f8", "<u2", ("<u1", (2,))],
+        "offsets": [0, 4, 8, 16, 24, 26],
+        "itemsize": 32,
+    }
+)
+
+
+def cloud_rows(size: int) -> np.ndarray[Any, Any]:
+    rows = np.zeros(size, KIND)
+    for number, axis in enumerate("xyz"):
+        rows[axis] = np.arange(size) + number / 4
+    rows["intensity"], rows["ring"] = np.arange(size) / 8, np.arange(size)
+    rows["pair"] = np.arange(2 * size).reshape(size, 2)
+    return rows
+
+
+def test_a_cloud_is_a_view_of_its_message_and_is_written_back_in_its_layout() -> None:
+    rows = cloud_rows(5)
+    data = bytearray(rows.tobytes())
+    message = cloud_fields(5, data=data)
+    cloud = from_message(as_object(message))
+    assert isinstance(cloud, PointCloud)
+    assert (cloud.frame, cloud.stamp, cloud.points.dtype) == ("lidar", STAMP, np.dtype(np.float32))
+    assert cloud.points.tolist() == [[n, n + 0.25, n + 0.5] for n in range(5)]
+    assert cloud.fields["intensity"].tolist() == [n / 8 for n in range(5)]
+    assert cloud.fields["ring"].tolist() == list(range(5))
+    assert cloud.fields["pair"].tolist() == [[2 * n, 2 * n + 1] for n in range(5)]
+    assert set(cloud.fields) == {"intensity", "ring", "pair"}
+    for values in (cloud.points, *cloud.fields.values()):
+        assert np.shares_memory(values, np.frombuffer(data, np.uint8))
+    moved = do_transform(cloud, TransformStamped("map", "lidar", STAMP, Transform((1.0, 0.0, 0.0))))
+    back = to_message(moved, like=message)
+    rows["x"] += 1
+    assert back["data"] == rows.tobytes()
+    assert (back["header"]["frame_id"], back["width"], back["row_step"]) == ("map", 5, 160)
+
+
+@pytest.mark.parametrize("kind", ["list", "array", "base64", "numpy"])
+def test_the_data_of_a_cloud_may_be_of_any_kind(kind: str) -> None:
+    raw = cloud_rows(3).tobytes()
+    data: Any = {
+        "list": list(raw),
+        "array": array("B", raw),
+        "base64": b64encode(raw).decode(),
+        "numpy": np.frombuffer(raw, np.uint8),
+    }[kind]
+    cloud = from_message(cloud_fields(3, data=data))
+    assert cloud.points.tolist() == [[n, n + 0.25, n + 0.5] for n in range(3)]
+    back = to_message(cloud, like=cloud_fields(3, data=data))
+    assert bytes(back["data"]) == raw
+
+
+def test_rows_with_gaps_other_orders_and_scattered_coordinates_are_read() -> None:
+    rows = cloud_rows(6)
+    gaps = b"".join(rows[first : first + 3].tobytes() + b"gap!" for first in (0, 3))
+    two = from_message(cloud_fields(3, height=2, row_step=100, data=gaps))
+    assert two.points.tolist() == [[n, n + 0.25, n + 0.5] for n in range(6)]
+    big = from_message(cloud_fields(6, is_bigendian=True, data=rows.astype(KIND.newbyteorder(">")).tobytes()))
+    assert big.points.tolist() == two.points.tolist()
+    swapped = cloud_fields(6, data=rows.tobytes())
+    swapped["fields"][0], swapped["fields"][2] = (
+        {**swapped["fields"][0], "offset": 8},
+        {**swapped["fields"][2], "offset": 0},
+    )
+    assert from_message(swapped).points.tolist() == [[n + 0.5, n + 0.25, n] for n in range(6)]
+    assert len(from_message(cloud_fields(0))) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"data": bytes(95)}, "is not in 95 bytes"),
+        ({"row_step": 10}, "10 bytes a row"),
+        ({"width": -1}, "-1 points"),
+        ({"point_step": 8}, "itemsize"),
+        ({"fields": [{"name": "x", "offset": 0, "datatype": 7, "count": 1}]}, "x, y and z, this one has x"),
+        ({"fields": [{"name": "x", "offset": 0, "datatype": 9, "count": 1}]}, "datatype 9"),
+    ],
+)
+def test_a_cloud_whose_layout_does_not_fit_is_refused(changes: dict[str, Any], why: str) -> None:
+    with pytest.raises(ValueError, match=why):
+        from_message(cloud_fields(3, **{"data": bytes(96), **changes}))
+
+
+def test_a_cloud_without_a_message_to_be_like_has_its_fields_side_by_side() -> None:
+    cloud = PointCloud("lidar", STAMP, np.ones((2, 3), np.float32), fields={"t": np.array([7, 8], np.uint32)})
+    message = to_message(cloud)
+    assert [(each["name"], each["offset"], each["datatype"]) for each in message["fields"]] == [
+        ("x", 0, 7),
+        ("y", 4, 7),
+        ("z", 8, 7),
+        ("t", 12, 6),
+    ]
+    assert (message["point_step"], message["row_step"], message["width"], message["height"]) == (16, 32, 2, 1)
+    again = from_message(message)
+    assert again.points.tolist() == cloud.points.tolist()
+    assert again.fields["t"].tolist() == [7, 8]
+    assert len(from_message(to_message(PointCloud("a", 1, np.empty((0, 3)))))) == 0
+    with pytest.raises(ValueError, match="'t' of dtype int64"):
+        to_message(PointCloud("a", 1, np.ones((1, 3)), fields={"t": np.array([1])}))
+    with pytest.raises(ValueError, match="no field 'intensity'"):
+        to_message(cloud, like=cloud_fields(1))
+
+
+@dataclass
+class Stamp:
+    sec: int = 0
+    nanosec: int = 0
+
+
+@dataclass
+class Header:
+    stamp: Stamp = field(default_factory=Stamp)
+    frame_id: str = ""
+
+
+@dataclass
+class Point:
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+
+
+@dataclass
+class PointMessage:
+    header: Header = field(default_factory=Header)
+    point: Point = field(default_factory=Point)
+
+
+def test_a_type_of_messages_is_as_good_as_a_message() -> None:
+    made = to_message(PointStamped("map", STAMP, (1.0, 2.0, 3.0)), like=PointMessage)
+    assert made == PointMessage(Header(Stamp(5, 7), "map"), Point(1.0, 2.0, 3.0))
+    assert PointMessage() == PointMessage(Header(Stamp(0, 0), ""), Point())
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        None,
+        5,
+        {"point": V},
+        {"header": header()},
+        {"header": header(), "pose": POSE, "twist": {"linear": V, "angular": W}},
+        {"header": {"frame_id": "map"}, "point": V},
+        {"header": header(), "point": {"x": 1.0}},
+    ],
+)
+def test_what_is_no_message_is_a_type_error(message: Any) -> None:
+    with pytest.raises(TypeError, match=r"is no message|has no field"):
+        from_message(message)
+
+
+def test_data_that_have_no_message_are_refused() -> None:
+    with pytest.raises(TypeError, match="int has no message"):
+        to_message(5)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="LATEST"):
+        to_message(PointStamped("map", LATEST, (1.0, 2.0, 3.0)))
+    with pytest.raises(TypeError, match="'point'"):
+        to_message(PointStamped("map", 5, (1.0, 2.0, 3.0)), like={"header": header()})

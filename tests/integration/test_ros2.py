@@ -1,0 +1,230 @@
+"""Links against a real ROS 2: rclpy, its middleware and tf2_ros, in a process of their own.
+
+The variable ``ROS2_PYTHON`` names a Python with rclpy and tf2_ros, such as ``/usr/bin/python3`` after
+``source /opt/ros/kilted/setup.bash``; without it, that Python is looked for as ``python3`` in a sourced ROS 2. The
+variable ``ROSBRIDGE`` is a command that serves a rosbridge at the port that is its last argument.
+"""
+
+import json
+import math
+import os
+import shlex
+import shutil
+import statistics
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import anyio
+import anyio.to_thread
+import pytest
+from support.processes import free_ports
+
+from tfbus import Buffer, Bus, Transform, TransformBroadcaster
+from tfbus.geometry.stamped import Batch
+from tfbus.links.ros import RosLink
+
+pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
+
+PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
+SECONDS = 10.0
+_next_domain = iter(range(100 + os.getpid() % 50, 200))
+
+
+def ros2_python() -> str:
+    """A Python that has ROS 2; skips the test if there is none."""
+    python = os.environ.get("ROS2_PYTHON") or shutil.which("python3")
+    if python is None or subprocess.run([python, "-c", "import rclpy, tf2_ros"], capture_output=True).returncode:
+        pytest.skip("no ROS 2: set ROS2_PYTHON to a Python with rclpy and tf2_ros")
+    return python
+
+
+class Ros2Peer:
+    """Such a process."""
+
+    def __init__(self, python: str, domain: int, seconds: float, x: float = 0.5) -> None:
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        command = [python, str(PEER), "--seconds", f"{seconds}", "--x", f"{x}"]
+        self.process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+    async def next_line(self) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        line = await anyio.to_thread.run_sync(self.process.stdout.readline)
+        return dict(json.loads(line))
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+@contextmanager
+def peer(domain: int, seconds: float, x: float = 0.5) -> Iterator[Ros2Peer]:
+    started = Ros2Peer(ros2_python(), domain, seconds, x)
+    try:
+        yield started
+    finally:
+        started.kill()
+
+
+@contextmanager
+def rosbridge(domain: int) -> Iterator[str]:
+    """The URL of a rosbridge of ROS 2; skips the test if there is none."""
+    command = os.environ.get("ROSBRIDGE")
+    if not command:
+        pytest.skip("no rosbridge: set ROSBRIDGE to a command that serves one at the port that is its last argument")
+    (port,) = free_ports(1)
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    process = subprocess.Popen(
+        [*shlex.split(command), str(port)], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        yield f"ws://127.0.0.1:{port}"
+    finally:
+        process.terminate()
+        process.wait()
+
+
+class Program:
+    """Our side: it broadcasts ``base:arm``, x = cos(t), and the static ``arm:tool``, and asks for ``odom:tool``."""
+
+    def __init__(self, bus: Bus, buffer: Buffer) -> None:
+        self.bus = bus
+        self.buffer = buffer
+        self.latencies: list[float] = []
+        self.authorities: set[str] = set()
+        self.answered = self.failed = self.wrong = 0
+        bus.subscribe(self._hear)
+        self._broadcaster = TransformBroadcaster(bus, authority="here")
+        self._broadcaster.send_static("arm", "tool", Transform((0.1, 0.0, 0.0)))
+
+    def _hear(self, batch: Batch) -> None:
+        for sample in batch:
+            if sample.child in ("base", "laser"):
+                self.authorities.add(sample.authority)
+                if not sample.static:
+                    self.latencies.append((time.time_ns() - sample.stamp) / 1e6)
+
+    async def send(self) -> None:
+        async for _ in self.bus.clock.ticks(100.0):
+            stamp = time.time_ns()
+            self._broadcaster.send("base", "arm", Transform((math.cos(stamp / 1e9), 0.0, 0.0)), at=stamp)
+
+    async def ask(self) -> None:
+        """Wait for the transform of the present, again and again."""
+        async for _ in self.bus.clock.ticks(100.0):
+            stamp = time.time_ns()
+            try:
+                found = await self.buffer.lookup("odom", "tool", stamp, timeout=1.0)
+            except TimeoutError:
+                self.failed += 1
+                continue
+            self.answered += 1
+            expected = math.sin(stamp / 1e9) + math.cos(stamp / 1e9) + 0.1
+            self.wrong += abs(found.transform.translation[0] - expected) > 1e-3
+
+
+async def meet(link: RosLink, bus: Bus, domain: int) -> dict[str, Any]:
+    """Have both sides broadcast and ask for ten seconds, and check the answers; returns the figures."""
+    with Buffer(bus) as buffer:
+        program = Program(bus, buffer)
+        async with link, anyio.create_task_group() as tasks:
+            tasks.start_soon(program.send)
+            with peer(domain, SECONDS) as ros:
+                assert (await ros.next_line())["event"] == "up"
+                await buffer.lookup("odom", "tool", timeout=20.0)
+                laser = await buffer.lookup("base", "laser", timeout=20.0)
+                assert laser.transform.translation == (0.5, 0.0, 0.0)
+                with anyio.CancelScope() as asking:
+                    async with anyio.create_task_group() as inner:
+                        inner.start_soon(program.ask)
+                        # The peer ends first, and nobody answers then.
+                        await anyio.sleep(SECONDS - 3.0)
+                        inner.cancel_scope.cancel()
+                        asking.cancel()
+                facts = await ros.next_line()
+            tasks.cancel_scope.cancel()
+    facts |= {
+        "in_ms": statistics.median(program.latencies),
+        "asked": program.answered + program.failed,
+        "authorities": sorted(program.authorities),
+    }
+    assert program.answered > 300
+    assert facts["answered"] > 300
+    assert (program.wrong, facts["wrong"]) == (0, 0)
+    assert program.failed <= 0.01 * (program.answered + program.failed)
+    assert facts["failed"] <= 0.01 * (facts["answered"] + facts["failed"])
+    assert link.statistics().rejected == {}
+    return facts
+
+
+async def test_dds_both_ways_with_every_answer_right() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    from tfbus.links.dds import DdsLink
+
+    domain = next(_next_domain)
+    ros2_python()
+    with Bus() as bus:
+        facts = await meet(DdsLink(bus, domain), bus, domain)
+    assert facts["authorities"] == ["/driver"]
+    print(facts)
+
+
+async def test_rosbridge_both_ways_with_every_answer_right() -> None:
+    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
+    from tfbus.links.rosbridge import RosbridgeLink
+
+    domain = next(_next_domain)
+    ros2_python()
+    with rosbridge(domain) as url, Bus() as bus:
+        with anyio.fail_after(20):
+            while True:
+                try:
+                    async with RosbridgeLink(bus, url):
+                        break
+                except OSError:
+                    await anyio.sleep(0.2)
+        print(await meet(RosbridgeLink(bus, url), bus, domain))
+
+
+async def test_a_node_that_is_killed_is_lost_and_heard_again_when_it_is_back() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    from tfbus.links.dds import DdsLink
+
+    domain = next(_next_domain)
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with DdsLink(bus, domain) as link:
+            with peer(domain, 60.0):
+                found = await buffer.lookup("base", "laser", timeout=20.0)
+                assert found.transform.translation[0] == 0.5
+            # Killed without a word: a new one says something else.
+            with peer(domain, 60.0, x=0.75):
+                with anyio.fail_after(20):
+                    async with anyio.create_task_group() as tasks:
+                        with buffer.watch("base", "laser") as changes:
+                            async for change in changes:
+                                if change.transform.translation[0] == 0.75:
+                                    break
+                        tasks.cancel_scope.cancel()
+            assert link.statistics().rejected == {}
+
+
+async def test_a_node_hears_the_static_frames_of_a_link_that_came_back() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    from tfbus.links.dds import DdsLink
+
+    domain = next(_next_domain)
+    with peer(domain, 8.0) as ros, Bus() as bus, Buffer(bus) as buffer:
+        assert (await ros.next_line())["event"] == "up"
+        program = Program(bus, buffer)
+        for _ in range(2):
+            async with DdsLink(bus, domain), anyio.create_task_group() as tasks:
+                tasks.start_soon(program.send)
+                await buffer.lookup("odom", "tool", timeout=20.0)
+                await anyio.sleep(1.0)
+                tasks.cancel_scope.cancel()
+        facts = await ros.next_line()
+    assert facts["answered"] > 50
+    assert facts["wrong"] == 0

@@ -1,0 +1,155 @@
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import anyio
+import anyio.to_thread
+import pytest
+import zenoh
+from support.joint_messages import joint_state
+from support.processes import free_ports, until
+from support.samples import moving, static
+from support.wires import latched
+
+from tfbus import Bus
+from tfbus.links.rmw_zenoh import RmwZenohLink
+from tfbus.links.rmw_zenoh._wire import JOINT_HASH, JOINT_TYPE
+from tfbus.links.zenoh import ZenohRouter
+
+pytestmark = pytest.mark.anyio
+
+PEER = Path(__file__).parents[2] / "support" / "rmw_zenoh_peer.py"
+DOMAIN = 7
+
+
+@asynccontextmanager
+async def router() -> AsyncIterator[str]:
+    """The address of a router, as rmw_zenohd is one."""
+    (port,) = free_ports(1)
+    async with ZenohRouter(f"tcp/127.0.0.1:{port}"):
+        yield f"tcp/127.0.0.1:{port}"
+
+
+@contextmanager
+def sdk_peer(address: str) -> Iterator[subprocess.Popen[str]]:
+    if importlib.util.find_spec("zenoh_ros2_sdk") is None:
+        pytest.skip('no peer: pip install "tfbus[thorough]"')
+    command = [sys.executable, str(PEER), address.rpartition(":")[2], str(DOMAIN)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ})
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.thorough
+async def test_two_buses_hear_each_other_and_a_late_one_the_static_frames() -> None:
+    with Bus() as near, Bus() as far:
+        heard: list[Any] = []
+        far.subscribe(lambda batch: heard.extend(batch))
+        async with router() as address, RmwZenohLink(near, address, DOMAIN) as here:
+            near.publish([static("map", "lidar", 1.0, 3), static("map", "gone", 2.0)])
+            near.remove_frame("gone")
+            await until(lambda: here.statistics().sent_messages == 1)
+            async with RmwZenohLink(far, address, DOMAIN) as there:
+                await until(lambda: there.statistics().received_samples == 1)
+                for stamp in range(100):
+                    near.publish(moving("map", "base", stamp, 1.0))
+                    await anyio.sleep(0.001)
+                far.publish([moving("base", "arm", 6, 2.0), static("arm", "tool", 3.0, 7)])
+                await until(lambda: len(heard) == 103)
+                await until(lambda: here.statistics().received_samples == 2)
+                assert latched(near) == {
+                    "lidar": static("map", "lidar", 1.0, 3),
+                    "tool": static("arm", "tool", 3.0, 7, "rmw_zenoh"),
+                }
+                # Neither hears itself.
+                assert (here.statistics().duplicates, there.statistics().duplicates) == (0, 0)
+        assert heard[0] == static("map", "lidar", 1.0, 3, "rmw_zenoh")
+        assert heard[1:101] == [moving("map", "base", stamp, 1.0, "rmw_zenoh") for stamp in range(100)]
+
+
+@pytest.mark.thorough
+async def test_a_node_of_another_program_and_a_link_hear_each_other() -> None:
+    with Bus() as bus:
+        heard: list[float] = []
+        bus.subscribe(lambda batch: heard.extend(each.transform.translation[0] for each in batch if each.authority))
+        async with router() as address, RmwZenohLink(bus, address, DOMAIN) as link:
+            with sdk_peer(address) as process:
+                assert process.stdout is not None
+
+                async def send() -> None:
+                    for number in range(10_000):
+                        bus.publish(moving("base", "arm", number, float(number)))
+                        await anyio.sleep(0.01)
+
+                async with anyio.create_task_group() as tasks:
+                    tasks.start_soon(send)
+                    lines = [json.loads(await anyio.to_thread.run_sync(process.stdout.readline)) for _ in range(2)]
+                    tasks.cancel_scope.cancel()
+            assert link.statistics().rejected == {}
+    assert heard == [float(number) for number in range(100)]
+    arms = lines[1]["arms"]
+    assert len(arms) > 100
+    assert all(later - earlier == 1.0 for earlier, later in pairwise(arms))
+
+
+@pytest.mark.thorough
+async def test_positions_of_joints_go_to_who_takes_them() -> None:
+    taken: list[Any] = []
+    async with router() as address:
+        with Bus() as bus:
+            async with RmwZenohLink(bus, address, DOMAIN, joint_states=lambda *state: taken.append(state)):
+                config = zenoh.Config()
+                config.insert_json5("mode", '"client"')
+                config.insert_json5("connect/endpoints", json.dumps([address]))
+                with zenoh.open(config) as session:
+                    key = f"{DOMAIN}/joint_states/{JOINT_TYPE}/{JOINT_HASH}"
+                    session.put(key, joint_state(5, {"a": 0.5}))
+                    await until(lambda: taken == [({"a": 0.5}, 5)])
+
+
+@pytest.mark.thorough
+async def test_links_begin_and_end_again_and_again() -> None:
+    async with router() as address:
+        for _ in range(10):
+            with Bus() as bus, anyio.fail_after(10):
+                async with RmwZenohLink(bus, address, DOMAIN), RmwZenohLink(bus, address, DOMAIN):
+                    bus.publish([moving("map", "base", 1), static("map", "lidar")])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "said"),
+    [
+        ({"router": "localhost:7447"}, ValueError, "setting"),
+        ({"router": 7447}, TypeError, "router"),
+        ({"domain": 300}, ValueError, "0 to 232"),
+        ({"node": "a b"}, ValueError, "name of a node"),
+        ({"config": {"no/such": 1}}, ValueError, "setting"),
+        ({"tf": "a b"}, ValueError, "topic"),
+    ],
+)
+def test_arguments_that_are_not_valid_are_refused(arguments: Any, error: type[Exception], said: str) -> None:
+    with pytest.raises(error, match=said):
+        RmwZenohLink(Bus(), **arguments)
+
+
+def test_the_domain_is_that_of_the_variable_unless_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "42")
+    assert [RmwZenohLink(Bus()).domain, RmwZenohLink(Bus(), domain=3).domain] == [42, 3]
+
+
+@pytest.mark.thorough
+async def test_a_router_that_is_not_there_is_an_os_error() -> None:
+    (port,) = free_ports(1)
+    with Bus() as bus, pytest.raises(OSError, match="no router"):
+        async with RmwZenohLink(bus, f"tcp/127.0.0.1:{port}", config={"connect/timeout_ms": 500}):
+            raise AssertionError

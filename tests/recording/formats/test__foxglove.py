@@ -1,0 +1,45 @@
+import struct
+
+import pytest
+from foxglove.messages import FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfbus.recording.formats._foxglove import foxglove_channel, write_protobuf
+from tfbus.recording.formats._raw_transforms import RawTransform, parser_of
+from tfbus.recording.formats._storage import Channel
+from tfbus.tf_message import MalformedMessageError
+
+CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})
+
+numbers = st.lists(st.floats(), min_size=7, max_size=7).map(lambda values: struct.pack("<7d", *values))
+names = st.text(max_size=200).filter(lambda text: text.isprintable()).map(str.encode)
+transforms = st.builds(RawTransform, st.integers(-(2**31), 2**40), st.integers(0, 2**31 - 1), names, names, numbers)
+
+
+@given(transforms=st.lists(transforms, max_size=4))
+def test_what_is_written_is_what_the_parser_reads(transforms: list[RawTransform]) -> None:
+    assert parser_of(CHANNEL)(write_protobuf(transforms)) == transforms
+
+
+def test_the_bytes_are_those_of_foxglove_s_own_encoder() -> None:
+    theirs = FrameTransforms(
+        transforms=[
+            FrameTransform(
+                timestamp=Timestamp(1_700_000_000, 300),
+                parent_frame_id="map",
+                child_frame_id="base",
+                translation=Vector3(x=1.0, y=-2.0, z=0.1),
+                rotation=Quaternion(x=0.1, y=0.2, z=0.3, w=0.9),
+            )
+        ]
+    ).encode()
+    ours = RawTransform(1_700_000_000, 300, b"map", b"base", struct.pack("<7d", 1.0, -2.0, 0.1, 0.1, 0.2, 0.3, 0.9))
+    assert write_protobuf([ours]) == theirs
+
+
+def test_a_name_that_is_no_text_is_refused() -> None:
+    with pytest.raises(MalformedMessageError, match="UTF-8"):
+        write_protobuf([RawTransform(0, 0, b"map", b"\xff", bytes(56))])
+    with pytest.raises(MalformedMessageError, match="does not fit"):
+        write_protobuf([RawTransform(2**63, 0, b"map", b"base", bytes(56))])

@@ -1,0 +1,137 @@
+"""Measurements of samples as they arrive: rates, delays, gaps and losses of each frame and sender."""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from tfbus.geometry.stamped import Batch
+from tfbus.stamps import SECOND, from_seconds
+
+MAX_SAMPLES: Final = 20_000
+"""The number of samples of a frame and sender that are kept; older ones are left out of a window that has more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """The samples of one frame from one sender within a window; durations in s, None where there are too few samples.
+
+    Attributes
+    ----------
+    frame, parent, authority : str
+        The parent is that of the newest sample.
+    static : bool
+        Whether the newest sample is static; such a frame is not measured.
+    samples : int
+        Those in the window.
+    rate : float or None
+        Arrivals a second.
+    delay_mean, delay_p99, delay_max : float or None
+        Of arrival minus stamp: the mean, what 99 % do not exceed, and the greatest. Negative, if the clock of the
+        sender is ahead.
+    jitter : float or None
+        The standard deviation of the time between two arrivals.
+    longest_gap : float or None
+        The longest time between two arrivals, or since the last one.
+    late : int
+        Samples with an older stamp than one before them.
+    lost : int
+        Samples that are missing between the stamps, if they are to have the median period: an estimate, and for
+        senders with a fixed rate only.
+    """
+
+    frame: str
+    parent: str
+    authority: str
+    static: bool
+    samples: int
+    rate: float | None
+    delay_mean: float | None
+    delay_p99: float | None
+    delay_max: float | None
+    jitter: float | None
+    longest_gap: float | None
+    late: int
+    lost: int
+
+
+class Arrivals:
+    """Measures what arrives, over a window that ends now.
+
+    Parameters
+    ----------
+    window : float
+        Its length in s.
+    """
+
+    def __init__(self, window: float) -> None:
+        self._window = from_seconds(window)
+        self._received: dict[tuple[str, str], _Received] = {}
+
+    def note(self, batch: Batch, now: int) -> None:
+        """Count the samples of a batch that arrives at the stamp `now`, in ns."""
+        for sample in batch:
+            key = sample.child, sample.authority
+            received = self._received.get(key)
+            if received is None:
+                received = self._received[key] = _Received()
+            received.parent, received.static = sample.parent, sample.static
+            if not sample.static:
+                received.times.append((now, sample.stamp))
+
+    def forget(self, frame: str) -> None:
+        """Forget a frame that was removed."""
+        for key in [key for key in self._received if key[0] == frame]:
+            del self._received[key]
+
+    def measure(self, now: int) -> list[Arrival]:
+        """Each frame and sender, sorted by both; one that was silent for the whole window stays, without a rate."""
+        found = []
+        for (frame, authority), received in sorted(self._received.items()):
+            times = received.times
+            while times and times[0][0] < now - self._window:
+                times.popleft()
+            found.append(received.measured(frame, authority, now))
+        return found
+
+
+class _Received:
+    """The arrivals and stamps of one frame and sender, in ns."""
+
+    def __init__(self) -> None:
+        self.parent = ""
+        self.static = False
+        self.times: deque[tuple[int, int]] = deque(maxlen=MAX_SAMPLES)
+
+    def measured(self, frame: str, authority: str, now: int) -> Arrival:
+        count = len(self.times)
+        if not count:
+            unknown = (None, None, None, None, None, None)
+            return Arrival(frame, self.parent, authority, self.static, 0, *unknown, late=0, lost=0)
+        arrived, stamps = np.array(self.times, np.int64).T
+        delays = np.sort(arrived - stamps) / SECOND
+        periods = np.diff(arrived) / SECOND
+        several = count > 1 and arrived[-1] > arrived[0]
+        return Arrival(
+            frame,
+            self.parent,
+            authority,
+            self.static,
+            count,
+            rate=float((count - 1) * SECOND / (arrived[-1] - arrived[0])) if several else None,
+            delay_mean=float(delays.mean()),
+            delay_p99=float(delays[-(-99 * count // 100) - 1]),
+            delay_max=float(delays[-1]),
+            jitter=float(periods.std()) if count > 1 else None,
+            longest_gap=max(float(periods.max(initial=0.0)), (now - int(arrived[-1])) / SECOND),
+            late=int(np.count_nonzero(stamps[1:] < np.maximum.accumulate(stamps)[:-1])),
+            lost=_lost(np.diff(np.unique(stamps))),
+        )
+
+
+def _lost(steps: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> int:
+    """The number of samples that are missing where two stamps are several usual periods apart."""
+    if len(steps) < 2:
+        return 0
+    return int((np.rint(steps / np.median(steps)).astype(np.int64) - 1).clip(0).sum())

@@ -1,0 +1,198 @@
+"""``tfbus monitor``."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from tfbus.analysis.arrivals import Arrival, Arrivals
+from tfbus.buffer.buffer import Buffer
+from tfbus.bus.bus import Bus
+from tfbus.cli._table import Column, table_lines
+from tfbus.cli._width import terminal_width, wrapped
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Positive, Rate, UsageError
+from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
+from tfbus.cli.output import print_now, printable
+from tfbus.errors import TransformLookupError
+from tfbus.stamps import format_duration, from_seconds
+from tfbus.tree.tree import TransformTree
+
+# The least important column has the lowest number.
+_COLUMNS = (
+    Column("frame"),
+    Column("sender", importance=1),
+    Column("rate", right=True),
+    Column("delay mean", right=True, importance=9),
+    Column("p99", right=True, importance=7),
+    Column("max", right=True, importance=8),
+    Column("jitter", right=True, importance=3),
+    Column("longest gap", right=True, importance=6),
+    Column("late", right=True, importance=4),
+    Column("lost", right=True, importance=5),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """The way between two frames.
+
+    Attributes
+    ----------
+    frames : list of str
+        From target to source; empty if they are not connected.
+    slowest : str or None
+        The moving frame with the lowest rate on it.
+    age : float or None
+        The time since the newest stamp that all moving frames on it have data for, in s.
+    problem : str
+        The reason why there is no transform.
+    """
+
+    frames: list[str]
+    slowest: str | None
+    age: float | None
+    problem: str
+
+
+def monitor(
+    target: Annotated[str | None, Parameter(show_default=False)] = None,
+    source: Annotated[str | None, Parameter(show_default=False)] = None,
+    /,
+    *,
+    window: Positive = 10.0,
+    rate: Rate = 1.0,
+    once: Flag = False,
+    duration: Duration = 3.0,
+    as_json: JsonFlag = False,
+    link: LinkOptions = DEFAULT_LINK,
+) -> None:
+    """Measure the rate, the delay, the jitter and the losses of each frame and sender of a domain, until Ctrl-C.
+
+    A delay is the time from the stamp of a sample to its arrival here; jitter is the standard deviation of the time
+    between two arrivals. Late samples have an older stamp than one before; lost ones are missing between the stamps, as
+    far as a sender has a fixed rate. With TARGET and SOURCE, only the frames between the two are shown, and the
+    slowest of them.
+
+    Example: tfbus monitor map base_link
+
+    Parameters
+    ----------
+    target
+        The frame in which the transform of a pair is expressed.
+    source
+        The frame whose transform it is.
+    window
+        The time over which is measured, in s before now.
+    rate
+        Updates per second.
+    once
+        Print once and end.
+    duration
+        How many seconds to listen before, with --once.
+    as_json
+        Print a JSON object instead, one a line unless --once is given; durations in s.
+    """
+    from rich.text import Text
+
+    from tfbus.cli._tree_display import TreeDisplay
+
+    pair = None
+    if target is not None:
+        if source is None:
+            raise UsageError(f"a pair is TARGET and SOURCE, and {target!r} has no SOURCE")
+        pair = (target, source)
+
+    async def measure(bus: Bus) -> None:
+        arrivals = Arrivals(window)
+        with (
+            Buffer(bus) as buffer,
+            bus.subscribe(lambda batch: arrivals.note(batch, bus.clock.now()), arrivals.forget),
+            TreeDisplay(live=not once and not as_json) as display,
+        ):
+
+            def show() -> None:
+                now = bus.clock.now()
+                found = arrivals.measure(now)
+                chain = None if pair is None else chain_of(buffer.tree, *pair, found, now)
+                if chain is not None and chain.frames:
+                    found = [arrival for arrival in found if arrival.frame in chain.frames]
+                if as_json:
+                    document = to_document(found, chain, window)
+                    print_now(json.dumps(document, indent=2 if once else None))
+                else:
+                    display.show_lines([Text(line) for line in text_lines(found, chain, terminal_width())])
+
+            await link.first_transform(bus)
+            if once:
+                await bus.clock.sleep(duration)
+                show()
+                return
+            async for _ in bus.clock.ticks(rate):
+                show()
+
+    link.run(measure)
+
+
+def chain_of(tree: TransformTree, target: str, source: str, arrivals: Sequence[Arrival], now: int) -> Chain:
+    """The way between two frames, with what was measured of its frames up to `now`, in ns."""
+    try:
+        frames = tree.chain(target, source)
+        newest = tree.latest_common_stamp(target, source)
+    except TransformLookupError as error:
+        return Chain([], None, None, str(error))
+    # The frame on top of a way has its edge above the way.
+    crossed = {child for pair in pairwise(frames) for child in pair if tree.parent(child) in pair}
+    moving = [each for each in arrivals if each.frame in crossed and each.rate is not None]
+    slowest = min(moving, key=lambda each: each.rate or 0.0).frame if moving else None
+    return Chain(frames, slowest, None if newest is None else (now - newest) / from_seconds(1), "")
+
+
+def to_document(arrivals: Sequence[Arrival], chain: Chain | None, window: float) -> dict[str, Any]:
+    """The JSON object of one update."""
+    pair = {} if chain is None else {"chain": asdict(chain)}
+    return {"window": window, "frames": [asdict(arrival) for arrival in arrivals], **pair}
+
+
+def text_lines(arrivals: Sequence[Arrival], chain: Chain | None, width: int | None) -> Iterator[str]:
+    """The lines of one update, which fit the width."""
+    if chain is not None:
+        yield from wrapped(_describe(chain), width, 2)
+        yield ""
+    if not arrivals:
+        yield "(no frames)"
+        return
+    yield from table_lines(_COLUMNS, [_row(arrival) for arrival in arrivals], width)
+
+
+def _describe(chain: Chain) -> str:
+    if not chain.frames:
+        return f"no transform: {chain.problem}"
+    way = " <- ".join(map(printable, chain.frames))
+    age = "static" if chain.age is None else f"age {_duration(chain.age)}"
+    slowest = f", the slowest is {printable(chain.slowest)}" if chain.slowest else ""
+    return f"{way}: {age}{slowest}"
+
+
+def _row(arrival: Arrival) -> tuple[str, ...]:
+    rate = "" if arrival.rate is None else f"{arrival.rate:.1f} Hz"
+    state = "static" if arrival.static else "silent" if not arrival.samples else rate or "one sample"
+    counted = not arrival.static
+    return (
+        printable(arrival.frame),
+        printable(arrival.authority),
+        state,
+        _duration(arrival.delay_mean),
+        _duration(arrival.delay_p99),
+        _duration(arrival.delay_max),
+        _duration(arrival.jitter),
+        _duration(arrival.longest_gap),
+        f"{arrival.late:,}" if counted else "",
+        f"{arrival.lost:,}" if counted else "",
+    )
+
+
+def _duration(seconds: float | None) -> str:
+    return "" if seconds is None else format_duration(from_seconds(seconds))

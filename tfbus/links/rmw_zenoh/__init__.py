@@ -1,0 +1,10 @@
+"""Links to ROS 2 over zenoh, as its middleware rmw_zenoh speaks it: `RmwZenohLink`, with the extra ``tfbus[zenoh]``."""
+
+try:
+    import zenoh  # noqa: F401 - the inner modules need it
+except ImportError:
+    raise ImportError('a link to rmw_zenoh needs a package more: pip install "tfbus[zenoh]"') from None
+
+from tfbus.links.rmw_zenoh.rmw_zenoh_link import RmwZenohLink
+
+__all__ = ["RmwZenohLink"]

@@ -1,0 +1,178 @@
+"""The carrier of links to rmw_zenoh."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from threading import Thread
+from time import time_ns
+from typing import Any
+from uuid import uuid4
+
+import anyio
+import anyio.to_thread
+import zenoh
+import zenoh.ext
+
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._receive_queue import Received
+from tfbus.links.rmw_zenoh._wire import (
+    CLOCK_HASH,
+    CLOCK_TYPE,
+    JOINT_HASH,
+    JOINT_TYPE,
+    Attachment,
+    endpoint_token,
+    node_token,
+    other_token,
+    pack,
+    publisher_of,
+    topic_expression,
+    topic_key,
+)
+from tfbus.links.ros._carrier import RosCarrier, RosMessage
+from tfbus.links.ros.settings import RosSettings
+from tfbus.tf_message import MalformedMessageError, encode
+
+MAX_SIZE = 2**22
+"""The largest message that is received, in bytes."""
+_CLOSING_TIME = 1.0
+_HEARTBEAT = 0.5
+_AUTHORITY = "rmw_zenoh"
+
+
+class RmwZenohCarrier(RosCarrier):
+    """Speaks as a node of ROS 2 with rmw_zenoh does; see `RosCarrier`.
+
+    Parameters
+    ----------
+    domain : int
+    node : str
+        The name of the node.
+    config : zenoh.Config
+    settings : RosSettings
+    """
+
+    def __init__(self, domain: int, node: str, config: zenoh.Config, settings: RosSettings) -> None:
+        super().__init__(f"{_AUTHORITY}:{domain}", settings)
+        self._domain = domain
+        self._node = node
+        self._config = config
+        self._session: zenoh.Session | None = None
+        self._declared: list[Any] = []
+        self._publishers: dict[bool, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {}
+        self._ids = {static: uuid4().bytes for static in (False, True)}
+        self._numbers = {False: 0, True: 0}
+
+    async def _connect(self) -> None:
+        try:
+            await anyio.to_thread.run_sync(self._join)
+        except zenoh.ZError as error:
+            raise ConnectionError(f"no router of rmw_zenoh: {error}") from error
+
+    def _join(self) -> None:
+        session = self._session = zenoh.open(self._config)
+        name = str(session.zid())
+        self._token(node_token(self._domain, name, self._node))
+        topics = [
+            *((topic, True, publishes) for topic in self.settings.tf_static for publishes in (False, True)),
+            *((topic, False, publishes) for topic in self.settings.tf for publishes in (False, True)),
+        ]
+        first = {True: self.settings.tf_static[0], False: self.settings.tf[0]}
+        for number, (topic, static, publishes) in enumerate(topics, 1):
+            if publishes and (not self.settings.send or topic != first[static]):
+                continue
+            if publishes:
+                self._publishers[static] = self._publisher(session, topic, static)
+            else:
+                self._declared.append(self._subscriber(session, topic, static))
+            self._token(endpoint_token(self._domain, name, number, self._node, topic, static, publishes))
+
+        others = (
+            *((topic, JOINT_TYPE, JOINT_HASH, self._take_joints) for topic in self.settings.joint_topic),
+            *((topic, CLOCK_TYPE, CLOCK_HASH, self._take_clock) for topic in self.settings.clock_topic),
+        )
+        for number, (topic, kind, digest, take) in enumerate(others, len(topics) + 1):
+            self._declared.append(session.declare_subscriber(topic_expression(self._domain, topic, kind), take))
+            self._token(other_token(self._domain, name, number, self._node, topic, kind, digest))
+
+    def _token(self, key: str) -> None:
+        assert self._session is not None
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def _publisher(
+        self, session: zenoh.Session, topic: str, static: bool
+    ) -> zenoh.Publisher | zenoh.ext.AdvancedPublisher:
+        key = topic_key(self._domain, topic)
+        if not static:
+            return session.declare_publisher(key)
+        return zenoh.ext.declare_advanced_publisher(
+            session,
+            key,
+            cache=zenoh.ext.CacheConfig(max_samples=1),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT),
+            publisher_detection=True,
+        )
+
+    def _subscriber(self, session: zenoh.Session, topic: str, static: bool) -> object:
+        key = topic_expression(self._domain, topic)
+        take: Callable[[zenoh.Sample], None] = partial(self._take, static)
+        if not static:
+            return session.declare_subscriber(key, take)
+        return zenoh.ext.declare_advanced_subscriber(
+            session,
+            key,
+            take,
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+            subscriber_detection=True,
+        )
+
+    async def close(self) -> None:
+        """Close the session, or give up waiting for that."""
+        closing = Thread(target=self._leave, name="tfbus rmw_zenoh close", daemon=True)
+        closing.start()
+        with anyio.move_on_after(_CLOSING_TIME, shield=True):
+            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
+
+    def _leave(self) -> None:
+        session, self._session = self._session, None
+        self._publishers.clear()
+        # Closing the session undeclares all of them.
+        if session is not None:
+            session.close()
+        self._declared.clear()
+
+    def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
+        publisher = self._publishers.get(static)
+        if publisher is None:
+            return False
+        self._numbers[static] += 1
+        attachment = pack(Attachment(self._numbers[static], time_ns(), self._ids[static]))
+        try:
+            publisher.put(encode(samples), attachment=attachment)
+        except zenoh.ZError as error:
+            self._report.failed(error)
+            return False
+        return True
+
+    def _take(self, static: bool, sample: zenoh.Sample) -> None:
+        """Take a message, in zenoh's threads."""
+        attachment = sample.attachment
+        if attachment is not None and publisher_of(bytes(attachment)) in self._ids.values():
+            return
+        self._pass_on(RosMessage(bytes(sample.payload), static, _AUTHORITY))
+
+    def _take_joints(self, sample: zenoh.Sample) -> None:
+        """Take positions of joints, in zenoh's threads."""
+        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, joints=True))
+
+    def _take_clock(self, sample: zenoh.Sample) -> None:
+        """Take the time, in zenoh's threads."""
+        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, clock=True))
+
+    def _pass_on(self, message: RosMessage) -> None:
+        size = len(message.payload)
+        if size > MAX_SIZE:
+            error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
+            self._receive(Received(_AUTHORITY, error))
+        else:
+            self._receive(Received(_AUTHORITY, message, size, moving=not message.static))
