@@ -142,6 +142,8 @@ async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: st
                 with pytest.raises(RuntimeError, match="1 lookups wait"):
                     await client.lookup("map", "base")
                 tasks.cancel_scope.cancel()
+            with pytest.raises(RuntimeError, match="not entered"):
+                await client.lookup("map", "base")
             with pytest.raises(RuntimeError, match="entered once"):
                 await client.__aenter__()
     with Bus() as bus, pytest.raises(RuntimeError, match="not entered"):

@@ -28,6 +28,7 @@ from tfbus.tree.policy import Hold, policy_of
 
 PATIENCE = 3.0
 """s; a client waits for so long for a server that it has not met, and for an answer that is late."""
+_MOST_SILENCES = 3
 _SETTLING = 0.5
 """s."""
 
@@ -88,6 +89,7 @@ class BufferClient:
         self._capacity = capacity
         self._id = uuid4().hex
         self._entered = False
+        self._is_open = False
         self._number = 0
         self._pending: dict[int, _Pending] = {}
         self._arrived: deque[tuple[int, bytes | None]] = deque()
@@ -105,11 +107,15 @@ class BufferClient:
         await self._session.open()
         self._session.announce_asker(self._id)
         self._session.follow("@lookup", self._note_server)
+        self._is_open = True
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self._is_open = False
+        for pending in self._pending.values():
+            pending.done.set()
         await self._session.close()
 
     async def lookup(
@@ -165,12 +171,22 @@ class BufferClient:
             max_gap=max_gap,
             hold=None if extrapolate is None else extrapolate.max_age,
         )
+        if not self._is_open:
+            raise RuntimeError("the client is not entered")
         await anyio.lowlevel.checkpoint()
+        silences = 0
         while True:
             await self._meet(until)
+            if not self._is_open:
+                raise self._error("lost", "this client has ended")
             left = max(until - monotonic(), 0.0)
             try:
                 return await self._ask(question, min(left, LONGEST_WAIT))
+            except RemoteLookupError as error:
+                # zenoh drops questions and answers while the network is congested.
+                silences += 1
+                if error.reason != "silent" or silences > _MOST_SILENCES or monotonic() >= until:
+                    raise
             except LookupTimeoutError as error:
                 missing = error.__cause__
                 if monotonic() >= until or left <= LONGEST_WAIT:
@@ -210,6 +226,8 @@ class BufferClient:
         if not answered:
             raise self._error("silent", f"it has not answered within {timeout + PATIENCE:g} s")
         if pending.answer is None:
+            if not self._is_open:
+                raise self._error("lost", "this client has ended")
             # The news that the server has gone may come a moment after the end of its questions.
             with anyio.move_on_after(_SETTLING):
                 while self._servers:
