@@ -151,15 +151,15 @@ def test_others_follow_the_clock_of_the_recording(ten_seconds: Path, backend: st
         with start_tfbus("echo", "map", "rig", "--rate", "20", "--json", "--connect", address, *options) as echo:
             ages = []
             for _ in range(20):
-                line = echo.output.expect(r'"age": ([-\d.e]+)')
-                assert line is not None
-                ages.append(float(line[1]))
-        # The stamps of this recording are its first second in ns; the clock is at the log times.
+                age = re.search(r'"age": ([-\d.e]+)', echo.output.expect('"age"'))
+                assert age is not None
+                ages.append(float(age[1]))
+        # The stamps are all in the first microsecond of the recording; the clock is at the log times.
         assert all(0.0 <= age <= 11.0 for age in ages)
         with start_tfbus("tree", "--json", "--duration", "0.3", "--connect", address, *options) as tree:
-            found = tree.output.expect(r'"stamp": (\d+)')
+            found = re.search(r"\d+", tree.output.expect('"stamp"'))
             assert found is not None
-            assert at_first <= int(found[1]) / SECOND <= at_first + 10
+            assert at_first <= int(found[0]) / SECOND <= at_first + 10
             assert tree.wait() == 0
         assert player.end() == 130
 
