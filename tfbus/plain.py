@@ -110,7 +110,7 @@ def from_plain(hint: Any, value: Any, name: str) -> Any:
     """
     problem = ""
     for kind in get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,):
-        read = _READERS.get(get_origin(kind) or kind, _read_dict)
+        read = _READERS.get(_origin_of(kind), _read_dict)
         try:
             found = read(kind, value, name)
         except ValueError as error:
@@ -119,6 +119,13 @@ def from_plain(hint: Any, value: Any, name: str) -> Any:
             if found is not _OTHER:
                 return found
     raise ValueError(f"{name} cannot be {value!r}{problem}")
+
+
+def _origin_of(kind: Any) -> Any:
+    """The class behind a type; from Python 3.12 on, that of an array of numpy is behind an alias."""
+    origin = get_origin(kind) or kind
+    alias = getattr(origin, "__value__", None)
+    return origin if alias is None else _origin_of(alias)
 
 
 _OTHER = object()
