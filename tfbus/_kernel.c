@@ -1445,6 +1445,80 @@ static PyType_Spec chain_spec = {
     "tfbus._kernel.Chain", sizeof(Chain), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, chain_slots
 };
 
+/* The plain commit -------------------------------------------------------------------------------------------------- */
+
+enum { FEW = 64 }; /* samples whose histories fit on the stack */
+
+/* Store the samples of a batch from the index `first` on, up to the first that is not plain; its index, or -1 for an
+ * error. If `whole` is set and not all are plain, or out of memory, all histories are as before. */
+static Py_ssize_t
+store(PyObject *frames, PyObject *batch, Py_ssize_t first, int whole)
+{
+    const Py_ssize_t size = PyTuple_Size(batch);
+    if (first < 0 || first >= size) {
+        return size;
+    }
+    History *few[FEW], **histories = few;
+    if (size - first > FEW && (histories = PyMem_Malloc((size_t)(size - first) * sizeof(History *))) == NULL) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    Py_ssize_t stored = 0;
+    int failed = 0;
+    while (first + stored < size) {
+        PyObject *item = PyTuple_GetItem(batch, first + stored);
+        const Sample *sample = (const Sample *)item;
+        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static) {
+            break;
+        }
+        PyObject *known = PyDict_GetItemWithError(frames, sample->child);
+        if (known == NULL || !PyObject_TypeCheck(known, HistoryType)) {
+            failed = PyErr_Occurred() != NULL;
+            break;
+        }
+        History *history = (History *)known;
+        if (!history_continues(history, sample->parent, sample->stamp, sample->authority)) {
+            break;
+        }
+        if (history_push(history, sample->stamp, sample->row) < 0) {
+            failed = 1;
+            break;
+        }
+        histories[stored++] = history;
+    }
+    const int keep = !failed && !(whole && first + stored < size);
+    for (Py_ssize_t i = 0; i < stored; i++) {
+        if (keep) {
+            history_slide(histories[i]);
+        } else {
+            histories[i]->end--;
+        }
+    }
+    if (histories != few) {
+        PyMem_Free(histories);
+    }
+    if (failed) {
+        return -1;
+    }
+    return keep ? first + stored : first;
+}
+
+/* commit(frames, batch, first) */
+static PyObject *
+commit(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 3 || !PyDict_Check(args[0]) || !PyTuple_CheckExact(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a tuple of samples and an index");
+        return NULL;
+    }
+    const Py_ssize_t first = PyLong_AsSsize_t(args[2]);
+    if (first == -1 && PyErr_Occurred()) {
+        return NULL;
+    }
+    const Py_ssize_t end = store(args[0], args[1], first, 0);
+    return end < 0 ? NULL : PyLong_FromSsize_t(end);
+}
+
 /* Paths: the plain answer ------------------------------------------------------------------------------------------ */
 
 typedef struct {
@@ -1453,7 +1527,22 @@ typedef struct {
     PyObject *lock_is_held;  /* the method of the tree's lock that says so */
     PyObject *latest;        /* the sentinel */
     PyObject *kind;          /* the class of an answer, made of Sample */
+    long long inserted;      /* samples at new stamps */
+    long long version;       /* another one after each change */
 } Paths;
+
+/* Whether nobody holds the lock: whoever does may be in the middle of a change, or of a look at several histories. As
+ * nothing here lets go of the interpreter, it need not be taken then. -1 for an error. */
+static int
+paths_are_free(const Paths *self)
+{
+    PyObject *held = PyObject_CallNoArgs(self->lock_is_held);
+    if (held == NULL) {
+        return -1;
+    }
+    Py_DECREF(held);
+    return held == Py_False;
+}
 
 static int
 paths_traverse(Paths *self, visitproc visit, void *arg)
@@ -1531,16 +1620,13 @@ paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
     if (self->recent == NULL || !PyUnicode_CheckExact(target) || !PyUnicode_CheckExact(source)) {
         Py_RETURN_NONE;
     }
-    /* Whoever holds the lock may be in the middle of a change. */
-    PyObject *held = PyObject_CallNoArgs(self->lock_is_held);
-    if (held != Py_False) {
-        if (held == NULL) {
-            return NULL;
-        }
-        Py_DECREF(held);
+    const int free = paths_are_free(self);
+    if (free < 0) {
+        return NULL;
+    }
+    if (!free) {
         Py_RETURN_NONE;
     }
-    Py_DECREF(held);
     PyObject *by_source = PyDict_GetItemWithError(self->recent, target);
     PyObject *chain = by_source == NULL ? NULL : PyDict_GetItemWithError(by_source, source);
     if (chain == NULL || !PyObject_TypeCheck(chain, ChainType)) {
@@ -1582,6 +1668,34 @@ paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
     return (PyObject *)sample;
 }
 
+/* commit(frames, readers, batch): store the whole batch if it is plain, nobody holds the lock and nobody has to be told. */
+static PyObject *
+paths_commit(Paths *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 3 || !PyDict_Check(args[0]) || !PyDict_Check(args[1]) || !PyTuple_CheckExact(args[2])) {
+        PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a dict of readers and a tuple of samples");
+        return NULL;
+    }
+    if (self->recent == NULL || PyDict_Size(args[1]) > 0) {
+        Py_RETURN_FALSE;
+    }
+    const int free = paths_are_free(self);
+    if (free < 0) {
+        return NULL;
+    }
+    const Py_ssize_t size = PyTuple_Size(args[2]);
+    const Py_ssize_t end = free ? store(args[0], args[2], 0, 1) : 0;
+    if (end < 0) {
+        return NULL;
+    }
+    if (!free || end < size) {
+        Py_RETURN_FALSE;
+    }
+    self->inserted += size;
+    self->version++;
+    Py_RETURN_TRUE;
+}
+
 static PyObject *
 paths_recent(Paths *self, void *Py_UNUSED(closure))
 {
@@ -1610,11 +1724,19 @@ paths_set_recent(Paths *self, PyObject *value, void *Py_UNUSED(closure))
 static PyMethodDef paths_methods[] = {
     {"answer", FAST(paths_answer), METH_FASTCALL,
      PyDoc_STR("answer(target, source, at): the plain answer; None if Python has to look closer.")},
+    {"commit", FAST(paths_commit), METH_FASTCALL,
+     PyDoc_STR("commit(frames, readers, batch): store a batch if all of it is plain and nobody looks; else nothing.")},
     {NULL}
 };
 
 static PyGetSetDef paths_getset[] = {
     {"recent", (getter)paths_recent, (setter)paths_set_recent, PyDoc_STR("{target: {source: Chain}}"), NULL},
+    {NULL}
+};
+
+static PyMemberDef paths_members[] = {
+    {"inserted", T_LONGLONG, offsetof(Paths, inserted), 0, PyDoc_STR("The number of samples at new stamps.")},
+    {"version", T_LONGLONG, offsetof(Paths, version), 0, PyDoc_STR("Another number after each change.")},
     {NULL}
 };
 
@@ -1626,6 +1748,7 @@ static PyType_Slot paths_slots[] = {
     {Py_tp_traverse, paths_traverse},
     {Py_tp_clear, paths_clear},
     {Py_tp_methods, paths_methods},
+    {Py_tp_members, paths_members},
     {Py_tp_getset, paths_getset},
     {0, NULL}
 };
@@ -1633,66 +1756,6 @@ static PyType_Slot paths_slots[] = {
 static PyType_Spec paths_spec = {
     "tfbus._kernel.Paths", sizeof(Paths), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, paths_slots
 };
-
-/* The plain commit -------------------------------------------------------------------------------------------------- */
-
-enum { FEW = 64 }; /* samples whose histories fit on the stack */
-
-/* commit(frames, batch, first): store samples from the index `first` on, up to the first that is not plain; its index.
- * Out of memory, all histories are as before. */
-static PyObject *
-commit(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
-{
-    if (nargs != 3 || !PyDict_Check(args[0]) || !PyTuple_CheckExact(args[1])) {
-        PyErr_SetString(PyExc_TypeError, "commit takes a dict of histories, a tuple of samples and an index");
-        return NULL;
-    }
-    const Py_ssize_t first = PyLong_AsSsize_t(args[2]), size = PyTuple_Size(args[1]);
-    if (first == -1 && PyErr_Occurred()) {
-        return NULL;
-    }
-    if (first < 0 || first >= size) {
-        return PyLong_FromSsize_t(size);
-    }
-    History *few[FEW], **histories = few;
-    if (size - first > FEW && (histories = PyMem_Malloc((size_t)(size - first) * sizeof(History *))) == NULL) {
-        return PyErr_NoMemory();
-    }
-    Py_ssize_t stored = 0;
-    int failed = 0;
-    while (first + stored < size) {
-        PyObject *item = PyTuple_GetItem(args[1], first + stored);
-        const Sample *sample = (const Sample *)item;
-        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static) {
-            break;
-        }
-        PyObject *known = PyDict_GetItemWithError(args[0], sample->child);
-        if (known == NULL || !PyObject_TypeCheck(known, HistoryType)) {
-            failed = PyErr_Occurred() != NULL;
-            break;
-        }
-        History *history = (History *)known;
-        if (!history_continues(history, sample->parent, sample->stamp, sample->authority)) {
-            break;
-        }
-        if (history_push(history, sample->stamp, sample->row) < 0) {
-            failed = 1;
-            break;
-        }
-        histories[stored++] = history;
-    }
-    for (Py_ssize_t i = 0; i < stored; i++) {
-        if (failed) {
-            histories[i]->end--;
-        } else {
-            history_slide(histories[i]);
-        }
-    }
-    if (histories != few) {
-        PyMem_Free(histories);
-    }
-    return failed ? NULL : PyLong_FromSsize_t(first + stored);
-}
 
 /* Edge: the newest edge of a frame on a bus, and the plain judgement of a batch --------------------------------------- */
 

@@ -66,8 +66,11 @@ class Held:
 
 class Paths:
     recent: dict[str, dict[str, Chain]]
+    inserted: int
+    version: int
     def __init__(self, lock: Any, latest: object, kind: type[Sample], /) -> None: ...
     def answer(self, target: str, source: str, at: object, /) -> Any: ...
+    def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Any, /) -> bool: ...
 
 class Edge:
     parent: str

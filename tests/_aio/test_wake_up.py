@@ -15,7 +15,7 @@ class Waiting:
 
     def __init__(self) -> None:
         self.woken = WakeUp()
-        self.ended = ""
+        self.ended: str = ""
 
     async def run(self) -> None:
         try:
@@ -31,12 +31,12 @@ async def test_the_task_goes_on_once_the_wait_is_ended_and_not_before() -> None:
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(waiting.run)
         await settle()
-        assert not waiting.ended
+        assert waiting.ended == ""
         waiting.woken.end()
         # Again, before the task has run and after it.
         waiting.woken.end()
         await settle()
-        assert waiting.ended == "woken"
+        assert str(waiting.ended) == "woken"
         waiting.woken.end()
 
 

@@ -188,3 +188,17 @@ def test_any_numbers_are_examined_without_an_error() -> None:
         for _ in range(200)
     ]
     assert ("translation", "b") in examine(samples, delay=0)
+
+
+def test_a_frame_that_is_sent_as_moving_and_never_moves_is_a_hint() -> None:
+    still = [moving("a", "box", k * 100 * MS, 2.0) for k in range(10)]
+    found = examine(still)
+    finding = found.pop(("never moves", "box"))
+    assert facts(finding) == (10, 0, None, None)
+    assert (finding.is_hint, "for 0.9 s" in finding.detail) == (True, True)
+    assert found == {}
+    assert examine(still[:9]) == {}
+    assert examine([*still, moving("a", "box", SECOND, 2.0 + 1e-12)]) == {}
+    assert ("never moves", "box") not in examine([*still, static("a", "box", 2.0)])
+    assert not drive(10)[0].static
+    assert not any(finding.is_hint for finding in examine(drive(10), delay=-80 * MS).values())

@@ -119,7 +119,12 @@ def test_alarms_on_one_loop_ring_although_another_one_ran_meanwhile() -> None:
 
     async def on_the_first() -> None:
         done = anyio.Event()
-        alarms.call_after(0.001, lambda: (rung.append("first"), done.set()))
+
+        def ring() -> None:
+            rung.append("first")
+            done.set()
+
+        alarms.call_after(0.001, ring)
         await anyio.to_thread.run_sync(anyio.run, on_the_other)
         await done.wait()
 

@@ -2,8 +2,10 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -11,7 +13,7 @@ from pathlib import Path
 import pytest
 from support.commands import Command, check_wrong_call
 from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS
+from support.programs import PATIENCE, TFBUS, Program, start_tfbus
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
@@ -220,3 +222,26 @@ def test_every_command_has_a_module_of_its_name() -> None:
     folder = Path(sys.modules["tfbus.cli.commands"].__path__[0])
     modules = {path.stem for path in folder.glob("*.py")} - {"__init__"}
     assert {name for name in application(None) if not name.startswith("-")} == modules
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_silently_whenever_it_comes(number: signal.Signals) -> None:
+    statuses = set()
+    for step in range(16):
+        with start_tfbus("tree", "--domain", new_domain()) as tree:
+            # Python itself shows a traceback of its own start: until then, nothing of tfbus has been loaded.
+            time.sleep(0.3 + 0.05 * step)
+            statuses.add(tree.end(number))
+        assert tree.errors.text.replace("waiting for transforms", "").count("\n") <= 1
+        assert "Traceback" not in tree.errors.text
+    assert statuses <= {-number, 128 + number}
+
+
+@pytest.mark.thorough
+def test_where_ctrl_c_is_ignored_a_termination_ends_it() -> None:
+    script = 'trap "" INT; exec "$0" tree --domain "$1"'
+    with Program("sh", "-c", script, TFBUS, new_domain()) as tree:
+        tree.errors.expect("waiting")
+        tree.process.send_signal(signal.SIGINT)
+        assert tree.end(signal.SIGTERM) == -signal.SIGTERM

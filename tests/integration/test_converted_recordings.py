@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from mcap.reader import make_reader
@@ -102,9 +102,10 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_npm_s_reader_finds_the_same_messages(tmp_path: Path, source: Path, node: Path) -> None:
     database = tmp_path / "run.db3"
     convert([source], database)
-    for schema in ("ros", "foxglove"):
+    schemas: tuple[Literal["ros", "foxglove"], ...] = ("ros", "foxglove")
+    for schema in schemas:
         path = tmp_path / f"{schema}.mcap"
-        convert([database], path, schema=schema)  # type: ignore[arg-type]
+        convert([database], path, schema=schema)
         read = subprocess.run(["node", "read.js", str(path)], cwd=node, capture_output=True, text=True, check=True)
         found = [json.loads(line) for line in read.stdout.splitlines()]
         with path.open("rb") as file:
@@ -153,7 +154,8 @@ def test_the_real_tf2_gives_the_same_answers_from_what_convert_wrote(
     # Decoded by the official reader and by rosbags, not by tfbus.
     with path.open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
-            for each in TYPES.deserialize_cdr(message.data, TF).transforms:
+            decoded: Any = TYPES.deserialize_cdr(message.data, TF)
+            for each in decoded.transforms:
                 stamp = each.header.stamp.sec * SECOND + each.header.stamp.nanosec
                 samples.append(
                     (

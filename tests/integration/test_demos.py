@@ -119,6 +119,24 @@ def test_the_demo_of_two_robots_runs_as_a_script() -> None:
 
 
 @pytest.mark.thorough
+def test_the_demo_of_a_fleet_shows_what_each_view_brings() -> None:
+    options = ["--robots", "12", "--frames", "3", "--rate", "10", "--processes", "2", "--seconds", "2"]
+    done = subprocess.run(
+        [sys.executable, DEMOS / "fleet.py", *options], capture_output=True, text=True, timeout=120, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    heading, _, nobody, in_full, slowly, last = done.stdout.splitlines()
+    assert heading.startswith("12 robots x 3 frames x 10 Hz in 2 processes, ")
+    peers = [int(re.split("  +", line)[1]) for line in (nobody, in_full, slowly)]
+    assert peers == [0, 10, 12]
+    samples = [float(re.findall(r"cores +(\d+) ", line)[0]) for line in (nobody, in_full, slowly)]
+    # At most what ten robots publish, and of all the newest samples once a second.
+    assert samples[0] == 0
+    assert 0 < samples[2] < samples[1] < 1.2 * 10 * 3 * 10
+    assert last.startswith("the ten publish ")
+
+
+@pytest.mark.thorough
 def test_the_demo_of_a_watch_redraws_no_more_than_can_be_seen() -> None:
     done = subprocess.run([sys.executable, DEMOS / "watch.py"], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0

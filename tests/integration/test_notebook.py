@@ -65,3 +65,12 @@ def test_a_tree_a_buffer_and_a_recording_draw_themselves(kernel: Kernel) -> None
         assert "from &#x27;me&#x27;" in data["text/html"]
     assert "<pre" in recording["text/html"]
     assert "Hz" in recording["text/html"]
+
+
+def test_a_lookup_is_awaited_at_the_top_level_of_a_cell(kernel: Kernel) -> None:
+    kernel.run("import tfbus; bus = tfbus.Bus(); buffer = tfbus.Buffer(bus); repr(buffer)")
+    publish = "bus.publish(tfbus.TransformStamped('map', 'base', 5, tfbus.Transform((1.0, 2.0, 0.0))))"
+    waiting = "import asyncio; task = asyncio.ensure_future(buffer.lookup('map', 'base', timeout=60.0)); task.done()"
+    assert kernel.run(waiting)["text/plain"] == "False"
+    assert kernel.run(f"{publish}; (await task).transform.translation")["text/plain"] == "(1.0, 2.0, 0.0)"
+    assert kernel.run("(await buffer.lookup('map', 'base')).stamp")["text/plain"] == "5"

@@ -341,7 +341,7 @@ async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own(
     carrier = LoggedCarrier()
     told: list[int | None] = []
     carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
-    carrier.read = lambda content: ReceivedMessage([], time=content)  # type: ignore[method-assign, assignment]
+    carrier.read = lambda content: ReceivedMessage([], time=content)  # type: ignore[method-assign, arg-type]
     with Bus(clock) as bus:
         async with Link(bus, "world", carrier, clock=clock, tell_clock=True):
             carrier.receive(Received("robot", Presence.JOINED))

@@ -142,6 +142,16 @@ def test_other_files_are_refused_with_an_error_of_one_line(
     assert "\n" not in str(raised.value)
 
 
+def test_a_topic_that_is_not_there_is_refused_with_ten_that_are(tmp_path: Path) -> None:
+    lines = [(number, f"/robot_{number:02}/tf", [moving("odom", "base", number)]) for number in range(12)]
+    path = write_mcap(tmp_path / "run.mcap", lines)
+    with pytest.raises(RecordingError) as raised:
+        open_recording(path, topics=["/gone"])
+    assert raised.value.reason == "no such topic"
+    there = ", ".join(f"/robot_{number:02}/tf" for number in range(10))
+    assert str(raised.value).endswith(f"topic 'gone' is not there; topics with transforms: {there}")
+
+
 def test_a_file_that_does_not_exist_is_missing(tmp_path: Path) -> None:
     for path in (tmp_path / "run.mcap", tmp_path / "no folder" / "run.mcap"):
         with pytest.raises(RecordingError, match="there is no such file") as raised:

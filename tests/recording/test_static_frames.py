@@ -72,6 +72,7 @@ def test_a_file_written_by_hand_has_angles_in_either_unit(tmp_path: Path) -> Non
         ([{"parent": "a", "child": "b", "xyz": "abc"}], "'xyz' is a list of 3 numbers"),
         ([{"parent": "a", "child": "b", "quaternion": [0, 0, 0, 0]}], "transform 1: "),
         ([{"parent": "a", "child": "b", "rpy": [0, 0, 0], "rpy_deg": [0, 0, 0]}], "rpy and rpy_deg say the same"),
+        ([{"parent": "a", "child": "b", "rotation": [0, 0, 0, 1], "quaternion": [0, 0, 0, 1]}], "say the same"),
         ([{"parent": 1, "child": "b"}], "transform 1: "),
         ([{"parent": "a", "child": "b", "authority": 1}], "transform 1: "),
         ([{"parent": "a", "child": "b", "transform": 1}], "transform 1: "),
@@ -96,3 +97,12 @@ def test_a_file_that_is_no_text_or_not_there_is_named(tmp_path: Path) -> None:
         load_static(file)
     with pytest.raises(RecordingError, match="it cannot be read"):
         load_static(tmp_path)
+
+
+def test_what_convert_writes_is_read(tmp_path: Path) -> None:
+    pytest.importorskip("ruamel.yaml", reason="the extra bag is not installed")
+    file = tmp_path / "statics.yaml"
+    file.write_text(
+        '- parent: "base"\n  child: "lidar"\n  translation: [1.0, 2.0, 3.0]\n  rotation: [0.0, 0.0, 1.0, 0.0]\n'
+    )
+    assert load_static(file) == [TransformStamped("base", "lidar", 0, Transform((1, 2, 3), (0, 0, 1, 0)), static=True)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import anyio
 import pytest
 from anyio.abc import TaskGroup
-from hypothesis import HealthCheck, event, given, settings
+from hypothesis import HealthCheck, event, example, given, settings
 from hypothesis import strategies as st
 
 from tfbus import (
@@ -187,11 +187,11 @@ class Reader:
             edge = edges.get(frame)
             if frame in self.stale and edge is not None and (edge.static or edge.newest + self.limit >= now):
                 self.stale.remove(frame)
-                self.read.append(FrameLive(now, frame, None if edge.static else edge.newest, edge.authority))
+                self.read.append(FrameLive(now, frame, None if edge.static else edge.newest, edge.publisher))
         for frame, edge in sorted(edges.items(), key=lambda known: (known[1].newest, known[0])):
             if not edge.static and frame not in self.stale and edge.newest + self.limit < now:
                 self.stale.add(frame)
-                self.read.append(FrameStale(now, frame, edge.newest, edge.authority))
+                self.read.append(FrameStale(now, frame, edge.newest, edge.publisher))
 
     def flush(self) -> None:
         self.read += self.pending
@@ -435,7 +435,7 @@ class Game:
     def join(self, joining: Join) -> None:
         now = self.clock.now()
         known: list[Event] = [
-            FrameAdded(now, child, edge.parent, edge.authority, edge.static) for child, edge in self.model.edges.items()
+            FrameAdded(now, child, edge.parent, edge.publisher, edge.static) for child, edge in self.model.edges.items()
         ]
         limit = math.inf if joining.stale_after is None else joining.stale_after * SECOND
         self.model.readers.append(Reader(joining.capacity, limit, known, len(known)))
@@ -539,7 +539,19 @@ BURSTS = st.builds(
 )
 
 
+STRANGERS = Draft(("a", "b"), 0, "odometry", False, False)
+OWNERS = Draft(("b", "a"), 0, "slam", False, False)
+RESERVED = Reserve("a", "slam")
+# What is rare: a stranger's edge goes to make room, from the bus or from a batch.
+MAKING_ROOM = [
+    Burst((), (Publish((STRANGERS,), False), RESERVED, Publish((OWNERS,), False)), 0.0),
+    Burst((), (Remove("a"), Publish((STRANGERS, STRANGERS, OWNERS), True), Remove("a")), 0.0),
+    Burst((), (Publish((STRANGERS,), False), Publish((OWNERS, STRANGERS), False), Publish((OWNERS,), True)), 1.5),
+]
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@example(on_conflict="last", bursts=MAKING_ROOM)
 @given(on_conflict=st.sampled_from(["last", "reject"]), bursts=st.lists(BURSTS, min_size=2, max_size=10))
 @pytest.mark.thorough
 def test_every_reader_reads_exactly_what_the_model_says(run: Run, on_conflict: OnConflict, bursts: list[Burst]) -> None:

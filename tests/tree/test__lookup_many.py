@@ -735,7 +735,7 @@ def test_the_answers_have_the_stamps_that_were_asked_and_slices_and_masks_keep_t
         assert found.stamps is not None
         assert found.stamps.tolist() == stamps.tolist()
         for chosen in (slice(1, 3), stamps > 15, [2, 0]):
-            part = found[chosen]  # type: ignore[index]
+            part = found[chosen]
             assert part.stamps is not None
             assert part.stamps.tolist() == stamps[chosen].tolist()
         # The caller may change what it gave.

@@ -525,9 +525,11 @@ def test_a_commit_takes_a_batch_of_any_size(kernel: ModuleType) -> None:
 
 
 @needs_both
-def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was() -> None:
+@pytest.mark.parametrize("without_lock", [False, True])
+def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was(without_lock: bool) -> None:
     nomemory = pytest.importorskip("_testcapi")
     assert COMPILED is not None
+    whole = answers_of(COMPILED, threading.Lock()) if without_lock else None
     failures = 0
     for allowed in range(40):
         frames = {name: history(COMPILED, [(stamp, x(stamp)) for stamp in range(8)], keep=9) for name in "ab"}
@@ -536,7 +538,7 @@ def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was() -> None:
         batch = tuple(sample(COMPILED, "ab"[i % 2], 100 + i, i) for i in range(200))
         nomemory.set_nomemory(allowed, 0)
         try:
-            stored = COMPILED.commit(frames, batch, 0)
+            stored = COMPILED.commit(frames, batch, 0) if whole is None else whole.commit(frames, {}, batch)
         except MemoryError:
             stored = None
         finally:
@@ -546,6 +548,45 @@ def test_out_of_memory_in_a_commit_leaves_every_history_as_it_was() -> None:
             assert [contents(edge) for edge in frames.values()] == before
             assert COMPILED.commit(frames, batch, 0) == 200
     assert 0 < failures < 40
+
+
+def answers_of(kernel: Any, lock: Any) -> Any:
+    return kernel.Paths(lock, LATEST, sample_class(kernel))
+
+
+@on_both
+@pytest.mark.parametrize(
+    ("frames", "batch", "readers", "stored"),
+    [
+        ("a", [("a", 1)], {}, True),
+        ("a", [("a", 0)], {}, False),
+        ("a", [("b", 1)], {}, False),
+        ("a", [("a", 1)], {1: set()}, False),
+        ("ab", [("a", 1), ("b", 1), ("a", 1)], {}, False),
+        ("ab", [("a", 1), ("c", 1)], {}, False),
+    ],
+)
+def test_a_batch_is_committed_without_the_lock_if_it_is_plain_as_a_whole(
+    kernel: ModuleType, frames: str, batch: list[tuple[str, int]], readers: dict[int, Any], stored: bool
+) -> None:
+    paths = answers_of(kernel, threading.Lock())
+    histories = {name: history(kernel, [(0, x(0.0))]) for name in frames}
+    samples = tuple(sample(kernel, child, stamp) for child, stamp in batch)
+    assert paths.commit(histories, readers, samples) is stored
+    assert [edge.count for edge in histories.values()] == [1 + stored] * len(frames)
+    assert (paths.inserted, paths.version) == (stored, stored)
+
+
+@needs_both
+def test_the_compiled_kernel_commits_nothing_while_somebody_holds_the_lock() -> None:
+    lock = threading.Lock()
+    paths, edge = answers_of(COMPILED, lock), history(COMPILED, [(0, x(0.0))])
+    with lock:
+        assert not paths.commit({"a": edge}, {}, (sample(COMPILED, "a", 1),))
+    assert edge.count == 1
+    batch = tuple(sample(COMPILED, "a", 1 + i) for i in range(100))
+    assert paths.commit({"a": edge}, {}, batch)
+    assert (edge.count, paths.inserted, paths.version) == (101, 100, 1)
 
 
 # Samples

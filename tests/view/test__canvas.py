@@ -44,6 +44,20 @@ def test_axes_dots_and_lines_are_where_the_scene_has_them() -> None:
     assert clicked == [picture.scene.frames[3], "map"]
 
 
+def test_the_shapes_of_a_robot_are_drawn_with_each_picture() -> None:
+    page = Page(tree_of(moving("map", "base", 0, 1.0)))
+    drawn: list[object] = []
+    with viser_page() as server:
+        canvas = Canvas(server, print)
+        canvas.draw(page.picture(0), 0.2)
+        canvas.show_solids(SimpleNamespace(draw=drawn.append))  # type: ignore[arg-type]
+        for _ in range(2):
+            picture = page.picture(0)
+            canvas.draw(picture, 0.2)
+            assert drawn.pop() is picture.scene
+    assert drawn == []
+
+
 def test_labels_follow_their_frames_and_hide_when_they_are_not_wanted() -> None:
     tree = tree_of(moving("map", "base", 0, 1.0))
     page = Page(tree)

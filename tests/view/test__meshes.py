@@ -40,6 +40,23 @@ def test_meshes_of_the_usual_kinds_are_read(box: Path, kind: str) -> None:
     assert files.missing == {}
 
 
+@pytest.mark.parametrize(("unit", "side"), [("0.01", 0.02), ("1", 2.0), ("0.0254", 0.0508)])
+def test_a_collada_file_says_its_unit(box: Path, unit: str, side: float) -> None:
+    path = box / "robot" / "meshes" / "box.dae"
+    text = path.read_text()
+    assert "<unit" not in text
+    path.write_text(text.replace("</asset>", f'<unit name="own" meter="{unit}"/></asset>', 1))
+    assert extents(solid(Mesh(str(path), (1.0, 1.0, 1.0)))) == [side / 2, side, round(side * 1.5, 6)]
+
+
+def test_a_collada_file_without_a_sensible_unit_is_missing(box: Path) -> None:
+    path = box / "robot" / "meshes" / "box.dae"
+    path.write_text(path.read_text().replace("</asset>", '<unit name="own" meter="0"/></asset>', 1))
+    files = MeshFiles((), Path())
+    assert files.read(str(path)) is None
+    assert "unit" in files.missing[str(path)]
+
+
 def test_a_package_is_looked_for_in_and_as_each_folder(box: Path) -> None:
     path = box / "robot" / "meshes" / "box.stl"
     name = "package://robot/meshes/box.stl"

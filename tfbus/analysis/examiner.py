@@ -11,8 +11,11 @@ from tfbus.analysis.finding import Finding
 from tfbus.analysis.limits import Limits
 from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.stamps import SECOND
 
 _SHOWN = 5
+_MANY = 10
+"""Fewer samples in one place do not tell that a frame never moves."""
 
 
 class Examiner:
@@ -133,6 +136,16 @@ class _Frame:
             yield Finding("two kinds", self._name, len(self._stamps), self._stamps[0], None, "", detail)
         if self._stamps:
             yield from self._moving().findings(limits)
+        if not self._statics:
+            yield from self._at_rest()
+
+    def _at_rest(self) -> Iterator[Finding]:
+        """A hint, if a frame is sent as moving and has the same place in the same parent all the time."""
+        rows = np.array(self._rows, np.float64).reshape(-1, 7)
+        if len(rows) >= _MANY and len(self._parents) == 1 and (rows == rows[0]).all():
+            span = (max(self._stamps) - min(self._stamps)) / SECOND
+            detail = f"sent as moving for {span:.4g} s, and never moves"
+            yield Finding("never moves", self._name, len(rows), min(self._stamps), None, "", detail)
 
     def _of_senders(self) -> Iterator[Finding]:
         for kind, names, numbers in (

@@ -18,10 +18,13 @@ ADVICE = {
     "rotation": "normalise quaternions before they are sent",
     "static changes": "a static transform is sent once: send it as a moving one",
     "two kinds": "a frame is static or moving: the last kind wins, and drops the history of the other",
+    "never moves": "if it is fixed, send it once as a static transform; if it only stood still, all is well",
     "disconnected": "nothing can be looked up between these trees: a transform is missing",
     "refused": "these are left out",
 }
 """The advice for each kind of finding."""
+HINTS = frozenset(("never moves",))
+"""The kinds that may be as they are meant."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,11 @@ class Finding:
     unit: str
     detail: str
     at: int | None = None
+
+    @property
+    def is_hint(self) -> bool:
+        """Whether it may be as it is meant, rather than wrong."""
+        return self.kind in HINTS
 
     @property
     def advice(self) -> str:

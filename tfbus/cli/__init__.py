@@ -3,7 +3,8 @@
 Standard output carries the result of a command; notices, warnings and errors go to standard error.
 """
 
-import signal
+# Not `signal`, which loads enum: meanwhile Ctrl-C would still be a traceback.
+import _signal as signal  # type: ignore[import-not-found]
 import sys
 
 

@@ -30,7 +30,7 @@ class Block:
         self._decode = decode
 
     def __len__(self) -> int:
-        return self._content.count if isinstance(self._content, Packed) else len(self._content)
+        return self._content.size if isinstance(self._content, Packed) else len(self._content)
 
     @property
     def stored(self) -> list[StoredMessage]:

@@ -14,7 +14,7 @@ from tfbus.stamps import SECOND, to_seconds
 
 _GROWTH: Final = math.log(1.01)
 _SINGLE: Final = 1_000
-"""Durations that come one by one are counted so many at once."""
+"""Durations that come in few are counted so many at once."""
 
 
 class Durations:
@@ -42,16 +42,24 @@ class Durations:
     def add_one(self, duration: int) -> None:
         """Count a duration in ns."""
         self._single.append(duration)
-        if len(self._single) == _SINGLE:
+        if len(self._single) >= _SINGLE:
             self._count_single()
+
+    def add(self, durations: npt.NDArray[np.int64]) -> None:
+        """Count durations in ns; there is at least one."""
+        if len(durations) < _SINGLE:
+            self._single.frombytes(durations.astype(np.int64, copy=False).tobytes())
+            if len(self._single) >= _SINGLE:
+                self._count_single()
+        else:
+            self._count_all(durations)
 
     def _count_single(self) -> None:
         if self._single:
             single, self._single = self._single, array("q")
-            self.add(np.array(single, np.int64))
+            self._count_all(np.array(single, np.int64))
 
-    def add(self, durations: npt.NDArray[np.int64]) -> None:
-        """Count durations in ns; there is at least one."""
+    def _count_all(self, durations: npt.NDArray[np.int64]) -> None:
         self._count += len(durations)
         self._total += float(durations.sum(dtype=np.float64)) / SECOND
         self._max = max(self._max, to_seconds(int(durations.max())))

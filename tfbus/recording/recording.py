@@ -291,10 +291,10 @@ def _open_storage(path: Path, folders: bool = False) -> Storage:
         first = file.read(_FIRST_BYTES)
     if not first:
         raise RecordingError("the file is empty", path=str(path), reason="empty")
-    from tfbus.recording.formats import _mcap, _ros1, _sqlite
+    from tfbus.recording.formats import _mcap, _mcap_records, _ros1, _sqlite
 
     formats: list[tuple[bytes, Callable[[Path], Storage]]] = [
-        (_mcap.MAGIC, _mcap.McapStorage),
+        (_mcap_records.MAGIC, _mcap.McapStorage),
         (_sqlite.MAGIC, _sqlite.SqliteStorage),
         (_ros1.MAGIC, _ros1.Ros1Storage),
     ]

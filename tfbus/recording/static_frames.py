@@ -13,6 +13,8 @@ from tfbus.geometry.transform import Transform
 from tfbus.stamps import is_real
 
 _SIZES = {"xyz": 3, "rpy": 3, "rpy_deg": 3, "quaternion": 4}
+_SAME = {"translation": "xyz", "rotation": "quaternion"}
+"""The names that ``tfbus convert --static-to-yaml`` writes."""
 _ROTATIONS = ("rpy", "rpy_deg", "quaternion")
 
 
@@ -51,7 +53,7 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
     The file is a list in YAML or JSON. Each entry has a ``parent`` and a ``child``; ``xyz`` in m; one of ``rpy`` (roll,
     pitch and yaw about fixed axes, in rad), ``rpy_deg`` (degrees) and ``quaternion`` (x, y, z, w); and an
     ``authority``. All but the names of the frames may be left out. What `TransformStamped.to_dict` gives is an entry
-    too.
+    too, and so is what ``tfbus convert --static-to-yaml`` writes, with ``translation`` and ``rotation``.
 
     Parameters
     ----------
@@ -113,6 +115,10 @@ def _sample(entry: Any, authority: str) -> TransformStamped:
     if "transform" in entry:
         sample = TransformStamped.from_dict(entry)
         return sample.replace(stamp=0, static=True, authority=sample.authority or authority)
+    both = [name for name, same in _SAME.items() if name in entry and same in entry]
+    if both:
+        raise ValueError(f"{both[0]} and {_SAME[both[0]]} say the same: give one of them")
+    entry = {_SAME.get(name, name): value for name, value in entry.items()}
     unknown = [str(name) for name in entry if name not in {"parent", "child", "authority", *_SIZES}]
     missing = [name for name in ("parent", "child") if name not in entry]
     if unknown or missing:

@@ -372,15 +372,21 @@ class Paths:
     ----------
     recent : dict
         ``{target: {source: Chain}}``. Each chain must hold at every stamp that it covers.
+    inserted : int
+        Number of samples at new stamps.
+    version : int
+        Another number after each change.
     """
 
-    __slots__ = ("_kind", "_latest", "_lock", "recent")
+    __slots__ = ("_kind", "_latest", "_lock", "inserted", "recent", "version")
 
     def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: type[TransformStamped]) -> None:
         self._lock = lock
         self._latest = latest
         self._kind = kind
         self.recent: dict[str, dict[str, Chain]] = {}
+        self.inserted = 0
+        self.version = 0
 
     def answer(self, target: str, source: str, at: object) -> TransformStamped | None:
         """The answer of a lookup, if it needs nothing but a path of `recent` that covers the stamp; else None."""
@@ -399,6 +405,22 @@ class Paths:
         sample = kind.__new__(kind)
         sample._fields = target, source, stamp, row, "", False
         return sample
+
+    def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Batch) -> bool:
+        """Store a batch if all of it continues its histories and there are no readers to be told; else do nothing.
+
+        Here only a batch of one sample is stored.
+        """
+        if len(batch) != 1:
+            return False
+        parent, child, stamp, row, authority, static = batch[0]._fields
+        with self._lock:
+            history = frames.get(child)
+            if readers or history is None or static or not history.append(parent, stamp, row, authority):
+                return False
+            self.inserted += 1
+            self.version += 1
+        return True
 
 
 def commit(frames: Mapping[str, History], batch: Batch, first: int) -> int:

@@ -82,10 +82,10 @@ def _columns(
 ) -> tuple[Stamps, npt.NDArray[np.float64], list[tuple[str, str]]]:
     """Stamps, rows, parents and authorities of the samples from `low` to `high`, and of the next one on either side."""
     samples = history.samples_between(low, high)
-    parents = samples.parents or [history.parent] * len(samples)
-    authorities = samples.authorities or [history.authority] * len(samples)
-    # Copies, because the arrays share memory with the history.
-    return samples.stamps.copy(), samples.rows.copy(), list(zip(parents, authorities, strict=True))
+    count = len(samples)
+    parents = samples.parents or [history.parent] * count
+    authorities = samples.authorities or [history.authority] * count
+    return samples.stamps, np.ascontiguousarray(samples.rows), list(zip(parents, authorities, strict=True))
 
 
 def _row(row: npt.NDArray[np.float64]) -> Row:

@@ -72,12 +72,10 @@ class Forest:
         Samples since `forget_changes` that are part of a loop of parents at a past stamp.
     expired_frames : list of str
         The frame of each sample that expired since `forget_changes`.
-    inserted, replaced, expired : int
-        Number of samples that had each `Outcome`.
+    replaced, expired : int
+        Number of samples that had each of these outcomes.
     looped : int
         Number of samples that have been in `looping`.
-    version : int
-        Another number after each change.
     structure : int
         Another number after each change that may make a path wrong.
     """
@@ -95,12 +93,28 @@ class Forest:
         self._suspects: list[TransformStamped] = []
         self._readers: dict[int, set[str]] = {}
         self.expired_frames: list[str] = []
-        self.inserted = 0
         self.replaced = 0
         self.expired = 0
         self.looped = 0
-        self.version = 0
         self.structure = 0
+
+    @property
+    def inserted(self) -> int:
+        """The number of samples that were `INSERTED`."""
+        return self.paths.inserted
+
+    @inserted.setter
+    def inserted(self, inserted: int) -> None:
+        self.paths.inserted = inserted
+
+    @property
+    def version(self) -> int:
+        """Another number after each change."""
+        return self.paths.version
+
+    @version.setter
+    def version(self, version: int) -> None:
+        self.paths.version = version
 
     # Changes
 
@@ -112,14 +126,11 @@ class Forest:
         InvalidTransformError
             If a sample would close a loop of parents, judged after the whole batch.
         """
+        if self.paths.commit(self.frames, self._readers, batch):
+            # Nearly always so: samples that only continue their histories close no loop and change no path.
+            return [Outcome.INSERTED] * len(batch)
         with self.lock:
             self.version += 1
-            if len(batch) == 1 and commit(self.frames, batch, 0):
-                # Nearly always so: a sample that only continues its history closes no loop and changes no path.
-                self.inserted += 1
-                if self._readers:
-                    self._tell_readers([batch[0].child])
-                return [Outcome.INSERTED]
             _, refused = admit(self.frames, batch, self.names.parents)
             if refused:
                 raise refused[0]
@@ -137,6 +148,8 @@ class Forest:
         bool
             Whether every sample was the next one of its frame, so that nothing but stamps has changed.
         """
+        if self.paths.commit(self.frames, self._readers, batch):
+            return True
         count = len(batch)
         with self.lock:
             self.version += 1

@@ -1,12 +1,11 @@
 """The poses of all frames in one of them: what a picture of the tree needs, and faster than a lookup for each frame.
 
 The tree is walked from the fixed frame outwards, edges above it upside down, so each edge is read once for each stamp
-at which it is needed, which is usually one. The samples are read under the lock; numpy composes them after that, one
-level of the tree at a time.
+at which it is needed, which is usually one. The samples are read under the lock; numpy composes them after that,
+doubling the length of the paths each time.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 from struct import Struct
 from typing import NamedTuple
 
@@ -55,7 +54,6 @@ class _Plan(NamedTuple):
     edges: list[str]
     """The child of the edge between the two."""
     inverted: list[bool]
-    levels: list[int]
     parents: npt.NDArray[np.intp]
 
 
@@ -65,11 +63,17 @@ class PoseReader:
     Parameters
     ----------
     forest : Forest
+
+    Attributes
+    ----------
+    topology : object
+        Another object whenever the frames and their parents may have changed between two readings.
     """
 
     def __init__(self, forest: Forest) -> None:
         self._forest = forest
         self._plans: dict[str, _Plan] = {}
+        self.topology: object = None
 
     def read(self, fixed: str, at: int | Latest = LATEST) -> Poses:
         """The poses in the frame `fixed` at a stamp, or for each frame at the one that `LATEST` means.
@@ -84,22 +88,33 @@ class PoseReader:
             forest.check_known(fixed)
             plan = self._plan(fixed, at)
             histories = [None if child == "" else forest.frames[child] for child in plan.edges]
-            gathered = _gather(plan, histories, at)
+            together = _gather_newest(plan, histories) if at is LATEST else None
+            gathered = _gather(plan, histories, at) if together is None else together.gathered
             moved = _moved_to_another_parent(plan, histories) if at is LATEST else []
             corrections = [(place, _find(forest, fixed, plan.frames[place])) for place in moved]
-            own = [forest.frames.get(frame) for frame in plan.frames]
-            static = np.array([history is not None and history.static for history in own])
-            if isinstance(at, Latest):
-                newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
+            if together is not None and not any(plan.inverted):
+                # Each frame is reached by its own edge.
+                static = np.array(together.static)
+                heard = np.where(static, STAMP_MIN, STAMP_MIN if together.stamp is None else together.stamp)
+                heard[0] = STAMP_MIN
             else:
-                newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
-            heard = np.array(newest, np.int64)
+                static, heard = self._own_edges(plan, at)
         columns, answered = gathered.compose()
         for place, row in corrections:
             answered[place] = row is not None
             if row is not None:
                 columns[:, place] = row
         return Poses(tuple(plan.frames), columns, plan.parents, answered, static, heard)
+
+    def _own_edges(self, plan: _Plan, at: int | Latest) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+        """Whether the edge above each frame is static, and its newest stamp."""
+        own = [self._forest.frames.get(frame) for frame in plan.frames]
+        static = np.array([history is not None and history.static for history in own])
+        if isinstance(at, Latest):
+            newest = [STAMP_MIN if history is None else _heard(history.newest) for history in own]
+        else:
+            newest = [STAMP_MIN if history is None else _heard(history.around(at)[0]) for history in own]
+        return static, np.array(newest, np.int64)
 
     def _plan(self, fixed: str, at: int | Latest) -> _Plan:
         frames = self._forest.frames
@@ -113,6 +128,7 @@ class PoseReader:
         if plan is None or plan.topology != topology:
             # Only one: a picture seldom changes its fixed frame.
             self._plans = {fixed: (plan := _make_plan(fixed, topology))}
+            self.topology = topology
         return plan
 
 
@@ -122,7 +138,7 @@ def _make_plan(fixed: str, topology: tuple[list[str], list[str]]) -> _Plan:
     for child, parent in above.items():
         below.setdefault(parent, []).append(child)
     places = {fixed: 0}
-    plan = _Plan(topology, [fixed], [-1], [""], [False], [0], np.empty(0, np.intp))
+    plan = _Plan(topology, [fixed], [-1], [""], [False], np.empty(0, np.intp))
     for place, frame in enumerate(plan.frames):
         reached = [(child, child, False) for child in below.get(frame, ())]
         if frame in above:
@@ -134,7 +150,6 @@ def _make_plan(fixed: str, topology: tuple[list[str], list[str]]) -> _Plan:
                 plan.origins.append(place)
                 plan.edges.append(child)
                 plan.inverted.append(inverted)
-                plan.levels.append(plan.levels[place] + 1)
     parents = [places.get(above.get(frame, ""), -1) for frame in plan.frames]
     return plan._replace(parents=np.array(parents, np.intp))
 
@@ -155,20 +170,21 @@ class _Gathered(NamedTuple):
 
     def compose(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
         """The poses of the frames as columns of shape (7, n), and whether each is answered."""
-        places = np.array(self.places, np.intp)
-        levels = np.array(self.plan.levels, np.intp)[places]
-        order = levels.argsort(kind="stable")
-        rank = np.empty_like(order)
-        rank[order] = np.arange(len(order))
-        columns = np.frombuffer(self.rows, np.float64).reshape(-1, _WIDTH).T[:, order]
-        origins = rank[np.array(self.origins, np.intp)[order]]
-        upside_down = np.flatnonzero(np.array(self.plan.inverted, np.bool_)[places][order])
-        columns[:, upside_down] = invert((*columns[:, upside_down],))
-        ends = levels[order].searchsorted(np.arange(1, levels.max() + 2))
-        for start, end in pairwise(ends.tolist()):
-            columns[:, start:end] = compose((*columns[:, origins[start:end]],), (*columns[:, start:end],))
-        own = rank[self.own]
-        return columns[:, own], np.array(self.answered, np.bool_)[self.own]
+        columns = np.frombuffer(self.rows, np.float64).reshape(-1, _WIDTH).T.copy()
+        inverted = np.array(self.plan.inverted, np.bool_)
+        upside_down = np.flatnonzero(inverted if len(self.places) == len(inverted) else inverted[self.places])
+        if len(upside_down):
+            columns[:, upside_down] = invert((*columns[:, upside_down],))
+        # Each round doubles the part of the path that a column is about: its end is that frame, its beginning the other
+        # one in `above` (pointer jumping; JaJa, "An Introduction to Parallel Algorithms", section 2.2).
+        above = np.array(self.origins, np.intp)
+        rest = np.flatnonzero(above)
+        while len(rest):
+            before = above[rest]
+            columns[:, rest] = compose((*columns[:, before],), (*columns[:, rest],))
+            above[rest] = above[before]
+            rest = rest[above[rest] != 0]
+        return columns[:, self.own], np.array(self.answered, np.bool_)[self.own]
 
 
 def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Latest) -> _Gathered:
@@ -235,6 +251,37 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
             above = add_at_another_stamp(origin, stamp)
         own.append(add(place, stamp, above))
     return gathered
+
+
+class _Together(NamedTuple):
+    """Edges that were all read at one stamp."""
+
+    gathered: _Gathered
+    static: list[bool]
+    stamp: int | None
+    """The newest stamp of all moving edges, in ns; None if all are static."""
+
+
+def _gather_newest(plan: _Plan, histories: Sequence[FrameHistory | None]) -> _Together | None:
+    """Read every edge at its newest stamp, if that is the same for all moving edges, as it mostly is; else None."""
+    rows = bytearray()
+    static = []
+    common: int | None = None
+    for history in histories:
+        static.append(history is not None and history.static)
+        if history is None:
+            rows += _IDENTITY
+        elif history.static:
+            rows += _pack(*history.static_row)
+        else:
+            newest = history.newest
+            if newest is None or newest != (newest if common is None else common):
+                return None
+            common = newest
+            rows += _pack(*history.sample(history.count - 1)[1])
+    every = list(range(len(histories)))
+    gathered = _Gathered(plan, rows, every, [0, *plan.origins[1:]], [True] * len(every), every)
+    return _Together(gathered, static, common)
 
 
 def _heard(stamp: int | None) -> int:

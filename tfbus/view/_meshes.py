@@ -144,9 +144,20 @@ def _unit(shape: Shape) -> Triangles:
 def _read_mesh(path: Path) -> tuple[Triangles, tuple[int, int, int] | None]:
     mesh = trimesh.load_mesh(path)
     triangles = _triangles(mesh)
+    if path.suffix.lower() == ".dae":
+        triangles = triangles._replace(vertices=triangles.vertices * np.float32(_metres(mesh.units)))
     if not len(triangles.faces) or not np.isfinite(triangles.vertices).all():
         raise ValueError("it has no triangles, or some that are not finite")
     return triangles, _main_colour(mesh)
+
+
+def _metres(units: str | None) -> float:
+    """The unit of a COLLADA file in m, from trimesh's text such as ``0.01 * meters``."""
+    number, star, _ = (units or "").partition("*")
+    metres = float(number) if star else 1.0
+    if not 0.0 < metres < np.inf:
+        raise ValueError(f"its unit is {metres} m")
+    return metres
 
 
 def _triangles(mesh: trimesh.Trimesh) -> Triangles:

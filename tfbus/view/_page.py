@@ -106,6 +106,7 @@ class Page:
         self._events: deque[Event] = deque(maxlen=EVENTS_KEPT)
         self._live_tree = tree
         self._root: str | None = None
+        self._counted: object = None
         self._stale_after = stale_after
         self._tree_key: object = None
         self._tree_html = ""
@@ -197,7 +198,9 @@ class Page:
         """The texts of the side panel beside a scene, with ages from the stamp `now`, in ns."""
         at = self.timeline.stamp
         # Not for each picture, because all frames are counted.
-        self._root = None
+        if self._scenes.topology is not self._counted:
+            self._counted = self._scenes.topology
+            self._root = None
         frames = tuple(self._tree.frames())
         then = now if at is None else at
         facts: dict[str, str] = {}
@@ -245,6 +248,7 @@ class Page:
     def _show(self, tree: TransformTree) -> None:
         self._tree = tree
         self._root = None
+        self._counted = None
         self._scenes = SceneReader(forest_of(tree), self._stale_after)
 
 

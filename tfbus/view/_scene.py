@@ -78,6 +78,11 @@ class SceneReader:
         self._poses = PoseReader(forest)
         self._stale_after = round(stale_after * SECOND)
 
+    @property
+    def topology(self) -> object:
+        """Another object whenever the frames and their parents may have changed between two scenes."""
+        return self._poses.topology
+
     def read(self, fixed: str, at: int | Latest, now: int, selected: str | None = None) -> Scene:
         """The scene in a fixed frame.
 

@@ -157,12 +157,12 @@ class LiveTree:
 
     def _wake_with_answers(self, waiters: Iterable[Waiter]) -> None:
         """Wake waiters, each with its answer if the kernel has one; it counts as long as the forest stays as it is."""
-        forest = self.forest
+        paths = self.forest.paths
         for waiter in waiters:
             question = waiter.question
             if question.is_plain:
-                waiter.answer = forest.paths.answer(question.target, question.source, question.at)
-                waiter.version = forest.version
+                waiter.answer = paths.answer(question.target, question.source, question.at)
+                waiter.version = paths.version
         _wake(waiters)
 
     def _limits(self, waiter: Waiter, error: TransformLookupError | None) -> list[tuple[str, int]]:

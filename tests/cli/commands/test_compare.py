@@ -38,6 +38,14 @@ def test_errors_are_printed_with_and_without_alignment(both: tuple[Path, Path], 
     assert aligned["alignment"]["translation"] == pytest.approx([-2.0, 0.0, 0.0])
 
 
+def test_without_a_pair_all_frames_that_move_in_both_are_compared(
+    tmp_path: Path, both: tuple[Path, Path], tfbus: Command
+) -> None:
+    assert tfbus("compare", *both).stdout == tfbus("compare", *both, "--pair", "map:base").stdout
+    other = write_mcap(tmp_path / "other.mcap", [(1, "/tf", [moving("map", "arm", 1)])])
+    check_wrong_call(tfbus("compare", both[0], other), "no frame moves in both")
+
+
 def test_errors_over_time_are_a_table(both: tuple[Path, Path], tfbus: Command) -> None:
     done = tfbus("compare", *both, "--pair", "map:base", "--delta", "3", "--csv")
     rows = list(csv.DictReader(StringIO(done.stdout)))
@@ -60,7 +68,6 @@ def test_what_cannot_be_aligned_is_warned_of(tmp_path: Path, tfbus: Command) -> 
         (("--pair", "base"), "a pair is TARGET:SOURCE"),
         (("--pair", "map:base", "--csv", "--json"), "give one of them"),
         (("--pair", "map:base", "--delta", "0"), "delta must be at least 1"),
-        ((), "--pair"),
     ],
 )
 def test_a_wrong_call_is_one_line_and_status_2(

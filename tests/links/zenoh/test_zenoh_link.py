@@ -671,5 +671,5 @@ def run_program(program: str) -> subprocess.CompletedProcess[str]:
 async def test_without_the_extra_the_error_names_it() -> None:
     done = run_program("import sys; sys.modules['zenoh'] = None; import tfbus.links.zenoh")
     assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].endswith('pip install "tfbus[zenoh]"')
+    assert 'pip install "tfbus[zenoh]"' in done.stderr.splitlines()[-1]
     assert "Error: No module" not in done.stderr

@@ -144,7 +144,7 @@ def random_schedule(seed: int) -> list[Burst]:
         happenings = tuple(happening() for _ in range(random.randint(2, 5)))
         return Burst(random.choice(PLACES), happenings, random.choice(PLACES), random.choice((0.0, 0.5, 1.5, 5.0)))
 
-    return [burst() for _ in range(random.randint(3, 6))]
+    return [burst() for _ in range(random.randint(2, 5))]
 
 
 def smaller(bursts: list[Burst]) -> Iterator[list[Burst]]:

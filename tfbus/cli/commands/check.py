@@ -49,7 +49,7 @@ def check(
 ) -> None:
     """Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.
 
-    The exit status is 0 if nothing is wrong and 1 if something is.
+    The exit status is 0 if nothing is wrong and 1 if something is. A frame that never moves is only a hint.
 
     Example: tfbus check run.mcap
 
@@ -84,7 +84,7 @@ def check(
         print(json.dumps([{**asdict(finding), "advice": finding.advice} for finding in findings], indent=2))
     else:
         _print(findings)
-    sys.exit(_WRONG if findings else 0)
+    sys.exit(0 if all(finding.is_hint for finding in findings) else _WRONG)
 
 
 def _check_file(

@@ -3,7 +3,7 @@
 import csv
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,7 +33,7 @@ def compare(
     estimate: Path,
     /,
     *,
-    pair: Annotated[tuple[str, ...], Parameter(negative="")],
+    pair: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
     scale: Flag = False,
     max_difference: Duration = 0.01,
     delta: int = 1,
@@ -52,7 +52,8 @@ def compare(
     estimate
         The recording to judge.
     pair
-        As TARGET:SOURCE, the frames whose transform is compared; may be given several times.
+        As TARGET:SOURCE, the frames whose transform is compared; may be given several times. By default, every frame
+        that moves in both recordings, in its parent.
     scale
         Scale the estimate as well where it is aligned.
     max_difference
@@ -68,10 +69,7 @@ def compare(
         raise UsageError("--csv and --json are two ways to print the same: give one of them")
     wanted, judged = (_load(file, topics) for file in (reference, estimate))
     found = {}
-    for text in pair:
-        target, colon, source = text.partition(":")
-        if not (target and colon and source):
-            raise UsageError(f"a pair is TARGET:SOURCE, such as map:base_link, not {text!r}")
+    for text, (target, source) in (_pairs(pair) if pair else _moving_pairs(wanted, judged)).items():
         for aligned in (False,) if as_csv else (False, True):
             try:
                 found[text, aligned] = compare_trees(
@@ -85,7 +83,7 @@ def compare(
                     delta=delta,
                 )
             except ValueError as error:
-                if not aligned:
+                if not aligned and pair:
                     raise UsageError(str(error)) from None
                 warn(f"{text}: {error}")
     if as_csv:
@@ -94,6 +92,30 @@ def compare(
         print(json.dumps([_to_json(text, each) for (text, _), each in found.items()], indent=2))
     else:
         _print_tables(found)
+
+
+def _pairs(texts: Sequence[str]) -> dict[str, tuple[str, str]]:
+    pairs = {}
+    for text in texts:
+        target, colon, source = text.partition(":")
+        if not (target and colon and source):
+            raise UsageError(f"a pair is TARGET:SOURCE, such as map:base_link, not {text!r}")
+        pairs[text] = target, source
+    return pairs
+
+
+def _moving_pairs(wanted: TransformTree, judged: TransformTree) -> dict[str, tuple[str, str]]:
+    """The frames that move in both trees, each with its parent in the first one."""
+    moving = {edge.child for edge in judged.edges() if not edge.static}
+    known = set(judged.frames())
+    pairs = {
+        f"{edge.parent}:{edge.child}": (edge.parent, edge.child)
+        for edge in wanted.edges()
+        if not edge.static and edge.child in moving and edge.parent in known
+    }
+    if not pairs:
+        raise UsageError("no frame moves in both recordings: give --pair TARGET:SOURCE")
+    return pairs
 
 
 def _load(file: Path, topics: TopicOptions) -> TransformTree:

@@ -28,6 +28,8 @@ from tfbus.tree.policy import Hold, policy_of
 
 PATIENCE = 3.0
 """s; a client waits for so long for a server that it has not met, and for an answer that is late."""
+_SETTLING = 0.5
+"""s."""
 
 
 class _Pending:
@@ -92,6 +94,7 @@ class BufferClient:
         self._servers_changed: deque[tuple[str, bool]] = deque()
         self._servers: set[str] = set()
         self._met = anyio.Event()
+        self._left = anyio.Event()
         self._waker = LoopWaker(self._handle_arrived)
 
     async def __aenter__(self) -> Self:
@@ -207,6 +210,11 @@ class BufferClient:
         if not answered:
             raise self._error("silent", f"it has not answered within {timeout + PATIENCE:g} s")
         if pending.answer is None:
+            # The news that the server has gone may come a moment after the end of its questions.
+            with anyio.move_on_after(_SETTLING):
+                while self._servers:
+                    self._left = anyio.Event()
+                    await self._left.wait()
             if not self._servers:
                 raise self._error("lost", "it has gone")
             raise self._error("silent", "it has dropped the question, or it has gone")
@@ -241,8 +249,7 @@ class BufferClient:
         while self._servers_changed:
             server, present = self._servers_changed.popleft()
             (self._servers.add if present else self._servers.discard)(server)
-            if present:
-                self._met.set()
+            (self._met if present else self._left).set()
         if not self._servers:
             for pending in self._pending.values():
                 pending.done.set()

@@ -113,7 +113,7 @@ class ColumnDecoder:
     def decode(self, messages: Packed) -> list[Columns] | None:
         """One `Columns` for each frame and authority; None if the messages have to be decoded one by one."""
         sizes = messages.ends - messages.starts
-        if not messages.count:
+        if not messages.size:
             return []
         if sizes.max() > MAX_MESSAGE:
             return None

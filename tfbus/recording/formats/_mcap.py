@@ -11,70 +11,36 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import cached_property
-from itertools import accumulate, chain
-from operator import itemgetter
 from pathlib import Path
-from typing import IO, Final, NamedTuple
+from typing import IO, Final
 
-import numpy as np
 from mcap import records
 from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats._bounds import MAX_CHUNK_MESSAGES, MAX_INDEX
-from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks, separate
+from tfbus.recording.formats._bounds import MAX_INDEX
+from tfbus.recording.formats._chunks import ChunkPlace, separate
+from tfbus.recording.formats._mcap_reading import IndexedChunk, McapReading
 from tfbus.recording.formats._mcap_records import (
     DAMAGE,
+    MAGIC,
     Chunk,
-    Torn,
     parse_record,
     read_records,
-    record_places,
-    scan_chunks,
     split_chunk,
     split_message,
 )
-from tfbus.recording.formats._packed import Packed, Stored, batches, in_order
+from tfbus.recording.formats._packed import Packed, Stored, batches
 from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message, select, shortfalls
 from tfbus.stamps import STAMP_MAX
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-
 _FOOTER = struct.Struct("<BQQQI8s")
 _FOOTER_LENGTH: Final = 20
-_KINDS: Final[dict[int, str]] = {
-    Opcode.CHUNK: "chunk",
-    Opcode.MESSAGE: "message",
-    Opcode.SCHEMA: "schema",
-    Opcode.CHANNEL: "channel",
-    Opcode.CHUNK_INDEX: "chunk index",
-    Opcode.STATISTICS: "statistics",
-}
-"""The names of the records that are read."""
 _ANY: Final = Channel("", "", "")
 _PIECE: Final = 2**16
-_FIRST_BLOCK: Final = 2**16
-_BLOCK: Final = 2**20
-"""Bytes that are decoded at once: few at first, for the first message of each frame has to be judged by itself."""
 _MOST_OVERLAPPING: Final = 16
 """Chunks; if more have to be in memory at once, their messages are merged one by one."""
-
-
-class _IndexedChunk(NamedTuple):
-    """An entry of the index: the place of a chunk, its length in bytes, and the numbers of the channels in it."""
-
-    place: ChunkPlace
-    length: int
-    channels: tuple[int, ...]
-
-
-class _OpenChunk(NamedTuple):
-    """The records of a chunk, and where each begins, with the end of the last."""
-
-    place: ChunkPlace
-    content: bytes
-    places: list[int]
 
 
 class McapStorage:
@@ -107,7 +73,7 @@ class McapStorage:
             self.size = self._file.seek(0, 2)
             self._schemas: dict[int, records.Schema] = {}
             self._numbered: dict[int, Channel] = {}
-            self._chunks: list[_IndexedChunk] = []
+            self._chunks: list[IndexedChunk] = []
             self._statistics: records.Statistics | None = None
             self._counted: Counter[int] | None = None
             self.finished = self._read_index()
@@ -148,7 +114,7 @@ class McapStorage:
         """Iterate over messages, as `Storage.messages`; without an index, in the order of the file."""
         low = 0 if since is None else since
         high = STAMP_MAX if until is None else until
-        reading = _Reading(self, wanted)
+        reading = McapReading(self, wanted)
         read: Counter[Channel] = Counter()
         now = low
         for stored in select(
@@ -166,7 +132,7 @@ class McapStorage:
             return
         low = 0 if since is None else since
         high = STAMP_MAX if until is None else until
-        reading = _Reading(self, wanted)
+        reading = McapReading(self, wanted)
         read: Counter[Channel] = Counter()
         now = low
         for found in reading.packed(parts, low, high):
@@ -180,7 +146,7 @@ class McapStorage:
         reports = self._reports(reading, now, None if since is not None or until is not None else read)
         yield from batches(reports)
 
-    def _reports(self, reading: "_Reading", now: int, read: Counter[Channel] | None) -> Iterator[StoredMessage]:
+    def _reports(self, reading: McapReading, now: int, read: Counter[Channel] | None) -> Iterator[StoredMessage]:
         """What a reading has found wrong; `read` has the number of the messages, if none was left out."""
         if reading.unknown:
             yield lost_message(now, f"{reading.unknown:,} messages are on channels that the file does not describe")
@@ -221,7 +187,7 @@ class McapStorage:
         return checksum
 
     def _use_index(self, start: int) -> None:
-        chunks: list[_IndexedChunk] = []
+        chunks: list[IndexedChunk] = []
         statistics: records.Statistics | None = None
         # Nearly all chunks have the same channels: one tuple for all of them saves most of the memory.
         shared: dict[tuple[int, ...], tuple[int, ...]] = {}
@@ -232,7 +198,7 @@ class McapStorage:
             if isinstance(record, records.ChunkIndex):
                 numbers = tuple(record.message_index_offsets)
                 place = ChunkPlace(record.message_start_time, record.message_end_time, record.chunk_start_offset)
-                chunks.append(_IndexedChunk(place, record.chunk_length, shared.setdefault(numbers, numbers)))
+                chunks.append(IndexedChunk(place, record.chunk_length, shared.setdefault(numbers, numbers)))
             elif isinstance(record, records.Statistics):
                 statistics = record
             elif record is not None:
@@ -318,11 +284,11 @@ class McapStorage:
         raise ValueError("there is no chunk, or it is too large")
 
     @property
-    def index(self) -> "list[_IndexedChunk]":
+    def index(self) -> list[IndexedChunk]:
         """The entries of the index, in the order of their first log times."""
         return self._chunks
 
-    def records(self, at: int) -> Iterator[tuple[int, int, bytes | None]]:
+    def records_from(self, at: int) -> Iterator[tuple[int, int, bytes | None]]:
         """The records from an offset on, as `read_records`; other readers of the file may come between."""
         while True:
             self._file.seek(at)
@@ -336,183 +302,3 @@ class McapStorage:
     def set_counts(self, counts: Counter[int]) -> None:
         """Note the number of messages of each channel, counted by a reading of the whole file."""
         self._counted = counts
-
-
-class _Reading:
-    """One iteration over the messages of a file.
-
-    Attributes
-    ----------
-    wants : callable
-        Whether the messages of a channel are read.
-    unknown : int
-        Messages on channels that the file does not describe.
-    contradictions : set of int
-        Numbers of channels and schemas that are described in two ways.
-    """
-
-    def __init__(self, storage: McapStorage, wanted: Wanted) -> None:
-        self._storage = storage
-        self.wants = wanted
-        self._counts: Counter[int] = Counter()
-        self._table: list[Channel] = []
-        self._places: dict[Channel, int] = {}
-        self.unknown = 0
-        self.contradictions: set[int] = set()
-
-    def by_index(self, low: int, high: int) -> Iterator[list[StoredMessage]]:
-        """The messages of all chunks that overlap the range, in the order of their log times."""
-        size = self._storage.size
-        places, too_long = [], set()
-        for place, length, numbers in self._storage.index:
-            # Without numbers, or with unknown ones, only reading the chunk tells what is in it.
-            if place.start <= high and place.end >= low and (not numbers or any(map(self._may_be_wanted, numbers))):
-                places.append(place)
-                if place.offset + length > size:
-                    too_long.add(place.offset)
-
-        def read(place: ChunkPlace) -> list[StoredMessage]:
-            try:
-                if place.offset in too_long:
-                    raise ValueError("it is behind the end of the file")
-                return self._in_chunk(self._storage.read_chunk(place.offset))
-            except (*DAMAGE, EndOfFile) as error:
-                return self._lost(place, low, error)
-
-        return merge_chunks(places, read)
-
-    def packed(self, separated: list[slice], low: int, high: int) -> Iterator[Stored]:
-        """The messages of parts of the index that do not overlap, several parts at once."""
-        chunks: list[_OpenChunk] = []
-        size, enough = 0, _FIRST_BLOCK
-        for part in separated:
-            for place, length, numbers in sorted(self._storage.index[part], key=lambda chunk: chunk.place.offset):
-                if place.start > high or place.end < low or (numbers and not any(map(self._may_be_wanted, numbers))):
-                    continue
-                try:
-                    if place.offset + length > self._storage.size:
-                        raise ValueError("it is behind the end of the file")
-                    content = self._storage.read_chunk(place.offset).unfold()
-                    chunks.append(_OpenChunk(place, content, record_places(content)))
-                except (*DAMAGE, EndOfFile) as error:
-                    yield from self._pack(chunks, low, high)
-                    chunks.clear()
-                    yield self._lost(place, low, error)
-                else:
-                    size += len(content)
-            if size >= enough:
-                yield from self._pack(chunks, low, high)
-                chunks.clear()
-                size, enough = 0, min(4 * enough, _BLOCK)
-        yield from self._pack(chunks, low, high)
-
-    def _pack(self, chunks: "list[_OpenChunk]", low: int, high: int) -> Iterator[Stored]:
-        """The messages of some chunks; in the order of their log times, if no later chunk overlaps them."""
-        if not chunks:
-            return
-        shifts = list(accumulate((len(chunk.content) for chunk in chunks), initial=0))
-        data = b"".join([chunk.content for chunk in chunks])
-        places = [np.array(chunk.places) + shift for chunk, shift in zip(chunks, shifts, strict=False)]
-        begins = np.concatenate([found[:-1] for found in places])
-        ends = np.concatenate([found[1:] for found in places])
-        try:
-            if max(len(chunk.places) for chunk in chunks) > MAX_CHUNK_MESSAGES:
-                raise ValueError("one has too many messages")
-            numbers, received, starts, ends = scan_chunks(data, begins, ends, self._register)
-        except DAMAGE:
-            # One by one, to find out which of them is damaged.
-            yield sorted(chain.from_iterable(self._split(chunk, low) for chunk in chunks), key=itemgetter(0))
-            return
-        present, which, counts = np.unique(numbers, return_inverse=True, return_counts=True)
-        self._count(dict(zip(present.tolist(), counts.tolist(), strict=True)))
-        wanted = [self._place(self._wanted_channel(number)) for number in present.tolist()]
-        # A log time that is no stamp becomes negative.
-        whole = Packed(data, self._table, np.array(wanted, np.int64)[which], received.view(np.int64), starts, ends)
-        yield from in_order(whole if min(wanted, default=0) >= 0 else whole.chosen(whole.numbers >= 0), low, high)
-
-    def _split(self, chunk: "_OpenChunk", low: int) -> list[StoredMessage]:
-        try:
-            found, counts = split_chunk(chunk.content, self._wanted_channel, self._register)
-        except DAMAGE as error:
-            return self._lost(chunk.place, low, error)
-        self._count(counts)
-        return found
-
-    def _place(self, channel: Channel | None) -> int:
-        """The place of a channel in the table of packed messages; -1 for one that is not read."""
-        if channel is None:
-            return -1
-        if channel not in self._places:
-            self._places[channel] = len(self._table)
-            self._table.append(channel)
-        return self._places[channel]
-
-    def _lost(self, place: ChunkPlace, low: int, error: Exception) -> list[StoredMessage]:
-        reason = str(error) if not isinstance(error, EndOfFile) else "it is cut off"
-        return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {reason}")]
-
-    def in_sequence(self, low: int) -> Iterator[list[StoredMessage]]:
-        """All messages in the order of the file, up to its end; damage before `low` is reported at `low`."""
-        now = low
-        summary = False
-        try:
-            for offset, opcode, content in self._storage.records(len(MAGIC)):
-                # Behind the data, schemas and channels come again, and these copies may be the damaged part.
-                summary = summary or opcode == Opcode.DATA_END
-                if summary and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
-                    continue
-                try:
-                    found = self._in_record(opcode, content)
-                except DAMAGE as error:
-                    found = [lost_message(now, f"the {_KINDS.get(opcode, 'record')} at byte {offset}: {error}")]
-                if found:
-                    now = max(now, found[-1][0])
-                    yield found
-        except EndOfFile as end:
-            for torn in end.args:
-                yield self._in_torn(torn)
-            if self._storage.finished:
-                yield [lost_message(now, "a record goes on behind the end of the file")]
-        self._storage.set_counts(self._counts)
-
-    def _in_record(self, opcode: int, content: bytes | None) -> list[StoredMessage]:
-        if content is None:
-            raise ValueError("it exceeds its bound" if opcode in _KINDS else f"its kind, {opcode}, is unknown")
-        if opcode == Opcode.CHUNK:
-            return self._in_chunk(Chunk.parse(content))
-        if opcode == Opcode.MESSAGE:
-            received, number, payload = split_message(content)
-            self._count({number: 1})
-            channel = self._wanted_channel(number)
-            return [] if channel is None else [(received, channel, payload)]
-        if record := parse_record(opcode, content):
-            self._register(record)
-        return []
-
-    def _in_chunk(self, chunk: Chunk, torn: bool = False) -> list[StoredMessage]:
-        found, counts = split_chunk(chunk.unfold(torn), self._wanted_channel, self._register, torn)
-        self._count(counts)
-        return found
-
-    def _count(self, counts: Mapping[int, int]) -> None:
-        self._counts.update(counts)
-        self.unknown += sum(count for number, count in counts.items() if self._storage.channel(number) is None)
-
-    def _in_torn(self, torn: Torn) -> list[StoredMessage]:
-        """The readable part of the record in which the file ends."""
-        with suppress(*DAMAGE):
-            if torn.opcode == Opcode.CHUNK:
-                return self._in_chunk(Chunk.parse(torn.data, torn=True), torn=True)
-        return []
-
-    def _wanted_channel(self, number: int) -> Channel | None:
-        channel = self._storage.channel(number)
-        return channel if channel is not None and self.wants(channel) else None
-
-    def _may_be_wanted(self, number: int) -> bool:
-        channel = self._storage.channel(number)
-        return channel is None or self.wants(channel)
-
-    def _register(self, record: records.McapRecord) -> None:
-        if not self._storage.register(record) and isinstance(record, (records.Channel, records.Schema)):
-            self.contradictions.add(record.id)

@@ -33,6 +33,7 @@ DAMAGE: Final = (
 )
 """The errors that `mcap` raises for damaged bytes."""
 
+MAGIC: Final = b"\x89MCAP0\r\n"
 RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<HIQQ")
 _MESSAGE_RECORD: Final = struct.Struct("<BQHIQQ")

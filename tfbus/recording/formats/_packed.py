@@ -37,7 +37,7 @@ class Packed(NamedTuple):
         return {channel: count for channel, count in zip(self.channels, counts, strict=True) if count}
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """The number of messages."""
         return len(self.received)
 
@@ -133,7 +133,7 @@ def in_order(messages: Packed, low: int, high: int) -> Iterator[Stored]:
     if (received[1:] < received[:-1]).any():
         messages = messages.chosen(np.argsort(received, kind="stable"))
         received = messages.received
-    if messages.count and (received[0] < low or received[-1] > high):
+    if messages.size and (received[0] < low or received[-1] > high):
         messages = messages.chosen((low <= received) & (received <= high))
-    if messages.count:
+    if messages.size:
         yield messages
