@@ -54,7 +54,7 @@ EXTRAS = {
     "pyarrow": ("cli",),
     "rich": ("cli", "view"),
     "rosbags": ("recording.formats",),
-    "ruamel": ("recording.formats",),
+    "ruamel": ("recording.formats", "recording.static_frames"),
     "scipy": ("geometry",),
     "trimesh": ("view",),
     "urdf_parser_py": ("robot",),

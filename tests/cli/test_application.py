@@ -33,7 +33,7 @@ def test_a_domain_and_addresses_come_from_the_environment_unless_they_are_given(
     tfbus: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[LinkOptions] = []
-    monkeypatch.setattr(LinkOptions, "run", lambda options, _: seen.append(options))
+    monkeypatch.setattr(LinkOptions, "run", lambda options, *_, **__: seen.append(options))
     monkeypatch.setenv("TFBUS_DOMAIN", "yard")
     monkeypatch.setenv("TFBUS_CONNECT", "tcp/10.0.0.1:7447 tcp/10.0.0.2:7447")
     tfbus("listen")
@@ -86,7 +86,7 @@ def test_completion_is_written_for_a_shell_with_all_commands(
 
 def test_what_the_caller_does_once_all_is_loaded_comes_before_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
-    monkeypatch.setattr(LinkOptions, "run", lambda *_: steps.append("run"))
+    monkeypatch.setattr(LinkOptions, "run", lambda *_, **__: steps.append("run"))
     assert run(["listen"], lambda: steps.append("loaded")) == 0
     assert run(["listen", "--no-such-option"], lambda: steps.append("loaded")) == 2
     assert steps == ["loaded", "run"]

@@ -125,7 +125,7 @@ def test_a_usage_error_is_one_line_on_standard_error_and_status_2(
 
 
 def test_several_errors_at_once_are_a_line_each(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
+    def fail(*_: object, **__: object) -> None:
         raise ExceptionGroup("two tasks", [UsageError("one"), UsageError("two")])
 
     monkeypatch.setattr(LinkOptions, "run", fail)
@@ -134,7 +134,7 @@ def test_several_errors_at_once_are_a_line_each(tfbus: Command, monkeypatch: pyt
 
 
 def test_ctrl_c_is_status_130_and_silent(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(LinkOptions, "run", interrupt)
