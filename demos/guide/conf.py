@@ -58,6 +58,8 @@ nitpick_ignore_regex = [
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
     # What the methods of a recording for those who read it in blocks have.
     ("py:class", r"tfbus\.recording\.(_blocks|formats\._raw_transforms)\.\w+"),
+    # What a link is made of, and what can follow the time besides a clock.
+    ("py:class", r"tfbus\.links\.(_clock_follower\.HearsTime|ros\._carrier\.RosCarrier|ros\.settings\.RosOptions)"),
     # Sphinx splits the parameters of such types.
     ("py:class", r"[\w.]+\[\w+"),
 ]

@@ -78,7 +78,8 @@ async def test_the_end_of_a_connection_is_an_os_error(how: str) -> None:
         elif how == "cut":
             await server.cut()
         else:
-            await client.stream.send(b"\xff" * 100)
+            async with client.sending:
+                await client.stream.send(b"\xff" * 100)
         with pytest.raises(OSError, match="good night" if how == "close" else "gone|no websocket|has closed"):
             await socket.receive()
         await socket.close()

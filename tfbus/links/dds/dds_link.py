@@ -44,7 +44,7 @@ class DdsLink(RosLink):
     Raises
     ------
     ValueError
-        If `domain` or `discovery` is out of range, or as `RosLink`.
+        If the domain or the discovery is out of range, or as `tfbus.links.ros.RosLink`.
     TypeError
         If an argument has the wrong type.
     OSError

@@ -45,8 +45,8 @@ class RmwZenohLink(RosLink):
     Raises
     ------
     ValueError
-        If `domain` is out of range, `node` cannot be the name of a node, zenoh does not take the address or a setting,
-        or as `RosLink`.
+        If the domain is out of range, the node cannot have that name, zenoh does not take the address or a setting, or
+        as `tfbus.links.ros.RosLink`.
     TypeError
         If an argument has the wrong type.
     OSError

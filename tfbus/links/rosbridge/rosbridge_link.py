@@ -34,7 +34,7 @@ class RosbridgeLink(RosLink):
     Raises
     ------
     ValueError
-        If `url` is no URL of a websocket, or as `RosLink`.
+        If it is no URL of a websocket, or as `tfbus.links.ros.RosLink`.
     TypeError
         If an argument has the wrong type.
     OSError
