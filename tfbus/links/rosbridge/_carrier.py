@@ -66,6 +66,8 @@ class RosbridgeCarrier(RosCarrier):
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
         self._woken = anyio.Event()
+        self._writing = anyio.CancelScope(shield=True)
+        self._ending = False
 
     async def _connect(self) -> None:
         self._socket = await WebSocket.connect(self._url, MAX_SIZE, CONNECT_TIME)
@@ -128,11 +130,14 @@ class RosbridgeCarrier(RosCarrier):
 
     async def _talk(self, socket: WebSocket) -> None:
         """Send and receive until the server is gone."""
+        # What is being sent when the link ends goes out whole, or later messages could not be read.
+        self._writing, self._ending = anyio.CancelScope(shield=True), False
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
         for work in (self._read_all, self._write_all, self._keep_alive):
             tasks.start_soon(self._until_gone, work, socket, tasks.cancel_scope)
         tasks.start_soon(self._ask_again)
+        tasks.start_soon(self._end_writing)
         await close_task_group(tasks)
         # Not when the link ends: then there is still something to send.
         self._socket = None
@@ -191,10 +196,22 @@ class RosbridgeCarrier(RosCarrier):
                 self._request(subscribe(topic, ENCODINGS[self._encoding]))
 
     async def _write_all(self, socket: WebSocket) -> None:
-        while True:
-            self._woken = anyio.Event()
-            await self._send_all(socket)
-            await self._woken.wait()
+        with self._writing:
+            while True:
+                self._woken = anyio.Event()
+                await self._send_all(socket)
+                if self._ending:
+                    return
+                await self._woken.wait()
+
+    async def _end_writing(self) -> None:
+        """When all ends, give `_write_all` a little time for what it has begun and what waits."""
+        try:
+            await anyio.sleep_forever()
+        finally:
+            self._ending = True
+            self._writing.deadline = anyio.current_time() + _CLOSING_TIME
+            self._woken.set()
 
     async def _send_all(self, socket: WebSocket) -> None:
         while True:
