@@ -18,6 +18,7 @@ from tfbus.links.ros.settings import RosSettings
 from tfbus.links.rosbridge._protocol import (
     CLOCK_TYPE,
     JOINT_TYPE,
+    TEXT_TYPE,
     Incoming,
     advertise,
     decode_content,
@@ -81,6 +82,8 @@ class RosbridgeCarrier(RosCarrier):
             self._request(subscribe(topic, ENCODINGS[0], JOINT_TYPE))
         for topic in self.settings.clock_topic:
             self._request(subscribe(topic, ENCODINGS[0], CLOCK_TYPE))
+        for topic in self.settings.description_topic:
+            self._request(subscribe(topic, ENCODINGS[0], TEXT_TYPE))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
             self._request(advertise(self.settings.tf[0], static=False))
@@ -174,11 +177,17 @@ class RosbridgeCarrier(RosCarrier):
         if not incoming.topic:
             self._report.failed(ConnectionError(f"{self._url} says: {incoming.content}"))
             return
-        joints, clock = (incoming.topic in topics for topics in (self.settings.joint_topic, self.settings.clock_topic))
-        if joints or clock:
-            other = RosMessage(incoming.content, static=False, authority="", joints=joints, clock=clock)
-            self._receive(Received(self._url, other, size, moving=True))
-            return
+        others = {
+            "joints": self.settings.joint_topic,
+            "clock": self.settings.clock_topic,
+            "description": self.settings.description_topic,
+        }
+        for kind, topics in others.items():
+            if incoming.topic in topics:
+                other = RosMessage(incoming.content, static=False, authority="", **{kind: True})
+                # What is latched comes once.
+                self._receive(Received(self._url, other, size, moving=kind != "description"))
+                return
         static = incoming.topic in self.settings.tf_static
         if not static and incoming.topic not in self.settings.tf:
             raise MalformedMessageError("topic", f"a message on {incoming.topic[:100]!r}, which nobody asked for")
