@@ -25,10 +25,10 @@ def decode_text(content: Any) -> str:
         if order is None or len(content) < 2 * _SIZE:
             raise MalformedMessageError("truncated", f"{len(content)} bytes are no text")
         (length,) = struct.unpack_from(f"{order}I", content, _SIZE)
-        text = content[2 * _SIZE : 2 * _SIZE + length]
-        if len(text) < length:
+        held = content[2 * _SIZE : 2 * _SIZE + length]
+        if len(held) < length:
             raise MalformedMessageError("truncated", f"{len(content)} bytes cannot hold a text of {length}")
-        return _as_text(text.removesuffix(b"\0"))
+        return _as_text(held.removesuffix(b"\0"))
     text = content.get("data") if isinstance(content, dict) else None
     if not isinstance(text, str):
         raise MalformedMessageError("encoding", f"it has not the field of a String: {content!r}"[:200])
