@@ -6,13 +6,11 @@ variable ``ROSBRIDGE`` is a command that serves a rosbridge at the port that is 
 """
 
 import json
-import math
 import os
 import shlex
 import shutil
 import statistics
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,10 +19,10 @@ from typing import Any
 import anyio
 import anyio.to_thread
 import pytest
+from support.both_sides import Program
 from support.processes import free_ports
 
-from tfbus import Buffer, Bus, Transform, TransformBroadcaster
-from tfbus.geometry.stamped import Batch
+from tfbus import Buffer, Bus
 from tfbus.links.ros import RosLink
 
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
@@ -85,45 +83,6 @@ def rosbridge(domain: int) -> Iterator[str]:
     finally:
         process.terminate()
         process.wait()
-
-
-class Program:
-    """Our side: it broadcasts ``base:arm``, x = cos(t), and the static ``arm:tool``, and asks for ``odom:tool``."""
-
-    def __init__(self, bus: Bus, buffer: Buffer) -> None:
-        self.bus = bus
-        self.buffer = buffer
-        self.latencies: list[float] = []
-        self.authorities: set[str] = set()
-        self.answered = self.failed = self.wrong = 0
-        bus.subscribe(self._hear)
-        self._broadcaster = TransformBroadcaster(bus, authority="here")
-        self._broadcaster.send_static("arm", "tool", Transform((0.1, 0.0, 0.0)))
-
-    def _hear(self, batch: Batch) -> None:
-        for sample in batch:
-            if sample.child in ("base", "laser"):
-                self.authorities.add(sample.authority)
-                if not sample.static:
-                    self.latencies.append((time.time_ns() - sample.stamp) / 1e6)
-
-    async def send(self) -> None:
-        async for _ in self.bus.clock.ticks(100.0):
-            stamp = time.time_ns()
-            self._broadcaster.send("base", "arm", Transform((math.cos(stamp / 1e9), 0.0, 0.0)), at=stamp)
-
-    async def ask(self) -> None:
-        """Wait for the transform of the present, again and again."""
-        async for _ in self.bus.clock.ticks(100.0):
-            stamp = time.time_ns()
-            try:
-                found = await self.buffer.lookup("odom", "tool", stamp, timeout=1.0)
-            except TimeoutError:
-                self.failed += 1
-                continue
-            self.answered += 1
-            expected = math.sin(stamp / 1e9) + math.cos(stamp / 1e9) + 0.1
-            self.wrong += abs(found.transform.translation[0] - expected) > 1e-3
 
 
 async def meet(link: RosLink, bus: Bus, domain: int) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support import pr2
 from support.commands import START, Command, check_wrong_call
-from support.processes import new_domain
+from support.processes import new_domain, until
 from support.programs import free_address, start_tfbus
 
 from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
@@ -257,3 +257,35 @@ def test_a_joint_like_none_is_not_suggested(tfbus: Command) -> None:
 )
 def test_following_needs_ros_and_no_positions(tfbus: Command, words: tuple[str, ...], why: str) -> None:
     check_wrong_call(tfbus("robot", "arm.urdf", *words), why)
+
+
+@pytest.mark.parametrize("words", [(), ("--follow",), ("--follow", "--tree", "--ros", "dds")])
+def test_without_a_urdf_that_of_ros_is_followed(tfbus: Command, words: tuple[str, ...]) -> None:
+    check_wrong_call(tfbus("robot", *words), "give")
+
+
+@pytest.mark.thorough
+@pytest.mark.anyio
+async def test_the_description_and_the_positions_of_ros_move_a_robot() -> None:
+    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
+    from support.rosbridge import rosbridge_server
+
+    async with rosbridge_server() as server:
+        with start_tfbus("robot", "--follow", "--ros", server.url):
+            await until(lambda: "/robot_description" in server.operations("subscribe"))
+            text = {"op": "publish", "topic": "/robot_description", "msg": {"data": CRANE}}
+            await server.say_anything(json.dumps(text))
+            await until(lambda: "/joint_states" in server.operations("subscribe"))
+            state = {"header": {"stamp": {"secs": 5, "nsecs": 0}}, "name": ["swing"], "position": [0.5]}
+            await server.say_anything(json.dumps({"op": "publish", "topic": "/joint_states", "msg": state}))
+            await until(lambda: "/tf" in server.operations("publish"))
+    (boom,) = (
+        row
+        for request in server.requests
+        if request["op"] == "publish" and request["topic"] == "/tf"
+        for row in request["msg"]["transforms"]
+        if row["child_frame_id"] == "boom"
+    )
+    assert boom["header"]["frame_id"] == "base"
+    assert boom["header"]["stamp"] == {"secs": 5, "nsecs": 0}
+    assert boom["transform"]["rotation"]["z"] == pytest.approx(math.sin(0.25))

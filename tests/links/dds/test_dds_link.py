@@ -10,11 +10,13 @@ pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
+from cyclonedds.util import duration
 
 from tfbus import Bus, PeerJoined, PeerLost, SimulatedClock
 from tfbus.links.dds import DdsLink
-from tfbus.links.dds._types import Header, RawClock, RawJointState, Time
+from tfbus.links.dds._types import Header, RawClock, RawJointState, RawString, Time
 
 pytestmark = pytest.mark.anyio
 
@@ -91,6 +93,25 @@ async def test_positions_of_joints_go_to_who_takes_them(domain_number: int) -> N
             writer.__del__()
             participant.__del__()
     assert taken[0] == ({"a": 0.5, "b": 1.5}, 5)
+
+
+@pytest.mark.thorough
+async def test_the_description_of_a_robot_is_latched(domain_number: int) -> None:
+    latched = Qos(
+        Policy.Reliability.Reliable(duration(seconds=1)), Policy.Durability.TransientLocal, Policy.History.KeepLast(1)
+    )
+    taken: list[str] = []
+    with Bus() as bus:
+        async with DdsLink(bus, domain_number):
+            participant = DomainParticipant(domain_number)
+            topic = Topic(participant, "rt/robot_description", RawString)
+            writer = DataWriter(participant, topic, latched)
+            # Long before the link.
+            writer.write(RawString("<robot/>"))
+            async with DdsLink(bus, domain_number, robot_description=taken.append):
+                await until(lambda: taken == ["<robot/>"])
+            writer.__del__()
+            participant.__del__()
 
 
 @pytest.mark.thorough

@@ -135,6 +135,7 @@ async def test_links_begin_and_end_again_and_again() -> None:
         ({"node": "a b"}, ValueError, "name of a node"),
         ({"config": {"no/such": 1}}, ValueError, "setting"),
         ({"tf": "a b"}, ValueError, "topic"),
+        ({"robot_description": print}, ValueError, "only over DDS"),
     ],
 )
 def test_arguments_that_are_not_valid_are_refused(arguments: Any, error: type[Exception], said: str) -> None:

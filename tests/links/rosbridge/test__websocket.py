@@ -1,12 +1,14 @@
 from typing import Any
 
 import anyio
+import anyio.abc
 import pytest
 
 pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 
 from support.rosbridge import rosbridge_server
-from wsproto.events import BytesMessage, CloseConnection, Ping, TextMessage
+from wsproto import ConnectionType, WSConnection
+from wsproto.events import AcceptConnection, BytesMessage, CloseConnection, Ping, Request, TextMessage
 
 from tfbus.links.rosbridge._websocket import WebSocket, check_url
 
@@ -85,6 +87,28 @@ async def test_the_end_of_a_connection_is_an_os_error(how: str) -> None:
         await socket.close()
         with pytest.raises(OSError, match=r"closed|gone"):
             await socket.send("late")
+
+
+@pytest.mark.thorough
+async def test_closing_does_not_wait_for_an_end_that_reads_nothing() -> None:
+    async def freeze(stream: anyio.abc.SocketStream) -> None:
+        connection = WSConnection(ConnectionType.SERVER)
+        async with stream:
+            connection.receive_data(await stream.receive())
+            assert isinstance(next(connection.events()), Request)
+            await stream.send(connection.send(AcceptConnection()))
+            await anyio.sleep_forever()
+
+    async with await anyio.create_tcp_listener(local_host="127.0.0.1") as listener, anyio.create_task_group() as tasks:
+        tasks.start_soon(listener.serve, freeze)
+        url = f"ws://127.0.0.1:{listener.extra(anyio.abc.SocketAttribute.local_port)}"
+        socket = await WebSocket.connect(url, 1_000, 5)
+        with anyio.move_on_after(0.5):
+            while True:
+                await socket.send("x" * 1_000_000)
+        with anyio.fail_after(20):
+            await socket.close()
+        tasks.cancel_scope.cancel()
 
 
 async def test_nobody_a_page_and_a_silent_program_are_os_errors() -> None:

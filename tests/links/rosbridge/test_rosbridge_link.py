@@ -156,6 +156,19 @@ async def test_positions_of_joints_go_to_who_takes_them() -> None:
                 await until(lambda: taken == [({"a": 0.5}, 5)])
 
 
+async def test_the_description_of_a_robot_goes_to_who_takes_it() -> None:
+    async with rosbridge_server() as server:
+        taken: list[str] = []
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url, robot_description=taken.append) as link:
+                await until(lambda: "/robot_description" in server.operations("subscribe"))
+                for data in (5, "<robot/>"):
+                    message = {"op": "publish", "topic": "/robot_description", "msg": {"data": data}}
+                    await server.say_anything(json.dumps(message))
+                await until(lambda: taken == ["<robot/>"])
+                assert link.statistics().rejected == {"encoding": 1}
+
+
 async def test_a_simulated_clock_follows_the_time_of_ros() -> None:
     async with rosbridge_server() as server:
         clock = SimulatedClock()
@@ -167,10 +180,13 @@ async def test_a_simulated_clock_follows_the_time_of_ros() -> None:
                 await until(lambda: clock.now() == 100_000_000_005)
 
 
-async def test_what_was_published_before_the_end_still_goes_out() -> None:
+@pytest.mark.parametrize("settled", [False, True])
+async def test_what_was_published_before_the_end_still_goes_out(settled: bool) -> None:
     async with rosbridge_server() as server:
         with Bus() as bus:
             async with RosbridgeLink(bus, server.url):
+                # At the end, the link has not begun to write yet, or waits for something to write.
+                await until(lambda: not settled or len(server.requests) == 4)
                 bus.publish([moving("map", "base", 5), static("map", "camera")])
             await until(lambda: sorted(server.operations("publish")) == ["/tf", "/tf_static"])
             await until(lambda: server.clients == [])

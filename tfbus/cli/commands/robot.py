@@ -4,6 +4,7 @@ import difflib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AsyncExitStack
+from functools import partial
 from pathlib import Path
 
 import anyio
@@ -34,7 +35,7 @@ _COLUMNS = (Column("frame"), Column("joint", importance=2), Column("type", impor
 
 
 def robot(
-    file: Path,
+    file: Path | None = None,
     /,
     *position: str,
     tree: Flag = False,
@@ -54,7 +55,7 @@ def robot(
     Parameters
     ----------
     file
-        A URDF.
+        A URDF. Without one, --follow takes that of /robot_description of ROS, over DDS or rosbridge.
     position
         As NAME=NUMBER, the position of a joint in rad or m; for a planar joint x,y,angle, for a floating one
         x,y,z,qx,qy,qz,qw.
@@ -67,12 +68,19 @@ def robot(
     prefix
         A prefix for the names of all frames, such as robot1/.
     """
-    if "=" in file.name and not file.exists():
+    if file is None and not (follow and link.ros):
+        raise UsageError("give a URDF, or take that of ROS with --follow and --ros")
+    if file is not None and "=" in file.name and not file.exists():
         raise UsageError(f"the URDF comes first: tfbus robot FILE {file}")
     if follow and not link.ros:
         raise UsageError("--follow takes positions from ROS: give --ros, such as --ros dds")
     if follow and position:
         raise UsageError("--follow takes positions from ROS: give none")
+    if file is None:
+        if tree:
+            raise UsageError("--tree prints the frames of a URDF: give one")
+        link.run(partial(_follow, link=link, model=None, prefix=prefix))
+        return
     model = _read_model(file)
     positions = {**model.zeros(), **_parse_positions(model, position)}
     try:
@@ -95,17 +103,47 @@ def robot(
             async for _ in bus.clock.ticks(rate):
                 bus.publish(model.moving_transforms(positions, bus.clock.now(), AUTHORITY, prefix), invalid="drop")
 
-    async def follow_ros(bus: Bus) -> None:
-        publisher = RobotStatePublisher(bus, model, prefix, AUTHORITY, invalid="drop")
-        say(f"publishing the frames of {model.name!r} as /joint_states of {link.place} says, until Ctrl-C")
-        async with AsyncExitStack() as stack:
-            for place in link.ros:
-                # A link for the positions only: the frames pass by the others.
-                positions_only = ros_link(bus, place, send=False, frames=(), joint_states=publisher.publish)
-                await stack.enter_async_context(positions_only)
-            await anyio.sleep_forever()
+    link.run(partial(_follow, link=link, model=model, prefix=prefix) if follow else publish)
 
-    link.run(follow_ros if follow else publish)
+
+async def _follow(bus: Bus, link: LinkOptions, model: RobotModel | None, prefix: str) -> None:
+    """Publish a robot as ROS moves it, and as ROS describes it if no model is given."""
+    if model is None:
+        model = await _model_of_ros(bus, link)
+    publisher = RobotStatePublisher(bus, model, prefix, AUTHORITY, invalid="drop")
+    say(f"publishing the frames of {model.name!r} as /joint_states of {link.place} says, until Ctrl-C")
+    async with AsyncExitStack() as stack:
+        for place in link.ros:
+            # A link for the positions only: the frames pass by the others.
+            positions_only = ros_link(bus, place, send=False, frames=(), joint_states=publisher.publish)
+            await stack.enter_async_context(positions_only)
+        await anyio.sleep_forever()
+
+
+async def _model_of_ros(bus: Bus, link: LinkOptions) -> RobotModel:
+    """Wait for the URDF on /robot_description; raises `UsageError` if it is no robot."""
+    described = anyio.Event()
+    texts: list[str] = []
+
+    def take(text: str) -> None:
+        texts.append(text)
+        described.set()
+
+    say(f"waiting for /robot_description of {link.place}")
+    async with AsyncExitStack() as stack:
+        for place in link.ros:
+            description_only = ros_link(bus, place, send=False, frames=(), robot_description=take)
+            await stack.enter_async_context(description_only)
+        await described.wait()
+    # A text without a tag would be taken for a path.
+    if "<" not in texts[0]:
+        raise UsageError("/robot_description holds no URDF")
+    try:
+        return RobotModel.from_urdf(texts[0])
+    except InvalidRobotError as error:
+        raise UsageError(f"/robot_description: {error}") from None
+    except ImportError as error:
+        raise UsageError(str(error)) from None
 
 
 def tree_lines(

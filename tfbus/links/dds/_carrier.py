@@ -21,7 +21,7 @@ from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds._domains import domain
 from tfbus.links.dds._publishers import PATIENCE, Publishers
-from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawTFMessage
+from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawString, RawTFMessage
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.tf_message import encode
@@ -96,6 +96,10 @@ class DdsCarrier(RosCarrier):
             for name in self.settings.clock_topic:
                 clock = Topic(participant, f"rt{name}", RawClock)
                 self._read(participant, clock, _ANY, partial(self._take_other, "clock"), None)
+            for name in self.settings.description_topic:
+                # Latched, as static frames are.
+                description = Topic(participant, f"rt{name}", RawString)
+                self._read(participant, description, _STATICS, partial(self._take_other, "description"), None)
             for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
                 static = number < len(self.settings.tf_static)
                 self._read(
@@ -181,13 +185,14 @@ class DdsCarrier(RosCarrier):
             if not isinstance(message, InvalidSample):
                 self._publishers.nodes(*_nodes_of(message))
 
-    def _take_other(self, kind: Literal["joints", "clock"], reader: DataReader[Any]) -> None:
+    def _take_other(self, kind: Literal["joints", "clock", "description"], reader: DataReader[Any]) -> None:
         messages: list[Any] = reader.take(N=_AT_ONCE)
         for message in messages:
             if not isinstance(message, InvalidSample):
-                joints, clock = kind == "joints", kind == "clock"
-                content = RosMessage(message.payload, static=False, authority="", joints=joints, clock=clock)
-                self._receive(Received(_OTHERS, content, len(message.payload), moving=True))
+                other = {kind: True}
+                content = RosMessage(message.payload, static=False, authority="", **other)
+                # What is latched comes once.
+                self._receive(Received(_OTHERS, content, len(message.payload), moving=kind != "description"))
 
     def _match(self, number: int, reader: DataReader[RawTFMessage]) -> None:
         with self._lock:

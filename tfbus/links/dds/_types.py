@@ -138,6 +138,26 @@ class RawClock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
 
 
 @dataclass
+class RawString(IdlStruct, typename="std_msgs::msg::dds_::String_"):
+    """``std_msgs/msg/String``, which becomes its bytes when it comes."""
+
+    data: str
+    payload = b""
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
+        """The message of the bytes that have come."""
+        message = cls.__new__(cls)
+        message.payload = bytes(data)
+        return message
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
+        """What comes of a writer that has gone."""
+        return cls.deserialize(b"")
+
+
+@dataclass
 class Gid(IdlStruct, typename="rmw_dds_common::msg::dds_::Gid_"):
     """``rmw_dds_common/msg/Gid``: the id of a participant or of a writer, as DDS has it."""
 

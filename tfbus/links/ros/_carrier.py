@@ -18,6 +18,7 @@ from tfbus.links._outbox import Turn
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Received
 from tfbus.links.ros._clock_message import decode_clock
+from tfbus.links.ros._text_message import decode_text
 from tfbus.links.ros.settings import RosSettings
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, decode, refusal
@@ -38,8 +39,8 @@ class RosMessage:
         Whether the topic is one of static frames.
     authority : str
         The node that has published it, or what is known of it.
-    joints, clock : bool
-        Whether it has positions of joints, or the time, rather than transforms.
+    joints, clock, description : bool
+        Whether it has positions of joints, the time, or the URDF of a robot, rather than transforms.
     """
 
     payload: Any
@@ -47,6 +48,7 @@ class RosMessage:
     authority: str
     joints: bool = False
     clock: bool = False
+    description: bool = False
 
 
 class RosCarrier:
@@ -103,6 +105,11 @@ class RosCarrier:
             stamp, positions = self._decode_joints(content.payload)
             if self.settings.joint_states is not None:
                 self.settings.joint_states(positions, stamp)
+            return ReceivedMessage([])
+        if content.description:
+            description = decode_text(content.payload)
+            if self.settings.robot_description is not None:
+                self.settings.robot_description(description)
             return ReceivedMessage([])
         decoded = self._decode(content.payload)
         errors = decoded.errors

@@ -37,6 +37,11 @@ class RosLink(Link):
         `RobotStatePublisher.publish` of a robot. What it raises is counted in `LinkStatistics.rejected`.
     joint_topic : str
         The topic of these, by default ``/joint_states``.
+    robot_description : callable, optional
+        Takes the URDF of the robot, a str, where ROS has it as a topic, as ``robot_state_publisher`` does in ROS 2.
+        What it raises is counted in `LinkStatistics.rejected`. `RmwZenohLink` refuses it.
+    description_topic : str
+        The topic of that, by default ``/robot_description``.
     clock : SimulatedClock, optional
         Follows ``/clock``, the time of a simulation: it advances, and jumps where that time jumps; one jump back is one
         reset. Give the clock of the bus.

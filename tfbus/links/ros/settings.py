@@ -16,6 +16,10 @@ JointStates = Callable[[Mapping[str, float], int], object]
 """Takes the positions of joints by their names, in rad or m, and the stamp in ns."""
 
 
+TakesDescription = Callable[[str], object]
+"""Takes the URDF of a robot."""
+
+
 class RosOptions(TypedDict, total=False):
     """The arguments that all links to ROS share; `RosLink` describes them."""
 
@@ -28,6 +32,8 @@ class RosOptions(TypedDict, total=False):
     authority: str | None
     joint_states: JointStates | None
     joint_topic: str
+    robot_description: TakesDescription | None
+    description_topic: str
     clock: SimulatedClock | HearsTime | None
     drop_lost: bool
     max_frames: int
@@ -51,6 +57,10 @@ class RosSettings:
         Takes the positions of joints that come in.
     joint_topic : tuple of str
         The topic of these, if somebody takes them.
+    robot_description : callable or None
+        Takes the URDF of the robot.
+    description_topic : tuple of str
+        The topic of that, if somebody takes it.
     clock_topic : tuple of str
         The topic of the time, if a clock follows it.
     """
@@ -63,6 +73,8 @@ class RosSettings:
     joint_states: JointStates | None = None
     joint_topic: tuple[str, ...] = ()
     clock_topic: tuple[str, ...] = ()
+    robot_description: TakesDescription | None = None
+    description_topic: tuple[str, ...] = ()
 
 
 def settings_of(options: RosOptions) -> RosSettings:
@@ -79,6 +91,9 @@ def settings_of(options: RosOptions) -> RosSettings:
     joint_states = options.get("joint_states")
     if joint_states is not None and not callable(joint_states):
         raise TypeError(f"joint_states must be callable, such as the publish of a robot, not {joint_states!r}")
+    description = options.get("robot_description")
+    if description is not None and not callable(description):
+        raise TypeError(f"robot_description must be callable, not {description!r}")
     return RosSettings(
         as_topics(options.get("tf", "/tf"), "tf"),
         as_topics(options.get("tf_static", "/tf_static"), "tf_static"),
@@ -88,6 +103,10 @@ def settings_of(options: RosOptions) -> RosSettings:
         joint_states,
         () if joint_states is None else as_topics(options.get("joint_topic", "/joint_states"), "joint_topic"),
         () if options.get("clock") is None else ("/clock",),
+        description,
+        ()
+        if description is None
+        else as_topics(options.get("description_topic", "/robot_description"), "description_topic"),
     )
 
 

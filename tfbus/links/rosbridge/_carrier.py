@@ -18,6 +18,7 @@ from tfbus.links.ros.settings import RosSettings
 from tfbus.links.rosbridge._protocol import (
     CLOCK_TYPE,
     JOINT_TYPE,
+    TEXT_TYPE,
     Incoming,
     advertise,
     decode_content,
@@ -66,6 +67,8 @@ class RosbridgeCarrier(RosCarrier):
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
         self._woken = anyio.Event()
+        self._writing = anyio.CancelScope(shield=True)
+        self._ending = False
 
     async def _connect(self) -> None:
         self._socket = await WebSocket.connect(self._url, MAX_SIZE, CONNECT_TIME)
@@ -79,6 +82,8 @@ class RosbridgeCarrier(RosCarrier):
             self._request(subscribe(topic, ENCODINGS[0], JOINT_TYPE))
         for topic in self.settings.clock_topic:
             self._request(subscribe(topic, ENCODINGS[0], CLOCK_TYPE))
+        for topic in self.settings.description_topic:
+            self._request(subscribe(topic, ENCODINGS[0], TEXT_TYPE))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
             self._request(advertise(self.settings.tf[0], static=False))
@@ -128,11 +133,14 @@ class RosbridgeCarrier(RosCarrier):
 
     async def _talk(self, socket: WebSocket) -> None:
         """Send and receive until the server is gone."""
+        # What is being sent when the link ends goes out whole, or later messages could not be read.
+        self._writing, self._ending = anyio.CancelScope(shield=True), False
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
         for work in (self._read_all, self._write_all, self._keep_alive):
             tasks.start_soon(self._until_gone, work, socket, tasks.cancel_scope)
         tasks.start_soon(self._ask_again)
+        tasks.start_soon(self._end_writing)
         await close_task_group(tasks)
         # Not when the link ends: then there is still something to send.
         self._socket = None
@@ -169,11 +177,17 @@ class RosbridgeCarrier(RosCarrier):
         if not incoming.topic:
             self._report.failed(ConnectionError(f"{self._url} says: {incoming.content}"))
             return
-        joints, clock = (incoming.topic in topics for topics in (self.settings.joint_topic, self.settings.clock_topic))
-        if joints or clock:
-            other = RosMessage(incoming.content, static=False, authority="", joints=joints, clock=clock)
-            self._receive(Received(self._url, other, size, moving=True))
-            return
+        others = {
+            "joints": self.settings.joint_topic,
+            "clock": self.settings.clock_topic,
+            "description": self.settings.description_topic,
+        }
+        for kind, topics in others.items():
+            if incoming.topic in topics:
+                other = RosMessage(incoming.content, static=False, authority="", **{kind: True})
+                # What is latched comes once.
+                self._receive(Received(self._url, other, size, moving=kind != "description"))
+                return
         static = incoming.topic in self.settings.tf_static
         if not static and incoming.topic not in self.settings.tf:
             raise MalformedMessageError("topic", f"a message on {incoming.topic[:100]!r}, which nobody asked for")
@@ -191,10 +205,22 @@ class RosbridgeCarrier(RosCarrier):
                 self._request(subscribe(topic, ENCODINGS[self._encoding]))
 
     async def _write_all(self, socket: WebSocket) -> None:
-        while True:
-            self._woken = anyio.Event()
-            await self._send_all(socket)
-            await self._woken.wait()
+        with self._writing:
+            while True:
+                self._woken = anyio.Event()
+                await self._send_all(socket)
+                if self._ending:
+                    return
+                await self._woken.wait()
+
+    async def _end_writing(self) -> None:
+        """When all ends, give `_write_all` a little time for what it has begun and what waits."""
+        try:
+            await anyio.sleep_forever()
+        finally:
+            self._ending = True
+            self._writing.deadline = anyio.current_time() + _CLOSING_TIME
+            self._woken.set()
 
     async def _send_all(self, socket: WebSocket) -> None:
         while True:

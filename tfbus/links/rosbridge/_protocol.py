@@ -20,6 +20,7 @@ TYPE: Final = "tf2_msgs/TFMessage"
 """ROS 2 takes this name too."""
 JOINT_TYPE: Final = "sensor_msgs/JointState"
 CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
+TEXT_TYPE: Final = "std_msgs/String"
 QUEUE: Final = 100
 _DOUBLES: Final = 86
 """The tag of little endian float64 (RFC 8746)."""

@@ -22,6 +22,8 @@ from wsproto.utilities import ProtocolError
 
 _AT_ONCE = 2**16
 _GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError)
+_CLOSING_TIME = 1.0
+"""s; an end that reads nothing is told so long that this one closes."""
 _PORTS = {"ws": 9090, "wss": 443}
 
 
@@ -140,7 +142,8 @@ class WebSocket:
     async def close(self) -> None:
         """Close, without waiting for the other end."""
         try:
-            await self._send(CloseConnection(1000))
+            with anyio.move_on_after(_CLOSING_TIME):
+                await self._send(CloseConnection(1000))
         except OSError:
             pass
         finally:

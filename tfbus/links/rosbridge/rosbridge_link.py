@@ -50,6 +50,10 @@ class RosbridgeLink(RosLink):
     ends the connection. The only peer is the server. While a lookup waits on the bus, the static frames are asked for
     now and then, because a server for ROS 2 may have had them before this link came.
 
+    A server asks ROS once for each topic, for all its clients, as the first of them wants it. Where that is this link,
+    with ``cbor-raw``, a client that wants JSON, such as roslib in a browser, hears nothing on the same topics; where it
+    came first, this link hears nothing. Give such clients a server of their own.
+
     A server keeps one latched message of ``/tf_static`` for all its clients. So of several programs that send static
     frames through one server, late joiners hear only the last.
 
