@@ -12,30 +12,36 @@ the thorough one, new ones at each run unless the variable `CI` is set. ``--hypo
 
 Folders are tested by as many processes as there are cores, at most four; single files and benchmarks by one. ``-n``
 chooses otherwise.
+
+A test, or a file of tests, that needs an extra which is not installed is skipped with the name of the extra.
 """
 
 import os
 import shutil
 import signal
 import tempfile
-from collections.abc import Awaitable, Callable, Generator
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
 import anyio
 import pytest
 from hypothesis import HealthCheck, configuration, is_hypothesis_test, settings
+from support.extras import absent_extra
 
 import tfbus
 
 T = TypeVar("T")
 Backend = tuple[str, dict[str, Any]]
 
+# Anyio's plugin does not recover from a runner that it cannot start.
+WITHOUT_UVLOOP = pytest.mark.skipif(find_spec("uvloop") is None, reason="the extra test is not installed")
 ASYNCIO: Backend = ("asyncio", {})
 BACKENDS = [
     pytest.param(ASYNCIO, id="asyncio"),
-    pytest.param(("asyncio", {"use_uvloop": True}), id="uvloop"),
+    pytest.param(("asyncio", {"use_uvloop": True}), id="uvloop", marks=WITHOUT_UVLOOP),
     pytest.param(("trio", {}), id="trio"),
 ]
 DEFAULT_SUITE = "not thorough"
@@ -106,8 +112,45 @@ def is_on_another_loop(item: pytest.Item) -> bool:
     return not every_loop and parameters.get("anyio_backend", ASYNCIO) != ASYNCIO
 
 
+@contextmanager
+def skip_without_extra() -> Iterator[None]:
+    """Skip what fails for want of an extra, with its name."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        extra = absent_extra(error)
+        if extra is None:
+            raise
+        pytest.skip(f"the extra {extra} is not installed", allow_module_level=True)
+
+
+class TestFile(pytest.Module):
+    """A file of tests; one that cannot be imported for want of an extra is skipped as a whole."""
+
+    def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
+        with skip_without_extra():
+            return super().collect()
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
+    module: pytest.Module = TestFile.from_parent(parent, path=module_path)
+    return module
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup() -> Generator[None, None, None]:
+    with skip_without_extra():
+        yield
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    with skip_without_extra(), end_in_time(item):
+        yield
+
+
+@contextmanager
+def end_in_time(item: pytest.Item) -> Iterator[None]:
     """End a test that hangs; one that does not return to Python is ended with its process, by faulthandler."""
     if not hasattr(signal, "setitimer"):
         yield
