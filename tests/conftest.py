@@ -22,7 +22,7 @@ import signal
 import tempfile
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -36,12 +36,10 @@ import tfbus
 T = TypeVar("T")
 Backend = tuple[str, dict[str, Any]]
 
-# Anyio's plugin does not recover from a runner that it cannot start.
-WITHOUT_UVLOOP = pytest.mark.skipif(find_spec("uvloop") is None, reason="the extra test is not installed")
 ASYNCIO: Backend = ("asyncio", {})
 BACKENDS = [
     pytest.param(ASYNCIO, id="asyncio"),
-    pytest.param(("asyncio", {"use_uvloop": True}), id="uvloop", marks=WITHOUT_UVLOOP),
+    pytest.param(("asyncio", {"use_uvloop": True}), id="uvloop"),
     pytest.param(("trio", {}), id="trio"),
 ]
 DEFAULT_SUITE = "not thorough"
@@ -138,8 +136,12 @@ def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> 
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_setup() -> Generator[None, None, None]:
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, None, None]:
     with skip_without_extra():
+        backend = item.callspec.params.get("anyio_backend") if hasattr(item, "callspec") else None
+        if isinstance(backend, tuple) and backend[1].get("use_uvloop"):
+            # Anyio's plugin does not recover from a runner that it cannot start.
+            import_module("uvloop")
         yield
 
 

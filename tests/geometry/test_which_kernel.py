@@ -20,7 +20,7 @@ def run(wanted: str | None, script: str = SHOW) -> subprocess.CompletedProcess[s
     if wanted is not None:
         environment["TFBUS_KERNEL"] = wanted
     return subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False, timeout=60
+        [sys.executable, "-P", "-c", script], env=environment, capture_output=True, text=True, check=False, timeout=60
     )
 
 
