@@ -15,7 +15,7 @@ print(kernel, TransformStamped.__mro__[1].__module__)
 
 
 def run(wanted: str | None, script: str = SHOW) -> subprocess.CompletedProcess[str]:
-    """A Python with `TFBUS_KERNEL` as wanted."""
+    """A Python with `TFBUS_KERNEL` as wanted, which does not look into the working directory for the package."""
     environment = {name: value for name, value in os.environ.items() if name != "TFBUS_KERNEL"}
     if wanted is not None:
         environment["TFBUS_KERNEL"] = wanted
