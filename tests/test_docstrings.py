@@ -52,7 +52,7 @@ def test_the_examples_that_need_an_extra_are_true(module: str, package: str) -> 
 
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_what_people_call_most_has_an_example(name: str) -> None:
-    assert "Examples\n    --------\n    >>> " in getattr(tfbus, name).__doc__
+    assert "Examples\n--------\n>>> " in (inspect.getdoc(getattr(tfbus, name)) or "")
 
 
 def test_everything_public_has_a_docstring() -> None:
