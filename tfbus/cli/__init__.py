@@ -5,7 +5,6 @@ Standard output carries the result of a command; notices, warnings and errors go
 
 # Not `signal`, which loads enum: meanwhile Ctrl-C would still be a traceback.
 import _signal as signal  # type: ignore[import-not-found]
-import gc
 import sys
 
 
@@ -17,21 +16,17 @@ def main() -> None:
     """
     heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
-    def begin() -> None:
-        gc.enable()
+    def hear_ctrl_c() -> None:
         if heard:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     if heard:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    # Loading modules makes no garbage; to look for it takes a tenth of the start.
-    gc.disable()
     from tfbus.cli.application import run
 
     try:
-        status = run(sys.argv[1:], begin)
+        status = run(sys.argv[1:], hear_ctrl_c)
     finally:
-        gc.enable()
         if heard:
             signal.signal(signal.SIGINT, signal.SIG_DFL)
     sys.exit(status)
