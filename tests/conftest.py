@@ -12,20 +12,24 @@ the thorough one, new ones at each run unless the variable `CI` is set. ``--hypo
 
 Folders are tested by as many processes as there are cores, at most four; single files and benchmarks by one. ``-n``
 chooses otherwise.
+
+A test, or a file of tests, that needs an extra which is not installed is skipped with the name of the extra.
 """
 
 import os
 import shutil
 import signal
 import tempfile
-from collections.abc import Awaitable, Callable, Generator
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
 import anyio
 import pytest
 from hypothesis import HealthCheck, configuration, is_hypothesis_test, settings
+from support.extras import absent_extra
 
 import tfbus
 
@@ -106,8 +110,49 @@ def is_on_another_loop(item: pytest.Item) -> bool:
     return not every_loop and parameters.get("anyio_backend", ASYNCIO) != ASYNCIO
 
 
+@contextmanager
+def skip_without_extra() -> Iterator[None]:
+    """Skip what fails for want of an extra, with its name."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        extra = absent_extra(error)
+        if extra is None:
+            raise
+        pytest.skip(f"the extra {extra} is not installed", allow_module_level=True)
+
+
+class TestFile(pytest.Module):
+    """A file of tests; one that cannot be imported for want of an extra is skipped as a whole."""
+
+    def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
+        with skip_without_extra():
+            return super().collect()
+
+
+def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
+    module: pytest.Module = TestFile.from_parent(parent, path=module_path)
+    return module
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup(item: pytest.Item) -> Generator[None, None, None]:
+    with skip_without_extra():
+        backend = item.callspec.params.get("anyio_backend") if hasattr(item, "callspec") else None
+        if isinstance(backend, tuple) and backend[1].get("use_uvloop"):
+            # Anyio's plugin does not recover from a runner that it cannot start.
+            import_module("uvloop")
+        yield
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Generator[None, None, None]:
+    with skip_without_extra(), end_in_time(item):
+        yield
+
+
+@contextmanager
+def end_in_time(item: pytest.Item) -> Iterator[None]:
     """End a test that hangs; one that does not return to Python is ended with its process, by faulthandler."""
     if not hasattr(signal, "setitimer"):
         yield

@@ -9,8 +9,6 @@ import anyio.lowlevel
 import pytest
 
 from tfbus import SECOND, Bus, Clock, SimulatedClock
-from tfbus.cli.application import run
-from tfbus.cli.domain import LinkOptions
 from tfbus.testing import simulate
 
 START = 100 * SECOND
@@ -37,6 +35,9 @@ class Command:
 
     def __call__(self, *arguments: object) -> Done:
         """Run the command to its end."""
+        # Loaded here, where the test is skipped if the extra is not installed.
+        from tfbus.cli.application import run
+
         try:
             status = run(list(map(str, arguments)))
         except SystemExit as ended:
@@ -56,8 +57,9 @@ class Command:
         clock : Clock, optional
             By default a `SimulatedClock` that begins at `START` and goes on by itself.
         """
+        from tfbus.cli.domain import LinkOptions
 
-        def run_beside(options: LinkOptions, program: Callable[[Bus], Awaitable[Any]], **_: Any) -> Any:
+        def run_beside(options: Any, program: Callable[[Bus], Awaitable[Any]], **_: Any) -> Any:
             results = anyio.run(_run_beside, program, others, clock, backend=options.backend)
             if not results:
                 raise KeyboardInterrupt

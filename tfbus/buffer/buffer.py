@@ -69,12 +69,22 @@ class Buffer:
     TypeError
         If an argument is of another type, or there are shared names but no prefix.
 
-    Notes ----- Any thread may use the methods that only read. `lookup`, `transform`, `watch` and `close` belong to the
-    event loop of the bus.
+    Notes
+    -----
+    Any thread may use the methods that only read. `lookup`, `transform`, `watch` and `close` belong to the event loop
+    of the bus.
 
     With a prefix, the frames of another robot have no name here: to ask for them, use a buffer without a prefix. `tree`
     and all errors have the names of the bus. Texts and explanations write a frame of another robot with a slash in
     front.
+
+    Examples
+    --------
+    >>> with Bus() as bus, Buffer(bus) as buffer:
+    ...     TransformBroadcaster(bus).send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+    ...     print(buffer.describe())
+    base_link
+    └── laser  static
     """
 
     def __init__(
@@ -139,6 +149,15 @@ class Buffer:
         ------
         TransformLookupError, TypeError
             As `TransformTree.lookup`.
+
+        Examples
+        --------
+        >>> with Bus() as bus, Buffer(bus) as buffer:
+        ...     broadcaster = TransformBroadcaster(bus)
+        ...     broadcaster.send("map", "base_link", Transform((1.0, 2.0, 0.0)))
+        ...     broadcaster.send_static("base_link", "laser", Transform((0.1, 0.0, 0.2)))
+        ...     buffer.lookup_nowait("map", "laser").transform.translation
+        (1.1, 2.0, 0.2)
         """
         bounds = None if max_age is None else self._lookups.bounds(max_age, as_at(at), as_at(source_at))
         names = self._local_names

@@ -37,6 +37,15 @@ class TransformBroadcaster:
         if `invalid` is neither.
     TypeError
         If an argument is of another type, or there are shared names but no prefix.
+
+    Examples
+    --------
+    >>> with Bus() as bus, Buffer(bus) as buffer:
+    ...     broadcaster = TransformBroadcaster(bus, "driver", prefix="r17/", shared={"map"})
+    ...     broadcaster.send("map", "base_link", Transform((1.0, 2.0, 0.0)), at=0)
+    ...     sample = buffer.lookup_nowait("map", "r17/base_link")
+    >>> sample.child, sample.stamp
+    ('r17/base_link', 0)
     """
 
     def __init__(

@@ -67,6 +67,13 @@ class Bus:
     A bus may be made before an event loop runs. It belongs to the thread that made it, until an event loop in another
     thread uses it first; a loop has a claim on it once it has awaited a lookup, read a stream or entered `threadsafe`.
     Other threads publish through `threadsafe`.
+
+    Examples
+    --------
+    >>> with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
+    ...     bus.publish(TransformStamped("map", "base_link", 0, Transform((1.0, 2.0, 0.0))))
+    ...     buffer.can_transform("map", "base_link")
+    True
     """
 
     def __init__(

@@ -13,6 +13,17 @@ from tfbus.geometry.transform import Transform
 from tfbus.stamps import LATEST, as_stamp
 
 
+def construct(data: Any, *values: object) -> None:
+    """Set the fields of a frozen dataclass, and check them: what its own ``__init__`` does.
+
+    A class writes its ``__init__`` for the types of its arguments, which are wider than those of its fields.
+    """
+    # The fields of a subclass begin with those of its base.
+    for name, value in zip(data.__match_args__, values, strict=False):
+        object.__setattr__(data, name, value)
+    data.__post_init__()
+
+
 def check_header(data: Stamped) -> None:
     """Check the frame and the stamp of a frozen dataclass under construction; the stamp becomes a plain ``int``.
 

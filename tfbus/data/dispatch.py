@@ -76,6 +76,12 @@ def do_transform(data: Any, transform: TransformStamped) -> Any:  # noqa: ARG001
         If the type is not registered. The message says how to register it.
     ValueError
         If the frame of the data is not the source frame of the transform.
+
+    Examples
+    --------
+    >>> base_from_laser = TransformStamped("base_link", "laser", 0, Transform((0.1, 0.0, 0.2)))
+    >>> do_transform(PointStamped("laser", 0, (1.0, 0.2, 0.0)), base_from_laser)
+    PointStamped(frame='base_link', stamp=0, point=(1.1, 0.2, 0.2))
     """
     check_registered(data)
 

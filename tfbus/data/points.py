@@ -6,17 +6,17 @@ from typing import Any
 import numpy.typing as npt
 
 from tfbus.data._arrays import CopiedByFields, as_points
-from tfbus.data._header import as_triple, check_header, check_pose
+from tfbus.data._header import as_triple, check_header, check_pose, construct
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.geometry.read_only import locked
-from tfbus.geometry.rows import Quaternion, Vector, as_rotation, rotate
+from tfbus.geometry.rows import Numbers, Quaternion, Vector, as_rotation, rotate
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.plain import PlainData
-from tfbus.stamps import Latest
+from tfbus.stamps import AtLike, Latest
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(init=False, frozen=True, slots=True)
 class PointStamped(PlainData):
     """A position.
 
@@ -33,12 +33,15 @@ class PointStamped(PlainData):
     stamp: int | Latest
     point: Vector
 
+    def __init__(self, frame: str, stamp: AtLike, point: Numbers) -> None:
+        construct(self, frame, stamp, point)
+
     def __post_init__(self) -> None:
         check_header(self)
         object.__setattr__(self, "point", as_triple(self.point, "point"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(init=False, frozen=True, slots=True)
 class Vector3Stamped(PlainData):
     """A direction with a length, such as a velocity or a normal: a transform rotates it but does not translate it.
 
@@ -55,12 +58,15 @@ class Vector3Stamped(PlainData):
     stamp: int | Latest
     vector: Vector
 
+    def __init__(self, frame: str, stamp: AtLike, vector: Numbers) -> None:
+        construct(self, frame, stamp, vector)
+
     def __post_init__(self) -> None:
         check_header(self)
         object.__setattr__(self, "vector", as_triple(self.vector, "vector"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(init=False, frozen=True, slots=True)
 class QuaternionStamped(PlainData):
     """An orientation.
 
@@ -78,12 +84,15 @@ class QuaternionStamped(PlainData):
     stamp: int | Latest
     quaternion: Quaternion
 
+    def __init__(self, frame: str, stamp: AtLike, quaternion: Numbers) -> None:
+        construct(self, frame, stamp, quaternion)
+
     def __post_init__(self) -> None:
         check_header(self)
         object.__setattr__(self, "quaternion", as_rotation(self.quaternion, "quaternion"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(init=False, frozen=True, slots=True)
 class PoseStamped(PlainData):
     """A position and an orientation.
 
@@ -100,12 +109,15 @@ class PoseStamped(PlainData):
     stamp: int | Latest
     pose: Transform
 
+    def __init__(self, frame: str, stamp: AtLike, pose: Transform) -> None:
+        construct(self, frame, stamp, pose)
+
     def __post_init__(self) -> None:
         check_header(self)
         check_pose(self.pose)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(init=False, frozen=True, slots=True, eq=False)
 class Polygon(CopiedByFields, PlainData):
     """The corners of an area, in order; the last one is joined to the first. Equal only to itself.
 
@@ -121,6 +133,9 @@ class Polygon(CopiedByFields, PlainData):
     frame: str
     stamp: int | Latest
     points: npt.NDArray[Any]
+
+    def __init__(self, frame: str, stamp: AtLike, points: npt.ArrayLike) -> None:
+        construct(self, frame, stamp, points)
 
     def __post_init__(self) -> None:
         check_header(self)

@@ -7,17 +7,17 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.data._arrays import CopiedByFields, as_floats
-from tfbus.data._header import as_triple, check_header, check_pose
+from tfbus.data._header import as_triple, check_header, check_pose, construct
 from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.geometry.read_only import locked
-from tfbus.geometry.rows import Vector, rotate
+from tfbus.geometry.rows import Numbers, Vector, rotate
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.plain import PlainData
-from tfbus.stamps import Latest
+from tfbus.stamps import AtLike, Latest
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(init=False, frozen=True, slots=True, eq=False)
 class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     """A pose and its covariance. Equal only to itself.
 
@@ -45,6 +45,9 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     pose: Transform
     covariance: npt.NDArray[np.float64]
 
+    def __init__(self, frame: str, stamp: AtLike, pose: Transform, covariance: npt.ArrayLike) -> None:
+        construct(self, frame, stamp, pose, covariance)
+
     def __post_init__(self) -> None:
         check_header(self)
         check_pose(self.pose)
@@ -54,7 +57,7 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
         object.__setattr__(self, "covariance", locked(covariance.reshape(6, 6)))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(init=False, frozen=True, slots=True)
 class TwistStamped(PlainData):
     """The velocity of a body at the origin of a frame that is fixed to it.
 
@@ -84,13 +87,16 @@ class TwistStamped(PlainData):
     linear: Vector
     angular: Vector
 
+    def __init__(self, frame: str, stamp: AtLike, linear: Numbers, angular: Numbers) -> None:
+        construct(self, frame, stamp, linear, angular)
+
     def __post_init__(self) -> None:
         check_header(self)
         object.__setattr__(self, "linear", as_triple(self.linear, "linear"))
         object.__setattr__(self, "angular", as_triple(self.angular, "angular"))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(init=False, frozen=True, slots=True)
 class WrenchStamped(PlainData):
     """A force on a body, and its torque about the origin of a frame.
 
@@ -115,6 +121,9 @@ class WrenchStamped(PlainData):
     stamp: int | Latest
     force: Vector
     torque: Vector
+
+    def __init__(self, frame: str, stamp: AtLike, force: Numbers, torque: Numbers) -> None:
+        construct(self, frame, stamp, force, torque)
 
     def __post_init__(self) -> None:
         check_header(self)

@@ -92,6 +92,12 @@ def load(
     ValueError, TypeError
         If `max_speed` or `max_translation` is not greater than zero, or `max_translation` is greater than 1e100; or as
         `open_recording`.
+
+    Examples
+    --------
+    >>> tree = load("small.bag")
+    >>> tree.chain("map", "laser")
+    ['map', 'odom', 'base_link', 'laser']
     """
     limit = None if max_speed is None else SpeedLimit(max_speed)
     found = Problems()

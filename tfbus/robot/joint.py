@@ -37,7 +37,7 @@ class Joint:
         The links, whose names are those of their frames.
     origin : Transform
         The pose of the child in the parent at position zero.
-    axis : sequence of 3 floats
+    axis : tuple of 3 floats
         The axis of rotation, the direction of sliding, or the normal of the plane, in the coordinates of the child at
         position zero. Any length but zero; it is normalised. Fixed and floating joints ignore it.
     lower, upper : float, optional

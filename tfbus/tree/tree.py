@@ -302,6 +302,16 @@ class TransformTree:
             If stamps are not integers, or only one of `source_at` and `fixed` is given.
         ValueError
             If shapes do not agree.
+
+        Examples
+        --------
+        >>> tree = TransformTree()
+        >>> for stamp in (0, 100):
+        ...     outcome = tree.insert(TransformStamped("map", "base_link", stamp, Transform((stamp / 10, 0.0, 0.0))))
+        >>> tree.lookup_many("map", "base_link", [0, 50, 100]).translations
+        array([[ 0.,  0.,  0.],
+               [ 5.,  0.,  0.],
+               [10.,  0.,  0.]])
         """
         asked = as_stamps(stamps)
         if (source_at is None) != (fixed is None):

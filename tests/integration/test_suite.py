@@ -1,0 +1,109 @@
+"""What `tests/conftest.py` promises of every test: it ends in time, leaves no process behind, and needs no extra."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [
+    pytest.mark.thorough,
+    pytest.mark.skipif(
+        not Path("/proc/self/task").is_dir(), reason="this system does not show the children of a process"
+    ),
+]
+
+TESTS = Path(__file__).parents[1]
+HANGING = """
+import time
+
+def test_that_sleeps() -> None:
+    time.sleep(100.0)
+
+def test_that_spins() -> None:
+    while True:
+        pass
+
+def test_that_ends() -> None:
+    pass
+"""
+LEAVING = """
+import subprocess
+import sys
+from pathlib import Path
+
+def test_that_leaves_a_process() -> None:
+    process = subprocess.Popen([sys.executable, "-c", "import signal; print('up', flush=True); signal.pause()"],
+                               stdout=subprocess.PIPE)
+    process.stdout.readline()
+    Path(__file__).with_name("left").write_text(str(process.pid))
+"""
+AFTER_IT = """
+from pathlib import Path
+
+def test_that_it_has_been_killed() -> None:
+    process = Path(__file__).with_name("left").read_text()
+    assert Path("/proc", process, "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+"""
+NEEDY = """
+def test_that_needs_an_extra() -> None:
+    import package_of_an_extra
+
+def test_that_is_told_to_install_it() -> None:
+    raise ValueError('to do this, pip install "tfbus[cli,fancy]"')
+
+def test_that_calls_a_command_that_needs_it() -> None:
+    raise SystemExit('pip install "tfbus[fancy]"')
+
+def test_that_needs_another_package() -> None:
+    import package_of_nobody
+"""
+
+
+def run(folder: Path, **files: str) -> list[str]:
+    """Run files of tests under a copy of our conftest, whose time limit is 1 s; returns the lines of its output."""
+    conftest = (TESTS / "conftest.py").read_text(encoding="utf-8")
+    limits = "LIMIT, THOROUGH_LIMIT = 60.0, 280.0"
+    assert limits in conftest
+    conftest = conftest.replace(limits, "LIMIT, THOROUGH_LIMIT = 1.0, 280.0")
+    conftest += '\n\nfrom support.extras import EXTRAS\nEXTRAS["fancy"] = ("package_of_an_extra",)\n'
+    for name, text in {"conftest": conftest, **files}.items():
+        (folder / f"{name}.py").write_text(text, encoding="utf-8")
+    settings = f"[pytest]\npythonpath = {str(TESTS)!r}\nmarkers =\n  thorough\n  every_loop\n"
+    (folder / "pytest.ini").write_text(settings, encoding="utf-8")
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-n0",
+        "-rA",
+        "--tb=short",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not thorough",
+    ]
+    done = subprocess.run([*command, str(folder)], cwd=folder, capture_output=True, text=True, timeout=60, check=False)
+    return done.stdout.splitlines()
+
+
+def test_a_test_that_hangs_fails_and_the_next_ones_run(tmp_path: Path) -> None:
+    lines = run(tmp_path, test_hanging=HANGING)
+    for name in ("test_that_sleeps", "test_that_spins"):
+        assert f"FAILED test_hanging.py::{name} - Failed: it has not ended within 1 s" in lines
+    assert "PASSED test_hanging.py::test_that_ends" in lines
+
+
+def test_a_process_that_a_test_has_left_is_killed_with_its_file(tmp_path: Path) -> None:
+    lines = run(tmp_path, test_a_leaving=LEAVING, test_b_after_it=AFTER_IT)
+    assert "PASSED test_b_after_it.py::test_that_it_has_been_killed" in lines, "\n".join(lines)
+
+
+def test_what_needs_an_absent_extra_is_skipped_with_its_name(tmp_path: Path) -> None:
+    lines = run(tmp_path, test_needy=NEEDY, test_file="import package_of_an_extra\n")
+    skipped = [line for line in lines if line.startswith("SKIPPED")]
+    assert sum(int(line.partition("[")[2].partition("]")[0]) for line in skipped) == 4
+    assert all(line.endswith(": the extra fancy is not installed") for line in skipped)
+    failed = [line for line in lines if line.startswith("FAILED")]
+    assert len(failed) == 1
+    assert "test_that_needs_another_package" in failed[0]
