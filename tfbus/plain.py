@@ -7,7 +7,7 @@ the JSON of protobuf. An array becomes a dict of its dtype, its shape, and its v
 
 import math
 import types
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import cache
 from typing import Any, Self, Union, get_args, get_origin, get_type_hints
@@ -108,9 +108,10 @@ def from_plain(hint: Any, value: Any, name: str) -> Any:
     ValueError
         If the plain data are of another kind. The message has `name`.
     """
+    if type(value) is hint:
+        return value
     problem = ""
-    for kind in get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,):
-        read = _READERS.get(_origin_of(kind), _read_dict)
+    for kind, read in _readers_of(hint):
         try:
             found = read(kind, value, name)
         except ValueError as error:
@@ -119,6 +120,13 @@ def from_plain(hint: Any, value: Any, name: str) -> Any:
             if found is not _OTHER:
                 return found
     raise ValueError(f"{name} cannot be {value!r}{problem}")
+
+
+@cache
+def _readers_of(hint: Any) -> tuple[tuple[Any, Callable[[Any, Any, str], Any]], ...]:
+    """The alternatives of a type, and the function that reads each of them."""
+    kinds = get_args(hint) if get_origin(hint) in (Union, types.UnionType) else (hint,)
+    return tuple((kind, _READERS.get(_origin_of(kind), _read_dict)) for kind in kinds)
 
 
 def _origin_of(kind: Any) -> Any:

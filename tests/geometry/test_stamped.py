@@ -11,7 +11,7 @@ from support.strategies import samples
 
 from tfbus import LATEST, InvalidTransformError, Transform, TransformStamped
 from tfbus.geometry.rows import IDENTITY
-from tfbus.geometry.stamped import as_batch, qualified_answer
+from tfbus.geometry.stamped import answer_of, as_batch, qualified_answer
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MOVE = Transform((1.0, 2.0, 3.0))
@@ -191,3 +191,14 @@ def test_an_answer_with_a_policy_comes_back_with_its_use_of_the_policy() -> None
     for wrong in ({"gap": None}, {"extrapolated_by": "3"}, {"more": 1}, {"stamp": 0.5}, {"parent": "/map"}):
         with pytest.raises(ValueError, match=r"gap|extrapolated_by|more|stamp|/map"):
             TransformStamped.from_dict({**data, **wrong})
+
+
+@pytest.mark.parametrize(
+    "answer", [answer_of("map", "map", 5, IDENTITY, True), qualified_answer("map", "map", 5, IDENTITY, False, 3, 4)]
+)
+def test_the_answer_of_a_frame_in_itself_comes_back_from_json(answer: TransformStamped) -> None:
+    back = TransformStamped.from_dict(json.loads(json.dumps(answer.to_dict())))
+    assert (type(back), back) == (type(answer), answer)
+    assert (back.extrapolated_by, back.gap) == (answer.extrapolated_by, answer.gap)
+    with pytest.raises(ValueError, match="/map"):
+        TransformStamped.from_dict({**answer.to_dict(), "parent": "/map", "child": "/map"})

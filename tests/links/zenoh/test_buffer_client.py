@@ -4,6 +4,7 @@ from typing import Any
 
 import anyio
 import pytest
+import zenoh
 from support.processes import until
 from support.samples import moving, static
 
@@ -17,9 +18,12 @@ from tfbus import (
     LookupTimeoutError,
     PastExtrapolationError,
     RemoteLookupError,
+    TransformStamped,
     UnknownFrameError,
 )
-from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
+from tfbus.links._remote_lookup import Cancellation, read_question, write_answer
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, buffer_client
+from tfbus.links.zenoh._lookup_session import LookupSession
 
 pytestmark = pytest.mark.anyio
 
@@ -149,3 +153,58 @@ async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: st
     with Bus() as bus, pytest.raises(RuntimeError, match="not entered"):
         async with BufferClient(link=ZenohLink(bus, domain)):
             raise AssertionError("it has no session")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("told", [True, False])
+async def test_a_question_without_an_answer_is_asked_again_three_times(
+    address: str, domain: str, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Told or not of the end of its question, the client waits so long for the news that the server has gone.
+    for name in ("_SETTLING", "PATIENCE", "LONGEST_WAIT"):
+        monkeypatch.setattr(buffer_client, name, 0.05)
+    answer, losses = moving("map", "base", 7), 3
+    numbers: list[int] = []
+    kept: list[zenoh.Query] = []
+    session = LookupSession(domain, "r1", None, address, None, None, 2.0)
+
+    def receive(query: zenoh.Query) -> None:
+        assert query.payload is not None
+        question = read_question(query.payload.to_bytes())
+        if not isinstance(question, Cancellation):
+            numbers.append(question.number)
+            if len(numbers) > losses:
+                session.reply(query, write_answer(answer))
+                return
+            kept.append(query)
+        if told:
+            query.drop()
+
+    async def ask() -> TransformStamped:
+        async with BufferClient(domain, robot="r1", connect=address) as client:
+            await until(lambda: bool(client._servers))
+            return await client.lookup("map", "base")
+
+    await session.open()
+    try:
+        session.answer(receive, "server")
+        assert await ask() == answer
+        assert numbers == [1, 2, 3, 4]
+        numbers.clear()
+        losses = 4
+        with pytest.raises(RemoteLookupError) as silent:
+            await ask()
+        assert (silent.value.reason, numbers) == ("silent", [1, 2, 3, 4])
+    finally:
+        await session.close()
+
+
+@pytest.mark.thorough
+async def test_a_thousand_lookups_at_once_are_each_asked_once_and_answered(address: str, domain: str) -> None:
+    async with asked(address, domain) as (bus, server, client), anyio.create_task_group() as tasks:
+        bus.publish(static("map", "base"))
+        for _ in range(1_000):
+            tasks.start_soon(client.lookup, "map", "base")
+        await until(lambda: server.statistics().answered == 1_000)
+    assert client._number == 1_000
+    assert server.statistics().queue.dropped == 0

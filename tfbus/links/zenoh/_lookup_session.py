@@ -7,9 +7,11 @@ Where *robot* is ``~`` without one, the keys are::
     tfbus/domain/robot/@asking/asker     a liveliness token of each asker
 """
 
+import threading
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from queue import SimpleQueue
 from typing import Any
 
 import anyio
@@ -23,9 +25,14 @@ from tfbus.links.zenoh.zenoh_link import ZenohLink
 
 _CLOSING_TIME = 1.0
 
+_Sending = SimpleQueue[Callable[[], object] | None]
+
 
 class LookupSession:
     """A session, and the keys of one robot's lookups.
+
+    Questions and answers are sent by a thread of its own: zenoh drops none, and waits for a peer that is frozen or
+    overloaded.
 
     Parameters
     ----------
@@ -64,6 +71,7 @@ class LookupSession:
         self._base = f"tfbus/{self.domain}/{NO_ROBOT if robot is None else check_robot(robot)}"
         self._session: zenoh.Session | None = None
         self._declared: list[Any] = []
+        self._sending: _Sending = SimpleQueue()
         self._close_at_exit: weakref.finalize[..., LookupSession] | None = None
 
     def key(self, *parts: str) -> str:
@@ -82,13 +90,15 @@ class LookupSession:
         """
         if self._link is not None:
             self._session = self._link._zenoh_session()
-            return
-        try:
-            self._session = await anyio.to_thread.run_sync(zenoh.open, self._config)
-        except zenoh.ZError as error:
-            raise as_os_error(error) from error
+        else:
+            try:
+                self._session = await anyio.to_thread.run_sync(zenoh.open, self._config)
+            except zenoh.ZError as error:
+                raise as_os_error(error) from error
+        threading.Thread(target=_send_all, args=(self._sending,), daemon=True).start()
         # A program may exit without the end of its server.
-        self._close_at_exit = weakref.finalize(self, close_session, self._session)
+        own = None if self._link is not None else self._session
+        self._close_at_exit = weakref.finalize(self, _end_sending, self._sending, own)
 
     def answer(self, receive: Callable[[zenoh.Query], object], server: str) -> None:
         """Have questions received in zenoh's threads, and announce a server."""
@@ -111,23 +121,59 @@ class LookupSession:
         key = self.key(kind, "*")
         self._declared.append(self._opened().liveliness().declare_subscriber(key, directly(receive), history=True))
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether the session has ended, as that of a link does with the link."""
+        return bool(self._opened().is_closed())
+
+    @property
+    def unsent(self) -> int:
+        """How many questions and answers wait to be sent."""
+        return self._sending.qsize()
+
     def ask(self, payload: bytes, take: Callable[[bytes | None], object], timeout: float, to_all: bool = False) -> None:
-        """Send a question; `take` is called in zenoh's threads with the answer, or at the end with None."""
+        """Send a question; `take` is called once in another thread, with the answer or with None."""
+        session = self._opened()
+        answered = False
 
         def take_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
+            nonlocal answered
+            if reply.ok is not None and not answered:
+                answered = True
                 take(reply.ok.payload.to_bytes())
 
-        self._opened().get(
-            self.key("lookup"),
-            zenoh.handlers.Callback(take_reply, lambda: take(None), indirect=False),
-            target=zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING,
-            payload=payload,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
-            congestion_control=zenoh.CongestionControl.DROP,
-            express=True,
-        )
+        def end() -> None:
+            if not answered:
+                take(None)
+
+        def send() -> None:
+            try:
+                session.get(
+                    self.key("lookup"),
+                    zenoh.handlers.Callback(take_reply, end, indirect=False),
+                    target=zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING,
+                    payload=payload,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                    timeout=timeout,
+                    # The answer is sent as the question was.
+                    congestion_control=zenoh.CongestionControl.BLOCK,
+                    express=True,
+                )
+            except zenoh.ZError:
+                end()
+
+        self._sending.put(send)
+
+    def reply(self, query: zenoh.Query, answer: bytes) -> None:
+        """Send the answer of a question that was received."""
+
+        def send() -> None:
+            # An asker that has gone needs no answer.
+            with suppress(zenoh.ZError):
+                query.reply(query.key_expr, answer, express=True)
+            query.drop()
+
+        self._sending.put(send)
 
     async def close(self) -> None:
         """End what was declared, and the session if it is not the link's."""
@@ -135,6 +181,7 @@ class LookupSession:
         session, self._session = self._session, None
         if self._close_at_exit is not None:
             self._close_at_exit.detach()
+        self._sending.put(None)
         with anyio.move_on_after(_CLOSING_TIME, shield=True):
             await anyio.to_thread.run_sync(_end, declared, abandon_on_cancel=True)
             if self._link is None:
@@ -143,6 +190,18 @@ class LookupSession:
     def _opened(self) -> zenoh.Session:
         assert self._session is not None
         return self._session
+
+
+def _send_all(sending: _Sending) -> None:
+    while (send := sending.get()) is not None:
+        send()
+        # It refers to the session, which is closed when nobody else does.
+        del send
+
+
+def _end_sending(sending: _Sending, session: zenoh.Session | None) -> None:
+    sending.put(None)
+    close_session(session)
 
 
 def _end(declared: list[Any]) -> None:

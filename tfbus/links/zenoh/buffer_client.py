@@ -11,8 +11,6 @@ from typing import Any, Self
 from uuid import uuid4
 
 import anyio
-import anyio.lowlevel
-import zenoh
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus.bus.sample_queue import check_capacity
@@ -173,10 +171,10 @@ class BufferClient:
         )
         if not self._is_open:
             raise RuntimeError("the client is not entered")
-        await anyio.lowlevel.checkpoint()
         silences = 0
         while True:
-            await self._meet(until)
+            if not self._servers:
+                await self._meet(until)
             if not self._is_open:
                 raise self._error("lost", "this client has ended")
             left = max(until - monotonic(), 0.0)
@@ -204,7 +202,8 @@ class BufferClient:
             raise self._error("absent", "nobody offers it")
 
     async def _ask(self, question: RemoteQuestion, timeout: float) -> TransformStamped:
-        if len(self._pending) >= self._capacity:
+        # Questions that were given up may wait to be sent, too.
+        if max(len(self._pending), self._session.unsent) >= self._capacity:
             raise RuntimeError(f"{self._capacity} lookups wait for this client already")
         self._number = number = self._number + 1
         pending = self._pending[number] = _Pending()
@@ -212,10 +211,9 @@ class BufferClient:
         answered = False
         try:
             payload = write_question(asked)
-            try:
-                self._session.ask(payload, lambda answer: self._take(number, answer), timeout + 2 * PATIENCE)
-            except zenoh.ZError as error:
-                raise self._error("lost", f"the session is closed: {error}") from None
+            if self._session.is_closed:
+                raise self._error("lost", "the session is closed")
+            self._session.ask(payload, lambda answer: self._take(number, answer), timeout + 2 * PATIENCE)
             with anyio.move_on_after(timeout + PATIENCE):
                 await pending.done.wait()
                 answered = True
@@ -243,9 +241,10 @@ class BufferClient:
 
     def _cancel(self, number: int) -> None:
         # Without a session, nobody waits there.
-        with suppress(zenoh.ZError, AssertionError):
-            payload = write_question(Cancellation(self._id, number))
-            self._session.ask(payload, lambda _: None, PATIENCE, to_all=True)
+        with suppress(AssertionError):
+            if self._session.unsent < self._capacity:
+                payload = write_question(Cancellation(self._id, number))
+                self._session.ask(payload, lambda _: None, PATIENCE, to_all=True)
 
     def _error(self, reason: str, detail: str) -> RemoteLookupError:
         return RemoteLookupError(domain=self._session.domain, robot=self._session.robot, reason=reason, detail=detail)

@@ -10,7 +10,6 @@ from uuid import uuid4
 
 import anyio
 import anyio.abc
-import anyio.to_thread
 import zenoh
 
 from tfbus._aio.loop_waker import LoopWaker
@@ -103,8 +102,6 @@ class BufferServer:
         self._came = anyio.Event()
         self._waker = LoopWaker(lambda: self._came.set())
         self._waiting: dict[tuple[str, int], anyio.CancelScope] = {}
-        self._replies: deque[tuple[zenoh.Query, bytes]] = deque()
-        self._replied = anyio.Event()
         self._counts: Counter[str] = Counter()
         self._tasks: anyio.abc.TaskGroup | None = None
 
@@ -127,7 +124,6 @@ class BufferServer:
         self._waker.bind()
         await self._session.open()
         self._tasks = await anyio.create_task_group().__aenter__()
-        self._tasks.start_soon(self._send_replies)
         self._tasks.start_soon(self._take_all, self._tasks)
         self._session.follow("@asking", self._note_asker)
         self._session.answer(self._receive, uuid4().hex)
@@ -245,18 +241,11 @@ class BufferServer:
         self._reply(query, write_answer(error))
 
     def _reply(self, query: zenoh.Query, answer: bytes) -> None:
-        self._replies.append((query, answer))
-        self._replied.set()
-
-    async def _send_replies(self) -> None:
-        while True:
-            self._replied = anyio.Event()
-            while self._replies:
-                batch = list(self._replies)
-                self._replies.clear()
-                # zenoh waits for an asker that is frozen.
-                await anyio.to_thread.run_sync(_send, batch)
-            await self._replied.wait()
+        if self._session.unsent >= self._capacity:
+            self._dropped += 1
+            query.drop()
+            return
+        self._session.reply(query, answer)
 
 
 def _arguments(question: RemoteQuestion) -> dict[str, Any]:
@@ -271,11 +260,3 @@ def _arguments(question: RemoteQuestion) -> dict[str, Any]:
         "max_gap": question.max_gap,
         "extrapolate": None if question.hold is None else Hold(question.hold),
     }
-
-
-def _send(batch: list[tuple[zenoh.Query, bytes]]) -> None:
-    for query, answer in batch:
-        # An asker that has gone needs no answer.
-        with suppress(zenoh.ZError):
-            query.reply(query.key_expr, answer, express=True)
-        query.drop()
