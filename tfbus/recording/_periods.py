@@ -12,7 +12,7 @@ from tfbus.recording._durations import Durations
 from tfbus.recording.spread import Spread
 from tfbus.stamps import SECOND, to_seconds
 
-_AT_ONCE: Final = 200_000
+_AT_ONCE: Final = 50_000
 """So many stamps are merged at once, roughly."""
 
 

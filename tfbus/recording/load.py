@@ -6,8 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping
 from operator import itemgetter
 
-import numpy as np
-
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
 from tfbus.geometry.stamped import Batch, TransformStamped
@@ -159,7 +157,8 @@ def _append(forest: Forest, columns: list[Columns], max_translation: float) -> b
     """Insert the samples of a block, if no edge changes by them; returns whether that was so."""
     together: dict[str, list[Columns]] = {}
     for each in columns:
-        near = np.square(each.rows[:, :3]).sum(axis=1).max() <= max_translation**2
+        x, y, z = each.rows[:, :3].T
+        near = (x * x + y * y + z * z).max() <= max_translation**2
         history = forest.frames.get(each.child)
         if not near or history is None or (history.parent, history.static) != (each.parent, each.static):
             return False

@@ -8,6 +8,7 @@ give the same bits.
 
 import struct
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -59,41 +60,49 @@ class _Slot(NamedTuple):
     numbers: int
 
 
+Ranges = tuple[tuple[int, int], ...]
+"""Begin and end of each of some pieces of a message."""
+
+
 class _Layout(NamedTuple):
     """The bytes that are the same in all messages of a layout, and the transforms between them."""
 
-    places: npt.NDArray[np.intp]
+    ranges: Ranges
     """Where those bytes are."""
-    fixed: npt.NDArray[np.uint8]
+    fixed: npt.NDArray[np.uint64]
     slots: tuple[_Slot, ...]
 
 
 class _Structure:
-    """Layouts whose names are equally long, so that all have their fixed bytes at the same places.
+    """Layouts whose names are equally long, so that all have their fixed bytes and their numbers at the same places.
 
     Parameters
     ----------
-    places : array of int
+    ranges : tuple of (int, int)
     """
 
-    def __init__(self, places: npt.NDArray[np.intp]) -> None:
-        self.places = places
+    def __init__(self, ranges: Ranges) -> None:
+        self.ranges = ranges
         self.layouts: dict[int, _Layout] = {}
-        words = -(-len(places) // 8)
-        self._padding = 8 * words - len(places)
+        words = _words_in(ranges)
         # Odd numbers without a pattern; messages with the same sum are compared byte by byte as well.
         self._weights = np.random.default_rng(words).integers(2**62, size=words, dtype=np.uint64) * 2 + 1
 
-    def fixed(self, matrix: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-        """The bytes of each message at the fixed places."""
-        return matrix[:, self.places]
-
-    def hashes(self, fixed: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint64]:
+    def hashes(self, fixed: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
         """A number for the fixed bytes of each message."""
-        whole = np.zeros((len(fixed), fixed.shape[1] + self._padding), np.uint8)
-        whole[:, : fixed.shape[1]] = fixed
-        sums: npt.NDArray[np.uint64] = whole.view(np.uint64) @ self._weights
+        sums: npt.NDArray[np.uint64] = fixed @ self._weights
         return sums
+
+
+class _Values(NamedTuple):
+    """What one transform of each message of a structure holds."""
+
+    stamps: Stamps
+    """ns."""
+    rows: npt.NDArray[np.float64]
+    """Shape (n, 7): translation and unit quaternion (x, y, z, w)."""
+    sound: npt.NDArray[np.bool_]
+    """Whether it is valid for certain."""
 
 
 class ColumnDecoder:
@@ -128,15 +137,8 @@ class ColumnDecoder:
                 return None
             everywhere = np.ndarray((len(messages.data) - size + 1,), f"V{size}", messages.data, strides=(1,))
             matrix = everywhere[messages.starts[order]].view(np.uint8).reshape(-1, size)
-            parts = self._split(decoder, matrix, order)
-            if parts is None:
+            if not self._add(decoder, matrix, order, messages.received, found):
                 return None
-            for layout, its_order, rows in parts:
-                for place, slot in enumerate(layout.slots):
-                    columns = _columns(decoder, layout, place, slot, its_order, messages.received, rows)
-                    if columns is None:
-                        return None
-                    found.setdefault((columns.child, columns.authority), []).append(columns)
         edges: dict[str, tuple[str, bool]] = {}
         for parts_of_one in found.values():
             for each in parts_of_one:
@@ -144,47 +146,89 @@ class ColumnDecoder:
                     return None
         return list(map(_merge, found.values()))
 
-    def _split(
-        self, decoder: ChannelDecoder, matrix: npt.NDArray[np.uint8], order: npt.NDArray[np.intp]
-    ) -> list[tuple[_Layout, npt.NDArray[np.intp], npt.NDArray[np.uint8]]] | None:
-        """Parts of a matrix that have one layout each, with the places of their messages."""
+    def _add(
+        self,
+        decoder: ChannelDecoder,
+        matrix: npt.NDArray[np.uint8],
+        order: npt.NDArray[np.intp],
+        received: Stamps,
+        found: dict[tuple[str, str], list[Columns]],
+    ) -> bool:
+        """Decode messages of one channel and one size, in a matrix; returns whether all could be.
+
+        Parameters
+        ----------
+        decoder : ChannelDecoder
+        matrix : array of uint8, shape (n, size)
+        order : array of int, shape (n,)
+            The places of the messages.
+        received : array of int
+            The log times of the messages at all places.
+        found : dict
+            Gets the samples, by child and authority.
+        """
         known = self._structures.setdefault((decoder.channel, matrix.shape[1]), [])
-        parts = []
         at = 0
         while len(matrix):
             if at == len(known):
                 layout = _layout_of(matrix[0].tobytes(), decoder)
                 if layout is None or at == _MAX_STRUCTURES:
-                    return None
-                known.append(_Structure(layout.places))
+                    return False
+                known.append(_Structure(layout.ranges))
             structure = known[at]
             at += 1
-            fixed = structure.fixed(matrix)
-            hashes = structure.hashes(fixed)
-            rest = np.zeros(len(matrix), bool)
-            for rows in _groups(hashes):
-                number = int(hashes[rows[0]])
-                layout = structure.layouts.get(number)
-                if layout is None:
-                    layout = _layout_of(matrix[rows[0]].tobytes(), decoder)
-                    if layout is None or self._layouts == _MAX_LAYOUTS:
-                        return None
-                    if not np.array_equal(layout.places, structure.places):
-                        rest[rows] = True
-                        continue
-                    structure.layouts[number] = layout
-                    self._layouts += 1
-                its = slice(None) if len(rows) == len(matrix) else rows
-                fits = (fixed[its] == layout.fixed).all(axis=1)
-                if fits.all():
-                    parts.append((layout, order[its], matrix[its]))
-                else:
-                    rest[rows[~fits]] = True
-                    if fits.any():
-                        parts.append((layout, order[rows[fits]], matrix[rows[fits]]))
-            if not rest.any():
-                break
+            parts = self._parts(structure, decoder, matrix)
+            if parts is None:
+                return False
+            if not parts:
+                continue
+            rest = np.ones(len(matrix), bool)
+            for _, places in parts:
+                rest[places] = False
+            for place, slot in enumerate(parts[0][0].slots):
+                values = _values(matrix, slot, decoder.channel.encoding == "cdr")
+                if not (values.sound | rest).all():
+                    return False
+                for layout, places in parts:
+                    frame = layout.slots[place]
+                    authority = decoder.authority_of(place, len(layout.slots))
+                    its_order = order[places]
+                    found.setdefault((frame.child, authority), []).append(
+                        Columns(
+                            frame.parent,
+                            frame.child,
+                            authority,
+                            decoder.static,
+                            its_order,
+                            received[its_order],
+                            values.stamps[places],
+                            values.rows[places],
+                        )
+                    )
             matrix, order = matrix[rest], order[rest]
+        return True
+
+    def _parts(
+        self, structure: _Structure, decoder: ChannelDecoder, matrix: npt.NDArray[np.uint8]
+    ) -> list[tuple[_Layout, npt.NDArray[np.intp]]] | None:
+        """The layouts of the messages that have the structure, with their places; None if one has no layout."""
+        fixed = _fixed(matrix, structure.ranges)
+        hashes = structure.hashes(fixed)
+        parts = []
+        for places in _groups(hashes):
+            number = int(hashes[places[0]])
+            layout = structure.layouts.get(number)
+            if layout is None:
+                layout = _layout_of(matrix[places[0]].tobytes(), decoder)
+                if layout is None or self._layouts == _MAX_LAYOUTS:
+                    return None
+                if layout.ranges != structure.ranges:
+                    continue
+                structure.layouts[number] = layout
+                self._layouts += 1
+            same = (fixed[places] == layout.fixed).all(axis=1)
+            if same.any():
+                parts.append((layout, places[same]))
         return parts
 
 
@@ -192,7 +236,22 @@ def _groups(keys: npt.NDArray[Any]) -> list[npt.NDArray[np.intp]]:
     """The places of equal keys, one array for each key; they ascend."""
     order = np.argsort(keys, kind="stable")
     ascending = keys[order]
-    return np.split(order, np.flatnonzero(ascending[1:] != ascending[:-1]) + 1)
+    bounds = [0, *(np.flatnonzero(ascending[1:] != ascending[:-1]) + 1).tolist(), len(order)]
+    return [order[begin:end] for begin, end in pairwise(bounds)]
+
+
+def _words_in(ranges: Ranges) -> int:
+    return -(-sum(end - begin for begin, end in ranges) // 8)
+
+
+def _fixed(matrix: npt.NDArray[np.uint8], ranges: Ranges) -> npt.NDArray[np.uint64]:
+    """The bytes of each message in some ranges, in words of 8; the last one is filled with zeros."""
+    found = np.zeros((len(matrix), 8 * _words_in(ranges)), np.uint8)
+    at = 0
+    for begin, end in ranges:
+        found[:, at : at + end - begin] = matrix[:, begin:end]
+        at += end - begin
+    return found.view(np.uint64)
 
 
 def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
@@ -233,44 +292,33 @@ def _layout_of(payload: bytes, decoder: ChannelDecoder) -> _Layout | None:
         return None
     if at != len(payload):
         return None
-    places = np.concatenate([np.arange(start, end) for start, end in fixed], dtype=np.intp)
-    return _Layout(places, np.frombuffer(payload, np.uint8)[places], tuple(slots))
+    ranges = tuple(fixed)
+    return _Layout(ranges, _fixed(np.frombuffer(payload, np.uint8)[None], ranges)[0], tuple(slots))
 
 
-def _columns(
-    decoder: ChannelDecoder,
-    layout: _Layout,
-    place: int,
-    slot: _Slot,
-    order: npt.NDArray[np.intp],
-    received: Stamps,
-    matrix: npt.NDArray[np.uint8],
-) -> Columns | None:
-    """The samples of one transform of a layout; None if one of them may be invalid."""
+def _values(matrix: npt.NDArray[np.uint8], slot: _Slot, signed: bool) -> _Values:
+    """One transform of each message; in those of another structure, it is any bytes."""
     times = np.ascontiguousarray(matrix[:, slot.stamp : slot.stamp + 8]).view("<u4")
     rows = np.ascontiguousarray(matrix[:, slot.numbers : slot.numbers + 56]).view("<f8")
     nanoseconds = times[:, 1]
-    if (nanoseconds >= SECOND).any() or not (np.abs(rows[:, :3]) < _LARGE).all():
-        return None
+    sound = nanoseconds < SECOND
+    for axis in range(3):
+        sound &= np.abs(rows[:, axis]) < _LARGE
     i, j, k, w = rows[:, 3], rows[:, 4], rows[:, 5], rows[:, 6]
     # Overflow and NaN are found by the comparison.
     with np.errstate(over="ignore", invalid="ignore"):
         square = i * i + j * j + k * k + w * w
-        excess = np.abs(square - 1.0)
-    if not (excess <= ROUNDING).all():
-        norm = np.sqrt(square)
-        if not (np.abs(norm - 1.0) <= NORM_TOLERANCE).all():
-            return None
-        rows = rows.copy()
-        uneven = excess > ROUNDING
-        rows[uneven, 3:] /= norm[uneven, None]
-    signed = decoder.channel.encoding == "cdr"
+        even = np.abs(square - 1.0) <= ROUNDING
+        if not even.all():
+            norm = np.sqrt(square)
+            sound &= np.abs(norm - 1.0) <= NORM_TOLERANCE
+            rows = rows.copy()
+            uneven = sound & ~even
+            rows[uneven, 3:] /= norm[uneven, None]
     seconds = times[:, 0].view(np.int32 if signed else np.uint32).astype(np.int64)
-    if not signed and (seconds >= 2**31).any():
-        return None
-    stamps = seconds * SECOND + nanoseconds
-    authority = decoder.authority_of(place, len(layout.slots))
-    return Columns(slot.parent, slot.child, authority, decoder.static, order, received[order], stamps, rows)
+    if not signed:
+        sound &= seconds < 2**31
+    return _Values(seconds * SECOND + nanoseconds, rows, sound)
 
 
 def _merge(parts: list[Columns]) -> Columns:

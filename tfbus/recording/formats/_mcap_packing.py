@@ -13,15 +13,15 @@ from tfbus.recording.formats._bounds import MAX_CHUNK_MESSAGES
 from tfbus.recording.formats._chunks import ChunkPlace
 from tfbus.recording.formats._mcap_records import DAMAGE, scan_chunks, split_chunk
 from tfbus.recording.formats._packed import Packed, Stored, in_order
+from tfbus.recording.formats._record_places import record_places
 from tfbus.recording.formats._storage import Channel, StoredMessage, lost_message
 
 
 class OpenChunk(NamedTuple):
-    """The records of a chunk, and where each begins, with the end of the last."""
+    """A chunk, and its records."""
 
     place: ChunkPlace
     content: bytes
-    places: list[int]
 
 
 class ChunkPacker:
@@ -53,15 +53,16 @@ class ChunkPacker:
         """The messages of some chunks; in the order of their log times, if no later chunk overlaps them."""
         if not chunks:
             return
-        shifts = list(accumulate((len(chunk.content) for chunk in chunks), initial=0))
         data = b"".join([chunk.content for chunk in chunks])
-        places = [np.array(chunk.places) + shift for chunk, shift in zip(chunks, shifts, strict=False)]
-        begins = np.concatenate([found[:-1] for found in places])
-        ends = np.concatenate([found[1:] for found in places])
+        bounds = np.fromiter(accumulate((len(chunk.content) for chunk in chunks), initial=0), np.int64)
         try:
-            if max(len(chunk.places) for chunk in chunks) > MAX_CHUNK_MESSAGES:
+            places = record_places(data)
+            firsts = np.searchsorted(places, bounds)
+            if not np.array_equal(places[firsts], bounds):
+                raise ValueError("a record goes on behind the end of its chunk")
+            if np.diff(firsts).max() > MAX_CHUNK_MESSAGES:
                 raise ValueError("one has too many messages")
-            numbers, received, starts, ends = scan_chunks(data, begins, ends, self._register)
+            numbers, received, starts, ends = scan_chunks(data, places[:-1], places[1:], self._register)
         except DAMAGE:
             # One by one, to find out which of them is damaged.
             yield sorted(chain.from_iterable(self._split(chunk, low) for chunk in chunks), key=itemgetter(0))

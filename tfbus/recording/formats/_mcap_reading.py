@@ -17,7 +17,6 @@ from tfbus.recording.formats._mcap_records import (
     Chunk,
     Torn,
     parse_record,
-    record_places,
     split_chunk,
     split_message,
 )
@@ -34,7 +33,7 @@ _KINDS: Final[dict[int, str]] = {
 }
 """The names of the records that are read."""
 _FIRST_BLOCK: Final = 2**16
-_BLOCK: Final = 2**20
+_BLOCK: Final = 2**21
 """Bytes that are decoded at once: few at first, for the first message of each frame has to be judged by itself."""
 
 
@@ -121,14 +120,14 @@ class McapReading:
                 try:
                     if place.offset + length > self._source.size:
                         raise ValueError("it is behind the end of the file")
-                    content = self._source.read_chunk(place.offset).unfold()
-                    chunks.append(OpenChunk(place, content, record_places(content)))
+                    chunk = OpenChunk(place, self._source.read_chunk(place.offset).unfold())
                 except (*DAMAGE, EndOfFile) as error:
                     yield from packer.pack(chunks, low, high)
                     chunks.clear()
                     yield lost_chunk(place, low, error)
                 else:
-                    size += len(content)
+                    chunks.append(chunk)
+                    size += len(chunk.content)
             if size >= enough:
                 yield from packer.pack(chunks, low, high)
                 chunks.clear()

@@ -1,0 +1,44 @@
+import struct
+from itertools import accumulate, cycle, islice
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from tfbus.recording.formats import _record_places
+from tfbus.recording.formats._record_places import record_places
+
+
+def written(sizes: list[int]) -> bytes:
+    # Contents that look like heads must not be taken for them.
+    return b"".join(struct.pack("<BQ", 5, size) + bytes(size) for size in sizes)
+
+
+@given(
+    st.lists(st.tuples(st.lists(st.integers(0, 5), min_size=1, max_size=5), st.integers(1, 90)), min_size=1, max_size=4)
+)
+@example([([1, 2, 3], 90), ([4], 1), ([1, 2, 3], 90)])
+def test_all_records_are_found_whether_their_lengths_repeat_or_not(parts: list[tuple[list[int], int]]) -> None:
+    sizes = [size for lengths, count in parts for size in islice(cycle(lengths), count)]
+    assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+def test_long_cycles_and_more_records_than_are_guessed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_record_places, "_GUESSED", 100)
+    sizes = list(islice(cycle([*range(30), 7]), 1_000))
+    assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_a_last_record_that_is_cut_off_is_damage(count: int) -> None:
+    data = written([3] * count)
+    for missing in range(1, 12):
+        with pytest.raises((ValueError, struct.error)):
+            record_places(data[:-missing])
+
+
+@pytest.mark.parametrize("size", [2**63, 2**64 - 1, 100])
+def test_a_record_that_claims_more_than_there_is_is_damage(size: int) -> None:
+    for count in (0, 40):
+        with pytest.raises(ValueError, match="behind the end"):
+            record_places(written([3] * count) + struct.pack("<BQ", 5, size) + bytes(90))
