@@ -21,6 +21,7 @@ from tfbus import kernel
 from tfbus.cli.application import COMMANDS, application
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import LinkOptions
+from tfbus.errors import pip_install
 
 LINK = ("--domain STR", "--listen STR...", "--connect STR...", "--backend CHOICE")
 URDF = Path(__file__).parents[2] / "demos" / "robot_arm.urdf"
@@ -159,19 +160,19 @@ def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("package", "arguments", "status", "message"),
     [
-        ("cyclopts", (), 1, 'the command needs some packages more: pip install "tfbus[cli]"'),
-        ("zenoh", ("listen",), 2, 'joining a domain needs a package more: pip install "tfbus[cli,zenoh]"'),
+        ("cyclopts", (), 1, f"the command needs some packages more: {pip_install('cli')}"),
+        ("zenoh", ("listen",), 2, f"joining a domain needs a package more: {pip_install('cli,zenoh')}"),
         (
             "mcap.writer",
             ("record", "run.mcap", "--domain", new_domain()),
             2,
-            'to record needs a package more: pip install "tfbus[bag]"',
+            f"to record needs a package more: {pip_install('bag')}",
         ),
         (
             "urdf_parser_py",
             ("robot", str(URDF), "--tree"),
             2,
-            'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"',
+            f"to read URDF, tfbus needs a package more: {pip_install('urdf')}",
         ),
     ],
 )

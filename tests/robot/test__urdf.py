@@ -284,7 +284,8 @@ def test_without_urdf_parser_py_the_error_names_the_extra() -> None:
         "except ImportError as error: print(error)"
     )
     done = subprocess.run([sys.executable, "-c", hidden], capture_output=True, text=True, check=True)
-    assert done.stdout == 'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]"\n'
+    expected = 'to read URDF, tfbus needs a package more: pip install "tfbus[urdf]", or ".[urdf]" in a checkout\n'
+    assert done.stdout == expected
 
 
 @pytest.mark.thorough

@@ -74,7 +74,10 @@ async def test_two_buses_hear_each_other_and_a_late_one_the_static_frames() -> N
                 # Neither hears itself.
                 assert (here.statistics().duplicates, there.statistics().duplicates) == (0, 0)
         assert heard[0] == static("map", "lidar", 1.0, 3, "rmw_zenoh")
-        assert heard[1:101] == [moving("map", "base", stamp, 1.0, "rmw_zenoh") for stamp in range(100)]
+        # What this bus publishes itself may come before the last of them.
+        assert [sample for sample in heard if sample.child == "base"] == [
+            moving("map", "base", stamp, 1.0, "rmw_zenoh") for stamp in range(100)
+        ]
 
 
 @pytest.mark.thorough
