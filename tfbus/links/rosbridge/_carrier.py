@@ -67,7 +67,8 @@ class RosbridgeCarrier(RosCarrier):
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
         self._woken = anyio.Event()
-        self._writing = anyio.CancelScope(shield=True)
+        # Made when the server is there: anyio makes none without an event loop.
+        self._writing: anyio.CancelScope
         self._ending = False
 
     async def _connect(self) -> None:
