@@ -1,4 +1,4 @@
-"""Where a command finds ROS, and the link to it."""
+"""The places at which a command finds ROS, and the links to them."""
 
 import re
 from contextlib import AbstractAsyncContextManager

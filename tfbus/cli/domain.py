@@ -71,7 +71,7 @@ class LinkOptions:
 
     @property
     def place(self) -> str:
-        """What is joined, for people."""
+        """The place that is joined, for people."""
         return f"ROS at {' and '.join(self.ros)}" if self.ros else f"domain {self.domain!r}"
 
     def run(self, program: Callable[[Bus], Awaitable[T]], *, clock: Clock | None = None) -> T:

@@ -12,7 +12,7 @@ FAR: Final = 10.0
 
 
 class HearsTime(Protocol):
-    """What follows the time of another program."""
+    """A follower of the time of another program."""
 
     def hear(self, stamp: int) -> None:
         """Take the time of the other program, a stamp in ns."""

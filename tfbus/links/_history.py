@@ -34,7 +34,7 @@ MOST_REMEMBERED = 10_000
 
 
 class HistoryTeller:
-    """Tells from the buffers of a bus what a link has brought in the last seconds.
+    """The moving samples of the last seconds that a link tells to a peer, from the buffers of a bus.
 
     Parameters
     ----------

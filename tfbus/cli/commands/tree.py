@@ -116,7 +116,7 @@ async def _listen_for_a_period(bus: Bus, tree: TransformTree) -> None:
 
 
 def remarks(edges: Sequence[Edge]) -> list[str]:
-    """What a drawing of the edges does not show: rates of frames that were heard once, and what connects trees."""
+    """Facts that a drawing of the edges does not show: rates of frames that were heard once, missing connections."""
     lines = []
     once = [edge.child for edge in edges if not edge.static and edge.samples == 1]
     if once:

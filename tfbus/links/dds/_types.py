@@ -89,7 +89,7 @@ class RawTFMessage(IdlStruct, typename="tf2_msgs::msg::dds_::TFMessage_"):
 
     @classmethod
     def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """What comes of a writer that has gone."""
+        """An empty message, for a writer that has gone."""
         return cls.of(b"")
 
 
@@ -113,7 +113,7 @@ class RawJointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
 
     @classmethod
     def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """What comes of a writer that has gone."""
+        """An empty message, for a writer that has gone."""
         return cls.deserialize(b"")
 
 
@@ -133,7 +133,7 @@ class RawClock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
 
     @classmethod
     def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """What comes of a writer that has gone."""
+        """An empty message, for a writer that has gone."""
         return cls.deserialize(b"")
 
 
@@ -153,7 +153,7 @@ class RawString(IdlStruct, typename="std_msgs::msg::dds_::String_"):
 
     @classmethod
     def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
-        """What comes of a writer that has gone."""
+        """An empty message, for a writer that has gone."""
         return cls.deserialize(b"")
 
 

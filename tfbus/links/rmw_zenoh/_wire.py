@@ -27,7 +27,7 @@ _STATIC_QOS = ":1:,1:,:,:,,"
 
 
 class Attachment(NamedTuple):
-    """What goes with a message."""
+    """The number, time and sender that go with a message."""
 
     number: int
     time: int

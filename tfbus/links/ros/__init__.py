@@ -1,4 +1,4 @@
-"""What links to ROS share: topics, names, and that nothing in ROS tells who a message comes from.
+"""The common half of links to ROS: topics, names, and no origin, for no message of ROS has one.
 
 `RosLink` is the base of the links that `tfbus.links.dds`, `tfbus.links.rosbridge` and `tfbus.links.rmw_zenoh` give.
 """

@@ -42,7 +42,7 @@ class RosOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class RosSettings:
-    """What a carrier to ROS has to know of them.
+    """The settings that a carrier to ROS needs.
 
     Attributes
     ----------

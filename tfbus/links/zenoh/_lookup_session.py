@@ -128,7 +128,7 @@ class LookupSession:
 
     @property
     def unsent(self) -> int:
-        """How many questions and answers wait to be sent."""
+        """The number of questions and answers that wait to be sent."""
         return self._sending.qsize()
 
     def ask(self, payload: bytes, take: Callable[[bytes | None], object], timeout: float, to_all: bool = False) -> None:

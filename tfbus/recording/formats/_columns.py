@@ -95,7 +95,7 @@ class _Structure:
 
 
 class _Values(NamedTuple):
-    """What one transform of each message of a structure holds."""
+    """The contents of one transform of each message of a structure."""
 
     stamps: Stamps
     """ns."""

@@ -147,7 +147,7 @@ class McapStorage:
         yield from batches(reports)
 
     def _reports(self, reading: McapReading, now: int, read: Counter[Channel] | None) -> Iterator[StoredMessage]:
-        """What a reading has found wrong; `read` has the number of the messages, if none was left out."""
+        """The faults that a reading has found; `read` has the number of the messages, if none was left out."""
         if reading.unknown:
             yield lost_message(now, f"{reading.unknown:,} messages are on channels that the file does not describe")
         if reading.contradictions:

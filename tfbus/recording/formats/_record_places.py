@@ -21,7 +21,7 @@ _GUESSED: Final = 2**16
 
 
 def record_places(data: bytes) -> npt.NDArray[np.int64]:
-    """Where each record of whole chunks begins, and where the last one ends.
+    """The beginnings of all records of whole chunks, and the end of the last one.
 
     Raises
     ------
