@@ -780,6 +780,18 @@ history_newest(History *self, void *Py_UNUSED(closure))
 }
 
 static PyObject *
+history_newest_record(History *self, void *Py_UNUSED(closure))
+{
+    if (self->end == self->start) {
+        return PyBytes_FromStringAndSize(NULL, 0);
+    }
+    char record[sizeof(int64_t) + ROW_SIZE];
+    memcpy(record, block_stamps(self->block) + self->end - 1, sizeof(int64_t));
+    memcpy(record + sizeof(int64_t), block_rows(self->block) + WIDTH * (self->end - 1), ROW_SIZE);
+    return PyBytes_FromStringAndSize(record, sizeof record);
+}
+
+static PyObject *
 history_count(History *self, void *Py_UNUSED(closure))
 {
     return PyLong_FromSsize_t(self->end - self->start);
@@ -894,6 +906,8 @@ static PyGetSetDef history_getset[] = {
     {"count", (getter)history_count, NULL, PyDoc_STR("The number of samples in the window."), NULL},
     {"oldest", (getter)history_oldest, NULL, PyDoc_STR("The oldest stamp in the window, or None."), NULL},
     {"newest", (getter)history_newest, NULL, PyDoc_STR("The newest stamp, or None."), NULL},
+    {"newest_record", (getter)history_newest_record, NULL,
+     PyDoc_STR("The newest stamp and its row, 64 bytes; none if there is no moving sample."), NULL},
     {"horizon", (getter)history_horizon, NULL, PyDoc_STR("Samples before this stamp have left the window."), NULL},
     {NULL}
 };
@@ -1921,7 +1935,47 @@ judge(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
 
 /* The module -------------------------------------------------------------------------------------------------------- */
 
+static PyObject *
+compose_paths(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer rows, origins;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "compose_paths takes rows and origins");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &rows, PyBUF_WRITABLE) < 0) {
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[1], &origins, PyBUF_SIMPLE) < 0) {
+        PyBuffer_Release(&rows);
+        return NULL;
+    }
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = origins.len / size;
+    const int fits = origins.len % size == 0 && rows.len % (Py_ssize_t)ROW_SIZE == 0
+                     && rows.len / (Py_ssize_t)ROW_SIZE == count;
+    Py_ssize_t i = 0;
+    for (; fits && i < count; i++) {
+        const int64_t origin = ((const int64_t *)origins.buf)[i];
+        if (origin < 0 || (origin > 0 && origin >= i)) {
+            break;
+        }
+        if (origin > 0) {
+            double *row = (double *)rows.buf + WIDTH * i;
+            compose((const double *)rows.buf + WIDTH * origin, row, row);
+        }
+    }
+    PyBuffer_Release(&origins);
+    PyBuffer_Release(&rows);
+    if (!fits || i < count) {
+        PyErr_SetString(PyExc_ValueError, "each row of seven floats needs an origin before it");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef module_methods[] = {
+    {"compose_paths", FAST(compose_paths), METH_FASTCALL,
+     PyDoc_STR("compose_paths(rows, origins): make each row, seen from its origin, one seen from the first place.")},
     {"commit", FAST(commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
                "index.")},
