@@ -25,12 +25,10 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
     if isinstance(sys.stdout, TextIOWrapper):
         # Its encoding may lack the letters of a frame name.
         sys.stdout.reconfigure(errors="backslashreplace")
+    program = _print_overview if asks_for_overview(words) else _command(words, loaded)
     status = 0
     try:
-        if asks_for_overview(words):
-            print(overview())
-        else:
-            _run_command(words, loaded)
+        program()
         sys.stdout.flush()
     except* KeyboardInterrupt:
         status = INTERRUPTED
@@ -44,17 +42,24 @@ def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> in
     return status
 
 
-def _run_command(words: Sequence[str], loaded: Callable[[], object]) -> None:
+def _print_overview() -> None:
+    print(overview())
+
+
+def _command(words: Sequence[str], loaded: Callable[[], object]) -> Callable[[], None]:
     # Loads cyclopts, which the overview does without.
     from tfbus.cli.application import application
 
-    app = application(next((word for word in words if word in COMMANDS), None))
-    prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
-    program = prepare(*arguments.args, **arguments.kwargs)
-    # Help has been printed by now.
-    if program is not None:
-        loaded()
-        program()
+    def parse_and_run() -> None:
+        app = application(next((word for word in words if word in COMMANDS), None))
+        prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
+        program = prepare(*arguments.args, **arguments.kwargs)
+        # Help has been printed by now.
+        if program is not None:
+            loaded()
+            program()
+
+    return parse_and_run
 
 
 def _report(errors: BaseExceptionGroup[BaseException], status: int) -> int:
