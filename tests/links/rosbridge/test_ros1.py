@@ -11,7 +11,7 @@ import shutil
 import statistics
 import subprocess
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -181,24 +181,32 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path:
     assert facts["wrong"] == 0
 
 
-@pytest.mark.xfail(
-    reason="rosbridge of ROS 1 gives a topic to all its clients as bytes or to none: a link asks for cbor-raw",
-    raises=(TimeoutError, ExceptionGroup),
-)
-async def test_roslib_hears_through_ros_what_a_link_publishes(tmp_path: Path) -> None:
+@pytest.mark.parametrize("link_first", [True, False])
+async def test_roslib_and_a_link_hear_the_same_topics_of_one_server(tmp_path: Path, link_first: bool) -> None:
     install_roslib(tmp_path)
-    async with ros1(tmp_path) as ros:
-        with Bus() as bus:
-            bus.publish(static("base", "lidar", 2.0))
-            async with RosbridgeLink(bus, ros.url), roslib_client(tmp_path, ros.url) as heard:
-                # The static frame was there before; it takes a moment until the moving one is heard.
-                with anyio.fail_after(30):
-                    stamp = 10**9
-                    while {fact["topic"] for fact in heard} != {"/tf", "/tf_static"}:
-                        bus.publish(moving("map", "base", stamp := stamp + 1, 1.5))
-                        await anyio.sleep(0.02)
-    said = {fact["topic"]: fact["transforms"][0] for fact in heard}
-    assert said["/tf_static"]["child_frame_id"] == "lidar"
-    assert said["/tf_static"]["transform"]["translation"]["x"] == 2.0
-    assert said["/tf"]["header"]["frame_id"] == "map"
-    assert said["/tf"]["transform"]["translation"] == {"x": 1.5, "y": 0.0, "z": 0.0}
+    async with ros1(tmp_path) as ros, AsyncExitStack() as stack:
+        bus = stack.enter_context(Bus())
+        buffer = stack.enter_context(Buffer(bus))
+        bus.publish(static("base", "lidar", 2.0))
+        if link_first:
+            await stack.enter_async_context(RosbridgeLink(bus, ros.url))
+        heard = await stack.enter_async_context(roslib_client(tmp_path, ros.url))
+        if not link_first:
+            await stack.enter_async_context(RosbridgeLink(bus, ros.url))
+        stack.enter_context(ros.node(60.0))
+        # Both hear the node, and roslib the link too: the static frame was there before it, the moving one comes now.
+        await buffer.lookup("odom", "laser", timeout=30.0)
+        with anyio.fail_after(30):
+            stamp = 10**9
+            while not {"base", "laser", "lidar", "arm"} <= {row["child_frame_id"] for row in rows(heard)}:
+                bus.publish(moving("base", "arm", stamp := stamp + 1, 1.5))
+                await anyio.sleep(0.02)
+    said = {row["child_frame_id"]: row for row in rows(heard)}
+    assert said["lidar"]["transform"]["translation"]["x"] == 2.0
+    assert said["arm"]["header"]["frame_id"] == "base"
+    assert said["arm"]["transform"]["translation"] == {"x": 1.5, "y": 0.0, "z": 0.0}
+
+
+def rows(heard: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The transforms of messages that roslib has heard."""
+    return [row for fact in heard for row in fact["transforms"]]
