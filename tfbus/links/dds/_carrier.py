@@ -143,7 +143,8 @@ class DdsCarrier(RosCarrier):
         closing = Thread(target=self._open.close, name="tfbus dds close", daemon=True)
         closing.start()
         with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
+            # With a limit, for a worker of asyncio keeps the interpreter.
+            await anyio.to_thread.run_sync(closing.join, _CLOSING_TIME, abandon_on_cancel=True)
 
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
         try:
