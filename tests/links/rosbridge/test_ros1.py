@@ -1,7 +1,8 @@
 """Links through rosbridge against a real ROS 1: roscore, rospy and tf2_ros, such as those of Debian 12.
 
 The variable ``ROS1_PYTHON`` names a Python with rospy and tf2_ros, by default ``/usr/bin/python3``; ``ROS1_ROSBRIDGE``
-is a command that serves a rosbridge of ROS 1 at the port that is its last argument.
+is a command that serves a rosbridge of ROS 1 at the port that is its last argument; ``ROS1_ROBOT_STATE_PUBLISHER`` is
+the path of robot_state_publisher, by default that of Debian's package ``ros-robot-state-publisher``.
 """
 
 import json
@@ -24,16 +25,19 @@ pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 
 from support.both_sides import Program
 from support.processes import free_ports, until
+from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
 from support.roslib_process import install_roslib, roslib_client
 from support.samples import moving, static
 from support.wires import latched
 
-from tfbus import Buffer, Bus
+from tfbus import Buffer, Bus, TransformStamped
 from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.robot import RobotModel, RobotStatePublisher
 
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[2] / "support" / "ros1_peer.py"
+ROBOT = PEER.with_name("ros1_robot.py")
 SECONDS = 10.0
 MOST_FAILED = 0.01
 
@@ -70,6 +74,19 @@ class Ros1:
         with running(command, self.environment, stdout=subprocess.PIPE) as process:
             yield process
             process.kill()
+
+
+@asynccontextmanager
+async def robot_of(ros: Ros1, folder: Path) -> AsyncIterator[None]:
+    """A robot in ROS, described and moving."""
+    urdf = folder / "arm.urdf"
+    urdf.write_text(URDF)
+    command = [ros.python, str(ROBOT), str(urdf)]
+    with running(command, ros.environment, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert await anyio.to_thread.run_sync(process.stdout.readline) == "up\n"
+        yield
+        process.kill()
 
 
 async def next_line(node: subprocess.Popen[str]) -> dict[str, Any]:
@@ -179,6 +196,41 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path:
             facts = await next_line(node)
     assert facts["answered"] > 50
     assert facts["wrong"] == 0
+
+
+async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed(tmp_path: Path) -> None:
+    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
+    async with ros1(tmp_path) as ros, robot_of(ros, tmp_path):
+
+        def link(bus: Bus, **options: Any) -> RosbridgeLink:
+            return RosbridgeLink(bus, ros.url, **options)
+
+        await check_clock(link)
+        await check_description_and_joints(link)
+        await check_command(link, ros.url)
+
+
+async def test_the_frames_of_a_robot_are_those_of_the_real_robot_state_publisher(tmp_path: Path) -> None:
+    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
+    command = os.environ.get("ROS1_ROBOT_STATE_PUBLISHER", "/usr/lib/robot_state_publisher/robot_state_publisher")
+    if shutil.which(command) is None:
+        pytest.skip("no robot_state_publisher of ROS 1: set ROS1_ROBOT_STATE_PUBLISHER to its path")
+    theirs: dict[tuple[str, int], TransformStamped] = {}
+    ours: dict[tuple[str, int], TransformStamped] = {}
+    async with ros1(tmp_path) as ros, robot_of(ros, tmp_path):
+        with running([command], ros.environment), Bus() as bus, Bus() as own:
+            bus.subscribe(lambda batch: theirs.update({(each.child, each.stamp): each for each in batch}))
+            own.subscribe(lambda batch: ours.update({(each.child, each.stamp): each for each in batch}))
+            robot = RobotStatePublisher(own, RobotModel.from_urdf(URDF))
+            async with RosbridgeLink(bus, ros.url, send=False, joint_states=robot.publish):
+                moving = ("upper", "fore", "finger")
+                await until(lambda: len([key for key in theirs.keys() & ours.keys() if key[0] in moving]) > 90)
+            assert latched(own)["hand"].transform.is_close(latched(bus)["hand"].transform)
+    shared = theirs.keys() & ours.keys()
+    assert {child for child, _ in shared} >= set(moving)
+    for key in shared:
+        assert theirs[key].parent == ours[key].parent
+        assert theirs[key].transform.is_close(ours[key].transform), key
 
 
 @pytest.mark.parametrize("link_first", [True, False])

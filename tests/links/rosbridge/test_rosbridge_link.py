@@ -181,6 +181,9 @@ async def test_positions_of_joints_go_to_who_takes_them() -> None:
         with Bus() as bus:
             async with RosbridgeLink(bus, server.url, joint_states=lambda *state: taken.append(state)):
                 await until(lambda: "/joint_states" in server.operations("subscribe"))
+                assert server.clients[0].subscriptions["/joint_states"] == "none", (
+                    "ROS 1 has no arrays of strings in CBOR"
+                )
                 message = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": [0.5]}
                 await server.say_anything(json.dumps({"op": "publish", "topic": "/joint_states", "msg": message}))
                 await until(lambda: taken == [({"a": 0.5}, 5)])

@@ -89,7 +89,8 @@ class RosbridgeCarrier(RosCarrier):
         for topic in (*self.settings.tf_static, *self.settings.tf):
             self._request(subscribe(topic, self._encoding))
         for topic in self.settings.joint_topic:
-            self._request(subscribe(topic, self._encoding, JOINT_TYPE))
+            # In CBOR, a server of ROS 1 fails at the names of the joints, an array of strings.
+            self._request(subscribe(topic, "none" if self._encoding == "cbor" else self._encoding, JOINT_TYPE))
         for topic in self.settings.clock_topic:
             self._request(subscribe(topic, self._encoding, CLOCK_TYPE))
         for topic in self.settings.description_topic:
