@@ -16,8 +16,17 @@ EXTRAS = {
     "view": ("collada", "trimesh", "viser"),
     "web": ("starlette", "uvicorn", "websockets"),
     "zenoh": ("zenoh",),
-    "test": ("fastapi", "httpx", "ipykernel", "jupyter_client", "pandas", "playwright", "scipy", "uvloop"),
-    "thorough": ("evo", "pytest_cov", "pyright", "zenoh_ros2_sdk"),
+    "test": ("fastapi", "httpx", "scipy", "uvloop"),
+    "thorough": (
+        "evo",
+        "ipykernel",
+        "jupyter_client",
+        "pandas",
+        "playwright",
+        "pyright",
+        "pytest_cov",
+        "zenoh_ros2_sdk",
+    ),
 }
 """The packages of each extra, by the names under which they are imported."""
 
