@@ -1,4 +1,4 @@
-"""How the tests run: two suites, three event loops, two profiles of hypothesis.
+"""Two suites, three event loops and two profiles of hypothesis.
 
 ``pytest`` runs the default suite. ``pytest -m thorough`` runs the rest: the slow tests, which are marked `thorough`.
 ``pytest -m ""`` runs both. A test that is named (``pytest file.py::test``) runs, marked or not.

@@ -38,7 +38,7 @@ ERRORS: dict[str, type[TransformLookupError]] = {
 
 
 def disagreement(tree: TransformTree, answer: dict[str, Any]) -> str:
-    """What the tree answers differently from tf2; empty if nothing."""
+    """The answers of the tree that differ from those of tf2."""
     at = LATEST if answer["at"] is None else answer["at"]
     try:
         found = tree.lookup(answer["target"], answer["source"], at)

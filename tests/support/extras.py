@@ -47,7 +47,7 @@ def absent_extra(error: BaseException | None) -> str | None:
 
 
 def _messages(error: BaseException | None) -> Iterator[str]:
-    """What an error says, then its parts, its cause and its context, down to the first."""
+    """The message of an error, then those of its parts, its cause and its context, down to the first."""
     if error is None:
         return
     yield str(error)

@@ -80,7 +80,7 @@ def stamps(low: int = STAMP_MIN, high: int = STAMP_MAX) -> st.SearchStrategy[int
 
 
 def data_stamps() -> st.SearchStrategy[int | Latest]:
-    """What data may carry: a stamp or LATEST."""
+    """The stamps that data may carry: an instant or LATEST."""
     return stamps() | st.just(LATEST)
 
 
