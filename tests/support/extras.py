@@ -16,7 +16,7 @@ EXTRAS = {
     "view": ("collada", "trimesh", "viser"),
     "web": ("starlette", "uvicorn", "websockets"),
     "zenoh": ("zenoh",),
-    "test": ("fastapi", "httpx", "scipy", "uvloop"),
+    "test": ("fastapi", "httpx", "uvloop"),
     "thorough": (
         "evo",
         "ipykernel",
@@ -25,6 +25,7 @@ EXTRAS = {
         "playwright",
         "pyright",
         "pytest_cov",
+        "scipy",
         "zenoh_ros2_sdk",
     ),
 }
