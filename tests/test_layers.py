@@ -197,7 +197,8 @@ def test_no_import_hides_behind_type_checking() -> None:
 
 
 def test_no_module_has_more_than_300_lines_of_code() -> None:
-    assert [module for module in MODULES if code_lines(module) > 300] == []
+    long = [module for module in MODULES if SOURCES[module].read_text(encoding="utf-8").count("\n") > 300]
+    assert [module for module in long if code_lines(module) > 300] == []
 
 
 def test_every_door_says_what_its_room_is_for() -> None:
