@@ -80,6 +80,10 @@ def reason_of(data: bytes) -> str:
 TIMES = st.none() | st.integers(-(2**63), 2**63 - 1)
 
 
+def test_the_limits_are_those_of_all_releases() -> None:
+    assert (VERSION, MAX_ENTRIES, MAX_BYTES) == (2, 10_000, 1_048_576)
+
+
 @given(number=NUMBERS, entries=entries_of_any_kind, step=st.none() | STEPS, time=TIMES)
 @settings(max_examples=40)
 def test_unpacking_gives_back_what_was_packed(
