@@ -231,6 +231,17 @@ def test_a_claim_after_a_lost_message_is_not_believed(second: int, told: int) ->
         assert mirror.number == told
 
 
+def test_a_claim_that_is_near_a_large_number_is_believed() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1, number=1)
+        peer = here.peers.find("peer")
+        assert peer is not None
+        peer.mirror = mirror = Mirror(10)
+        mirror.answered(StateStep(0, 2**40, 0))
+        here.receive_bytes(encode(()), pack(2, [], StateStep(2**40, 2**40 + 1, 0)))
+        assert (mirror.number, here.reports) == (2**40 + 1, [])
+
+
 def test_each_peer_has_numbers_of_its_own_and_begins_anew_when_it_comes_back() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=1, number=2)
