@@ -80,7 +80,7 @@ def streams() -> Iterator[Streams]:
 
 
 class DroppedMessages:
-    """What `on_drop` was told."""
+    """The calls of `on_drop`."""
 
     def __init__(self) -> None:
         self.all: list[Drop] = []

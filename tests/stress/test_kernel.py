@@ -21,8 +21,6 @@ from tfbus.tree._kernel import History
 
 pytestmark = pytest.mark.thorough
 
-X = tuple[float, ...]
-
 
 def row(metres: float) -> Any:
     return metres, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0

@@ -1,4 +1,4 @@
-"""What both kernels do. The compiled one has to do it with the same bits."""
+"""Both kernels do the same; the compiled one has to do it with the same bits."""
 
 import copy
 import gc
