@@ -12,25 +12,21 @@ class WakeUp:
     """``await wake_up`` waits until `end` is called; at once, without a checkpoint, if it was called before.
 
     Only one task may wait, on the loop that ran when this was made, and only once.
-
-    Attributes
-    ----------
-    wake : callable
-        As `end`, but faster, and it may raise an `Exception` if the wait has ended.
     """
 
-    __slots__ = ("_ended", "_future", "_task", "wake")
+    __slots__ = ("_ended", "_future", "_task")
 
     def __init__(self) -> None:
         loop = running_loop()
         self._task: Any = None
         self._ended = False
-        self._future: Any = None
-        self.wake: Callable[[], object] = self.end
-        if hasattr(loop, "create_future"):
-            self._future = loop.create_future()
-            # No function of Python is on the way from a publish to the event loop.
-            self.wake = partial(self._future.set_result, None)
+        self._future: Any = loop.create_future() if hasattr(loop, "create_future") else None
+
+    @property
+    def wake(self) -> Callable[[], object]:
+        """A function like `end`, but faster, and it may raise an `Exception` if the wait has ended."""
+        # No function of Python is then on the way from a publish to an asyncio loop.
+        return self.end if self._future is None else partial(self._future.set_result, None)
 
     def end(self) -> None:
         """End the wait, if it has not ended.

@@ -1,4 +1,8 @@
-"""Lookups that wait: parked under the frames that they lack, woken by new samples, and tried again."""
+"""Lookups that wait: parked under the frames that they lack, and woken by new samples.
+
+Whoever inserts the samples hands over the answer. It is given if the tree has not changed until the task runs, one turn
+of the event loop later; otherwise the lookup asks again, and may park again.
+"""
 
 import math
 from collections.abc import Callable

@@ -3,7 +3,7 @@
 A lookup that cannot be answered is parked under the frame that blocks it: an edge whose newest stamp is too old,
 ordered by the stamp that the lookup needs; an unknown frame; or the roots of two trees. An insertion then finds the
 lookups that it may have unblocked without looking at the others. Nothing here waits or computes an answer: the
-inserting code pops the waiters that may have an answer and wakes them, and each asks the tree again.
+inserting code pops the waiters that may have an answer and wakes them, each with its answer if that is plain.
 
 A lookup also ends when another edge of its path loses the stamp, because its window has slid on. Each of these edges
 has a limit: the newest stamp that it may reach until then. A waiter is kept by its first limit in one list for all
