@@ -13,6 +13,7 @@ from array import array
 from bisect import bisect_left
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from itertools import chain as chained
 from math import acos, sin
 from typing import Any, Protocol
 
@@ -21,11 +22,13 @@ import numpy.typing as npt
 
 from tfbus.geometry.rows import IDENTITY, Row, compose, invert
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps, StampsLike, as_stamps
 
 _RECORD = struct.Struct("q7d")
 _SIZE = _RECORD.size
 _FOREVER = 2**64
+ONE_BY_ONE = 40
+"""Up to this many stamps are answered faster one by one than by numpy."""
 _pack = _RECORD.pack
 _unpack = _RECORD.unpack_from
 _unpack_pair = struct.Struct("q7dq7d").unpack_from
@@ -405,6 +408,30 @@ class Paths:
         sample = kind.__new__(kind)
         sample._fields = target, source, stamp, row, "", False
         return sample
+
+    def answer_many(self, target: str, source: str, stamps: StampsLike) -> bytes | None:
+        """The answers at many stamps, if they need nothing but a path of `recent` that covers them all; else None.
+
+        Here only a few stamps have an answer; for more there is numpy, see `tfbus.tree._lookup_many`.
+
+        Returns
+        -------
+        bytes or None
+            Seven columns of floats, of shape (7, n), and behind them the stamps as int64.
+        """
+        asked = as_stamps(stamps)
+        if not 0 < len(asked) <= ONE_BY_ONE:
+            return None
+        with self._lock:
+            by_source = self.recent.get(target)
+            chain = None if by_source is None else by_source.get(source)
+            if chain is None:
+                return None
+            rows = [chain.row(at) for at in asked.tolist()]
+        if None in rows:
+            return None
+        columns: zip[Any] = zip(*rows, strict=True)
+        return array("d", chained.from_iterable(columns)).tobytes() + asked.tobytes()
 
     def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Batch) -> bool:
         """Store a batch if all of it continues its histories and there are no readers to be told; else do nothing.
