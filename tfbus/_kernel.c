@@ -618,6 +618,27 @@ history_find(History *self, PyObject *number)
     return PyLong_FromSsize_t(lower_bound(block_stamps(self->block) + self->start, self->end - self->start, stamp));
 }
 
+static PyObject *
+history_between(History *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    int64_t low, high;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "between takes two stamps");
+        return NULL;
+    }
+    if (read_stamp(args[0], &low) < 0 || read_stamp(args[1], &high) < 0) {
+        return NULL;
+    }
+    const Py_ssize_t count = self->end - self->start;
+    if (count == 0) {
+        return Py_BuildValue("nn", (Py_ssize_t)0, (Py_ssize_t)0);
+    }
+    const int64_t *stamps = block_stamps(self->block) + self->start;
+    const Py_ssize_t from_low = lower_bound(stamps, count, low), from_high = lower_bound(stamps, count, high);
+    const int hits = from_low < count && stamps[from_low] == low;
+    return Py_BuildValue("nn", from_low > 0 && !hits ? from_low - 1 : from_low, from_high < count ? from_high + 1 : count);
+}
+
 static int
 check_index(const History *self, Py_ssize_t index)
 {
@@ -877,6 +898,8 @@ static PyMethodDef history_methods[] = {
     {"put", FAST(history_put), METH_FASTCALL,
      PyDoc_STR("put(index, stamp, row): store a sample before another, or in its place if the stamps are equal.")},
     {"find", (PyCFunction)history_find, METH_O, PyDoc_STR("find(stamp): the index of the first sample not before it.")},
+    {"between", FAST(history_between), METH_FASTCALL,
+     PyDoc_STR("between(low, high): the index of the last sample up to a stamp, and that behind the first from one on.")},
     {"stamp", (PyCFunction)history_stamp, METH_O, PyDoc_STR("stamp(index): the stamp of a sample.")},
     {"sample", (PyCFunction)history_sample, METH_O, PyDoc_STR("sample(index): the stamp and the row of a sample.")},
     {"row", (PyCFunction)history_row, METH_O, PyDoc_STR("row(at): the row at a stamp; None if it is not plain.")},

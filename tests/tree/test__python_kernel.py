@@ -119,6 +119,9 @@ def test_a_history_holds_what_was_inserted_last_at_each_stamp_of_its_window(
     assert (edge.count, edge.oldest, edge.newest) == (len(kept), *((stamps[0], stamps[-1]) if kept else (None, None)))
     for at in range(-62, 63, 3):
         assert edge.find(at) == sum(stamp < at for stamp in stamps)
+        last, beyond = max(sum(stamp <= at for stamp in stamps) - 1, 0), sum(stamp < at for stamp in stamps)
+        assert edge.between(at, at + 5) == (last, min(sum(stamp < at + 5 for stamp in stamps) + 1, len(stamps)))
+        assert edge.between(-99, at) == (0, min(beyond + 1, len(stamps)))
 
 
 @on_both
@@ -741,6 +744,8 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: edge.put(5, 1, x(0.0)),
         lambda: edge.put(-1, 1, x(0.0)),
         lambda: edge.find(0.5),
+        lambda: edge.between(0),
+        lambda: edge.between(0, 0.5),
         lambda: edge.sample(1),
         lambda: edge.take(5),
         lambda: edge.columns(0),

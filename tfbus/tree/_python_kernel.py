@@ -10,7 +10,7 @@ are cut off later, many at once, because each cut moves all remaining samples.
 
 import struct
 from array import array
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from itertools import chain as chained
@@ -166,6 +166,17 @@ class History:
         start = self._start
         return bisect_left(self.stamps, stamp, start) - start
 
+    def between(self, low: int, high: int) -> tuple[int, int]:
+        """The index of the last sample up to stamp `low`, and that behind the first sample from stamp `high` on.
+
+        Where there is no such sample, the first sample and the end of all.
+        """
+        stamps = self.stamps
+        start = self._start
+        first = bisect_right(stamps, low, start) - 1
+        end = bisect_left(stamps, high, start) + 1
+        return max(first - start, 0), min(end, len(stamps)) - start
+
     def stamp(self, index: int) -> int:
         """The stamp of a sample, in ns; the errors are those of `sample`."""
         at = self._start + index
@@ -211,7 +222,8 @@ class History:
 
         Those that are next to none of the `wanted` stamps (ns) may be left out.
         """
-        begin, end = self._start + first, self._start + min(end, self.count)
+        start = self._start
+        begin, end = start + first, min(start + end, len(self.stamps))
         if wanted is None:
             stamps, records = self.stamps[begin:end], self.records[begin * _SIZE : end * _SIZE]
             return stamps, 0, records, 0, 8, len(stamps)
@@ -244,8 +256,10 @@ def climb(steps: tuple[Step, ...], at: int) -> Row | None:
     if not steps:
         return IDENTITY
     first = True
+    step: Any
     for step in steps:
-        if isinstance(step, History):
+        # Not by `isinstance`, which takes longer.
+        if type(step) is not tuple:
             stamps = step.stamps
             i = bisect_left(stamps, at)
             try:
@@ -419,6 +433,8 @@ class Paths:
         bytes or None
             Seven columns of floats, of shape (7, n), and behind them the stamps as int64.
         """
+        if isinstance(stamps, np.ndarray) and stamps.size > ONE_BY_ONE:
+            return None
         asked = as_stamps(stamps)
         if not 0 < len(asked) <= ONE_BY_ONE:
             return None
@@ -427,7 +443,9 @@ class Paths:
             chain = None if by_source is None else by_source.get(source)
             if chain is None:
                 return None
-            rows = [chain.row(at) for at in asked.tolist()]
+            instants = asked.tolist()
+            # Without a call in between, which takes longer.
+            rows = [climb(chain.up, at) for at in instants] if not chain.down else [chain.row(at) for at in instants]
         if None in rows:
             return None
         columns: zip[Any] = zip(*rows, strict=True)
