@@ -33,7 +33,8 @@ async def test_the_keys_end_with_the_terminal() -> None:
     os.write(typist, b"q")
     os.close(typist)
     try:
-        assert [key async for key in Keyboard(terminal).keys()] == ["q"]
+        keys = Keyboard(terminal).keys()
+        assert [key async for key in keys] == ["q"]
     finally:
         os.close(terminal)
 
