@@ -882,7 +882,7 @@ async def test_leaving_the_filter_drops_the_remaining_messages_and_ends_its_task
 
 
 async def test_a_filter_that_was_left_is_freed(buffer: Buffer, streams: Streams) -> None:
-    async def enter_and_leave(entered: MessageFilter[Scan, Any]) -> None:
+    async def enter_and_leave(entered: MessageFilter[Scan, TransformStamped]) -> None:
         async with entered:
             await settle()
 
