@@ -11,6 +11,7 @@ import shlex
 import shutil
 import statistics
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +30,7 @@ from tfbus.links.ros import RosLink
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
+MESSAGES = PEER.with_name("ros_messages.py")
 ROBOT = PEER.with_name("ros2_robot.py")
 SECONDS = 10.0
 _next_domain = iter(range(100 + os.getpid() % 50, 200))
@@ -245,3 +247,10 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back() -> None
         facts = await ros.next_line()
     assert facts["answered"] > 50
     assert facts["wrong"] == 0
+
+
+def test_messages_of_rclpy_become_data_and_messages_again() -> None:
+    # The Python of ROS comes first, for its numpy.
+    script = f"import sys, runpy; sys.path += {sys.path!r}; runpy.run_path({str(MESSAGES)!r}, run_name='__main__')"
+    done = subprocess.run([ros2_python(), "-c", script], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("equal 11\n", "")

@@ -11,6 +11,7 @@ import shlex
 import shutil
 import statistics
 import subprocess
+import sys
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
@@ -37,6 +38,7 @@ from tfbus.robot import RobotModel, RobotStatePublisher
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[2] / "support" / "ros1_peer.py"
+MESSAGES = PEER.with_name("ros_messages.py")
 ROBOT = PEER.with_name("ros1_robot.py")
 SECONDS = 10.0
 MOST_FAILED = 0.01
@@ -126,6 +128,16 @@ async def ros1(folder: Path) -> AsyncIterator[Ros1]:
         with running([*shlex.split(command), str(port)], environment):
             await reachable(port)
             yield Ros1(python, environment, f"ws://127.0.0.1:{port}")
+
+
+def test_messages_of_rospy_become_data_and_messages_again() -> None:
+    python = os.environ.get("ROS1_PYTHON", "/usr/bin/python3")
+    if not has_rospy(python):
+        pytest.skip("no ROS 1: set ROS1_PYTHON to a Python with rospy and tf2_ros")
+    # The Python of ROS comes first, for its numpy.
+    script = f"import sys, runpy; sys.path += {sys.path!r}; runpy.run_path({str(MESSAGES)!r}, run_name='__main__')"
+    done = subprocess.run([python, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("equal 11\n", "")
 
 
 async def reachable(port: int) -> None:
