@@ -5,7 +5,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -81,6 +81,24 @@ async def test_two_buses_hear_each_other_and_a_late_one_the_static_frames() -> N
         assert [sample for sample in heard if sample.child == "base"] == [
             moving("map", "base", stamp, 1.0, "rmw_zenoh") for stamp in range(100)
         ]
+
+
+@pytest.mark.thorough
+async def test_links_hear_each_other_again_when_their_router_is_back() -> None:
+    (port,) = free_ports(1)
+    address = f"tcp/127.0.0.1:{port}"
+    with Bus() as near, Bus() as far, Bus() as late:
+        async with AsyncExitStack() as first:
+            await first.enter_async_context(ZenohRouter(address))
+            async with RmwZenohLink(near, address, DOMAIN), RmwZenohLink(far, address, DOMAIN):
+                near.publish(static("map", "lidar", 1.0))
+                await until(lambda: "lidar" in latched(far))
+                await first.aclose()
+                near.publish([static("map", "camera", 2.0)])
+                async with ZenohRouter(address):
+                    await until(lambda: "camera" in latched(far))
+                    async with RmwZenohLink(late, address, DOMAIN):
+                        await until(lambda: latched(late).keys() == {"lidar", "camera"})
 
 
 @pytest.mark.thorough
