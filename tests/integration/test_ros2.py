@@ -31,7 +31,7 @@ from tfbus.links.ros import RosLink
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
-MESSAGES = PEER.with_name("ros_messages.py")
+MESSAGES = PEER.with_name("real_ros_messages.py")
 ROBOT = PEER.with_name("ros2_robot.py")
 SECONDS = 10.0
 _next_domain = iter(range(100 + os.getpid() % 50, 200))

@@ -39,7 +39,7 @@ from tfbus.robot import RobotModel, RobotStatePublisher
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[2] / "support" / "ros1_peer.py"
-MESSAGES = PEER.with_name("ros_messages.py")
+MESSAGES = PEER.with_name("real_ros_messages.py")
 ROBOT = PEER.with_name("ros1_robot.py")
 SECONDS = 10.0
 MOST_FAILED = 0.01

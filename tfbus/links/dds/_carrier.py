@@ -32,7 +32,7 @@ MAX_SIZE = 2**22
 _CLOSING_TIME = 1.0
 _DEPTH = 100
 _OTHERS = "other topics"
-"""Whoever positions of joints and the time come from."""
+"""The authority of joint positions and of the time."""
 _AT_ONCE = 100
 _MOST_PARTICIPANTS = 1_000
 _OF_ROS = b"enclave="

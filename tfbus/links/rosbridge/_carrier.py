@@ -224,7 +224,7 @@ class RosbridgeCarrier(RosCarrier):
                 await self._woken.wait()
 
     async def _end_writing(self) -> None:
-        """When all ends, give `_write_all` a little time for what it has begun and what waits."""
+        """Give `_write_all` a little time at the end, for the text that it has begun and for those that wait."""
         try:
             await anyio.sleep_forever()
         finally:

@@ -80,7 +80,7 @@ class ZenohCarrier:
 
     def claim(self, step: StateStep) -> None:
         """Tell all peers the state of this link."""
-        self._newest.step = step
+        self._newest.claim(step)
         self._put(self._writer.claim(step))
 
     def ask(self, peer: str, since: int) -> None:
@@ -118,7 +118,7 @@ class ZenohCarrier:
         while True:
             await anyio.sleep(self._slow_period)
             try:
-                if self._sessions.is_heard_slowly():
+                if self._newest.untold and self._sessions.is_heard_slowly():
                     self._sessions.put_slowly(self._newest.take())
             except zenoh.ZError as error:
                 self._report.failed(error)
