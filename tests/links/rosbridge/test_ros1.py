@@ -70,7 +70,8 @@ class Ros1:
     environment: dict[str, str]
     url: str
     serve: list[str]
-    """The command of a rosbridge, without its port."""
+    """The command of the rosbridge."""
+    server: subprocess.Popen[str]
 
     @contextmanager
     def node(self, seconds: float, x: float = 0.5) -> Iterator[subprocess.Popen[str]]:
@@ -128,9 +129,10 @@ async def ros1(folder: Path) -> AsyncIterator[Ros1]:
     }
     with running([roscore, "-p", str(master)], environment):
         await reachable(master)
-        with running([*shlex.split(command), str(port)], environment):
+        serve = [*shlex.split(command), str(port)]
+        with running(serve, environment) as server:
             await reachable(port)
-            yield Ros1(python, environment, f"ws://127.0.0.1:{port}", shlex.split(command))
+            yield Ros1(python, environment, f"ws://127.0.0.1:{port}", serve, server)
 
 
 def test_messages_of_rospy_become_data_and_messages_again() -> None:
@@ -214,27 +216,23 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path:
 
 
 async def test_a_link_comes_back_to_a_server_that_was_killed(tmp_path: Path) -> None:
-    (port,) = free_ports(1)
     async with ros1(tmp_path) as ros:
-        with ros.node(60.0) as node, Bus() as bus, Buffer(bus) as buffer:
+        with ros.node(60.0), Bus() as bus, Buffer(bus) as buffer:
             program = Program(bus, buffer)
-            with running([*ros.serve, str(port)], ros.environment) as server:
-                await reachable(port)
-                link = RosbridgeLink(bus, f"ws://127.0.0.1:{port}")
-                async with link, anyio.create_task_group() as tasks:
-                    tasks.start_soon(program.send)
-                    await buffer.lookup("odom", "tool", timeout=20.0)
-                    server.kill()
-                    await until(lambda: link.peers == ())
-                    with running([*ros.serve, str(port)], ros.environment):
-                        await until(lambda: link.peers != ())
-                        # What is only now: from there, and from here to whoever joins late.
-                        await buffer.lookup("odom", "tool", time.time_ns(), timeout=20.0)
-                        with Bus() as late_bus, Buffer(late_bus) as late:
-                            async with RosbridgeLink(late_bus, ros.url, send=False):
-                                await late.lookup("arm", "tool", timeout=20.0)
+            async with RosbridgeLink(bus, ros.url) as link, anyio.create_task_group() as tasks:
+                tasks.start_soon(program.send)
+                await buffer.lookup("odom", "tool", timeout=20.0)
+                ros.server.kill()
+                await until(lambda: link.peers == ())
+                with running(ros.serve, ros.environment):
+                    await until(lambda: link.peers != ())
+                    # The node is heard again, and who joins late has the static frames of both.
+                    await buffer.lookup("odom", "tool", time.time_ns(), timeout=20.0)
+                    with Bus() as late_bus, Buffer(late_bus) as late:
+                        async with RosbridgeLink(late_bus, ros.url, send=False):
+                            await late.lookup("base", "laser", timeout=20.0)
+                            await late.lookup("arm", "tool", timeout=20.0)
                     tasks.cancel_scope.cancel()
-            node.kill()
 
 
 async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed(tmp_path: Path) -> None:
