@@ -254,7 +254,7 @@ class Flood(threading.Thread):
 
 
 def messages_counted(link: dict[str, Any]) -> int:
-    """How many messages a link has rejected whole, or dropped from its queue."""
+    """The number of messages that a link has rejected whole, or dropped from its queue."""
     rejected: dict[str, int] = link["rejected"]
     whole = sum(number for reason, number in rejected.items() if reason != "too many frames")
     return whole + int(link["queue"]["dropped"])

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from threading import Thread
 
 import anyio
 import anyio.to_thread
@@ -16,11 +15,10 @@ from tfbus.links._message import Message, MessageWriter, can_hold, read_message,
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import HistoryQuestion, Question, Received
 from tfbus.links._state import StateEntry, StateStep
+from tfbus.links.zenoh._closing import wait_until_closed
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._newest import NewestSamples
 from tfbus.links.zenoh._sessions import ZenohSessions
-
-_CLOSING_TIME = 1.0
 
 
 class ZenohCarrier:
@@ -127,9 +125,9 @@ class ZenohCarrier:
 
     async def close(self) -> None:
         """Close the sessions, or give up waiting for them."""
-        closing = self._sessions.close()
-        with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(_join, closing, abandon_on_cancel=True)
+        late = await wait_until_closed(self._sessions.close())
+        if late is not None:
+            self._report.failed(late)
 
     def _put(self, message: Message) -> bool:
         try:
@@ -138,8 +136,3 @@ class ZenohCarrier:
             self._report.failed(error)
             return False
         return True
-
-
-def _join(threads: list[Thread]) -> None:
-    for thread in threads:
-        thread.join()
