@@ -48,7 +48,7 @@ def compile_kernel(folder: Path) -> None:
     """Compile the kernel into a folder."""
     from setuptools import Distribution, Extension  # type: ignore[import-untyped, unused-ignore]
 
-    flags = ["/O2", "/fp:precise"] if sys.platform == "win32" else ["-O2", "-g0", "-ffp-contract=off"]
+    flags = ["/O2", "/fp:precise"] if sys.platform == "win32" else ["-O3", "-g0", "-ffp-contract=off"]
     kernel = Extension(
         "tfbus._kernel",
         [str((PACKAGE / "_kernel.c").relative_to(Path.cwd()))],

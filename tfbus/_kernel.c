@@ -39,6 +39,8 @@ static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType;
 static PyObject *empty_string, *raise_string, *drop_string;
 
+static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
+
 /* Rows ------------------------------------------------------------------------------------------------------------ */
 
 static PyObject *
@@ -617,6 +619,27 @@ history_find(History *self, PyObject *number)
     return PyLong_FromSsize_t(lower_bound(block_stamps(self->block) + self->start, self->end - self->start, stamp));
 }
 
+static PyObject *
+history_between(History *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    int64_t low, high;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "between takes two stamps");
+        return NULL;
+    }
+    if (read_stamp(args[0], &low) < 0 || read_stamp(args[1], &high) < 0) {
+        return NULL;
+    }
+    const Py_ssize_t count = self->end - self->start;
+    if (count == 0) {
+        return Py_BuildValue("nn", (Py_ssize_t)0, (Py_ssize_t)0);
+    }
+    const int64_t *stamps = block_stamps(self->block) + self->start;
+    const Py_ssize_t from_low = lower_bound(stamps, count, low), from_high = lower_bound(stamps, count, high);
+    const int hits = from_low < count && stamps[from_low] == low;
+    return Py_BuildValue("nn", from_low > 0 && !hits ? from_low - 1 : from_low, from_high < count ? from_high + 1 : count);
+}
+
 static int
 check_index(const History *self, Py_ssize_t index)
 {
@@ -781,6 +804,18 @@ history_newest(History *self, void *Py_UNUSED(closure))
 }
 
 static PyObject *
+history_newest_record(History *self, void *Py_UNUSED(closure))
+{
+    if (self->end == self->start) {
+        return PyBytes_FromStringAndSize(NULL, 0);
+    }
+    char record[sizeof(int64_t) + ROW_SIZE];
+    memcpy(record, block_stamps(self->block) + self->end - 1, sizeof(int64_t));
+    memcpy(record + sizeof(int64_t), block_rows(self->block) + WIDTH * (self->end - 1), ROW_SIZE);
+    return PyBytes_FromStringAndSize(record, sizeof record);
+}
+
+static PyObject *
 history_count(History *self, void *Py_UNUSED(closure))
 {
     return PyLong_FromSsize_t(self->end - self->start);
@@ -876,6 +911,8 @@ static PyMethodDef history_methods[] = {
     {"put", FAST(history_put), METH_FASTCALL,
      PyDoc_STR("put(index, stamp, row): store a sample before another, or in its place if the stamps are equal.")},
     {"find", (PyCFunction)history_find, METH_O, PyDoc_STR("find(stamp): the index of the first sample not before it.")},
+    {"between", FAST(history_between), METH_FASTCALL,
+     PyDoc_STR("between(low, high): the index of the last sample up to a stamp, and that behind the first from one on.")},
     {"stamp", (PyCFunction)history_stamp, METH_O, PyDoc_STR("stamp(index): the stamp of a sample.")},
     {"sample", (PyCFunction)history_sample, METH_O, PyDoc_STR("sample(index): the stamp and the row of a sample.")},
     {"row", (PyCFunction)history_row, METH_O, PyDoc_STR("row(at): the row at a stamp; None if it is not plain.")},
@@ -895,6 +932,8 @@ static PyGetSetDef history_getset[] = {
     {"count", (getter)history_count, NULL, PyDoc_STR("The number of samples in the window."), NULL},
     {"oldest", (getter)history_oldest, NULL, PyDoc_STR("The oldest stamp in the window, or None."), NULL},
     {"newest", (getter)history_newest, NULL, PyDoc_STR("The newest stamp, or None."), NULL},
+    {"newest_record", (getter)history_newest_record, NULL,
+     PyDoc_STR("The newest stamp and its row, 64 bytes; none if there is no moving sample."), NULL},
     {"horizon", (getter)history_horizon, NULL, PyDoc_STR("Samples before this stamp have left the window."), NULL},
     {NULL}
 };
@@ -928,13 +967,17 @@ typedef struct {
     Py_ssize_t count;
 } Samples;
 
-/* The two samples round a stamp, prepared: tfbus.geometry.rows.interpolate up to the fraction. */
+/* The two samples round a stamp. */
 typedef struct {
-    int64_t before, after; /* a stamp belongs here if before < stamp <= after; before = after for none */
-    const double *a, *b;
-    double gap, angle, scale;
-    char turns, flipped;
+    int64_t before, after;
+    const double *a, *b; /* their rows; `a` is NULL if the stamp is that of `b` */
 } Segment;
+
+/* The rotation from one sample to the next: tfbus.geometry.rows.interpolate up to the fraction. */
+typedef struct {
+    double angle, scale;
+    char turns, flipped;
+} Turn;
 
 typedef enum { ANSWERED, MISSING, NOT_PLAIN } Status;
 
@@ -949,65 +992,95 @@ samples_of(const History *edge)
     return samples;
 }
 
-/* The row at a stamp. `segment` is the one that was used last, and becomes the one that is used. */
 static Status
-edge_at(const Samples *samples, int64_t at, Segment *segment, double *out)
+find_segment(const Samples *samples, int64_t at, Segment *segment)
 {
-    if (at > segment->after || at <= segment->before) {
-        if (samples->count == 0 || at < samples->stamps[0] || at > samples->stamps[samples->count - 1]) {
-            return MISSING;
-        }
-        const Py_ssize_t i = lower_bound(samples->stamps, samples->count, at);
-        const double *b = samples->rows + WIDTH * i;
-        if (i == 0) {
-            memcpy(out, b, ROW_SIZE);
-            return ANSWERED;
-        }
-        const double *a = b - WIDTH;
-        const int64_t before = samples->stamps[i - 1], after = samples->stamps[i];
-        const uint64_t gap = (uint64_t)after - (uint64_t)before;
-        if (gap > EXACT_GAP && after != at) {
-            return NOT_PLAIN;
-        }
-        segment->a = a;
-        segment->b = b;
-        segment->gap = (double)gap;
-        const double dot = a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6];
-        segment->flipped = dot < 0.0;
-        segment->turns = -1.0 < dot && dot < 1.0;
-        if (segment->turns && after != at) {
-            segment->angle = acos(fabs(dot));
-            segment->scale = 1.0 / sin(segment->angle);
-        }
-        if (after == at) {
-            memcpy(out, b, ROW_SIZE);
-            segment->before = segment->after = at;
-            return ANSWERED;
-        }
-        segment->before = before;
-        segment->after = after;
+    if (samples->count == 0 || at < samples->stamps[0] || at > samples->stamps[samples->count - 1]) {
+        return MISSING;
     }
-    const double *a = segment->a, *b = segment->b;
-    if (at == segment->after) {
-        memcpy(out, b, ROW_SIZE);
+    const Py_ssize_t i = lower_bound(samples->stamps, samples->count, at);
+    segment->after = samples->stamps[i];
+    segment->a = NULL;
+    segment->b = samples->rows + WIDTH * i;
+    if (segment->after == at) {
         return ANSWERED;
     }
-    const double fraction = (double)((uint64_t)at - (uint64_t)segment->before) / segment->gap;
-    double keep = 1.0 - fraction, turn = fraction;
-    if (segment->turns) {
-        keep = sin(segment->angle - fraction * segment->angle) * segment->scale;
-        turn = sin(fraction * segment->angle) * segment->scale;
+    segment->before = samples->stamps[i - 1];
+    segment->a = segment->b - WIDTH;
+    return (uint64_t)segment->after - (uint64_t)segment->before > EXACT_GAP ? NOT_PLAIN : ANSWERED;
+}
+
+enum { LANES = 32 }; /* rows that are made at once */
+
+/* Step by step for all, because the steps of one row wait for each other, and those of several rows do not. */
+static void
+find_turns(const Segment *segments, Turn *turns, Py_ssize_t count)
+{
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const double *a = segments[i].a, *b = segments[i].b;
+        turns[i].turns = turns[i].flipped = 0;
+        if (a != NULL) {
+            const double dot = a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6];
+            turns[i].angle = fabs(dot);
+            turns[i].turns = -1.0 < dot && dot < 1.0;
+            turns[i].flipped = dot < 0.0;
+        }
     }
-    if (segment->flipped) {
-        turn = -turn;
+    for (Py_ssize_t i = 0; i < count; i++) {
+        if (turns[i].turns) {
+            turns[i].angle = acos(turns[i].angle);
+        }
     }
-    for (int i = 0; i < 3; i++) {
-        out[i] = a[i] + fraction * (b[i] - a[i]);
+    for (Py_ssize_t i = 0; i < count; i++) {
+        if (turns[i].turns) {
+            turns[i].scale = 1.0 / sin(turns[i].angle);
+        }
     }
-    for (int i = 3; i < WIDTH; i++) {
-        out[i] = keep * a[i] + turn * b[i];
+}
+
+/* The rows of `count` lanes, of which the one numbered i lies in segments[which[i]] at stamps[i]. The next lane is
+ * `lane_step` floats on in `out`, the next float of the same row `float_step`. */
+static inline void
+blend(const Segment *segments, const Turn *turns, const unsigned char *which, const int64_t *stamps, Py_ssize_t count,
+      double *out, Py_ssize_t lane_step, Py_ssize_t float_step)
+{
+    double fractions[LANES], of_a[LANES], of_b[LANES];
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const Segment *segment = &segments[which[i]];
+        const Turn *turn = &turns[which[i]];
+        if (segment->a != NULL) {
+            /* Neither is more than EXACT_GAP. */
+            const int64_t elapsed = (int64_t)((uint64_t)stamps[i] - (uint64_t)segment->before);
+            const int64_t gap = (int64_t)((uint64_t)segment->after - (uint64_t)segment->before);
+            const double fraction = fractions[i] = (double)elapsed / (double)gap;
+            of_a[i] = turn->turns ? turn->angle - fraction * turn->angle : 1.0 - fraction;
+            of_b[i] = turn->turns ? fraction * turn->angle : fraction;
+        }
     }
-    return ANSWERED;
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const Turn *turn = &turns[which[i]];
+        if (turn->turns) {
+            of_a[i] = sin(of_a[i]) * turn->scale;
+            of_b[i] = sin(of_b[i]) * turn->scale;
+        }
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const double *a = segments[which[i]].a, *b = segments[which[i]].b;
+        double *row = out + lane_step * i;
+        if (a == NULL) {
+            for (int k = 0; k < WIDTH; k++) {
+                row[float_step * k] = b[k];
+            }
+            continue;
+        }
+        const double share = turns[which[i]].flipped ? -of_b[i] : of_b[i];
+        for (int k = 0; k < 3; k++) {
+            row[float_step * k] = a[k] + fractions[i] * (b[k] - a[k]);
+        }
+        for (int k = 3; k < WIDTH; k++) {
+            row[float_step * k] = of_a[i] * a[k] + share * b[k];
+        }
+    }
 }
 
 static PyObject *
@@ -1020,10 +1093,15 @@ history_row(History *self, PyObject *number)
         return NULL;
     }
     const Samples samples = samples_of(self);
-    Segment segment = {.before = INT64_MIN, .after = INT64_MIN};
-    if (overflow || self->mixed || edge_at(&samples, at, &segment, row) != ANSWERED) {
+    Segment segment;
+    if (overflow || self->mixed || find_segment(&samples, at, &segment) != ANSWERED) {
         Py_RETURN_NONE;
     }
+    Turn turn;
+    const int64_t stamp = at;
+    const unsigned char first = 0;
+    find_turns(&segment, &turn, 1);
+    blend(&segment, &turn, &first, &stamp, 1, row, WIDTH, 1);
     return boxed_row(row);
 }
 
@@ -1065,6 +1143,10 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
     if (!PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
         return -1;
     }
+    if (self->steps != NULL) {
+        PyErr_SetString(PyExc_RuntimeError, "a Chain is initialised once, because another thread may read it");
+        return -1;
+    }
     const Py_ssize_t up = PyTuple_Size(sides[0]), down = PyTuple_Size(sides[1]);
     Step *steps = PyMem_Calloc((size_t)(up + down + 1), sizeof(Step));
     if (steps == NULL) {
@@ -1084,7 +1166,6 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
     }
     Py_INCREF(sides[0]);
     Py_INCREF(sides[1]);
-    chain_clear(self);
     self->sides[0] = sides[0];
     self->sides[1] = sides[1];
     self->steps = steps;
@@ -1094,87 +1175,56 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
     return 0;
 }
 
-/* Source in target at a stamp, from what each step holds; `samples` and `segments` have one place a step. */
-static Status
-climb(const Step *steps, const Samples *samples, Segment *segments, Py_ssize_t count, int64_t at, double *out)
-{
-    for (Py_ssize_t i = 0; i < count; i++) {
-        double row[WIDTH];
-        const double *here = steps[i].row;
-        if (steps[i].edge != NULL) {
-            const Status status = edge_at(samples + i, at, segments + i, row);
-            if (status != ANSWERED) {
-                return status;
-            }
-            here = row;
-        }
-        if (i == 0) {
-            memcpy(out, here, ROW_SIZE);
-        } else {
-            compose(here, out, out);
-        }
-    }
-    if (count == 0) {
-        memset(out, 0, ROW_SIZE);
-        out[WIDTH - 1] = 1.0;
-    }
-    return ANSWERED;
-}
+static const unsigned char each[LANES] = {0,  1,  2,  3,  4,  5,  6,  7,  8,  9,  10, 11, 12, 13, 14, 15,
+                                          16, 17, 18, 19, 20, 21, 22, 23, 24, 25, 26, 27, 28, 29, 30, 31};
 
-static Status
-chain_climb(const Chain *self, const Samples *samples, Segment *segments, int64_t at, double *out)
-{
-    Status status = climb(self->steps, samples, segments, self->up, at, out);
-    if (status == ANSWERED && self->down > 0) {
-        double below[WIDTH], inverse[WIDTH];
-        const Py_ssize_t up = self->up;
-        status = climb(self->steps + up, samples + up, segments + up, self->down, at, below);
-        if (status == ANSWERED) {
-            invert(below, inverse);
-            compose(inverse, out, out);
-        }
-    }
-    return status;
-}
-
-/* Note the samples of each edge as they are now, and that no segment was used yet; false if an edge is not plain. */
-static int
-chain_look(const Chain *self, Samples *samples, Segment *segments)
-{
-    for (Py_ssize_t i = 0; i < self->up + self->down; i++) {
-        const History *edge = self->steps[i].edge;
-        if (edge != NULL) {
-            if (edge->mixed) {
-                return 0;
-            }
-            samples[i] = samples_of(edge);
-            segments[i].before = segments[i].after = INT64_MIN;
-        }
-    }
-    return 1;
-}
-
-enum { SHORT = 24 }; /* steps that fit on the stack */
-
+/* Source in target at a stamp. */
 static Status
 chain_at(const Chain *self, int64_t at, double *out)
 {
-    Samples samples[SHORT], *all_samples = samples;
-    Segment segments[SHORT], *all_segments = segments;
-    const Py_ssize_t count = self->up + self->down;
-    Status status = NOT_PLAIN;
-    if (count > SHORT) {
-        all_samples = PyMem_Malloc((size_t)count * sizeof(Samples));
-        all_segments = PyMem_Malloc((size_t)count * sizeof(Segment));
+    const Py_ssize_t steps = self->up + self->down;
+    double below[WIDTH];
+    memcpy(out, identity, ROW_SIZE);
+    for (Py_ssize_t first = 0; first < steps; first += LANES) {
+        const Py_ssize_t count = steps - first < LANES ? steps - first : LANES;
+        Segment segments[LANES];
+        Turn turns[LANES];
+        int64_t stamps[LANES];
+        double rows[LANES][WIDTH];
+        for (Py_ssize_t i = 0; i < count; i++) {
+            const Step *step = &self->steps[first + i];
+            stamps[i] = at;
+            if (step->edge == NULL) {
+                segments[i].a = NULL;
+                segments[i].b = step->row;
+                continue;
+            }
+            if (step->edge->mixed) {
+                return NOT_PLAIN;
+            }
+            const Samples samples = samples_of(step->edge);
+            const Status status = find_segment(&samples, at, &segments[i]);
+            if (status != ANSWERED) {
+                return status;
+            }
+        }
+        find_turns(segments, turns, count);
+        blend(segments, turns, each, stamps, count, rows[0], WIDTH, 1);
+        for (Py_ssize_t i = 0; i < count; i++) {
+            double *side = first + i < self->up ? out : below;
+            if (first + i == 0 || first + i == self->up) {
+                memcpy(side, rows[i], ROW_SIZE);
+            } else {
+                compose(rows[i], side, side);
+            }
+        }
     }
-    if (all_samples != NULL && all_segments != NULL && chain_look(self, all_samples, all_segments)) {
-        status = chain_climb(self, all_samples, all_segments, at, out);
+    if (self->down > 0) {
+        double inverse[WIDTH];
+        invert(below, inverse);
+        compose(inverse, out, out);
     }
-    if (count > SHORT) {
-        PyMem_Free(all_samples);
-        PyMem_Free(all_segments);
-    }
-    return status;
+    return ANSWERED;
 }
 
 /* Whether every edge has samples and something moves; then `stamp` is the newest one that all have reached. */
@@ -1226,44 +1276,199 @@ chain_latest(Chain *self, PyObject *Py_UNUSED(ignored))
 
 /* Held: the samples of a chain as they were at one moment, for many answers ----------------------------------------- */
 
+/* What is known of each step of a chain, of static ones nothing. */
+typedef struct {
+    Samples samples;
+    Segment last; /* the segment that was used last, which holds for all stamps between its two; none if equal */
+    Turn turn;    /* that of `last` */
+    Block *block; /* which it reads, or NULL */
+} Seen;
+
 typedef struct {
     PyObject_HEAD
     Chain *chain;
-    Samples *samples;  /* one place a step, as in the chain */
-    Segment *segments;
-    Block **blocks;    /* those of which it is a reader, or NULL */
-    Py_ssize_t count;
-    char busy;         /* whether a thread is at work on the segments */
+    Seen *seen; /* one a step */
+    char busy;  /* whether a thread is at work on what is seen */
 } Held;
 
-/* The answers at `count` stamps as seven columns; NaN where there is none. The first such place, -1 for none, or -2 if
- * an answer is not plain. */
-static Py_ssize_t
-fill_columns(const Chain *self, const Samples *samples, Segment *segments, const char *stamps, Py_ssize_t count,
-             double *columns)
+/* Note the samples of each edge as they are now; NULL without an error if an edge is not plain. */
+static Seen *
+chain_look(const Chain *self)
 {
-    Py_ssize_t first_missing = -1;
+    const Py_ssize_t count = self->up + self->down;
+    Seen *seen = PyMem_Calloc((size_t)count + 1, sizeof(Seen));
+    if (seen == NULL) {
+        PyErr_NoMemory();
+        return NULL;
+    }
     for (Py_ssize_t i = 0; i < count; i++) {
-        int64_t at;
-        double row[WIDTH];
-        memcpy(&at, stamps + i * sizeof(int64_t), sizeof(int64_t));
-        const Status status = chain_climb(self, samples, segments, at, row);
+        const History *edge = self->steps[i].edge;
+        if (edge != NULL) {
+            if (edge->mixed) {
+                PyMem_Free(seen);
+                return NULL;
+            }
+            seen[i].samples = samples_of(edge);
+        }
+    }
+    return seen;
+}
+
+/* Keep others from changing what was seen, until `let_go`. */
+static void
+keep_hold(const Chain *chain, Seen *seen)
+{
+    for (Py_ssize_t i = 0; i < chain->up + chain->down; i++) {
+        Block *block = chain->steps[i].edge == NULL ? NULL : chain->steps[i].edge->block;
+        if (block != NULL) {
+            Py_INCREF(OBJECT(block));
+            block->readers++;
+            seen[i].block = block;
+        }
+    }
+}
+
+static void
+let_go(Seen *seen, Py_ssize_t count)
+{
+    for (Py_ssize_t i = 0; i < count; i++) {
+        if (seen[i].block != NULL) {
+            seen[i].block->readers--;
+            Py_DECREF(OBJECT(seen[i].block));
+        }
+    }
+    PyMem_Free(seen);
+}
+
+typedef double Column[LANES];
+
+static void
+fill_row(const double *row, Column *out, Py_ssize_t count)
+{
+    for (int k = 0; k < WIDTH; k++) {
+        for (Py_ssize_t j = 0; j < count; j++) {
+            out[k][j] = row[k];
+        }
+    }
+}
+
+/* The rows of an edge at some stamps. Where there is none, `missing` is set and the row is any. */
+static Status
+edge_rows(Seen *edge, const int64_t *stamps, Py_ssize_t count, Column *out, char *missing)
+{
+    Segment segments[LANES + 1];
+    Turn turns[LANES + 1];
+    unsigned char which[LANES];
+    Py_ssize_t used = 1, last = 0;
+    segments[0] = edge->last;
+    turns[0] = edge->turn;
+    for (Py_ssize_t j = 0; j < count; j++) {
+        const int64_t at = stamps[j];
+        if (segments[last].before < at && at < segments[last].after) {
+            which[j] = (unsigned char)last;
+            continue;
+        }
+        Segment *segment = &segments[used];
+        const Status status = find_segment(&edge->samples, at, segment);
         if (status == NOT_PLAIN) {
-            return -2;
+            return NOT_PLAIN;
         }
         if (status == MISSING) {
-            if (first_missing < 0) {
-                first_missing = i;
+            missing[j] = 1;
+            segment->a = NULL;
+            segment->b = identity;
+        }
+        which[j] = (unsigned char)used;
+        last = segment->a == NULL ? last : used;
+        used++;
+    }
+    find_turns(segments + 1, turns + 1, used - 1);
+    blend(segments, turns, which, stamps, count, out[0], 1, LANES);
+    edge->last = segments[last];
+    edge->turn = turns[last];
+    return ANSWERED;
+}
+
+/* b = a @ b, or the inverse of a @ b. */
+static void
+compose_columns(Column *a, Column *b, Py_ssize_t count, int of_inverse)
+{
+    for (Py_ssize_t j = 0; j < count; j++) {
+        double first[WIDTH], second[WIDTH];
+        for (int k = 0; k < WIDTH; k++) {
+            first[k] = a[k][j];
+            second[k] = b[k][j];
+        }
+        if (of_inverse) {
+            invert(first, first);
+        }
+        compose(first, second, second);
+        for (int k = 0; k < WIDTH; k++) {
+            b[k][j] = second[k];
+        }
+    }
+}
+
+/* The answers at `count` stamps as seven columns; NaN where there is none. The first such place, -1 for none, or -2 if
+ * an answer is not plain. Neither `stamps` nor `columns` need be aligned. */
+static Py_ssize_t
+fill_columns(const Chain *self, Seen *seen, const char *stamps, Py_ssize_t count, char *columns)
+{
+    const Py_ssize_t steps = self->up + self->down;
+    Py_ssize_t first_missing = -1;
+    for (Py_ssize_t done = 0; done < count; done += LANES) {
+        const Py_ssize_t here = count - done < LANES ? count - done : LANES;
+        int64_t at[LANES];
+        char missing[LANES] = {0};
+        Column above[WIDTH], below[WIDTH], step[WIDTH];
+        memcpy(at, stamps + done * (Py_ssize_t)sizeof(int64_t), (size_t)here * sizeof(int64_t));
+        if (self->up == 0) {
+            fill_row(identity, above, here);
+        }
+        for (Py_ssize_t i = 0; i < steps; i++) {
+            const int begins = i == 0 || i == self->up;
+            Column *side = i < self->up ? above : below, *rows = begins ? side : step;
+            if (self->steps[i].edge == NULL) {
+                fill_row(self->steps[i].row, rows, here);
+            } else if (edge_rows(&seen[i], at, here, rows, missing) == NOT_PLAIN) {
+                return -2;
             }
-            for (int k = 0; k < WIDTH; k++) {
-                row[k] = NAN;
+            if (!begins) {
+                compose_columns(rows, side, here, 0);
+            }
+        }
+        if (self->down > 0) {
+            compose_columns(below, above, here, 1);
+        }
+        for (Py_ssize_t j = 0; j < here; j++) {
+            if (missing[j]) {
+                first_missing = first_missing < 0 ? done + j : first_missing;
+                for (int k = 0; k < WIDTH; k++) {
+                    above[k][j] = NAN;
+                }
             }
         }
         for (int k = 0; k < WIDTH; k++) {
-            columns[k * count + i] = row[k];
+            memcpy(columns + (k * count + done) * (Py_ssize_t)sizeof(double), above[k], (size_t)here * sizeof(double));
         }
     }
     return first_missing;
+}
+
+enum { FEW_STAMPS = 256 }; /* letting go of the interpreter costs more than so many */
+
+/* As `fill_columns`, of samples that others may not change: see Block. */
+static Py_ssize_t
+fill_columns_unlocked(Chain *chain, Seen *seen, const char *stamps, Py_ssize_t count, char *columns)
+{
+    Py_ssize_t missing;
+    if (count < FEW_STAMPS) {
+        return fill_columns(chain, seen, stamps, count, columns);
+    }
+    Py_BEGIN_ALLOW_THREADS
+    missing = fill_columns(chain, seen, stamps, count, columns);
+    Py_END_ALLOW_THREADS
+    return missing;
 }
 
 static PyObject *
@@ -1287,21 +1492,12 @@ held_rows(Held *self, PyObject *const *args, Py_ssize_t nargs)
     }
     PyObject *result = NULL;
     const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps.len / size;
-    if (columns.len != count * (Py_ssize_t)ROW_SIZE || stamps.len % size != 0
-        || (uintptr_t)columns.buf % sizeof(double) != 0) {
-        PyErr_SetString(PyExc_ValueError, "columns must have room for seven aligned floats a stamp");
+    if (columns.len != count * (Py_ssize_t)ROW_SIZE || stamps.len % size != 0) {
+        PyErr_SetString(PyExc_ValueError, "columns must have room for seven floats a stamp");
     } else {
-        Py_ssize_t missing;
         self->busy = 1;
         Py_INCREF(OBJECT(self));
-        /* Nobody changes what is held: see Block. Letting go of the interpreter costs more than a few stamps. */
-        if (count < 256) {
-            missing = fill_columns(self->chain, self->samples, self->segments, stamps.buf, count, columns.buf);
-        } else {
-            Py_BEGIN_ALLOW_THREADS
-            missing = fill_columns(self->chain, self->samples, self->segments, stamps.buf, count, columns.buf);
-            Py_END_ALLOW_THREADS
-        }
+        const Py_ssize_t missing = fill_columns_unlocked(self->chain, self->seen, stamps.buf, count, columns.buf);
         self->busy = 0;
         Py_DECREF(OBJECT(self));
         if (missing == -2) {
@@ -1329,15 +1525,9 @@ held_dealloc(Held *self)
 {
     PyTypeObject *type = Py_TYPE(OBJECT(self));
     PyObject_GC_UnTrack(self);
-    for (Py_ssize_t i = 0; i < self->count; i++) {
-        if (self->blocks[i] != NULL) {
-            self->blocks[i]->readers--;
-            Py_DECREF(OBJECT(self->blocks[i]));
-        }
+    if (self->seen != NULL) {
+        let_go(self->seen, self->chain->up + self->chain->down);
     }
-    PyMem_Free(self->samples);
-    PyMem_Free(self->segments);
-    PyMem_Free(self->blocks);
     Py_XDECREF(OBJECT(self->chain));
     ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
     Py_DECREF(type);
@@ -1366,33 +1556,21 @@ static PyType_Spec held_spec = {
 static PyObject *
 chain_hold(Chain *self, PyObject *Py_UNUSED(ignored))
 {
-    const Py_ssize_t steps = self->up + self->down;
     Held *held = (Held *)PyType_GenericAlloc(HeldType, 0);
     if (held == NULL) {
         return NULL;
     }
-    held->samples = PyMem_Calloc((size_t)steps + 1, sizeof(Samples));
-    held->segments = PyMem_Calloc((size_t)steps + 1, sizeof(Segment));
-    held->blocks = PyMem_Calloc((size_t)steps + 1, sizeof(Block *));
-    if (held->samples == NULL || held->segments == NULL || held->blocks == NULL) {
-        Py_DECREF(OBJECT(held));
-        return PyErr_NoMemory();
-    }
     Py_INCREF(OBJECT(self));
     held->chain = self;
-    if (!chain_look(self, held->samples, held->segments)) {
+    held->seen = chain_look(self);
+    if (held->seen == NULL) {
         Py_DECREF(OBJECT(held));
+        if (PyErr_Occurred()) {
+            return NULL;
+        }
         Py_RETURN_NONE;
     }
-    for (Py_ssize_t i = 0; i < steps; i++) {
-        Block *block = self->steps[i].edge == NULL ? NULL : self->steps[i].edge->block;
-        if (block != NULL) {
-            Py_INCREF(OBJECT(block));
-            block->readers++;
-            held->blocks[i] = block;
-        }
-    }
-    held->count = steps;
+    keep_hold(self, held->seen);
     return OBJECT(held);
 }
 
@@ -1607,6 +1785,20 @@ paths_init(Paths *self, PyObject *args, PyObject *kwargs)
     return 0;
 }
 
+/* The chain that is known between two frames, borrowed. NULL without an error if there is none, or somebody holds the
+ * lock. */
+static Chain *
+paths_find(const Paths *self, PyObject *target, PyObject *source)
+{
+    if (self->recent == NULL || !PyUnicode_CheckExact(target) || !PyUnicode_CheckExact(source)
+        || paths_are_free(self) <= 0) {
+        return NULL;
+    }
+    PyObject *by_source = PyDict_GetItemWithError(self->recent, target);
+    PyObject *chain = by_source == NULL ? NULL : PyDict_GetItemWithError(by_source, source);
+    return chain != NULL && PyObject_TypeCheck(chain, ChainType) ? (Chain *)chain : NULL;
+}
+
 /* None where Python has to look closer. */
 static PyObject *
 paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
@@ -1618,25 +1810,13 @@ paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
         return NULL;
     }
     PyObject *target = args[0], *source = args[1];
-    if (self->recent == NULL || !PyUnicode_CheckExact(target) || !PyUnicode_CheckExact(source)) {
-        Py_RETURN_NONE;
-    }
-    const int free = paths_are_free(self);
-    if (free < 0) {
-        return NULL;
-    }
-    if (!free) {
-        Py_RETURN_NONE;
-    }
-    PyObject *by_source = PyDict_GetItemWithError(self->recent, target);
-    PyObject *chain = by_source == NULL ? NULL : PyDict_GetItemWithError(by_source, source);
-    if (chain == NULL || !PyObject_TypeCheck(chain, ChainType)) {
+    const Chain *path = paths_find(self, target, source);
+    if (path == NULL) {
         if (PyErr_Occurred()) {
             return NULL;
         }
         Py_RETURN_NONE;
     }
-    const Chain *path = (const Chain *)chain;
     if (args[2] == self->latest) {
         if (!chain_newest(path, &at)) {
             Py_RETURN_NONE;
@@ -1667,6 +1847,92 @@ paths_answer(Paths *self, PyObject *const *args, Py_ssize_t count)
     sample->stamp = at;
     memcpy(sample->row, row, ROW_SIZE);
     return (PyObject *)sample;
+}
+
+/* Bytes that end with the given stamps, and have room for seven floats a stamp before. NULL without an error if they
+ * are not a list or a tuple of int, or an array of int64; or if there are none. */
+static PyObject *
+room_for_rows(PyObject *stamps)
+{
+    const int is_list = PyList_CheckExact(stamps), is_tuple = PyTuple_CheckExact(stamps);
+    Py_buffer view = {0};
+    Py_ssize_t count;
+    if (is_list || is_tuple) {
+        count = is_list ? PyList_Size(stamps) : PyTuple_Size(stamps);
+    } else {
+        if (!PyObject_CheckBuffer(stamps)) {
+            return NULL;
+        }
+        if (PyObject_GetBuffer(stamps, &view, PyBUF_STRIDES | PyBUF_FORMAT) < 0) {
+            if (PyErr_ExceptionMatches(PyExc_ValueError) || PyErr_ExceptionMatches(PyExc_TypeError)
+                || PyErr_ExceptionMatches(PyExc_BufferError)) {
+                PyErr_Clear();
+            }
+            return NULL;
+        }
+        const char *format = view.format == NULL ? "B" : view.format;
+        const int is_int64 = strcmp(format, "q") == 0 || (strcmp(format, "l") == 0 && sizeof(long) == sizeof(int64_t));
+        count = is_int64 && view.ndim == 1 && view.itemsize == (Py_ssize_t)sizeof(int64_t) ? view.shape[0] : 0;
+    }
+    PyObject *memory = NULL;
+    if (count > 0 && count <= PY_SSIZE_T_MAX / (Py_ssize_t)SAMPLE_SIZE / 2) {
+        memory = PyBytes_FromStringAndSize(NULL, count * (Py_ssize_t)SAMPLE_SIZE);
+    }
+    char *own = memory == NULL ? NULL : PyBytes_AsString(memory) + count * (Py_ssize_t)ROW_SIZE;
+    for (Py_ssize_t i = 0; own != NULL && i < count; i++) {
+        int64_t stamp;
+        if (is_list || is_tuple) {
+            PyObject *item = is_list ? PyList_GetItem(stamps, i) : PyTuple_GetItem(stamps, i);
+            int overflow = 1;
+            stamp = item != NULL && PyLong_CheckExact(item) ? PyLong_AsLongLongAndOverflow(item, &overflow) : 0;
+            if (overflow) {
+                Py_CLEAR(memory);
+                break;
+            }
+        } else {
+            memcpy(&stamp, (const char *)view.buf + i * view.strides[0], sizeof(stamp));
+        }
+        memcpy(own + i * (Py_ssize_t)sizeof(stamp), &stamp, sizeof(stamp));
+    }
+    if (view.obj != NULL) {
+        PyBuffer_Release(&view);
+    }
+    return memory;
+}
+
+/* None where Python has to look closer. */
+static PyObject *
+paths_answer_many(Paths *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 3) {
+        PyErr_SetString(PyExc_TypeError, "answer_many takes target, source and stamps");
+        return NULL;
+    }
+    /* Before all else, because it may run Python code. */
+    PyObject *memory = room_for_rows(args[2]);
+    Chain *path = memory == NULL ? NULL : paths_find(self, args[0], args[1]);
+    Seen *seen = path == NULL ? NULL : chain_look(path);
+    if (seen == NULL) {
+        Py_XDECREF(memory);
+        if (PyErr_Occurred()) {
+            return NULL;
+        }
+        Py_RETURN_NONE;
+    }
+    const Py_ssize_t count = PyBytes_Size(memory) / (Py_ssize_t)SAMPLE_SIZE;
+    char *columns = PyBytes_AsString(memory);
+    Py_INCREF(OBJECT(path));
+    if (count >= FEW_STAMPS) {
+        keep_hold(path, seen);
+    }
+    const Py_ssize_t missing = fill_columns_unlocked(path, seen, columns + count * (Py_ssize_t)ROW_SIZE, count, columns);
+    let_go(seen, path->up + path->down);
+    Py_DECREF(OBJECT(path));
+    if (missing != -1) {
+        Py_DECREF(memory);
+        Py_RETURN_NONE;
+    }
+    return memory;
 }
 
 /* commit(frames, readers, batch): store the whole batch if it is plain, nobody holds the lock and nobody has to be told. */
@@ -1725,6 +1991,9 @@ paths_set_recent(Paths *self, PyObject *value, void *Py_UNUSED(closure))
 static PyMethodDef paths_methods[] = {
     {"answer", FAST(paths_answer), METH_FASTCALL,
      PyDoc_STR("answer(target, source, at): the plain answer; None if Python has to look closer.")},
+    {"answer_many", FAST(paths_answer_many), METH_FASTCALL,
+     PyDoc_STR("answer_many(target, source, stamps): the plain answers as bytes, seven columns of floats, and the stamps; "
+               "None if Python has to look closer.")},
     {"commit", FAST(paths_commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, readers, batch): store a batch if all of it is plain and nobody looks; else nothing.")},
     {NULL}
@@ -2606,7 +2875,47 @@ static PyType_Spec intake_spec = {
 
 /* The module -------------------------------------------------------------------------------------------------------- */
 
+static PyObject *
+compose_paths(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer rows, origins;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "compose_paths takes rows and origins");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &rows, PyBUF_WRITABLE) < 0) {
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[1], &origins, PyBUF_SIMPLE) < 0) {
+        PyBuffer_Release(&rows);
+        return NULL;
+    }
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = origins.len / size;
+    const int fits = origins.len % size == 0 && rows.len % (Py_ssize_t)ROW_SIZE == 0
+                     && rows.len / (Py_ssize_t)ROW_SIZE == count;
+    Py_ssize_t i = 0;
+    for (; fits && i < count; i++) {
+        const int64_t origin = ((const int64_t *)origins.buf)[i];
+        if (origin < 0 || (origin > 0 && origin >= i)) {
+            break;
+        }
+        if (origin > 0) {
+            double *row = (double *)rows.buf + WIDTH * i;
+            compose((const double *)rows.buf + WIDTH * origin, row, row);
+        }
+    }
+    PyBuffer_Release(&origins);
+    PyBuffer_Release(&rows);
+    if (!fits || i < count) {
+        PyErr_SetString(PyExc_ValueError, "each row of seven floats needs an origin before it");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef module_methods[] = {
+    {"compose_paths", FAST(compose_paths), METH_FASTCALL,
+     PyDoc_STR("compose_paths(rows, origins): make each row, seen from its origin, one seen from the first place.")},
     {"commit", FAST(commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
                "index.")},

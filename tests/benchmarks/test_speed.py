@@ -1,4 +1,4 @@
-"""How fast it is, beside its peers: `pytest tests/benchmarks` ends with a table. The default run leaves this out.
+"""The speed of tfbus beside its peers: `pytest tests/benchmarks` ends with a table. The default run leaves this out.
 
 Timings on a shared machine drift, so what counts is the ratio of two sides that take turns: the peer has its turn in
 the setup of each of pytest-benchmark's rounds. No test asserts a time.

@@ -1,4 +1,4 @@
-"""What both kernels judge plain, and the stamps that they note."""
+"""The samples that both kernels judge plain, and the stamps that they note."""
 
 import math
 from types import ModuleType

@@ -24,8 +24,6 @@ from tfbus.waiting.waiting_index import Waiter
 
 pytestmark = pytest.mark.thorough
 
-X = tuple[float, ...]
-
 
 def row(metres: float) -> Any:
     return metres, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0
@@ -106,9 +104,10 @@ def test_no_call_leaks_memory_or_references() -> None:
         many = path.hold()
         edge.clear()
         many.rows(np.arange(50, 80), np.empty((7, 30)))
-        kernel.Chain((), ()).__init__((twin,), (row(0.0),))
         paths = kernel.Paths(threading.Lock(), LATEST, kernel.Sample)
         paths.recent[target] = {source: kernel.Chain((twin,), ())}
+        for stamps in ([60, 70], np.array([60, 70]), np.full(300, 60), np.array([60, 900]), [60, "x"], np.zeros(2), []):
+            paths.answer_many(target, source, stamps)
         found = paths.answer(target, source, 60)
         assert found._fields is found._fields
         found._fields = target, source, 5, row(1.0), me, True
@@ -124,8 +123,9 @@ def test_no_call_leaks_memory_or_references() -> None:
             lambda: many.rows(np.zeros(1), np.zeros(3)),
             lambda: kernel.Paths(5, 5, kernel.Sample),
             lambda: edge.put(9, 1, row(0.0)),
+            lambda: path.__init__((), ()),
         ):
-            with pytest.raises((TypeError, ValueError, IndexError, AttributeError)):
+            with pytest.raises((TypeError, ValueError, IndexError, AttributeError, RuntimeError)):
                 wrong()
         del held
 
@@ -305,11 +305,13 @@ def test_no_allocation_that_fails_does_harm() -> None:
             lambda: kernel.Chain((edge,), ()),
             lambda: path.row(3),
             lambda: path.hold(),
+            lambda: path.hold().rows(np.arange(5), np.empty((7, 5))),
+            lambda: paths_of(path).answer_many("parent", "child", [1, 2, 3]),
             lambda: kernel.Paths(threading.Lock(), LATEST, kernel.Sample),
         ]
 
     failures = 0
-    for number in range(10):
+    for number in range(len(calls(edge_of(), None))):
         for allowed in range(12):
             edge = edge_of()
             path = kernel.Chain((edge,) * 40, (edge,))
@@ -330,6 +332,13 @@ def test_no_allocation_that_fails_does_harm() -> None:
             edge.push(200, row(9.0))
             assert edge.newest == 200
     assert failures > 10
+
+
+def paths_of(path: Any) -> Any:
+    kernel: Any = COMPILED
+    paths = kernel.Paths(threading.Lock(), LATEST, kernel.Sample)
+    paths.recent = {"parent": {"child": path}}
+    return paths
 
 
 def edge_path(kernel: Any, edge: Any) -> Any:

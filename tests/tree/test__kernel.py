@@ -20,7 +20,7 @@ Question = tuple[str, str, int | None]
 
 
 def replies(kernel: str, keep: float | None, samples: list[Sample], questions: list[Question]) -> list[object]:
-    """What a tree on a kernel says to each sample and to each question: values to the last bit, and whole messages."""
+    """The answers of a tree on a kernel to samples and questions: values to the last bit, and whole messages."""
     tfbus = tfbus_on(kernel)
     tree = tfbus.TransformTree(keep)
     said: list[object] = []
@@ -41,6 +41,14 @@ def replies(kernel: str, keep: float | None, samples: list[Sample], questions: l
         else:
             numbers = struct.pack("7d", *found.transform.translation, *found.transform.rotation)
             said.append((found.parent, found.child, found.stamp, found.static, numbers))
+    stamps = [at for _, _, at in questions if at is not None]
+    for target, source, _ in questions:
+        try:
+            many = tree.lookup_many(target, source, stamps)
+        except tfbus.TransformError as error:
+            said.append((type(error).__name__, str(error)))
+        else:
+            said.append((many.translations.tobytes(), many.rotations.tobytes(), many.stamps.tobytes()))
     said.append([(edge.child, edge.parent, edge.samples, edge.oldest, edge.newest) for edge in tree.edges()])
     return said
 

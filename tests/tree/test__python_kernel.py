@@ -1,10 +1,12 @@
-"""What both kernels do. The compiled one has to do it with the same bits."""
+"""Both kernels do the same; the compiled one has to do it with the same bits."""
 
 import copy
 import gc
 import math
+import struct
 import threading
 import weakref
+from array import array
 from itertools import pairwise
 from types import ModuleType
 from typing import Any
@@ -62,6 +64,7 @@ def between(poses: Poses, at: int) -> Row | None:
 def test_an_empty_history_has_no_stamps(kernel: ModuleType) -> None:
     edge = history(kernel, keep=7)
     assert (edge.count, edge.oldest, edge.newest, edge.find(0), edge.keep) == (0, None, None, 0, 7)
+    assert edge.newest_record == b""
     assert (edge.parent, edge.authority, edge.mixed) == ("parent", "", False)
     with pytest.raises(IndexError):
         edge.sample(0)
@@ -118,6 +121,10 @@ def test_a_history_holds_what_was_inserted_last_at_each_stamp_of_its_window(
     assert (edge.count, edge.oldest, edge.newest) == (len(kept), *((stamps[0], stamps[-1]) if kept else (None, None)))
     for at in range(-62, 63, 3):
         assert edge.find(at) == sum(stamp < at for stamp in stamps)
+        last, beyond = max(sum(stamp <= at for stamp in stamps) - 1, 0), sum(stamp < at for stamp in stamps)
+        assert edge.between(at, at + 5) == (last, min(sum(stamp < at + 5 for stamp in stamps) + 1, len(stamps)))
+        assert edge.between(-99, at) == (0, min(beyond + 1, len(stamps)))
+    assert edge.newest_record == b"".join(struct.pack("q7d", stamp, *row) for stamp, row in kept[-1:])
 
 
 @on_both
@@ -318,6 +325,20 @@ def test_the_row_of_a_chain_is_bit_for_bit_the_product_of_its_interpolated_edges
     assert bits(row) == bits(expected_row(up, down, at))
 
 
+@on_both
+@given(st.lists(st.tuples(transforms(10.0).map(row_of), st.integers(0, 100)), min_size=1, max_size=12))
+def test_composed_paths_are_bit_for_bit_the_products_of_their_rows(
+    kernel: ModuleType, drawn: list[tuple[Row, int]]
+) -> None:
+    origins = [number % max(place, 1) for place, (_, number) in enumerate(drawn)]
+    expected: list[Row] = []
+    for (row, _), origin in zip(drawn, origins, strict=True):
+        expected.append(compose(expected[origin], row) if origin else row)
+    rows = np.array([row for row, _ in drawn]).reshape(-1, 7)
+    kernel.compose_paths(rows, np.array(origins, np.int64))
+    assert rows.tobytes() == np.array(expected).tobytes()
+
+
 @needs_both
 @given(drawn_chains(), st.data())
 def test_many_rows_are_bit_for_bit_the_single_ones(drawn: Drawn, data: st.DataObject) -> None:
@@ -469,6 +490,75 @@ def test_what_is_not_plain_is_handed_back(kernel: ModuleType, target: Any, sourc
     assert asked.answer(target, source, at) is None
 
 
+def unpacked(memory: bytes) -> tuple[list[bytes], list[int]]:
+    """The bits of each row of an answer at many stamps, and the stamps."""
+    count = len(memory) // 64
+    columns = np.frombuffer(memory, np.float64, 7 * count).reshape(7, count)
+    return [column.tobytes() for column in columns.T], np.frombuffer(memory, np.int64, count, 56 * count).tolist()
+
+
+@on_both
+@pytest.mark.parametrize(
+    "form", [list, tuple, np.array, lambda stamps: np.array(stamps * 2)[::2], lambda stamps: array("q", stamps)]
+)
+@pytest.mark.parametrize("stamps", [[4], [4, 4, 5, 0, 10, 7], [*range(11), *range(3)] * 2 + [9, 1]])
+def test_answers_at_many_stamps_are_the_rows_of_the_chain(kernel: ModuleType, form: Any, stamps: list[int]) -> None:
+    turned = Transform.from_axis_angle((1.0, 2.0, 3.0), 0.3, (1.0, 2.0, 3.0))
+    poses = [(0, x(0.0)), (3, row_of(turned)), (4, x(2.0)), (10, row_of(turned.inverse()))]
+    for edges in ([[poses], []], [[poses, row_of(turned)], [poses[::3]]], [[], [poses]], [[row_of(turned)], []]):
+        path = chain(kernel, *edges)
+        rows, kept = unpacked(paths(kernel, cart=path).answer_many("map", "cart", form(stamps)))
+        asked = form(stamps).tolist() if hasattr(form(stamps), "tolist") else stamps
+        assert kept == asked
+        assert rows == [bits(path.row(at)) for at in asked]
+
+
+@on_both
+@pytest.mark.parametrize("count", [1, 20])
+@pytest.mark.parametrize(
+    ("target", "source", "stamp"),
+    [("map", "nobody", 5), ("nobody", "cart", 5), ("map", "cart", 11), ("map", "cart", -1), ("map", "empty", 5)],
+)
+def test_many_stamps_of_which_one_is_not_plain_are_handed_back(
+    kernel: ModuleType, target: str, source: str, stamp: int, count: int
+) -> None:
+    asked = paths(kernel, cart=chain(kernel, [[(0, x(0.0)), (10, x(10.0))]], []), empty=chain(kernel, [[]], []))
+    for stamps in ([*[5] * count, stamp], [stamp, *[5] * count]):
+        assert asked.answer_many(target, source, stamps) is None
+        assert asked.answer_many(target, source, np.array(stamps)) is None
+    assert asked.answer_many("map", "cart", []) is None
+    far = paths(kernel, cart=chain(kernel, [[(0, x(0.0)), (2**60, x(1.0))]], []))
+    assert kernel is _python_kernel or far.answer_many("map", "cart", [2**59]) is None
+    assert far.answer_many("map", "cart", [0, 2**60]) is not None
+
+
+@needs_both
+@pytest.mark.parametrize(
+    "stamps",
+    [
+        [5, True],
+        [5, 5.0],
+        [2**63],
+        [5, None],
+        5,
+        "5",
+        b"12345678",
+        np.array(5),
+        np.array([[5]]),
+        np.array([5], np.int32),
+        np.array([5], np.uint64),
+        np.array([5.0]),
+        np.array([5], ">i8"),
+        np.array([5], "M8[ns]"),
+        np.broadcast_to(np.int64(5), 2**58),
+        [],
+    ],
+)
+def test_the_compiled_kernel_hands_back_what_are_no_plain_stamps(stamps: Any) -> None:
+    asked = paths(COMPILED, cart=chain(COMPILED, [[(0, x(0.0)), (10, x(10.0))]], []))
+    assert asked.answer_many("map", "cart", stamps) is None
+
+
 @needs_both
 def test_the_compiled_kernel_answers_nothing_while_somebody_holds_the_lock() -> None:
     lock = threading.Lock()
@@ -477,7 +567,10 @@ def test_the_compiled_kernel_answers_nothing_while_somebody_holds_the_lock() -> 
     asked.recent["map"] = {"cart": chain(COMPILED, [[(0, x(0.0)), (10, x(10.0))]], [])}
     with lock:
         assert asked.answer("map", "cart", 5) is None
+        assert asked.answer_many("map", "cart", [5]) is None
     assert asked.answer("map", "cart", 5) is not None
+    assert asked.answer_many("map", "cart", [5]) is not None
+    assert asked.answer_many(Name("map"), "cart", [5]) is None
     assert asked.answer(Name("map"), "cart", 5) is None
 
 
@@ -668,6 +761,8 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: edge.put(5, 1, x(0.0)),
         lambda: edge.put(-1, 1, x(0.0)),
         lambda: edge.find(0.5),
+        lambda: edge.between(0),
+        lambda: edge.between(0, 0.5),
         lambda: edge.sample(1),
         lambda: edge.take(5),
         lambda: edge.columns(0),
@@ -681,15 +776,21 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: path.hold().rows(5, 6),
         lambda: path.hold().rows(np.zeros(2, np.int64)),
         lambda: kernel.Held(),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.zeros(3, np.int64)),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.array([0, 1])),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.array([1, 0])),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.array([0, -1])),
         lambda: kernel.Paths(5, LATEST, kernel.Sample),
         lambda: kernel.Paths(threading.Lock(), LATEST, int),
+        lambda: path.__init__((), ()),
         lambda: paths(kernel).answer("map"),
+        lambda: paths(kernel).answer_many("map", "cart"),
         lambda: setattr(paths(kernel), "recent", []),
         lambda: kernel.commit({}, [], 0),
         lambda: kernel.commit({}, (), "0"),
         lambda: kernel.Block(),
     ):
-        with pytest.raises((TypeError, ValueError, IndexError, AttributeError, BufferError)):
+        with pytest.raises((TypeError, ValueError, IndexError, AttributeError, BufferError, RuntimeError)):
             call()
     assert contents(edge) == [(0, x(0.0))]
     for kind in (kernel.History, kernel.Chain, kernel.Paths):
@@ -698,4 +799,5 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
     assert kernel.commit({"a": 5}, (sample(kernel, "a", 1),), 0) == 0
     assert kernel.commit({}, (5,), 0) == 0
     assert kernel.Paths.__new__(kernel.Paths).answer("map", "cart", 0) is None
+    assert kernel.Paths.__new__(kernel.Paths).answer_many("map", "cart", [0]) is None
     assert kernel.Chain.__new__(kernel.Chain).row(0) == IDENTITY

@@ -18,6 +18,10 @@ from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Columns, Row, compose,
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.stamps import StampsLike, as_stamps, format_stamp
 
+_RECORD = 8 * 8
+"""The bytes of a transform and its stamp."""
+_new = object.__new__
+
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
@@ -53,10 +57,11 @@ class TransformArray:
     """
 
     __array_ufunc__ = None
-    __slots__ = ("_columns", "_policy_use", "_stamps")
-    _columns: Floats
+    __slots__ = ("_known_columns", "_known_stamps", "_memory", "_policy_use")
+    _known_columns: Floats
+    _known_stamps: Integers | None
+    _memory: bytes
     _policy_use: Integers | None
-    _stamps: Integers | None
 
     def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike, stamps: StampsLike | None = None) -> None:
         moves = np.asarray(translations, np.float64)
@@ -78,14 +83,14 @@ class TransformArray:
                 reason="not a unit quaternion",
             )
         norms[np.abs(squares - 1.0) <= ROUNDING] = 1.0
-        self._columns = locked(np.vstack((moves.T, turns.T / norms)))
+        self._known_columns = locked(np.vstack((moves.T, turns.T / norms)))
         self._policy_use = None
-        self._stamps = None
+        self._known_stamps = None
         if stamps is not None:
             instants = as_stamps(stamps)
             if len(instants) != len(moves):
                 raise ValueError(f"there are {len(instants)} stamps for {len(moves)} transforms")
-            self._stamps = locked(instants.copy())
+            self._known_stamps = locked(instants.copy())
 
     @classmethod
     def from_scipy(
@@ -93,6 +98,27 @@ class TransformArray:
     ) -> "TransformArray":
         """From translations in m, shape (n, 3), and n rotations in a ``scipy.spatial.transform.Rotation``."""
         return cls(translations, rotations.as_quat(), stamps)
+
+    @property
+    def _columns(self) -> Floats:
+        """All transforms, shape (7, n). Made of `_memory` when first read, as making an array takes as long as a few
+        answers."""
+        try:
+            return self._known_columns
+        except AttributeError:
+            memory = self._memory
+            self._known_columns = columns = np.ndarray((7, len(memory) // _RECORD), np.float64, memory)
+            return columns
+
+    @property
+    def _stamps(self) -> Integers | None:
+        try:
+            return self._known_stamps
+        except AttributeError:
+            memory = self._memory
+            count = len(memory) // _RECORD
+            self._known_stamps = stamps = np.ndarray((count,), np.int64, memory, 7 * 8 * count)
+            return stamps
 
     @property
     def stamps(self) -> Integers | None:
@@ -312,15 +338,24 @@ def from_columns(columns: Floats, policy_use: Integers | None = None, stamps: In
         In ns; must not be changed either.
     """
     transforms = TransformArray.__new__(TransformArray)
-    transforms._columns = locked(columns)
+    transforms._known_columns = locked(columns)
     transforms._policy_use = None if policy_use is None else locked(policy_use)
-    transforms._stamps = None if stamps is None else locked(stamps)
+    transforms._known_stamps = None if stamps is None else locked(stamps)
+    return transforms
+
+
+def from_memory(memory: bytes) -> TransformArray:
+    """The transforms of seven valid columns of floats, all in one piece, and behind them their stamps in ns."""
+    transforms = _new(TransformArray)
+    transforms._memory = memory
+    transforms._policy_use = None
     return transforms
 
 
 def with_stamps(transforms: TransformArray, stamps: Integers) -> TransformArray:
-    """The same transforms with a copy of these stamps, in ns; there is one for each."""
-    return from_columns(transforms._columns, transforms._policy_use, stamps.copy())
+    """Give a copy of these stamps, in ns, one for each, to transforms that nobody else has seen yet."""
+    transforms._known_stamps = locked(stamps.copy())
+    return transforms
 
 
 def move(columns: Columns, x: Any, y: Any, z: Any) -> tuple[Any, Any, Any]:

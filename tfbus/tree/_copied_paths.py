@@ -20,9 +20,6 @@ from tfbus.tree.path import Path, Step
 Places = slice | npt.NDArray[np.intp]
 """Indices into the stamps that were asked for."""
 
-_BLOCK = 64
-"""Up to this many samples for each stamp, all samples are copied at once, which is faster than to pick some."""
-
 
 class Query(NamedTuple):
     """The question where `source` is, seen from `target`, at many stamps."""
@@ -142,5 +139,4 @@ def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
 def _copy(step: Step, query: Query, low: int, high: int) -> Samples | Row:
     if not isinstance(step, FrameHistory):
         return step
-    many = step.find(high) - step.find(low) > _BLOCK * len(query.stamps)
-    return step.samples_between(low, high, query.stamps if many else None)
+    return step.samples_between(low, high, query.stamps)

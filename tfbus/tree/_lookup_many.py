@@ -17,6 +17,7 @@ from tfbus.geometry.rows import IDENTITY, Columns, Row, compose, invert
 from tfbus.geometry.transform_array import TransformArray, from_columns, from_rows, move
 from tfbus.stamps import LATEST, Stamps
 from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Places, Query, copy_paths
+from tfbus.tree._kernel import ONE_BY_ONE
 from tfbus.tree._plain_columns import plain_columns
 from tfbus.tree._segments import Floats, Segments
 from tfbus.tree.extrapolation import read_stamps_at_many
@@ -25,8 +26,6 @@ from tfbus.tree.history import Samples
 from tfbus.tree.lookup import answer, find, find_in_time_travel
 from tfbus.tree.policy import Policy
 
-ONE_BY_ONE = 40
-"""Up to this many stamps are answered faster one by one."""
 _CHUNK = 2048
 
 OutOfRange = Literal["raise", "nan"]

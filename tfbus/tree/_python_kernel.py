@@ -10,9 +10,10 @@ are cut off later, many at once, because each cut moves all remaining samples.
 
 import struct
 from array import array
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
+from itertools import chain as chained
 from math import acos, sin
 from typing import Any, Protocol
 
@@ -21,11 +22,13 @@ import numpy.typing as npt
 
 from tfbus.geometry.rows import IDENTITY, Row, compose, invert
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps, StampsLike, as_stamps
 
 _RECORD = struct.Struct("q7d")
 _SIZE = _RECORD.size
 _FOREVER = 2**64
+ONE_BY_ONE = 40
+"""Up to this many stamps are answered faster one by one than by numpy."""
 _pack = _RECORD.pack
 _unpack = _RECORD.unpack_from
 _unpack_pair = struct.Struct("q7dq7d").unpack_from
@@ -101,6 +104,11 @@ class History:
         """The newest stamp, in ns; None if there is no moving sample."""
         return self.stamps[-1] if self.stamps else None
 
+    @property
+    def newest_record(self) -> bytes:
+        """The newest stamp (int64, ns) and its row (seven float64), 64 bytes; none if there is no moving sample."""
+        return bytes(self.records[-_SIZE:])
+
     def append(self, parent: str, stamp: int, row: Row, authority: str) -> bool:
         """Store a sample that is newer and has the same parent and authority, as nearly all; else do nothing."""
         stamps = self.stamps
@@ -163,6 +171,17 @@ class History:
         start = self._start
         return bisect_left(self.stamps, stamp, start) - start
 
+    def between(self, low: int, high: int) -> tuple[int, int]:
+        """The index of the last sample up to stamp `low`, and that behind the first sample from stamp `high` on.
+
+        Where there is no such sample, the first sample and the end of all.
+        """
+        stamps = self.stamps
+        start = self._start
+        first = bisect_right(stamps, low, start) - 1
+        end = bisect_left(stamps, high, start) + 1
+        return max(first - start, 0), min(end, len(stamps)) - start
+
     def stamp(self, index: int) -> int:
         """The stamp of a sample, in ns; the errors are those of `sample`."""
         at = self._start + index
@@ -208,7 +227,8 @@ class History:
 
         Those that are next to none of the `wanted` stamps (ns) may be left out.
         """
-        begin, end = self._start + first, self._start + min(end, self.count)
+        start = self._start
+        begin, end = start + first, min(start + end, len(self.stamps))
         if wanted is None:
             stamps, records = self.stamps[begin:end], self.records[begin * _SIZE : end * _SIZE]
             return stamps, 0, records, 0, 8, len(stamps)
@@ -241,8 +261,10 @@ def climb(steps: tuple[Step, ...], at: int) -> Row | None:
     if not steps:
         return IDENTITY
     first = True
+    step: Any
     for step in steps:
-        if isinstance(step, History):
+        # Not by `isinstance`, which takes longer.
+        if type(step) is not tuple:
             stamps = step.stamps
             i = bisect_left(stamps, at)
             try:
@@ -406,6 +428,34 @@ class Paths:
         sample._fields = target, source, stamp, row, "", False
         return sample
 
+    def answer_many(self, target: str, source: str, stamps: StampsLike) -> bytes | None:
+        """The answers at many stamps, if they need nothing but a path of `recent` that covers them all; else None.
+
+        Here only a few stamps have an answer; for more there is numpy, see `tfbus.tree._lookup_many`.
+
+        Returns
+        -------
+        bytes or None
+            Seven columns of floats, of shape (7, n), and behind them the stamps as int64.
+        """
+        if isinstance(stamps, np.ndarray) and stamps.size > ONE_BY_ONE:
+            return None
+        asked = as_stamps(stamps)
+        if not 0 < len(asked) <= ONE_BY_ONE:
+            return None
+        with self._lock:
+            by_source = self.recent.get(target)
+            chain = None if by_source is None else by_source.get(source)
+            if chain is None:
+                return None
+            instants = asked.tolist()
+            # Without a call in between, which takes longer.
+            rows = [climb(chain.up, at) for at in instants] if not chain.down else [chain.row(at) for at in instants]
+        if None in rows:
+            return None
+        columns: zip[Any] = zip(*rows, strict=True)
+        return array("d", chained.from_iterable(columns)).tobytes() + asked.tobytes()
+
     def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Batch) -> bool:
         """Store a batch if all of it continues its histories and there are no readers to be told; else do nothing.
 
@@ -437,3 +487,28 @@ def commit(frames: Mapping[str, History], batch: Batch, first: int) -> int:
         if history is None or static or not history.append(parent, stamp, row, authority):
             return i
     return len(batch)
+
+
+def compose_paths(rows: npt.NDArray[np.float64], origins: npt.NDArray[np.int64]) -> None:
+    """Replace each row, which is seen from the place of its origin, by the one that is seen from the first place.
+
+    Parameters
+    ----------
+    rows : contiguous array of shape (n, 7)
+    origins : int64 array of shape (n,)
+        The place of each origin, which comes before; 0 leaves a row as it is.
+
+    Raises
+    ------
+    ValueError
+        If an origin does not come before its row, or there is not one for each.
+    """
+    if len(rows) != len(origins):
+        raise ValueError("each row of seven floats needs an origin before it")
+    composed: list[Row] = list(map(tuple, rows.tolist()))
+    for place, origin in enumerate(origins.tolist()):
+        if origin and not 0 < origin < place:
+            raise ValueError("each row of seven floats needs an origin before it")
+        if origin:
+            composed[place] = compose(composed[origin], composed[place])
+    rows[:] = composed

@@ -7,7 +7,6 @@ frame may be reparented; parents and authorities are stored as runs of samples w
 
 from dataclasses import dataclass
 from enum import Enum
-from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -18,6 +17,9 @@ from tfbus.geometry.rows import IDENTITY, Row, interpolate
 from tfbus.stamps import SECOND, Latest, Stamps
 from tfbus.tree._kernel import Columns, History
 from tfbus.tree._runs import Runs
+
+_BLOCK = 64
+"""Up to this many samples for each stamp, all samples are copied at once, which is faster than to pick some."""
 
 
 class Outcome(Enum):
@@ -60,24 +62,27 @@ class Samples:
     ----------
     columns : Columns
         The memory of the samples.
-    parents, authorities : Runs
+    parents, authorities : Runs or None
     """
 
-    def __init__(self, columns: Columns, parents: Runs, authorities: Runs) -> None:
+    def __init__(self, columns: Columns, parents: Runs | None, authorities: Runs | None) -> None:
         self._columns = columns
         self._parents = parents
         self._authorities = authorities
+        self._stamps: Stamps | None = None
 
     def __len__(self) -> int:
         return self._columns[-1]
 
-    @cached_property
+    @property
     def stamps(self) -> Stamps:
         """ns, shape (n,)."""
-        memory, begin, _, _, _, count = self._columns
-        return np.frombuffer(memory, np.int64, count, begin) if count else np.empty(0, np.int64)
+        if self._stamps is None:
+            memory, begin, _, _, _, count = self._columns
+            self._stamps = np.frombuffer(memory, np.int64, count, begin) if count else np.empty(0, np.int64)
+        return self._stamps
 
-    @cached_property
+    @property
     def rows(self) -> npt.NDArray[np.float64]:
         """Shape (n, 7)."""
         _, _, memory, begin, width, count = self._columns
@@ -85,12 +90,12 @@ class Samples:
             return np.empty((0, 7))
         return np.frombuffer(memory, np.float64, width * count, begin).reshape(count, width)[:, -7:]
 
-    @cached_property
+    @property
     def parents(self) -> list[str] | None:
         """The parent of each sample; None if all have the same."""
         return self._parents.at_all(self.stamps) if self._parents else None
 
-    @cached_property
+    @property
     def authorities(self) -> list[str] | None:
         """The authority of each sample; None if all have the same."""
         return self._authorities.at_all(self.stamps) if self._authorities else None
@@ -281,11 +286,15 @@ class FrameHistory(History):
 
         Those that are next to none of the `wanted` stamps (ns) may be left out.
         """
-        first = self.find(low)
-        if first and (first == self.count or self.stamp(first) != low):
-            first -= 1
-        columns = self.columns(first, self.find(high) + 1, wanted)
-        return Samples(columns, self._parents.copy(), self._authorities.copy())
+        first, end = self.between(low, high)
+        if wanted is not None and end - first <= _BLOCK * len(wanted):
+            wanted = None
+        parents, authorities = self._parents, self._authorities
+        return Samples(
+            self.columns(first, end, wanted),
+            parents.copy() if parents else None,
+            authorities.copy() if authorities else None,
+        )
 
     def edge(self) -> Edge:
         """The newest edge as plain data."""
