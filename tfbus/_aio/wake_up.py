@@ -9,10 +9,10 @@ from tfbus._aio.loop_timer import running_loop
 
 
 def wake_up() -> tuple[Awaitable[None], Callable[[], object]]:
-    """What one task awaits, once, on the loop that runs now; and the function that ends the wait.
+    """A wait of one task on the loop that runs now, to be awaited once, and the function that ends it.
 
-    If the wait was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if
-    the wait has ended, or the event loop is closed.
+    If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
+    has ended, or the event loop is closed.
     """
     loop = running_loop()
     if hasattr(loop, "create_future"):
@@ -24,7 +24,7 @@ def wake_up() -> tuple[Awaitable[None], Callable[[], object]]:
 
 
 class _TrioWakeUp:
-    """The same on trio."""
+    """A wait of one task on trio."""
 
     __slots__ = ("_ended", "_task")
 
