@@ -34,7 +34,7 @@ async def publish_odometry(bus: tfbus.Bus) -> None:
 
 
 def scan_the_wall(start: float) -> tfbus.LaserScan:
-    """What the laser measures: for each ray the way to the wall, from where the robot is at that instant."""
+    """The scan that the laser measures: for each ray the way to the wall, from the robot's place at that instant."""
     first, step, period = -math.pi / 4, math.pi / 2 / (RAYS - 1), SWEEP / (RAYS - 1)
     times = start + period * np.arange(RAYS)
     directions = first + step * np.arange(RAYS) + TURN * times

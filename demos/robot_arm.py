@@ -20,7 +20,7 @@ LINE = "({:.3f}, {:.3f}, {:.3f}) in the base, after {:.0f} ms; by the closed for
 
 
 def positions(seconds: float) -> tuple[float, ...]:
-    """Where the seven joints are, in rad: four swing, and the last one goes round and round."""
+    """The positions of the seven joints, in rad: four swing, and the last one goes round and round."""
     swing = math.sin(2.0 * seconds)
     return 1.2 * swing, 0.4 * swing, 0.0, -0.9 * swing, 0.0, 0.8 * swing, 3.0 * seconds
 

@@ -1,4 +1,4 @@
-"""How the tests run: two suites, three event loops, two profiles of hypothesis.
+"""Two suites, three event loops and two profiles of hypothesis.
 
 ``pytest`` runs the default suite. ``pytest -m thorough`` runs the rest: the slow tests, which are marked `thorough`.
 ``pytest -m ""`` runs both. A test that is named (``pytest file.py::test``) runs, marked or not.
@@ -16,6 +16,7 @@ chooses otherwise.
 A test, or a file of tests, that needs an extra which is not installed is skipped with the name of the extra.
 """
 
+import gc
 import os
 import shutil
 import signal
@@ -92,6 +93,16 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     paths = [Path(argument.partition("::")[0]) for argument in config.args]
     alone = all(path.is_file() or path.name == "benchmarks" for path in paths)
     return 0 if alone else min(os.cpu_count() or 1, 4)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Spare the garbage collector all that is imported and collected: it would walk through it again in every test."""
+    gc.disable()
+    done = yield
+    gc.freeze()
+    gc.enable()
+    return done
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -3,6 +3,7 @@
 import doctest
 import importlib
 import inspect
+import re
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,9 @@ WITH_EXTRAS = {"tfbus.recording.load": "rosbags"}
 """Modules whose examples need an extra, and a package of it."""
 
 EXAMPLES = ["Bus", "Buffer", "Transform", "TransformArray", "TransformBroadcaster", "TransformTree", "do_transform"]
-"""What people call most, so that its docstring has an example."""
+"""The names that people use most: their docstrings have examples."""
+
+QUESTION = re.compile(r'^ *r?"""(?:What|Where|How|Who|Whom|Whose|Which|Why|When)(?:ever)?\b.*', re.MULTILINE)
 
 
 @pytest.fixture
@@ -69,3 +72,15 @@ def test_everything_public_has_a_docstring() -> None:
         if (inspect.isclass(thing) or inspect.isroutine(thing)) and not thing.__doc__:
             missing.append(name)
     assert missing == []
+
+
+def test_no_docstring_opens_with_a_question_word() -> None:
+    root = Path(__file__).parents[1]
+    paths = [
+        path
+        for folder in (Path(tfbus.__file__).parent, root / "tests", root / "demos")
+        for path in folder.rglob("*.py")
+    ]
+    assert len(paths) > 100
+    found = {str(path): QUESTION.findall(path.read_text(encoding="utf-8")) for path in paths}
+    assert {path: lines for path, lines in found.items() if lines} == {}

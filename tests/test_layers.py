@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -197,7 +198,27 @@ def test_no_import_hides_behind_type_checking() -> None:
 
 
 def test_no_module_has_more_than_300_lines_of_code() -> None:
-    assert [module for module in MODULES if code_lines(module) > 300] == []
+    long = [module for module in MODULES if SOURCES[module].read_text(encoding="utf-8").count("\n") > 300]
+    assert [module for module in long if code_lines(module) > 300] == []
+
+
+def options_of_dataclasses(module: str) -> Iterator[tuple[str, dict[str, object]]]:
+    """The name of each dataclass of a module, with the options that it is made with."""
+    for node in ast.walk(parsed(module)):
+        for decorator in node.decorator_list if isinstance(node, ast.ClassDef) else ():
+            if isinstance(decorator, ast.Call) and getattr(decorator.func, "id", "") == "dataclass":
+                options = {str(option.arg): getattr(option.value, "value", None) for option in decorator.keywords}
+                yield f"{module}.{node.name}", options
+
+
+def test_a_dataclass_has_slots_and_is_frozen_unless_it_is_an_inner_record() -> None:
+    found = dict(pair for module in MODULES for pair in options_of_dataclasses(module))
+    assert len(found) > 80
+    assert [name for name, options in found.items() if options.pop("slots", None) is not True] == []
+    mutable = [name for name, options in found.items() if options.get("frozen") is not True]
+    # It counts on while messages are converted.
+    assert [name for name in mutable if "._" not in name] == ["recording.convert.Conversion"]
+    assert all(options.get(name, False) is False for options in found.values() for name in ("init", "eq"))
 
 
 def test_every_door_says_what_its_room_is_for() -> None:

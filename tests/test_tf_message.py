@@ -239,7 +239,7 @@ def test_leading_slashes_are_removed_only_with_bare_names() -> None:
 
 
 def expected(part: Part, tag: tuple[str, bool], bare_names: bool) -> TransformStamped | InvalidTransformError:
-    """What the classes themselves make of the parts of a transform."""
+    """The transform that the classes themselves make of its parts."""
     try:
         if part.nanosec >= SECOND:
             raise InvalidTransformError("", reason="stamp")
@@ -253,7 +253,7 @@ def expected(part: Part, tag: tuple[str, bool], bare_names: bool) -> TransformSt
 
 
 def faults() -> st.SearchStrategy[set[str]]:
-    """What is wrong with a transform: mostly nothing, or one thing."""
+    """The fault of a transform: mostly none, or one."""
     fault = st.sampled_from(("name", "nanosec", "norm", "slightly", "number", "rotation", "zero", "huge"))
     return st.just(set()) | st.sets(fault, min_size=1, max_size=1) | st.sets(fault, max_size=3)
 

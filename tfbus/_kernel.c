@@ -36,7 +36,8 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 #define EXACT_GAP ((uint64_t)1 << 53) /* ns; beyond, a difference of stamps is no exact float, and Python divides */
 
 static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
-static PyObject *empty_string;
+static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType;
+static PyObject *empty_string, *raise_string, *drop_string;
 
 static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
@@ -811,6 +812,18 @@ history_newest(History *self, void *Py_UNUSED(closure))
 }
 
 static PyObject *
+history_newest_record(History *self, void *Py_UNUSED(closure))
+{
+    if (self->end == self->start) {
+        return PyBytes_FromStringAndSize(NULL, 0);
+    }
+    char record[sizeof(int64_t) + ROW_SIZE];
+    memcpy(record, block_stamps(self->block) + self->end - 1, sizeof(int64_t));
+    memcpy(record + sizeof(int64_t), block_rows(self->block) + WIDTH * (self->end - 1), ROW_SIZE);
+    return PyBytes_FromStringAndSize(record, sizeof record);
+}
+
+static PyObject *
 history_count(History *self, void *Py_UNUSED(closure))
 {
     return PyLong_FromSsize_t(self->end - self->start);
@@ -927,6 +940,8 @@ static PyGetSetDef history_getset[] = {
     {"count", (getter)history_count, NULL, PyDoc_STR("The number of samples in the window."), NULL},
     {"oldest", (getter)history_oldest, NULL, PyDoc_STR("The oldest stamp in the window, or None."), NULL},
     {"newest", (getter)history_newest, NULL, PyDoc_STR("The newest stamp, or None."), NULL},
+    {"newest_record", (getter)history_newest_record, NULL,
+     PyDoc_STR("The newest stamp and its row, 64 bytes; none if there is no moving sample."), NULL},
     {"horizon", (getter)history_horizon, NULL, PyDoc_STR("Samples before this stamp have left the window."), NULL},
     {NULL}
 };
@@ -2123,39 +2138,104 @@ static PyType_Spec edge_spec = {
     "tfbus._kernel.Edge", sizeof(Edge), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE, edge_slots
 };
 
-/* judge(edges, batch, horizon, square): whether all samples continue known edges, none is newer than the horizon and no
- * translation longer than the root of `square`; then their stamps are noted, else nothing. */
-static PyObject *
-judge(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+/* Judge: the plain judgement of a batch by the newest edges. */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *edges; /* {child: Edge} */
+    double square;   /* m^2 */
+    int64_t horizon; /* ns */
+} Judge;
+
+static int
+judge_traverse(Judge *self, visitproc visit, void *arg)
 {
-    int64_t horizon;
-    if (nargs != 4 || !PyDict_Check(args[0]) || !PyTuple_CheckExact(args[1])) {
-        PyErr_SetString(PyExc_TypeError, "judge takes a dict of edges, a tuple of samples, a stamp and a float");
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->edges);
+    return 0;
+}
+
+static int
+judge_clear(Judge *self)
+{
+    Py_CLEAR(self->edges);
+    return 0;
+}
+
+static void
+judge_dealloc(Judge *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    judge_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static int
+judge_init(Judge *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *edges;
+    double square;
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "Judge takes no keyword arguments");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "O!d:Judge", &PyDict_Type, &edges, &square)) {
+        return -1;
+    }
+    Py_INCREF(edges);
+    judge_clear(self);
+    self->edges = edges;
+    self->square = square;
+    self->horizon = INT64_MIN;
+    return 0;
+}
+
+static PyObject *
+judge_horizon(Judge *self, void *Py_UNUSED(closure))
+{
+    return PyLong_FromLongLong(self->horizon);
+}
+
+static int
+judge_set_horizon(Judge *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "a judge keeps its horizon");
+        return -1;
+    }
+    return read_stamp(value, &self->horizon);
+}
+
+/* accepts(batch): whether all samples continue known edges, none is newer than the horizon and no translation longer
+ * than the root of `square`; then their stamps are noted, else nothing. */
+static PyObject *
+judge_accepts(Judge *self, PyObject *batch)
+{
+    if (!PyTuple_CheckExact(batch)) {
+        PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
         return NULL;
     }
-    const double square = PyFloat_AsDouble(args[3]);
-    if (read_stamp(args[2], &horizon) < 0 || (square == -1.0 && PyErr_Occurred())) {
-        return NULL;
-    }
-    const Py_ssize_t size = PyTuple_Size(args[1]);
+    const Py_ssize_t size = PyTuple_Size(batch);
     Edge *few[FEW], **edges = few;
     if (size > FEW && (edges = PyMem_Malloc((size_t)size * sizeof(Edge *))) == NULL) {
         return PyErr_NoMemory();
     }
     Py_ssize_t judged = 0;
-    for (; judged < size; judged++) {
-        PyObject *item = PyTuple_GetItem(args[1], judged);
+    for (; self->edges != NULL && judged < size; judged++) {
+        PyObject *item = PyTuple_GetItem(batch, judged);
         const Sample *sample = (const Sample *)item;
         if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static
-            || sample->stamp > horizon) {
+            || sample->stamp > self->horizon) {
             break;
         }
         const double *row = sample->row;
         /* Not `>`, which is false for NaN. */
-        if (!(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] <= square)) {
+        if (!(row[0] * row[0] + row[1] * row[1] + row[2] * row[2] <= self->square)) {
             break;
         }
-        PyObject *known = PyDict_GetItemWithError(args[0], sample->child);
+        PyObject *known = PyDict_GetItemWithError(self->edges, sample->child);
         if (known == NULL || !PyObject_TypeCheck(known, EdgeType)) {
             break;
         }
@@ -2167,7 +2247,7 @@ judge(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
     }
     const int plain = judged == size;
     for (Py_ssize_t i = 0; plain && i < size; i++) {
-        const int64_t stamp = ((const Sample *)PyTuple_GetItem(args[1], i))->stamp;
+        const int64_t stamp = ((const Sample *)PyTuple_GetItem(batch, i))->stamp;
         if (!edges[i]->has_newest || stamp > edges[i]->newest) {
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
@@ -2182,14 +2262,671 @@ judge(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
     return PyBool_FromLong(plain);
 }
 
+static PyMethodDef judge_methods[] = {
+    {"accepts", (PyCFunction)judge_accepts, METH_O,
+     PyDoc_STR("accepts(batch): whether the whole batch is plain; then its stamps are noted.")},
+    {NULL}
+};
+
+static PyGetSetDef judge_getset[] = {
+    {"horizon", (getter)judge_horizon, (setter)judge_set_horizon, PyDoc_STR("No stamp may be newer, in ns."), NULL},
+    {NULL}
+};
+
+static PyType_Slot judge_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The plain judgement of batches by the newest edges of a bus.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, judge_init},
+    {Py_tp_dealloc, judge_dealloc},
+    {Py_tp_traverse, judge_traverse},
+    {Py_tp_clear, judge_clear},
+    {Py_tp_methods, judge_methods},
+    {Py_tp_getset, judge_getset},
+    {0, NULL}
+};
+
+static PyType_Spec judge_spec = {
+    "tfbus._kernel.Judge", sizeof(Judge), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC, judge_slots
+};
+
+/* Waiting: the plain insertion and its plain wake-ups ---------------------------------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *plain;   /* target, source and at of a plain question; None of another */
+    PyObject *wake;    /* called without arguments, once */
+    PyObject *place;   /* its place in a line, if it has one */
+    PyObject *answer;  /* that of whoever woke it */
+    long long version; /* of the paths, when they had this answer */
+    char elsewhere;    /* whether it is noted elsewhere than in a line and among all that are parked */
+} Parked;
+
+static int
+parked_traverse(Parked *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->plain);
+    Py_VISIT(self->wake);
+    Py_VISIT(self->place);
+    Py_VISIT(self->answer);
+    return 0;
+}
+
+static int
+parked_clear(Parked *self)
+{
+    Py_CLEAR(self->plain);
+    Py_CLEAR(self->wake);
+    Py_CLEAR(self->place);
+    Py_CLEAR(self->answer);
+    return 0;
+}
+
+static void
+parked_dealloc(Parked *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    parked_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyMemberDef parked_members[] = {
+    {"plain", T_OBJECT, offsetof(Parked, plain), 0, PyDoc_STR("Target, source and at of a plain question, or None.")},
+    {"wake", T_OBJECT, offsetof(Parked, wake), 0, PyDoc_STR("Called once, after it was taken out of its line.")},
+    {"place", T_OBJECT, offsetof(Parked, place), 0, PyDoc_STR("Its place in a line, or None.")},
+    {"answer", T_OBJECT, offsetof(Parked, answer), 0, PyDoc_STR("The answer that whoever woke it has found, or None.")},
+    {"version", T_LONGLONG, offsetof(Parked, version), 0, PyDoc_STR("That of the paths which had this answer.")},
+    {"elsewhere", T_BOOL, offsetof(Parked, elsewhere), 0, PyDoc_STR("Whether more than its line has to forget it.")},
+    {NULL}
+};
+
+static PyType_Slot parked_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The part of a parked lookup by which it is woken.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_dealloc, parked_dealloc},
+    {Py_tp_traverse, parked_traverse},
+    {Py_tp_clear, parked_clear},
+    {Py_tp_members, parked_members},
+    {0, NULL}
+};
+
+static PyType_Spec parked_spec = {
+    "tfbus._kernel.Parked", sizeof(Parked), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC,
+    parked_slots
+};
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *places;  /* list of (-stamp, -order, Parked), sorted: the next due is the last */
+    PyObject *for_any; /* dict of those that any sample wakes */
+    PyObject *limits;  /* list of (-stamp, -order, Parked), sorted */
+} Line;
+
+static int
+line_traverse(Line *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->places);
+    Py_VISIT(self->for_any);
+    Py_VISIT(self->limits);
+    return 0;
+}
+
+static int
+line_clear(Line *self)
+{
+    Py_CLEAR(self->places);
+    Py_CLEAR(self->for_any);
+    Py_CLEAR(self->limits);
+    return 0;
+}
+
+static void
+line_dealloc(Line *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    line_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static int
+line_init(Line *self, PyObject *Py_UNUSED(args), PyObject *Py_UNUSED(kwargs))
+{
+    line_clear(self);
+    self->places = PyList_New(0);
+    self->for_any = PyDict_New();
+    self->limits = PyList_New(0);
+    return self->places == NULL || self->for_any == NULL || self->limits == NULL ? -1 : 0;
+}
+
+static int
+line_has_places_only(const Line *self)
+{
+    return self->places != NULL && PyDict_Size(self->for_any) == 0 && PyList_Size(self->limits) == 0;
+}
+
+static PyMemberDef line_members[] = {
+    {"places", T_OBJECT_EX, offsetof(Line, places), READONLY, PyDoc_STR("Those that need a stamp, the next due last.")},
+    {"for_any", T_OBJECT_EX, offsetof(Line, for_any), READONLY, PyDoc_STR("Those that any sample wakes.")},
+    {"limits", T_OBJECT_EX, offsetof(Line, limits), READONLY, PyDoc_STR("Those that a newer stamp wakes.")},
+    {NULL}
+};
+
+static PyType_Slot line_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The parked lookups under one frame.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, line_init},
+    {Py_tp_dealloc, line_dealloc},
+    {Py_tp_traverse, line_traverse},
+    {Py_tp_clear, line_clear},
+    {Py_tp_members, line_members},
+    {0, NULL}
+};
+
+static PyType_Spec line_spec = {
+    "tfbus._kernel.Line", sizeof(Line), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, line_slots
+};
+
+enum { PATHS, FRAMES, READERS, LINES, PARKED, LIMITS, WATCHES, FORGET, PARTS };
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *parts[PARTS];
+} Feed;
+
+static int
+feed_traverse(Feed *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    for (int i = 0; i < PARTS; i++) {
+        Py_VISIT(self->parts[i]);
+    }
+    return 0;
+}
+
+static int
+feed_clear(Feed *self)
+{
+    for (int i = 0; i < PARTS; i++) {
+        Py_CLEAR(self->parts[i]);
+    }
+    return 0;
+}
+
+static void
+feed_dealloc(Feed *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    feed_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static int
+feed_init(Feed *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *parts[PARTS];
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "Feed takes no keyword arguments");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "O!O!O!O!O!O!O!O:Feed", PathsType, &parts[PATHS], &PyDict_Type, &parts[FRAMES],
+                          &PyDict_Type, &parts[READERS], &PyDict_Type, &parts[LINES], &PyDict_Type, &parts[PARKED],
+                          &PyList_Type, &parts[LIMITS], &PyDict_Type, &parts[WATCHES], &parts[FORGET])) {
+        return -1;
+    }
+    feed_clear(self);
+    for (int i = 0; i < PARTS; i++) {
+        Py_INCREF(parts[i]);
+        self->parts[i] = parts[i];
+    }
+    return 0;
+}
+
+/* Whether a stamp is at a place, or beyond it; -1 for an error. */
+static int
+is_reached(PyObject *place, int64_t stamp)
+{
+    if (!PyTuple_CheckExact(place) || PyTuple_Size(place) != 3) {
+        PyErr_SetString(PyExc_TypeError, "a place is a tuple of three");
+        return -1;
+    }
+    int overflow;
+    const long long negative = PyLong_AsLongLongAndOverflow(PyTuple_GetItem(place, 0), &overflow);
+    if (negative == -1 && !overflow && PyErr_Occurred()) {
+        return -1;
+    }
+    /* The negative of the least stamp is too great, and every stamp has reached that. */
+    return overflow > 0 || (overflow == 0 && (stamp != INT64_MIN && negative >= -stamp));
+}
+
+/* Whether the wake-ups of a batch are plain: nobody watches its frames or waits for them but those that need a stamp, and
+ * no sample has passed the first limit. -1 for an error. */
+static int
+feed_is_plain(const Feed *self, PyObject *batch)
+{
+    PyObject *lines = self->parts[LINES], *limits = self->parts[LIMITS];
+    const Py_ssize_t size = PyTuple_Size(batch), limited = PyList_Size(limits);
+    for (Py_ssize_t i = 0; i < size; i++) {
+        PyObject *item = PyTuple_GetItem(batch, i);
+        const Sample *sample = (const Sample *)item;
+        if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL) {
+            return 0;
+        }
+        if (limited > 0) {
+            const int reached = sample->stamp == INT64_MIN
+                ? 0 : is_reached(PyList_GetItem(limits, limited - 1), sample->stamp - 1);
+            if (reached != 0) {
+                return reached < 0 ? -1 : 0;
+            }
+        }
+        const int watched = PyDict_Contains(self->parts[WATCHES], sample->child);
+        if (watched != 0) {
+            return watched < 0 ? -1 : 0;
+        }
+        PyObject *line = PyDict_GetItemWithError(lines, sample->child);
+        if (line == NULL) {
+            if (PyErr_Occurred()) {
+                return -1;
+            }
+        } else if (!PyObject_TypeCheck(line, LineType) || !line_has_places_only((Line *)line)) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* Wake those that a sample at a stamp has unblocked, each with its answer if that is plain. */
+static int
+feed_wake(Feed *self, PyObject *child, int64_t stamp)
+{
+    PyObject *lines = self->parts[LINES];
+    for (;;) {
+        /* Looked up each time, because to wake is to run the code of an event loop. */
+        PyObject *known = PyDict_GetItemWithError(lines, child);
+        if (known == NULL || !PyObject_TypeCheck(known, LineType)) {
+            return PyErr_Occurred() ? -1 : 0;
+        }
+        Line *line = (Line *)known;
+        const Py_ssize_t last = line->places == NULL ? -1 : PyList_Size(line->places) - 1;
+        if (last < 0) {
+            return 0;
+        }
+        PyObject *place = PyList_GetItem(line->places, last);
+        const int reached = is_reached(place, stamp);
+        if (reached <= 0) {
+            return reached;
+        }
+        PyObject *item = PyTuple_GetItem(place, 2);
+        if (!PyObject_TypeCheck(item, ParkedType)) {
+            PyErr_SetString(PyExc_TypeError, "only what is parked has a place");
+            return -1;
+        }
+        Parked *waiter = (Parked *)item;
+        Py_INCREF(item);
+        /* The place refers to the waiter. */
+        PyObject *own = waiter->place;
+        waiter->place = NULL;
+        Py_XDECREF(own);
+        int failed = PyList_SetSlice(line->places, last, last + 1, NULL) < 0
+            || (last == 0 && line_has_places_only(line) && PyDict_DelItem(lines, child) < 0);
+        if (!failed && waiter->elsewhere) {
+            PyObject *done = PyObject_CallFunctionObjArgs(self->parts[FORGET], item, NULL);
+            failed = done == NULL;
+            Py_XDECREF(done);
+        } else if (!failed) {
+            failed = PyDict_DelItem(self->parts[PARKED], item) < 0;
+        }
+        if (failed) {
+            Py_DECREF(item);
+            return -1;
+        }
+        if (waiter->plain != NULL && PyTuple_CheckExact(waiter->plain) && PyTuple_Size(waiter->plain) == 3) {
+            Paths *paths = (Paths *)self->parts[PATHS];
+            PyObject *asked[3] = {
+                PyTuple_GetItem(waiter->plain, 0), PyTuple_GetItem(waiter->plain, 1), PyTuple_GetItem(waiter->plain, 2)
+            };
+            PyObject *old = waiter->answer;
+            waiter->answer = paths_answer(paths, asked, 3);
+            waiter->version = paths->version;
+            Py_XDECREF(old);
+            if (waiter->answer == NULL) {
+                /* Out of memory: then it asks itself. */
+                PyErr_Clear();
+            }
+        }
+        PyObject *woken = waiter->wake == NULL ? NULL : PyObject_CallNoArgs(waiter->wake);
+        if (woken == NULL && PyErr_Occurred()) {
+            if (!PyErr_ExceptionMatches(PyExc_Exception)) {
+                Py_DECREF(item);
+                return -1;
+            }
+            /* Its wait was cancelled, or its event loop is gone. The others must be woken all the same. */
+            PyErr_Clear();
+        }
+        Py_XDECREF(woken);
+        Py_DECREF(item);
+    }
+}
+
+/* insert(batch): store a batch and wake those that it has unblocked, if all of that is plain; else do nothing. */
+static PyObject *
+feed_insert(Feed *self, PyObject *batch)
+{
+    if (!PyTuple_CheckExact(batch)) {
+        PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
+        return NULL;
+    }
+    if (self->parts[PATHS] == NULL) {
+        Py_RETURN_FALSE;
+    }
+    const int waits = PyDict_Size(self->parts[LINES]) > 0 || PyDict_Size(self->parts[WATCHES]) > 0
+        || PyList_Size(self->parts[LIMITS]) > 0;
+    const int plain = waits ? feed_is_plain(self, batch) : 1;
+    if (plain <= 0) {
+        return plain < 0 ? NULL : PyBool_FromLong(0);
+    }
+    PyObject *args[] = {self->parts[FRAMES], self->parts[READERS], batch};
+    PyObject *stored = paths_commit((Paths *)self->parts[PATHS], args, 3);
+    if (stored != Py_True || !waits) {
+        return stored;
+    }
+    const Py_ssize_t size = PyTuple_Size(batch);
+    for (Py_ssize_t i = 0; i < size; i++) {
+        const Sample *sample = (const Sample *)PyTuple_GetItem(batch, i);
+        if (feed_wake(self, sample->child, sample->stamp) < 0) {
+            Py_DECREF(stored);
+            return NULL;
+        }
+    }
+    return stored;
+}
+
+static PyMethodDef feed_methods[] = {
+    {"insert", (PyCFunction)feed_insert, METH_O,
+     PyDoc_STR("insert(batch): store a batch and wake those that it has unblocked, if all of it is plain; else do "
+               "nothing.")},
+    {NULL}
+};
+
+static PyType_Slot feed_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The plain insertion of batches, with the plain wake-ups.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, feed_init},
+    {Py_tp_dealloc, feed_dealloc},
+    {Py_tp_traverse, feed_traverse},
+    {Py_tp_clear, feed_clear},
+    {Py_tp_methods, feed_methods},
+    {0, NULL}
+};
+
+static PyType_Spec feed_spec = {
+    "tfbus._kernel.Feed", sizeof(Feed), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC, feed_slots
+};
+
+/* Intake: the plain publishing ---------------------------------------------------------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    PyObject *judge;      /* Judge */
+    PyObject *kind;       /* the class of samples */
+    PyObject *listeners;  /* a tuple of containers; whatever is in one has to hear of each batch */
+    PyObject *feeds;      /* a tuple of (Feed, callable that takes a batch which is not plain) */
+    long long samples;    /* how many were taken */
+    unsigned long thread; /* the only one that may publish */
+    char open;
+} Intake;
+
+static int
+intake_traverse(Intake *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->judge);
+    Py_VISIT(self->kind);
+    Py_VISIT(self->listeners);
+    Py_VISIT(self->feeds);
+    return 0;
+}
+
+static int
+intake_clear(Intake *self)
+{
+    Py_CLEAR(self->judge);
+    Py_CLEAR(self->kind);
+    Py_CLEAR(self->listeners);
+    Py_CLEAR(self->feeds);
+    return 0;
+}
+
+static void
+intake_dealloc(Intake *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    intake_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static int
+intake_init(Intake *self, PyObject *args, PyObject *kwargs)
+{
+    PyObject *judge, *kind, *listeners;
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "Intake takes no keyword arguments");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type, &listeners)) {
+        return -1;
+    }
+    PyObject *feeds = PyTuple_New(0);
+    if (feeds == NULL) {
+        return -1;
+    }
+    Py_INCREF(judge);
+    Py_INCREF(kind);
+    Py_INCREF(listeners);
+    intake_clear(self);
+    self->judge = judge;
+    self->kind = kind;
+    self->listeners = listeners;
+    self->feeds = feeds;
+    self->open = 1;
+    return 0;
+}
+
+/* A batch of samples of exactly the class; NULL without an error if it is anything else. */
+static PyObject *
+intake_batch(const Intake *self, PyObject *samples)
+{
+    if (OBJECT(Py_TYPE(samples)) == self->kind) {
+        return PyTuple_Pack(1, samples);
+    }
+    PyObject *batch = NULL;
+    if (PyList_CheckExact(samples)) {
+        batch = PyList_AsTuple(samples);
+    } else if (PyTuple_CheckExact(samples)) {
+        Py_INCREF(samples);
+        batch = samples;
+    }
+    const Py_ssize_t size = batch == NULL ? 0 : PyTuple_Size(batch);
+    for (Py_ssize_t i = 0; i < size; i++) {
+        if (OBJECT(Py_TYPE(PyTuple_GetItem(batch, i))) != self->kind) {
+            Py_DECREF(batch);
+            return NULL;
+        }
+    }
+    if (size == 0) {
+        Py_XDECREF(batch);
+        return NULL;
+    }
+    return batch;
+}
+
+/* take(samples, invalid): judge a batch and insert it into all buffers if it is plain and nobody else listens, else do
+ * nothing. */
+static PyObject *
+intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
+{
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "take takes samples and what to do with invalid ones");
+        return NULL;
+    }
+    if (!self->open || self->feeds == NULL || self->thread != PyThread_get_thread_ident()
+        || (args[1] != raise_string && args[1] != drop_string)) {
+        Py_RETURN_FALSE;
+    }
+    const Py_ssize_t containers = PyTuple_Size(self->listeners);
+    for (Py_ssize_t i = 0; i < containers; i++) {
+        const Py_ssize_t size = PyObject_Size(PyTuple_GetItem(self->listeners, i));
+        if (size != 0) {
+            return size < 0 ? NULL : PyBool_FromLong(0);
+        }
+    }
+    PyObject *batch = intake_batch(self, args[0]);
+    if (batch == NULL) {
+        return PyErr_Occurred() ? NULL : PyBool_FromLong(0);
+    }
+    PyObject *accepted = judge_accepts((Judge *)self->judge, batch);
+    if (accepted != Py_True) {
+        Py_DECREF(batch);
+        return accepted;
+    }
+    self->samples += PyTuple_Size(batch);
+    PyObject *feeds = self->feeds;
+    Py_INCREF(feeds);
+    const Py_ssize_t count = PyTuple_Size(feeds);
+    int failed = 0;
+    for (Py_ssize_t i = 0; !failed && i < count; i++) {
+        PyObject *pair = PyTuple_GetItem(feeds, i), *feed, *insert;
+        failed = !PyArg_ParseTuple(pair, "O!O", FeedType, &feed, &insert);
+        PyObject *done = failed ? NULL : feed_insert((Feed *)feed, batch);
+        if (done == Py_False) {
+            Py_DECREF(done);
+            done = PyObject_CallFunctionObjArgs(insert, batch, NULL);
+        }
+        failed = done == NULL;
+        Py_XDECREF(done);
+    }
+    Py_DECREF(feeds);
+    Py_DECREF(batch);
+    if (failed) {
+        Py_DECREF(accepted);
+        return NULL;
+    }
+    return accepted;
+}
+
+static PyObject *
+intake_feeds(Intake *self, void *Py_UNUSED(closure))
+{
+    PyObject *feeds = self->feeds == NULL ? Py_None : self->feeds;
+    Py_INCREF(feeds);
+    return feeds;
+}
+
+static int
+intake_set_feeds(Intake *self, PyObject *value, void *Py_UNUSED(closure))
+{
+    if (value == NULL || !PyTuple_CheckExact(value)) {
+        PyErr_SetString(PyExc_TypeError, "feeds must be a tuple");
+        return -1;
+    }
+    PyObject *old = self->feeds;
+    Py_INCREF(value);
+    self->feeds = value;
+    Py_XDECREF(old);
+    return 0;
+}
+
+static PyMethodDef intake_methods[] = {
+    {"take", FAST(intake_take), METH_FASTCALL,
+     PyDoc_STR("take(samples, invalid): judge a batch and insert it into all buffers if it is plain and nobody else "
+               "listens; else do nothing.")},
+    {NULL}
+};
+
+static PyGetSetDef intake_getset[] = {
+    {"feeds", (getter)intake_feeds, (setter)intake_set_feeds,
+     PyDoc_STR("A tuple of (Feed, callable that takes a batch which is not plain)."), NULL},
+    {NULL}
+};
+
+static PyMemberDef intake_members[] = {
+    {"samples", T_LONGLONG, offsetof(Intake, samples), 0, PyDoc_STR("The number of samples that were taken.")},
+    {"thread", T_ULONG, offsetof(Intake, thread), 0, PyDoc_STR("The only thread that may publish.")},
+    {"open", T_BOOL, offsetof(Intake, open), 0, PyDoc_STR("Whether anything is taken.")},
+    {NULL}
+};
+
+static PyType_Slot intake_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("The plain way of published samples into the buffers of a bus.")},
+    {Py_tp_new, PyType_GenericNew},
+    {Py_tp_init, intake_init},
+    {Py_tp_dealloc, intake_dealloc},
+    {Py_tp_traverse, intake_traverse},
+    {Py_tp_clear, intake_clear},
+    {Py_tp_methods, intake_methods},
+    {Py_tp_members, intake_members},
+    {Py_tp_getset, intake_getset},
+    {0, NULL}
+};
+
+static PyType_Spec intake_spec = {
+    "tfbus._kernel.Intake", sizeof(Intake), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC, intake_slots
+};
+
 /* The module -------------------------------------------------------------------------------------------------------- */
 
+static PyObject *
+compose_paths(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
+{
+    Py_buffer rows, origins;
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "compose_paths takes rows and origins");
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[0], &rows, PyBUF_WRITABLE) < 0) {
+        return NULL;
+    }
+    if (PyObject_GetBuffer(args[1], &origins, PyBUF_SIMPLE) < 0) {
+        PyBuffer_Release(&rows);
+        return NULL;
+    }
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = origins.len / size;
+    const int fits = origins.len % size == 0 && rows.len % (Py_ssize_t)ROW_SIZE == 0
+                     && rows.len / (Py_ssize_t)ROW_SIZE == count;
+    Py_ssize_t i = 0;
+    for (; fits && i < count; i++) {
+        const int64_t origin = ((const int64_t *)origins.buf)[i];
+        if (origin < 0 || (origin > 0 && origin >= i)) {
+            break;
+        }
+        if (origin > 0) {
+            double *row = (double *)rows.buf + WIDTH * i;
+            compose((const double *)rows.buf + WIDTH * origin, row, row);
+        }
+    }
+    PyBuffer_Release(&origins);
+    PyBuffer_Release(&rows);
+    if (!fits || i < count) {
+        PyErr_SetString(PyExc_ValueError, "each row of seven floats needs an origin before it");
+        return NULL;
+    }
+    Py_RETURN_NONE;
+}
+
 static PyMethodDef module_methods[] = {
+    {"compose_paths", FAST(compose_paths), METH_FASTCALL,
+     PyDoc_STR("compose_paths(rows, origins): make each row, seen from its origin, one seen from the first place.")},
     {"commit", FAST(commit), METH_FASTCALL,
      PyDoc_STR("commit(frames, batch, first): store the samples from `first` to the first that is not plain; its "
                "index.")},
-    {"judge", FAST(judge), METH_FASTCALL,
-     PyDoc_STR("judge(edges, batch, horizon, square): whether the whole batch is plain; then its stamps are noted.")},
     {NULL}
 };
 
@@ -2210,7 +2947,9 @@ module_exec(PyObject *module)
         PyErr_SetString(PyExc_ImportError, "the compiled kernel of tfbus runs in the main interpreter only");
         return -1;
     }
-    if (empty_string == NULL && (empty_string = PyUnicode_InternFromString("")) == NULL) {
+    if ((empty_string == NULL && (empty_string = PyUnicode_InternFromString("")) == NULL)
+        || (raise_string == NULL && (raise_string = PyUnicode_InternFromString("raise")) == NULL)
+        || (drop_string == NULL && (drop_string = PyUnicode_InternFromString("drop")) == NULL)) {
         return -1;
     }
     if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
@@ -2219,7 +2958,10 @@ module_exec(PyObject *module)
         || add_type(module, "Chain", &chain_spec, &ChainType) < 0
         || add_type(module, "Held", &held_spec, &HeldType) < 0
         || add_type(module, "Paths", &paths_spec, &PathsType) < 0
-        || add_type(module, "Edge", &edge_spec, &EdgeType) < 0) {
+        || add_type(module, "Edge", &edge_spec, &EdgeType) < 0 || add_type(module, "Judge", &judge_spec, &JudgeType) < 0
+        || add_type(module, "Parked", &parked_spec, &ParkedType) < 0
+        || add_type(module, "Line", &line_spec, &LineType) < 0 || add_type(module, "Feed", &feed_spec, &FeedType) < 0
+        || add_type(module, "Intake", &intake_spec, &IntakeType) < 0) {
         return -1;
     }
     return 0;

@@ -1,6 +1,8 @@
 """The compiled kernel. Its Python twins say what each class does.
 
-They are `tfbus.geometry._python_sample` for `Sample`, and `tfbus.tree._python_kernel` for the rest.
+They are `tfbus.geometry._python_sample` for `Sample`, `tfbus.bus._python_judge` for `Edge` and `Judge`,
+`tfbus.bus._python_intake` for `Intake`, `tfbus.waiting._python_feed` for `Parked`, `Line` and `Feed`, and
+`tfbus.tree._python_kernel` for the rest.
 """
 
 from collections.abc import Mapping
@@ -39,6 +41,8 @@ class History:
     def oldest(self) -> int | None: ...
     @property
     def newest(self) -> int | None: ...
+    @property
+    def newest_record(self) -> bytes: ...
     @property
     def horizon(self) -> int: ...
     def append(self, parent: str, stamp: int, row: Row, authority: str, /) -> bool: ...
@@ -81,5 +85,49 @@ class Edge:
     trusted: str | None
     newest: int | None
 
-def judge(edges: Mapping[str, Edge], batch: tuple[Sample, ...], horizon: int, square: float, /) -> bool: ...
+class Judge:
+    horizon: int
+    def __init__(self, edges: Mapping[str, Edge], square: float, /) -> None: ...
+    def accepts(self, batch: tuple[Sample, ...], /) -> bool: ...
+
+class Parked:
+    answer: Any
+    elsewhere: bool
+    place: Any
+    plain: tuple[str, str, Any] | None
+    version: int
+    wake: Any
+
+class Line:
+    @property
+    def places(self) -> list[Any]: ...
+    @property
+    def for_any(self) -> dict[Any, None]: ...
+    @property
+    def limits(self) -> list[Any]: ...
+
+class Feed:
+    def __init__(
+        self,
+        paths: Paths,
+        frames: Mapping[str, History],
+        readers: Mapping[int, Any],
+        lines: Mapping[str, Line],
+        parked: Mapping[Any, None],
+        limits: list[Any],
+        watches: Mapping[str, Any],
+        forget: Any,
+        /,
+    ) -> None: ...
+    def insert(self, batch: tuple[Sample, ...], /) -> bool: ...
+
+class Intake:
+    feeds: tuple[tuple[Any, Any], ...]
+    open: bool
+    samples: int
+    thread: int
+    def __init__(self, judge: Judge, kind: type[Sample], listeners: tuple[Any, ...], /) -> None: ...
+    def take(self, samples: object, invalid: object, /) -> bool: ...
+
 def commit(frames: Mapping[str, History], batch: tuple[Sample, ...], first: int, /) -> int: ...
+def compose_paths(rows: Any, origins: Any, /) -> None: ...

@@ -72,7 +72,11 @@ class Ticks:
 
 
 class Clock(Protocol):
-    """The protocol of clocks: now, sleeping, ticks, timeouts and jumps."""
+    """The protocol of clocks: now, sleeping, ticks, timeouts and jumps.
+
+    A buffer sets one timer of the event loop for all its waiting lookups on a `SystemClock`, and uses `call_after` of a
+    `SimulatedClock`. On any other clock, a class derived from these included, each wait has its `move_on_after`.
+    """
 
     def now(self) -> int:
         """The current stamp, in ns."""
@@ -232,7 +236,11 @@ class SimulatedClock:
                 self._stop_timer(timer)
 
     def call_after(self, seconds: float, callback: Callable[[], object]) -> Registration:
-        """Call `callback` once, after a simulated duration in s, unless the registration is closed before."""
+        """Call `callback` once, after a simulated duration in s, unless the registration is closed before.
+
+        The timeouts of waiting lookups are such calls. `advance` makes the call between two runs of the tasks; it
+        raises what the call raises.
+        """
         duration = as_duration(seconds, "seconds")
         if duration * SECOND >= STAMP_MAX:
             return Registration(lambda: None)

@@ -113,7 +113,7 @@ numpydoc_xref_aliases = BARE
 
 
 def words() -> Iterator[str]:
-    """What docstrings may call by its bare name: every argument and attribute of something public."""
+    """The words that docstrings may name without a reference: every argument and attribute of something public."""
     for name in NAMES.values():
         thing = find(name)
         members = [member for key, member in inspect.getmembers(thing) if not key.startswith("_") or key == "__init__"]
@@ -143,7 +143,7 @@ WORDS = frozenset(words())
 
 
 def resolve(app: Sphinx, env: BuildEnvironment, node: pending_xref, content: TextElement) -> Element | None:
-    """What the reference has under another name, or what is no reference at all.
+    """The targets that the reference has under another name, or not at all.
 
     Annotations have names from inner modules, such as ``tfbus.stamps.Latest``: they are found by identity. Docstrings
     of one import path name what is in another, such as `SimulatedClock` in ``tfbus.testing``. Arguments and attributes

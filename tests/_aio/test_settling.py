@@ -20,7 +20,7 @@ only_asyncio = pytest.mark.parametrize("anyio_backend", ASYNCIO)
 
 
 class Log:
-    """What has been set off, and whether all of it has come to its end."""
+    """Tasks that have been set off, and whether all of them have ended."""
 
     def __init__(self) -> None:
         self.ended = 0
@@ -176,7 +176,7 @@ async def test_two_tasks_may_settle_at_once() -> None:
 
 @types.coroutine
 def turns_of(call: Awaitable[None]) -> Generator[Any, Any, int]:
-    """How often a call gives way to the loop."""
+    """The number of times that a call gives way to the loop."""
     steps = call.__await__()
     turns = 0
     while True:

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from contextlib import suppress
 
 import anyio
 import anyio.lowlevel
@@ -56,6 +57,29 @@ async def test_a_cancelled_wait_may_be_ended() -> None:
     assert waiting.ended == "cancelled"
     waiting.woken.end()
     await settle()
+
+
+async def test_the_faster_way_ends_the_wait_and_does_no_harm_afterwards() -> None:
+    woken, cancelled = Waiting(), Waiting()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(woken.run)
+        await settle()
+        woken.woken.wake()
+        for _ in range(2):
+            with suppress(Exception):
+                woken.woken.wake()
+            woken.woken.end()
+            await settle()
+        assert woken.ended == "woken"
+        tasks.start_soon(cancelled.run)
+        await settle()
+        tasks.cancel_scope.cancel()
+        with suppress(Exception):
+            cancelled.woken.wake()
+    assert cancelled.ended in ("cancelled", "woken")
+    with suppress(Exception):
+        cancelled.woken.wake()
+    await anyio.lowlevel.checkpoint()
 
 
 @pytest.mark.parametrize("end_first", [True, False])

@@ -1,4 +1,4 @@
-"""What the benchmarks share: the table that they fill, and our side of the cases."""
+"""The table that all benchmarks fill, and our side of the cases."""
 
 import os
 import platform
@@ -19,7 +19,7 @@ Ask = Callable[[Case], tuple[float, Vector]]
 
 
 class Table:
-    """What was measured, shown at the end of the run."""
+    """The measurements, shown at the end of the run."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -49,7 +49,7 @@ def show(rounds: list[float], unit: str) -> str:
 
 
 def conditions() -> str:
-    """What the times depend on besides the code."""
+    """The versions and the machine that the times depend on."""
     packages = [f"{name} {version_of(name)}" for name in ("numpy", "transform-tree", "pytransform3d")]
     threads = os.environ.get("OPENBLAS_NUM_THREADS", "not set")
     machine = f"{os.cpu_count()} cores ({platform.machine()}), OPENBLAS_NUM_THREADS {threads}"

@@ -1,4 +1,4 @@
-"""What both sides measure: the same cases, on the same data from the same seed.
+"""The cases that both sides measure, on the same data from the same seed.
 
 Standard library only, because `tf2_peer.py` imports this under the system's Python.
 """

@@ -1,4 +1,4 @@
-"""How late an event loop is."""
+"""The lag of an event loop."""
 
 from time import perf_counter
 
@@ -8,7 +8,7 @@ PROBE = 0.001
 
 
 async def probe(lags: list[float]) -> None:
-    """How much later than it asked for a task that sleeps is woken."""
+    """The seconds by which a task that sleeps is woken too late."""
     while True:
         due = perf_counter() + PROBE
         await anyio.sleep(PROBE)

@@ -273,7 +273,7 @@ def test_one_transform_for_all_points(benchmark: Any, table: Table) -> None:
 @pytest.mark.parametrize("form", ["list", "array"])
 @pytest.mark.parametrize("edges", [1, 3, 10])
 def test_a_handful_of_stamps(benchmark: Any, table: Table, edges: int, form: str) -> None:
-    """Where one call of numpy costs as much as several lookups: here `lookup_many` must not be the slower way."""
+    """So few stamps that one call of numpy costs as much as several lookups: `lookup_many` must not be slower."""
     chain = "m" * edges
     tree, source, stamps = tree_of(chain), last_of(chain), cases.questions("few")
     handfuls = [stamps[i : i + HANDFUL] for i in range(0, len(stamps), HANDFUL)]

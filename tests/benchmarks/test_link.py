@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from beside import Table
+from presence import measure
 from support.processes import Crowd, PeerProcess, crowd, free_ports, new_domain
 
 pytest_plugins = ["side_by_side"]
@@ -112,6 +113,12 @@ def test_memory(table: Table, processes: Crowd) -> None:
     before, imported, linked = json.loads(done.stdout)
     parts = f"{imported - before:.1f} for its modules, {linked - imported:.1f} for itself; before {before:.1f}"
     table.add("memory that a link adds", f"{linked - before:.1f} MB", parts, "", "<= 15 MB")
+
+
+def test_presence_at_rest(table: Table) -> None:
+    links, bare, routed = measure(settle=60.0), measure(settle=60.0, bare=True), measure(settle=60.0, router=True)
+    floor = f"bare zenoh {bare:.2%}, behind a router {routed:.2%}"
+    table.add("of a core for 50 peers that rest", f"{links:.2%}", floor, f"{links / bare:.2f}", "0.5 % more")
 
 
 def test_late_joiner(table: Table, processes: Crowd) -> None:

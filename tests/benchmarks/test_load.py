@@ -1,4 +1,4 @@
-"""How late the event loop is while a whole robot's worth of tasks is on it."""
+"""The lag of the event loop while the tasks of a whole robot run on it."""
 
 import math
 import random

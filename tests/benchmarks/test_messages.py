@@ -103,7 +103,7 @@ def test_decoding(benchmark: Any, table: Table, label: str, precise: bool, littl
 
 
 def test_decoding_names_that_are_always_new(table: Table) -> None:
-    """What a peer costs that makes up names: nothing of it can be remembered."""
+    """The cost of a peer that makes up names: nothing of it can be remembered."""
     rng = random.Random(4)
     payloads = [encode(robot(f"{rng.getrandbits(64):x} {{}}")) for _ in range(CALLS)]
     rounds: list[float] = []

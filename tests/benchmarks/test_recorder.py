@@ -1,4 +1,4 @@
-"""How much later the event loop is while a busy bus is recorded, with and without in turns."""
+"""The lag of the event loop while a busy bus is recorded, with and without in turns."""
 
 from collections.abc import Awaitable, Callable
 from pathlib import Path

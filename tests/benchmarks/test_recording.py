@@ -1,4 +1,4 @@
-"""How fast a recording is read, and what ``tfbus info`` takes on a large one."""
+"""The speed at which a recording is read, and the time and memory of ``tfbus info`` on a large one."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""What simulated time costs: one timed task that wakes and sleeps again, among many others."""
+"""The cost of simulated time: one timed task that wakes and sleeps again, among many others."""
 
 from time import process_time
 

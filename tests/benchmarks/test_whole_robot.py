@@ -1,4 +1,4 @@
-"""What a whole robot costs, from a message of its joints to transforms that are inserted in one buffer."""
+"""The cost of a whole robot, from a message of its joints to transforms that are inserted in one buffer."""
 
 from collections.abc import Callable
 from time import perf_counter

@@ -14,7 +14,7 @@ from tfbus.buffer._alarms import LoopAlarms, _AlarmHeap, alarms_of
 
 
 class HandLoop:
-    """What a timer asks of an asyncio loop."""
+    """The part of an asyncio loop that a timer uses."""
 
     def __init__(self) -> None:
         self.now = 0.0

@@ -9,7 +9,7 @@ Run = Callable[[Callable[[], Awaitable[None]]], None]
 
 
 def in_thread(call: Callable[[], object]) -> BaseException | None:
-    """What a call raises in another thread."""
+    """The error that a call raises in another thread."""
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(call).exception()
 

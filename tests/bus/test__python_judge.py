@@ -1,4 +1,4 @@
-"""What both kernels judge plain, and the stamps that they note."""
+"""The samples that both kernels judge plain, and the stamps that they note."""
 
 import math
 from types import ModuleType
@@ -25,6 +25,14 @@ def edges(kernel: Any) -> dict[str, Any]:
     return made
 
 
+def judge(kernel: Any, edges: dict[str, Any], batch: Any, horizon: int, square: float) -> bool:
+    judge = kernel.Judge(edges, square)
+    assert judge.horizon == STAMP_MIN
+    judge.horizon = horizon
+    accepted: bool = judge.accepts(batch)
+    return accepted
+
+
 def sample(kernel: ModuleType, **changes: Any) -> Any:
     fields: dict[str, Any] = {"parent": "map", "child": "a", "stamp": 20, "x": 1.0, "authority": "me", "static": False}
     fields.update(changes)
@@ -39,11 +47,11 @@ def test_a_batch_that_continues_known_edges_is_plain_and_its_newest_stamps_are_n
     known = edges(kernel)
     known["b"].newest = None
     batch = (sample(kernel), sample(kernel, stamp=15), sample(kernel, child="b", stamp=-5), sample(kernel, stamp=30))
-    assert kernel.judge(known, batch, 30, 9.0)
+    assert judge(kernel, known, batch, 30, 9.0)
     assert [edge.newest for edge in known.values()] == [30, -5]
-    assert kernel.judge(known, (sample(kernel, stamp=7),), 30, math.inf)
+    assert judge(kernel, known, (sample(kernel, stamp=7),), 30, math.inf)
     assert known["a"].newest == 30
-    assert kernel.judge(known, (), 30, 9.0)
+    assert judge(kernel, known, (), 30, 9.0)
 
 
 @on_both
@@ -67,7 +75,7 @@ def test_one_sample_that_is_not_plain_leaves_every_edge_as_it_was(
     known = edges(kernel)
     plain = sample(kernel, child="b", stamp=min(30, horizon))
     for batch in ((plain, sample(kernel, **changes)), (sample(kernel, **changes), plain)):
-        assert not kernel.judge(known, batch, horizon, square)
+        assert not judge(kernel, known, batch, horizon, square)
         assert [edge.newest for edge in known.values()] == [10, 10]
 
 
@@ -76,13 +84,13 @@ def test_nobody_is_trusted_with_an_edge_that_trusts_nobody(kernel: Any) -> None:
     known = edges(kernel)
     known["a"].trusted = None
     assert known["a"].trusted is None
-    assert not kernel.judge(known, (sample(kernel),), STAMP_MAX, math.inf)
+    assert not judge(kernel, known, (sample(kernel),), STAMP_MAX, math.inf)
 
 
 @on_both
 def test_a_batch_of_any_size_is_judged(kernel: Any) -> None:
     known = edges(kernel)
-    assert kernel.judge(known, tuple(sample(kernel, stamp=stamp) for stamp in range(500)), STAMP_MAX, 9.0)
+    assert judge(kernel, known, tuple(sample(kernel, stamp=stamp) for stamp in range(500)), STAMP_MAX, 9.0)
     assert known["a"].newest == 499
 
 
@@ -91,10 +99,13 @@ def test_wrong_arguments_raise() -> None:
     kernel: Any = COMPILED
     edge = kernel.Edge()
     for call in (
-        lambda: kernel.judge({}, [], 0, 0.0),
-        lambda: kernel.judge({}, (), 0),
-        lambda: kernel.judge({}, (), "0", 0.0),
-        lambda: kernel.judge({}, (), 0, "0"),
+        lambda: judge(kernel, {}, [], 0, 0.0),
+        lambda: judge(kernel, {}, (), "0", 0.0),  # type: ignore[arg-type]
+        lambda: judge(kernel, {}, (), 0, "0"),  # type: ignore[arg-type]
+        lambda: kernel.Judge([], 0.0),
+        lambda: kernel.Judge({}),
+        lambda: kernel.Judge(edges={}, square=0.0),
+        lambda: delattr(kernel.Judge({}, 0.0), "horizon"),
         lambda: edge.parent,
         lambda: setattr(edge, "parent", 5),
         lambda: setattr(edge, "newest", "5"),
@@ -103,5 +114,5 @@ def test_wrong_arguments_raise() -> None:
     ):
         with pytest.raises((TypeError, AttributeError)):
             call()
-    assert not kernel.judge({"a": 5}, (sample(kernel),), STAMP_MAX, math.inf)
-    assert not kernel.judge({}, (5,), STAMP_MAX, math.inf)
+    assert not judge(kernel, {"a": 5}, (sample(kernel),), STAMP_MAX, math.inf)
+    assert not judge(kernel, {}, (5,), STAMP_MAX, math.inf)

@@ -22,7 +22,7 @@ class Known:
 
 
 class World:
-    """What a bus would know, and who watches it."""
+    """A stand-in for the frames of a bus, and for those who watch them."""
 
     def __init__(self) -> None:
         self.edges: dict[str, Known] = {}

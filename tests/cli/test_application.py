@@ -1,7 +1,5 @@
-"""The command line as a whole: summaries of commands that are not loaded, and the options that all of them share."""
+"""The options that all commands share."""
 
-import importlib
-import inspect
 import logging
 import re
 from pathlib import Path
@@ -10,23 +8,8 @@ import pytest
 from support.commands import Command, check_wrong_call, nobody
 
 from tfbus import Bus
-from tfbus.cli.application import COMMANDS, run
+from tfbus.cli._overview import COMMANDS
 from tfbus.cli.domain import LinkOptions
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_summary_of_a_command_is_the_first_line_of_its_help(name: str) -> None:
-    function = getattr(importlib.import_module(f"tfbus.cli.commands.{name}"), name)
-    assert (inspect.getdoc(function) or "").splitlines()[0].replace("`", "") == COMMANDS[name]
-
-
-def test_the_help_names_the_exit_statuses_and_the_variables_of_the_environment(tfbus: Command) -> None:
-    for words in ((), ("--help",), ("tree", "--help")):
-        done = tfbus(*words)
-        assert (done.returncode, done.stderr) == (0, "")
-        text = " ".join(done.stdout.split())
-        for fact in ("0 success", "1 a lookup", "2 wrong usage", "130", "143", "TFBUS_DOMAIN", "TFBUS_CONNECT"):
-            assert fact in text, fact
 
 
 def test_a_domain_and_addresses_come_from_the_environment_unless_they_are_given(
@@ -82,11 +65,3 @@ def test_completion_is_written_for_a_shell_with_all_commands(
     assert done.returncode == 0
     assert str(script) in (tmp_path / ".bashrc").read_text()
     assert set(COMMANDS) <= set(re.findall(r"\w+", script.read_text()))
-
-
-def test_what_the_caller_does_once_all_is_loaded_comes_before_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    steps: list[str] = []
-    monkeypatch.setattr(LinkOptions, "run", lambda *_, **__: steps.append("run"))
-    assert run(["listen"], lambda: steps.append("loaded")) == 0
-    assert run(["listen", "--no-such-option"], lambda: steps.append("loaded")) == 2
-    assert steps == ["loaded", "run"]

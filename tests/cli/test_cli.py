@@ -18,7 +18,8 @@ from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
 from tfbus import kernel
-from tfbus.cli.application import COMMANDS, application
+from tfbus.cli._overview import COMMANDS
+from tfbus.cli.application import application
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import LinkOptions
 from tfbus.errors import pip_install
@@ -160,7 +161,7 @@ def test_letters_that_the_output_cannot_encode_are_escaped(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("package", "arguments", "status", "message"),
     [
-        ("cyclopts", (), 1, f"the command needs some packages more: {pip_install('cli')}"),
+        ("cyclopts", ("tree",), 1, f"the command needs some packages more: {pip_install('cli')}"),
         ("zenoh", ("listen",), 2, f"joining a domain needs a package more: {pip_install('cli,zenoh')}"),
         (
             "mcap.writer",

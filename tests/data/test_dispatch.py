@@ -1,10 +1,11 @@
 import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, assert_type
 
 import numpy as np
 import pytest
 from hypothesis import given
+from support.ros_messages import Header, Point, PointMessage, Time
 from support.stamped_data import ANSWER, MOVABLE, POINTS, SCAN, arrays_of, contents, name_of, numbers
 from support.strategies import transforms
 
@@ -99,42 +100,15 @@ def test_a_program_can_register_its_own_type() -> None:
     assert moved.centre == pytest.approx((-9.0, 18.0, 27.0), abs=1e-13)
 
 
-@dataclass
-class Time:
-    sec: int = 0
-    nanosec: int = 0
-
-
-@dataclass
-class Header:
-    stamp: Time = field(default_factory=Time)
-    frame_id: str = ""
-
-
-@dataclass
-class Point:
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-
-
-@dataclass
-class RosPointStamped:
-    """As geometry_msgs/PointStamped is in rclpy: mutable, its frame and stamp in a header."""
-
-    header: Header
-    point: Point
-
-
 @do_transform.register
-def _(data: RosPointStamped, transform: TransformStamped) -> RosPointStamped:
+def _(data: PointMessage, transform: TransformStamped) -> PointMessage:
     p = data.point
     header = Header(Time(*divmod(transform.stamp, 1_000_000_000)), transform.parent)
-    return RosPointStamped(header, Point(*transform.transform.apply((p.x, p.y, p.z))))
+    return PointMessage(header, Point(*transform.transform.apply((p.x, p.y, p.z))))
 
 
 def test_a_message_of_ros_can_be_registered_although_its_frame_is_in_a_header() -> None:
-    message = RosPointStamped(Header(Time(2, 0), "B"), Point(1.0, 2.0, 3.0))
+    message = PointMessage(Header(Time(2, 0), "B"), Point(1.0, 2.0, 3.0))
     moved = do_transform(message, ANSWER)
     assert moved.header == Header(Time(2, 0), "A")
     assert (moved.point.x, moved.point.y, moved.point.z) == pytest.approx((-9.0, 18.0, 27.0), abs=1e-13)

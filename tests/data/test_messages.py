@@ -2,12 +2,12 @@ import math
 from array import array
 from base64 import b64encode
 from copy import deepcopy
-from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from support.ros_messages import Header, Point, PointMessage, Time
 
 from tfbus import (
     LATEST,
@@ -262,35 +262,10 @@ def test_a_cloud_without_a_message_to_be_like_has_its_fields_side_by_side() -> N
         to_message(cloud, like=cloud_fields(1))
 
 
-@dataclass
-class Stamp:
-    sec: int = 0
-    nanosec: int = 0
-
-
-@dataclass
-class Header:
-    stamp: Stamp = field(default_factory=Stamp)
-    frame_id: str = ""
-
-
-@dataclass
-class Point:
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-
-
-@dataclass
-class PointMessage:
-    header: Header = field(default_factory=Header)
-    point: Point = field(default_factory=Point)
-
-
 def test_a_type_of_messages_is_as_good_as_a_message() -> None:
     made = to_message(PointStamped("map", STAMP, (1.0, 2.0, 3.0)), like=PointMessage)
-    assert made == PointMessage(Header(Stamp(5, 7), "map"), Point(1.0, 2.0, 3.0))
-    assert PointMessage() == PointMessage(Header(Stamp(0, 0), ""), Point())
+    assert made == PointMessage(Header(Time(5, 7), "map"), Point(1.0, 2.0, 3.0))
+    assert PointMessage() == PointMessage(Header(Time(0, 0), ""), Point())
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What tfbus promises of errors and stamps, in the most obvious way: for questions that nobody wrote by hand.
+"""The promises of tfbus about errors and stamps, in the most obvious way: for questions that nobody wrote by hand.
 
 Where tf2's recorded answer is another one, the step gets the deviation that explains it. No transform is predicted.
 """
@@ -32,7 +32,7 @@ class Edge:
         return self.parents[max(before) if before else min(self.parents)]
 
     def error_at(self, at: int) -> str | None:
-        """Why it has no answer, if it has none."""
+        """The error of a question without an answer, else None."""
         if self.static:
             return None
         if not self.parents or at > max(self.parents):
@@ -140,7 +140,7 @@ def stamp_of_answer(
 
 
 def latest_stamp(edges: Edges, target: str, source: str) -> int | str | None:
-    """What LATEST means for two frames; None where nothing moves, or the error."""
+    """The stamp that LATEST means for two frames; None where nothing moves, or the error."""
     if not (_is_known(edges, target) and _is_known(edges, source)):
         return UNKNOWN
     if _path(edges, target, source, LATEST) is None:

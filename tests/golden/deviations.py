@@ -1,4 +1,4 @@
-"""Where tfbus does not do what Debian's tf2 does, and on whose word: the README's table says what each one does.
+"""The deviations of tfbus from Debian's tf2, each with its reason: the guide's table says what each side does.
 
 ``ros2`` means that ROS 1 and ROS 2 differ and tfbus does as ROS 2; ``design`` that neither is followed.
 """

@@ -70,7 +70,7 @@ def _insert(set_transform: Any, arguments: list[Any], authority: str = "golden")
 
 
 class _Log:
-    """What is written to stderr inside a `with`; tf2 writes there from C++."""
+    """The text that is written to stderr inside a `with`; tf2 writes there from C++."""
 
     def __enter__(self) -> "_Log":
         self._file = _LOG_FILE

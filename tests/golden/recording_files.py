@@ -16,7 +16,7 @@ def read(path: Path) -> list[Step]:
 
 
 def as_text(scenarios: list[Step]) -> str:
-    """What is written for one theme."""
+    """The content of the file of one theme."""
     return "[\n" + ",\n".join(map(_scenario, scenarios)) + "\n]\n"
 
 

@@ -1,4 +1,4 @@
-"""What is refused: invalid samples and invalid names in questions."""
+"""Invalid samples and invalid names in questions, which are refused."""
 
 import math
 

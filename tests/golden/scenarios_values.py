@@ -122,7 +122,7 @@ def _signs_along_a_path() -> Scenario:
 
 
 def _long_gap() -> Scenario:
-    """How far two samples are apart is never looked at."""
+    """The distance between two samples does not matter."""
     steps = [sample("a", "b", SECOND, 0.0), sample("a", "b", 10 * SECOND + 900_000_000, 99.0, _about_z(3.0))]
     return Scenario("long gap", [*steps, lookup("a", "b", 2 * SECOND), lookup("a", "b", 10 * SECOND)])
 

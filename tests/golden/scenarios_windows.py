@@ -1,4 +1,4 @@
-"""What each edge covers: extrapolation, cache length, order of insertion, repeated stamps."""
+"""The stamps that each edge covers: extrapolation, cache length, order of insertion, repeated stamps."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""What a scenario is made of: samples and questions, in order, each a small dict that JSON can hold.
+"""The steps of a scenario: samples and questions, in order, each a small dict that JSON can hold.
 
 A step's first key says what is done, its value holds the arguments. The recorder adds ``"tf2"``, the real answer.
 Where tfbus differs on purpose the step names the deviation and says what tfbus answers instead.
@@ -46,12 +46,12 @@ def _vector(translation: Numbers | float) -> list[float]:
 
 
 def lookup(target: str, source: str, at: Stamp = LATEST) -> Step:
-    """Where source is, seen from target."""
+    """A question for the pose of source, seen from target."""
     return {"lookup": [target, source, at]}
 
 
 def travel(target: str, source: str, at: Stamp, source_at: Stamp, fixed: str) -> Step:
-    """Where source was at its own stamp, seen from target at another, through a fixed frame."""
+    """A question for the pose of source at its own stamp, seen from target at another, through a fixed frame."""
     return {"lookup": [target, source, at, source_at, fixed]}
 
 
@@ -106,10 +106,10 @@ def deviates(step: Step, deviation: str, tfbus: Any) -> Step:
 
 
 def placed(stamp: int, translation: Numbers | float = 0.0, rotation: Numbers = UPRIGHT) -> list[Any]:
-    """What a lookup answers: a stamp and a transform."""
+    """The answer of a lookup: a stamp and a transform."""
     return [stamp, _vector(translation), list(rotation)]
 
 
 def verb_of(step: Step) -> str:
-    """What is done in a step."""
+    """The kind of a step."""
     return next(iter(step))

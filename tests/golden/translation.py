@@ -1,4 +1,4 @@
-"""What tfbus calls what tf2 answers; there is nothing for what tfbus has no counterpart of."""
+"""The names in tfbus of tf2's answers; those without a counterpart have none."""
 
 TRANSLATION = {
     "LookupException": "UnknownFrameError",

@@ -1,4 +1,4 @@
-"""What `convert` writes, read by npm's reader of MCAP, and answered from by the real tf2."""
+"""The files of `convert`, read by npm's reader of MCAP, and answered from by the real tf2."""
 
 import base64
 import json

@@ -197,7 +197,7 @@ async def test_what_the_camera_of_the_arm_sees_is_where_the_closed_form_puts_it(
 
 
 def arm_sees(seconds: float) -> tuple[float, float, float]:
-    """Where a thing 0.6 m ahead of the camera is, seen from the foot of the arm."""
+    """The position of a thing 0.6 m ahead of the camera, seen from the foot of the arm."""
     swing = math.sin(2.0 * seconds)
     pan, angles = 1.2 * swing, (0.4 * swing, (0.4 - 0.9) * swing, (0.4 - 0.9 + 0.8) * swing)
     parts = (0.4, 0.35, 0.1 + 0.05 + 0.6)

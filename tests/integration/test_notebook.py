@@ -30,7 +30,7 @@ class Kernel:
         self._client.wait_for_ready(timeout=PATIENCE)
 
     def run(self, cell: str) -> dict[str, Any]:
-        """What a cell displays for its last line, by kind."""
+        """The output that a cell displays for its last line, by kind."""
         shown: list[dict[str, Any]] = []
 
         def note(message: dict[str, Any]) -> None:

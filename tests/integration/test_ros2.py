@@ -21,6 +21,7 @@ import anyio.to_thread
 import pytest
 from support.both_sides import Program
 from support.processes import free_ports
+from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
 
 from tfbus import Buffer, Bus
 from tfbus.links.ros import RosLink
@@ -28,6 +29,7 @@ from tfbus.links.ros import RosLink
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
+ROBOT = PEER.with_name("ros2_robot.py")
 SECONDS = 10.0
 _next_domain = iter(range(100 + os.getpid() % 50, 200))
 
@@ -85,6 +87,19 @@ def rosbridge(domain: int) -> Iterator[str]:
         process.wait()
 
 
+async def answering(url: str) -> None:
+    """Wait until a rosbridge answers."""
+    from tfbus.links.rosbridge import RosbridgeLink
+
+    with anyio.fail_after(30), Bus() as bus:
+        while True:
+            try:
+                async with RosbridgeLink(bus, url, send=False, tf="/none", tf_static="/none_static"):
+                    return
+            except OSError:
+                await anyio.sleep(0.2)
+
+
 async def meet(link: RosLink, bus: Bus, domain: int) -> dict[str, Any]:
     """Have both sides broadcast and ask for ten seconds, and check the answers; returns the figures."""
     with Buffer(bus) as buffer:
@@ -138,14 +153,57 @@ async def test_rosbridge_both_ways_with_every_answer_right() -> None:
     domain = next(_next_domain)
     ros2_python()
     with rosbridge(domain) as url, Bus() as bus:
-        with anyio.fail_after(20):
-            while True:
-                try:
-                    async with RosbridgeLink(bus, url):
-                        break
-                except OSError:
-                    await anyio.sleep(0.2)
+        await answering(url)
         print(await meet(RosbridgeLink(bus, url), bus, domain))
+
+
+@contextmanager
+def robot(domain: int, folder: Path) -> Iterator[None]:
+    """A robot in ROS, described and moving."""
+    urdf = folder / "arm.urdf"
+    urdf.write_text(URDF)
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    process = subprocess.Popen([ros2_python(), str(ROBOT), str(urdf)], env=environment, stdout=subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"up\n"
+        yield
+    finally:
+        process.kill()
+        process.communicate()
+
+
+async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed_over_dds(tmp_path: Path) -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
+    from tfbus.links.dds import DdsLink
+
+    domain = next(_next_domain)
+
+    def link(bus: Bus, **options: Any) -> RosLink:
+        return DdsLink(bus, domain, **options)
+
+    with robot(domain, tmp_path):
+        await check_clock(link)
+        await check_description_and_joints(link)
+        await check_command(link, f"dds:{domain}")
+
+
+async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed_through_rosbridge(tmp_path: Path) -> None:
+    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
+    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
+    from tfbus.links.rosbridge import RosbridgeLink
+
+    domain = next(_next_domain)
+    with robot(domain, tmp_path), rosbridge(domain) as url:
+        await answering(url)
+
+        def link(bus: Bus, **options: Any) -> RosLink:
+            return RosbridgeLink(bus, url, **options)
+
+        await check_clock(link)
+        await check_description_and_joints(link)
+        await check_command(link, url)
 
 
 async def test_a_node_that_is_killed_is_lost_and_heard_again_when_it_is_back() -> None:

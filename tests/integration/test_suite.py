@@ -1,4 +1,4 @@
-"""What `tests/conftest.py` promises of every test: it ends in time, leaves no process behind, and needs no extra."""
+"""The promises of `tests/conftest.py` for every test: it ends in time, leaves no process behind, and needs no extra."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What commands draw on a real terminal fits its width, and keeps what matters."""
+"""The output of commands on a real terminal fits its width, and keeps the important columns."""
 
 from pathlib import Path
 

@@ -38,7 +38,7 @@ x, y, z = moved.point
 
 
 def faults(folder: Path, mode: str) -> list[Any]:
-    """What pyright reports on the programs in a folder."""
+    """The reports of pyright on the programs in a folder."""
     options = {"include": ["."], "typeCheckingMode": mode, "extraPaths": [str(ROOT)]}
     (folder / "pyrightconfig.json").write_text(json.dumps(options), encoding="utf-8")
     command = [sys.executable, "-m", "pyright", "-p", str(folder), "--pythonpath", sys.executable, "--outputjson"]

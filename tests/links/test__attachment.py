@@ -6,6 +6,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.allocations import peak_of
+from support.strategies import CHARACTERS
 
 from tfbus.links._attachment import (
     MAX_BYTES,
@@ -23,7 +24,7 @@ from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 ONE, OTHER = b"0123456789abcdef", b"another origin !"
 NUMBERS = st.integers(0, 2**64 - 1)
-NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+NAMES = st.text(CHARACTERS, max_size=20)
 ORIGINS = st.binary(min_size=16, max_size=16) | st.sampled_from((ONE, OTHER))
 RUNS = st.tuples(NAMES | st.sampled_from(("", "odometry")), st.booleans(), st.integers(0, 2**32 - 1))
 
@@ -77,6 +78,10 @@ def reason_of(data: bytes) -> str:
 
 
 TIMES = st.none() | st.integers(-(2**63), 2**63 - 1)
+
+
+def test_the_limits_are_those_of_all_releases() -> None:
+    assert (VERSION, MAX_ENTRIES, MAX_BYTES) == (2, 10_000, 1_048_576)
 
 
 @given(number=NUMBERS, entries=entries_of_any_kind, step=st.none() | STEPS, time=TIMES)

@@ -20,10 +20,12 @@ from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
 from tfbus.links._entries import RemovedFrame
 from tfbus.links._inbox import ReceivedBatch
 from tfbus.links._message import Message, read_message
+from tfbus.links._mirror import Mirror
 from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence
 from tfbus.links._relay import LARGEST_JUMP, Relay
+from tfbus.links._state import StateStep
 from tfbus.tf_message import encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
@@ -216,6 +218,28 @@ def test_gaps_in_the_numbers_of_a_peer_are_messages_that_were_lost(given: tuple[
         for stamp, number in enumerate(given):
             here.receive(moving("map", "a", stamp), sequence=stamp, number=number)
         assert here.counts == (len(given), len(given), 0, lost)
+
+
+@pytest.mark.parametrize(("second", "told"), [(2, 1), (3, 0)], ids=["without a gap", "after one lost message"])
+def test_a_claim_after_a_lost_message_is_not_believed(second: int, told: int) -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1, number=1)
+        peer = here.peers.find("peer")
+        assert peer is not None
+        peer.mirror = mirror = Mirror(10)
+        here.receive_bytes(encode(()), pack(second, [], StateStep(0, 1, 0)))
+        assert mirror.number == told
+
+
+def test_a_claim_that_is_near_a_large_number_is_believed() -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1, number=1)
+        peer = here.peers.find("peer")
+        assert peer is not None
+        peer.mirror = mirror = Mirror(10)
+        mirror.answered(StateStep(0, 2**40, 0))
+        here.receive_bytes(encode(()), pack(2, [], StateStep(2**40, 2**40 + 1, 0)))
+        assert (mirror.number, here.reports) == (2**40 + 1, [])
 
 
 def test_each_peer_has_numbers_of_its_own_and_begins_anew_when_it_comes_back() -> None:

@@ -24,7 +24,7 @@ START = 1_000 * SECOND
 
 
 class Application:
-    """What the Foxglove application does: it subscribes to the one channel, and reads messages."""
+    """A stand-in for the Foxglove application: it subscribes to the one channel, and reads messages."""
 
     def __init__(self, address: str) -> None:
         self._socket: ClientConnection = connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None)

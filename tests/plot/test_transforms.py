@@ -49,6 +49,17 @@ def test_several_frames_and_recordings_have_lines_and_names_of_their_own() -> No
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [str(line.get_label()) for line in lines]
 
 
+def test_changes_of_rounding_do_not_fill_an_axis() -> None:
+    tree = TransformTree()
+    for step in range(4):
+        tree.insert(TransformStamped("map", "base", step * SECOND, Transform((1e-17 * (step % 2), 1e-5 * step, 0.0))))
+    x, _, y, *_ = plot_transforms(tree, "map", "base").axes
+    low, high = x.get_ylim()
+    assert (low, high) == pytest.approx((-5e-7, 5e-7))
+    low, high = y.get_ylim()
+    assert 3e-5 <= high - low <= 4e-5
+
+
 def test_a_given_figure_is_drawn_in() -> None:
     figure = Figure()
     assert plot_transforms(turning(), "map", "base", figure=figure) is figure

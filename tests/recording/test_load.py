@@ -1,6 +1,7 @@
 import logging
 import math
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.recording import load
+from tfbus.recording.formats._mcap_output import McapOutput
 from tfbus.tree.tree import forest_of
 
 SECOND = 1_000_000_000
@@ -38,7 +40,7 @@ ERRORS: dict[str, type[TransformLookupError]] = {
 
 
 def disagreement(tree: TransformTree, answer: dict[str, Any]) -> str:
-    """What the tree answers differently from tf2; empty if nothing."""
+    """The answers of the tree that differ from those of tf2."""
     at = LATEST if answer["at"] is None else answer["at"]
     try:
         found = tree.lookup(answer["target"], answer["source"], at)
@@ -119,6 +121,17 @@ def test_samples_are_kept_however_old_they_are(tmp_path: Path) -> None:
     tree = load(path)
     assert tree.keep is None
     assert x_of(tree, "a", "b", 250_000 * SECOND) == pytest.approx(250_000.0)
+
+
+def test_an_authority_that_joins_another_in_a_long_recording_is_loaded_too(tmp_path: Path) -> None:
+    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+        senders = [1 if k > 1_000 and k % 2 else 0 for k in range(1_200)]
+        output.write([(k, (moving("a", "b", k, float(k), f"sender {one}"),)) for k, one in enumerate(senders)])
+        output.finish()
+    tree = load(tmp_path / "run.mcap")
+    (edge,) = tree.edges()
+    assert edge.samples == 1_200
+    assert [x_of(tree, "a", "b", k) for k in (999, 1_100, 1_101)] == [999.0, 1_100.0, 1_101.0]
 
 
 def test_a_range_has_its_own_samples_and_the_static_ones_from_before(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from tfbus.recording.speed_limit import SpeedLimit
 
 
 def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]:
-    """Which of some places, one a second, stay."""
+    """The indices of those of some places, one a second, that stay."""
     limit = SpeedLimit(speed)
     found: list[TransformStamped] = []
     for at, x in enumerate(places):

@@ -81,7 +81,7 @@ def ticks(rate: int, first: float = 0.0, last: float = LENGTH) -> Iterator[tuple
 
 
 def moving() -> Iterator[Sent]:
-    """What a robot sends."""
+    """The transforms that a robot sends."""
 
     def now(sender: str, stamp: int, *samples: Sample) -> Sent:
         return Sent(sender, stamp + DELAY, samples)
@@ -110,7 +110,7 @@ def out_of_order() -> Iterator[Sent]:
 
 
 def statics() -> Iterator[Sent]:
-    """What holds always; the first ones are from before everything else, one comes late."""
+    """The static transforms; the first ones are from before everything else, one comes late."""
     mounted = (
         Sample("/base_link", "/laser", START, (0.1, 0.0, 0.2), turned(0.0)),
         Sample("base_link", "camera", START, (0.3, 0.0, 0.5), turned(math.pi / 2, (1.0, -1.0, 1.0))),
@@ -126,7 +126,7 @@ def statics() -> Iterator[Sent]:
 
 
 def wrong() -> Iterator[Sent]:
-    """What nobody should believe, each beside a good transform; tf2 refuses all but the last three kinds."""
+    """Invalid transforms, each beside a good one; tf2 refuses all but the last three kinds."""
     upright = turned(0.0)
     nan, infinite = math.nan, math.inf
     kinds = [
@@ -193,7 +193,7 @@ def write_bag(path: Path) -> None:
 
 
 def answers() -> list[dict[str, Any]]:
-    """What tf2 answers once it has heard all of it, as a listener does."""
+    """The answers of tf2 once it has heard all of it, as a listener does."""
     core = tf2_py.BufferCore(rospy.Duration(1_000))
     for sent in everything():
         insert = core.set_transform_static if sent.static else core.set_transform

@@ -1,4 +1,4 @@
-"""What a URDF says, and what it must not contain."""
+"""The content of a URDF, and the parts that it must not contain."""
 
 import math
 import os

@@ -129,7 +129,7 @@ class Edge:
 
 @dataclass
 class Reader:
-    """What a stream holds, and what its reader has read."""
+    """The events that a stream holds, and those that its reader has read."""
 
     capacity: int
     limit: float
@@ -200,7 +200,7 @@ class Reader:
 
 
 def after(edges: dict[str, Edge], batch: list[TransformStamped]) -> dict[str, Edge]:
-    """What is known when a batch has been noted."""
+    """The state that is known when a batch has been noted."""
     edges = dict(edges)
     for sample in batch:
         before = edges.get(sample.child)
@@ -287,7 +287,7 @@ class Model:
     def admit(
         self, edges: dict[str, Edge], batch: list[TransformStamped]
     ) -> tuple[list[TransformStamped], list[TransformStamped]]:
-        """What of a batch closes no loop, and the last samples that do."""
+        """The samples of a batch that close no loop, and the last ones that do."""
         allowed, looped = list(batch), []
         while loops := loops_of(edges, allowed):
             new = after(edges, allowed)
@@ -365,7 +365,7 @@ class Model:
 
 
 class Crash(Exception):
-    """What the subscriber raises; one is like the other."""
+    """The error that the subscriber raises; one is like the other."""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Crash)

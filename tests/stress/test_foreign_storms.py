@@ -36,7 +36,7 @@ class SlowWorld(ForeignWorld):
 
     @property
     def transforms(self) -> Counter[tuple[bool, str, int]]:
-        """How often each transform was published."""
+        """The number of times that each transform was published."""
         return Counter(
             (message.static, each.child, each.stamp) for _, message in self.published for each in message.transforms
         )

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
+import anyio
+import anyio.lowlevel
 import numpy as np
 import pytest
 from support.both_kernels import COMPILED, bits, needs_both, sample_class
@@ -16,12 +18,11 @@ from support.samples import moving, over, static, tree_of
 from support.threads import threads_that
 
 import tfbus
-from tfbus import LATEST, TransformLookupError, TransformTree
+from tfbus import LATEST, Buffer, Bus, FutureExtrapolationError, Question, TransformLookupError, TransformTree
 from tfbus.tree._kernel import History
+from tfbus.waiting.waiting_index import Waiter
 
 pytestmark = pytest.mark.thorough
-
-X = tuple[float, ...]
 
 
 def row(metres: float) -> Any:
@@ -134,6 +135,148 @@ def test_no_call_leaks_memory_or_references() -> None:
     # The smallest object that a call could leak would make 8,000.
     assert grown(use) < 4_000
     assert [sys.getrefcount(thing) for thing in shared] == before
+
+
+@needs_both
+def test_no_publish_and_no_wake_up_leaks_memory_or_references() -> None:
+    kernel: Any = COMPILED
+    parent, child, me = "".join(["ma", "p"]), "".join(["ca", "rt"]), "".join(["m", "e"])
+    kinds = [kernel.Edge, kernel.Judge, kernel.Parked, kernel.Line, kernel.Feed, kernel.Intake]
+    shared: list[Any] = [parent, child, me, kernel.Sample, *kinds]
+
+    def sample(stamp: int) -> Any:
+        made = kernel.Sample()
+        made._fields = parent, child, stamp, row(1.0), me, False
+        return made
+
+    def use() -> None:
+        edge, history = kernel.Edge(), kernel.History(parent, 50)
+        edge.parent, edge.trusted, edge.newest = parent, me, 0
+        history.authority = me
+        history.push(0, row(0.0))
+        judge = kernel.Judge({child: edge}, 100.0)
+        judge.__init__({child: edge}, 100.0)
+        judge.horizon = 1_000
+        paths = kernel.Paths(threading.Lock(), LATEST, kernel.Sample)
+        paths.recent[parent] = {child: kernel.Chain((history,), ())}
+        lines, parked, limits = {child: kernel.Line()}, {}, []
+        lines[child].__init__()
+        woken: list[Any] = []
+        for stamp in (30, 20, 10):
+            waiter = kernel.Parked()
+            waiter.plain, waiter.place = (parent, child, stamp), (-stamp, 0, waiter)
+            waiter.wake, waiter.answer = woken.append if stamp == 20 else woken.clear, sample(1)
+            waiter.elsewhere = stamp == 30
+            lines[child].places.append(waiter.place)
+            parked[waiter] = None
+        # A cycle that only the garbage collector ends.
+        lines[child].for_any[lines[child].places[0][2]] = None
+        feed = kernel.Feed(paths, {child: history}, {}, lines, parked, limits, {}, parked.pop)
+        feed.__init__(paths, {child: history}, {}, lines, parked, limits, {}, parked.pop)
+        assert not feed.insert((sample(5),))
+        lines[child].for_any.clear()
+        intake = kernel.Intake(judge, kernel.Sample, ({}, []))
+        intake.__init__(judge, kernel.Sample, ({}, []))
+        intake.feeds, intake.thread = ((feed, list), (feed, list)), threading.get_ident()
+        assert intake.take(sample(15), "raise")
+        assert intake.take([sample(stamp) for stamp in range(16, 99)], "drop")
+        assert not parked
+        assert not intake.take(sample(2_000), "raise")
+        assert not intake.take([sample(100), 5], "raise")
+        lines[child] = kernel.Line()
+        lines[child].places.append((-5, 0, "nobody"))
+        for wrong in (
+            lambda: intake.take(sample(200), "raise"),
+            lambda: feed.insert([]),
+            lambda: setattr(intake, "feeds", 5),
+            lambda: kernel.Intake(judge, kernel.Sample, 5),
+            lambda: kernel.Judge([], 1.0),
+        ):
+            with pytest.raises(TypeError):
+                wrong()
+        around = kernel.Parked()
+        around.plain = around.wake = around.place = around.answer = around
+        lines[child].for_any[around] = lines
+        limits.append(feed)
+        parked[intake] = intake
+
+    use()
+    gc.collect()
+    before = [sys.getrefcount(thing) for thing in shared]
+    assert grown(use) < 4_000
+    assert [sys.getrefcount(thing) for thing in shared] == before
+
+
+@needs_both
+def test_out_of_memory_a_publish_stores_a_whole_batch_and_wakes_or_does_nothing() -> None:
+    memory = pytest.importorskip("_testcapi")
+    failures = successes = 0
+    for size in (1, 2, 100):
+        for allowed in range(12):
+            with Bus() as bus, Buffer(bus) as buffer:
+                bus.publish(moving("map", "a", 1, 1.0))
+                batch = tuple(moving("map", "a", stamp, 1.0) for stamp in range(2, 2 + size))
+                with pytest.raises(FutureExtrapolationError) as caught:
+                    buffer.lookup_nowait("map", "a", 2)
+                waiting = [None]
+                buffer._live.park(Waiter(Question("map", "a", 2), 0, waiting.clear), caught.value)
+                before = buffer.tree.edges()
+                take = bus._intake.take
+                memory.set_nomemory(allowed, 0)
+                try:
+                    took = take(batch, "raise")
+                except MemoryError:
+                    took = False
+                finally:
+                    memory.remove_mem_hooks()
+                if took:
+                    successes += 1
+                    assert waiting == []
+                    assert buffer.tree.edges()[0].samples == 1 + size
+                else:
+                    failures += 1
+                    assert waiting == [None]
+                    assert len(buffer.pending()) == 1
+                    assert buffer.tree.edges() == before
+                bus.publish(moving("map", "a", 1_000, 1.0))
+                assert waiting == []
+                assert not buffer.pending()
+    assert failures > 3
+    assert successes > 3
+
+
+def test_four_threads_read_whole_answers_while_the_loop_publishes_and_wakes() -> None:
+    """Left and right always move together; and each lookup that waits gets the answer of its own stamp."""
+    bus = Bus(max_ahead=None)
+    buffer = Buffer(bus, keep=1e-6)
+    bus.publish([*over("base", "left", [0]), *over("base", "right", [0])])
+    faults: list[object] = []
+    answers = [0]
+
+    def read() -> None:
+        found = buffer.lookup_nowait("left", "right").transform.translation
+        answers[0] += 1
+        if any(found):
+            faults.append(found)
+
+    async def wait(stamp: int) -> None:
+        found = await buffer.lookup("base", "left", stamp, timeout=60.0)
+        if (found.stamp, found.transform.translation[0]) != (stamp, float(stamp)):
+            faults.append(found)
+
+    async def publish() -> None:
+        for stamp in range(1, 2_000):
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(wait, stamp)
+                tasks.start_soon(wait, stamp)
+                while len(buffer.pending()) < 2:
+                    await anyio.lowlevel.checkpoint()
+                bus.publish([moving("base", side, stamp, float(stamp)) for side in ("left", "right")])
+
+    with threads_that(read, 4):
+        anyio.run(publish)
+    assert faults == []
+    assert answers[0] > 100
 
 
 @needs_both

@@ -105,7 +105,7 @@ class Pending:
 
 @dataclass
 class Model:
-    """What has become of each message, when everything has run until it blocks."""
+    """The outcome of each message, when everything has run until it blocks."""
 
     options: Options
     windows: dict[str, list[int]] = field(default_factory=dict)
@@ -123,7 +123,7 @@ class Model:
     dropped: list[tuple[Message, str]] = field(default_factory=list)
 
     def look(self, message: Message) -> str:
-        """What a lookup would find."""
+        """The transform that a lookup would find."""
         if message.frame in (self.target, "odom"):
             return "answer"
         window = self.windows.get(message.frame)
@@ -434,7 +434,7 @@ def is_answered(asked: Asked[Any]) -> bool:
 
 
 def outcome_of(asked: Asked[tuple[Message, TransformStamped]]) -> Any:
-    """What a read has come to, as the model writes it; where the transform is wrong, that."""
+    """The outcome of a read, as the model writes it; or the transform, if it is wrong."""
     if asked.cancelled:
         return "cancelled"
     if asked.error is not None:

@@ -37,7 +37,7 @@ Run = Callable[[Callable[[], Awaitable[None]]], None]
 ENDINGS: tuple[Ending, ...] = ("the bus closes", "all is cancelled", "buffers close one by one")
 USUAL = (LookupTimeoutError, PastExtrapolationError, GapError, BusClosedError, ClockResetError, UnknownFrameError)
 DOCUMENTED = (*USUAL, AheadError)
-"""How a lookup may end but by an answer; the last one is rare."""
+"""The ends of a lookup other than an answer; the last one is rare."""
 
 MET = {
     "answered",
@@ -49,7 +49,7 @@ MET = {
     *("AuthorityConflict", "ClockReset", "SubscriberFailed", "FrameRemoved", "Reparented", "KindChanged"),
     *("FrameStale", "FrameLive"),
 }
-"""What a few soaks meet between them; if they did not, there would be nothing to see."""
+"""The events that a few soaks meet between them; without them there would be nothing to see."""
 
 
 async def audit(crowd: Crowd) -> None:
@@ -61,7 +61,7 @@ async def audit(crowd: Crowd) -> None:
 
 
 def check_books(crowd: Crowd) -> None:
-    """What holds at every moment."""
+    """The invariants of every moment."""
     counted = crowd.bus.statistics()
     for its in counted.buffers:
         assert its.offered == its.inserted + its.replaced + its.expired
@@ -98,7 +98,7 @@ def check_lookups(crowd: Crowd) -> None:
 
 
 def check_events(crowd: Crowd) -> None:
-    """What the streams of events have told agrees with the counters, and with each other."""
+    """The streams of events agree with the counters, and with each other."""
     counted = crowd.bus.statistics()
     every, some, stale = (crowd.told[events] for events in (crowd.every, crowd.some, crowd.stale))
     told = Counter(type(event) for event in every)

@@ -66,7 +66,7 @@ class Model:
         self.closed = False
 
     def read(self, elapsed: float) -> TransformStamped | type[Exception] | None:
-        """What a reader has by now; None if it waits."""
+        """The answer that a reader has by now; None if it waits."""
         if self.reset:
             return ClockResetError
         if elapsed >= self.free_at or self.ended:

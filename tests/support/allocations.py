@@ -1,4 +1,4 @@
-"""What a call allocates."""
+"""The allocations of a call."""
 
 import tracemalloc
 from collections.abc import Callable

@@ -14,7 +14,7 @@ from tfbus import LATEST, ClockResetError, Hold, MessageFilter, PointStamped, fr
 
 
 class SourceError(Exception):
-    """What a source of messages raises."""
+    """The error that a source of messages raises."""
 
 
 class Message(NamedTuple):

@@ -1,4 +1,4 @@
-"""What the tests of the bus need all the time: a moving child, a pause, and a call in a task of its own."""
+"""A moving child, a pause, and a call in a task of its own, for the tests of the bus."""
 
 from collections.abc import Awaitable, Callable
 from typing import Generic, TypeVar
@@ -52,7 +52,7 @@ class Asked(Generic[T]):
 
     @property
     def answer(self) -> T:
-        """What the call returned; what it raised is raised here."""
+        """The result of the call; its error is raised here."""
         if self.error is not None:
             raise self.error
         assert self.ended, "the call still waits"

@@ -16,8 +16,18 @@ EXTRAS = {
     "view": ("collada", "trimesh", "viser"),
     "web": ("starlette", "uvicorn", "websockets"),
     "zenoh": ("zenoh",),
-    "test": ("fastapi", "httpx", "ipykernel", "jupyter_client", "pandas", "playwright", "scipy", "uvloop"),
-    "thorough": ("evo", "pytest_cov", "pyright", "zenoh_ros2_sdk"),
+    "test": ("fastapi", "httpx", "uvloop"),
+    "thorough": (
+        "evo",
+        "ipykernel",
+        "jupyter_client",
+        "pandas",
+        "playwright",
+        "pyright",
+        "pytest_cov",
+        "scipy",
+        "zenoh_ros2_sdk",
+    ),
 }
 """The packages of each extra, by the names under which they are imported."""
 
@@ -38,7 +48,7 @@ def absent_extra(error: BaseException | None) -> str | None:
 
 
 def _messages(error: BaseException | None) -> Iterator[str]:
-    """What an error says, then its parts, its cause and its context, down to the first."""
+    """The message of an error, then those of its parts, its cause and its context, down to the first."""
     if error is None:
         return
     yield str(error)

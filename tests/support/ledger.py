@@ -1,11 +1,11 @@
-"""What a stream of samples was offered, and where all of it has gone."""
+"""The samples that a stream was offered, and the fate of each."""
 
 from tfbus import Stream, TransformStamped
 from tfbus.geometry.stamped import Batch
 
 
 class Ledger:
-    """What a stream was offered while it was open, and where each moving sample of that has gone.
+    """The samples that a stream was offered while it was open, and the fate of each moving one.
 
     What a conflating stream gives up for something newer of the same child is `superseded` here, and `pending` is what
     such a stream must hold.

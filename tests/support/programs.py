@@ -15,7 +15,7 @@ from support.processes import free_ports
 
 TFBUS = str(Path(sys.executable).with_name("tfbus"))
 PATIENCE = 30.0
-"""How long a test waits for a line or for the end of a program, in s."""
+"""The longest that a test waits for a line or for the end of a program, in s."""
 
 
 def free_address() -> str:

@@ -29,7 +29,7 @@ WRONG_IN_SMALL = {
     "self transform": 1,
     "cycle": 1,
 }
-"""What `record.py` sends that nobody should believe."""
+"""The invalid transforms that `record.py` sends."""
 
 TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 
@@ -92,7 +92,7 @@ def as_ros2(bag: Path, folder: Path, storage: StoragePlugin, **options: Any) -> 
 
 
 def sender_of(connection: Any) -> str:
-    """Who recorded something in a bag, as the bag has it."""
+    """The name of the recorder in a bag, as the bag has it."""
     assert isinstance(connection.ext, ConnectionExtRosbag1)
     return connection.ext.callerid or ""
 
@@ -111,11 +111,11 @@ def batches_in(path: Path) -> list[tuple[int, tuple[TransformStamped, ...]]]:
 
 
 def facts(recording: Recording) -> tuple[int | None, int | None, int | None, bool]:
-    """What a recording tells without being read."""
+    """The facts that a recording tells without being read."""
     return recording.start, recording.end, recording.count, recording.finished
 
 
 def answers() -> list[dict[str, Any]]:
-    """What tf2 answered to the small bag."""
+    """The answers of tf2 to the small bag."""
     found: list[dict[str, Any]] = json.loads(ANSWERS.read_text(encoding="utf-8"))
     return found

@@ -1,22 +1,16 @@
 """A node of ROS 1 with the real tf2, for `tests/links/rosbridge/test_ros1.py`: run by a Python that has rospy.
 
-It broadcasts ``odom:base``, x = sin(t), at 100 Hz, and the static ``base:laser``, x = 0.5; it asks for ``odom:tool``
-100 times a second, which needs the frames of the other side; and it ends after so many seconds, with one line of JSON.
+It does what `ros_driver.py` says, and sends the static ``base:laser``, x = 0.5.
 """
 
-import argparse
-import json
-import math
 import time
-from collections import Counter
 from typing import Any
 
 import rospy  # type: ignore[import-not-found]
 import tf2_ros  # type: ignore[import-not-found]
 from geometry_msgs.msg import TransformStamped  # type: ignore[import-not-found]
+from ros_driver import Answer, Driver  # type: ignore[import-not-found]
 from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
-
-RATE = 100
 
 
 def transform(parent: str, child: str, stamp: int, x: float) -> Any:
@@ -29,46 +23,29 @@ def transform(parent: str, child: str, stamp: int, x: float) -> Any:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--x", type=float, default=0.5, help="of the laser")
-    options = parser.parse_args()
+    driver = Driver()
     rospy.init_node("driver", anonymous=True, disable_signals=True)
     buffer = tf2_ros.Buffer()
     listener = tf2_ros.TransformListener(buffer)
-    received: Counter[str] = Counter()
-    latencies: list[int] = []
 
     def hear(message: Any) -> None:
         for each in message.transforms:
-            received[each.child_frame_id] += 1
-            if each.child_frame_id == "arm":
-                latencies.append(time.time_ns() - each.header.stamp.to_nsec())
+            driver.hear(each.child_frame_id, each.header.stamp.to_nsec())
 
-    rospy.Subscriber("/tf", TFMessage, hear, queue_size=100, tcp_nodelay=True)
-    moving, static = tf2_ros.TransformBroadcaster(), tf2_ros.StaticTransformBroadcaster()
-    static.sendTransform([transform("base", "laser", time.time_ns(), options.x)])
-    print(json.dumps({"event": "up"}), flush=True)
-    answered = failed = wrong = sent = 0
-    start = due = time.monotonic()
-    while (now := time.monotonic()) - start < options.seconds:
-        time.sleep(max(0.0, due - now))
-        due = max(due + 1 / RATE, now - 1 / RATE)
-        stamp = time.time_ns()
-        moving.sendTransform(transform("odom", "base", stamp, math.sin(stamp / 1e9)))
-        sent += 1
+    def send(stamp: int, x: float) -> None:
+        moving.sendTransform(transform("odom", "base", stamp, x))
+
+    def ask() -> Answer | None:
         try:
             found = buffer.lookup_transform("odom", "tool", rospy.Time())
         except tf2_ros.TransformException:
-            # Before the two have met, nothing can be answered.
-            failed += answered > 0
-            continue
-        answered += 1
-        t = found.header.stamp.to_sec()
-        wrong += abs(found.transform.translation.x - (math.sin(t) + math.cos(t) + 0.1)) > 1e-3
-    facts = {"sent": sent, "answered": answered, "failed": failed, "wrong": wrong, "received": received}
-    median = sorted(latencies)[len(latencies) // 2] / 1e6 if latencies else None
-    print(json.dumps({"event": "end", **facts, "latency_ms": median}), flush=True)
+            return None
+        return found.header.stamp.to_sec(), found.transform.translation.x
+
+    rospy.Subscriber("/tf", TFMessage, hear, queue_size=100, tcp_nodelay=True)
+    moving, static = tf2_ros.TransformBroadcaster(), tf2_ros.StaticTransformBroadcaster()
+    static.sendTransform([transform("base", "laser", time.time_ns(), driver.x)])
+    driver.run(send, ask)
     listener.unregister()
     rospy.signal_shutdown("the time is over")
 

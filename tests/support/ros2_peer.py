@@ -1,15 +1,10 @@
 """A ROS 2 node with the real tf2, for `tests/integration/test_ros2.py`: run by a Python that has rclpy and tf2_ros.
 
-It broadcasts ``odom:base``, x = sin(t), at 100 Hz, and the static ``base:laser``, x = 0.5; it asks for ``odom:tool``
-100 times a second, which needs the frames of the other side; and it ends after so many seconds, with one line of JSON.
+It does what `ros_driver.py` says, and sends the static ``base:laser``, x = 0.5.
 """
 
-import argparse
-import json
-import math
 import threading
 import time
-from collections import Counter
 from typing import Any
 
 import rclpy
@@ -18,9 +13,8 @@ from geometry_msgs.msg import TransformStamped  # type: ignore[import-not-found]
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.time import Time
+from ros_driver import Answer, Driver  # type: ignore[import-not-found]
 from tf2_msgs.msg import TFMessage  # type: ignore[import-not-found]
-
-RATE = 100
 
 
 def transform(parent: str, child: str, stamp: int, x: float) -> Any:
@@ -32,50 +26,35 @@ def transform(parent: str, child: str, stamp: int, x: float) -> Any:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--seconds", type=float, default=10.0)
-    parser.add_argument("--x", type=float, default=0.5, help="of the laser")
-    options = parser.parse_args()
+    driver = Driver()
     rclpy.init()
     node = Node("driver")
     buffer = tf2_ros.Buffer(node=node)
     listener = tf2_ros.TransformListener(buffer, node)
-    received: Counter[str] = Counter()
-    latencies: list[int] = []
 
     def hear(message: Any) -> None:
         for each in message.transforms:
-            received[each.child_frame_id] += 1
-            if each.child_frame_id == "arm":
-                latencies.append(time.time_ns() - each.header.stamp.sec * 10**9 - each.header.stamp.nanosec)
+            stamp = each.header.stamp
+            driver.hear(each.child_frame_id, stamp.sec * 10**9 + stamp.nanosec)
+
+    def send(stamp: int, x: float) -> None:
+        moving.sendTransform(transform("odom", "base", stamp, x))
+
+    def ask() -> Answer | None:
+        try:
+            found = buffer.lookup_transform("odom", "tool", Time())
+        except tf2_ros.TransformException:
+            return None
+        stamp = found.header.stamp
+        return stamp.sec + stamp.nanosec / 1e9, found.transform.translation.x
 
     node.create_subscription(TFMessage, "/tf", hear, 100)
     moving, static = tf2_ros.TransformBroadcaster(node), tf2_ros.StaticTransformBroadcaster(node)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
-    static.sendTransform([transform("base", "laser", time.time_ns(), options.x)])
-    print(json.dumps({"event": "up"}), flush=True)
-    answered = failed = wrong = sent = 0
-    start = due = time.monotonic()
-    while (now := time.monotonic()) - start < options.seconds:
-        time.sleep(max(0.0, due - now))
-        due = max(due + 1 / RATE, now - 1 / RATE)
-        stamp = time.time_ns()
-        moving.sendTransform(transform("odom", "base", stamp, math.sin(stamp / 1e9)))
-        sent += 1
-        try:
-            found = buffer.lookup_transform("odom", "tool", Time())
-        except tf2_ros.TransformException:
-            # Before the two have met, nothing can be answered.
-            failed += answered > 0
-            continue
-        answered += 1
-        t = found.header.stamp.sec + found.header.stamp.nanosec / 1e9
-        wrong += abs(found.transform.translation.x - (math.sin(t) + math.cos(t) + 0.1)) > 1e-3
-    facts = {"sent": sent, "answered": answered, "failed": failed, "wrong": wrong, "received": received}
-    median = sorted(latencies)[len(latencies) // 2] / 1e6 if latencies else None
-    print(json.dumps({"event": "end", **facts, "latency_ms": median}), flush=True)
+    static.sendTransform([transform("base", "laser", time.time_ns(), driver.x)])
+    driver.run(send, ask)
     del listener
     executor.shutdown()
     node.destroy_node()

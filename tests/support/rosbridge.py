@@ -46,6 +46,8 @@ class Client:
 class RosbridgeServer:
     """Serves one topic tree: what a client publishes goes to all that have subscribed, itself included.
 
+    As the real one, it has each topic decoded or as bytes, as its first client wants it, and nothing for the others.
+
     Parameters
     ----------
     encodings : collection of str
@@ -71,8 +73,13 @@ class RosbridgeServer:
     async def say(self, *samples: TransformStamped, topic: str = "/tf") -> None:
         """Publish as a node of ROS 2 does."""
         for client in list(self.clients):
-            if topic in client.subscriptions:
+            if topic in client.subscriptions and self.passes(topic, client.subscriptions[topic]):
                 await client.send(self.encoded(topic, samples, client.subscriptions[topic]))
+
+    def passes(self, topic: str, encoding: str) -> bool:
+        """Whether a topic is decoded if an encoding needs that, and not if that wants the bytes."""
+        first = next(each.subscriptions[topic] for each in self.clients if topic in each.subscriptions)
+        return "cbor-raw" not in self.encodings or (first == "cbor-raw") == (encoding == "cbor-raw")
 
     def encoded(self, topic: str, samples: tuple[TransformStamped, ...], encoding: str) -> Event:
         envelope: dict[str, Any] = {"op": "publish", "topic": topic}

@@ -45,7 +45,7 @@ def install_roslib(folder: Path) -> None:
 
 @asynccontextmanager
 async def roslib_client(folder: Path, url: str) -> AsyncIterator[list[dict[str, Any]]]:
-    """What roslib, connected and subscribed to ``/tf`` and ``/tf_static``, has heard."""
+    """The transforms that roslib, subscribed to ``/tf`` and ``/tf_static``, has heard."""
     heard: list[dict[str, Any]] = []
     async with (
         await anyio.open_process(["node", "listen.js", url], cwd=folder, stderr=None) as process,

@@ -40,7 +40,7 @@ def tree_of(*batch: TransformStamped, keep: float | None = 10.0) -> TransformTre
 
 
 def x_of(tree: TransformTree, target: str, source: str, at: int | Latest = LATEST, **question: Any) -> float:
-    """What a lookup tells of x, in m."""
+    """The x of a lookup, in m."""
     return tree.lookup(target, source, at, **question).transform.translation[0]
 
 

@@ -61,12 +61,14 @@ def transforms(limit: float = 1_000.0) -> st.SearchStrategy[Transform]:
     return st.builds(Transform, vectors(limit), rotations())
 
 
+CHARACTERS = st.characters(exclude_categories=["Cs"])
+"""The default alphabet of `st.text`, which takes hypothesis seconds in each process to work out from a codec."""
+
+
 def frame_names() -> st.SearchStrategy[str]:
     """Everything that may name a frame: blanks, quotes, newlines, any alphabet."""
     odd = st.sampled_from(("base link", " ", 'a"b', "a\\b", "a\nb", "a/b", "NO_PARENT", "küche", "腕", "🦾", "null"))
-    # The default alphabet is the same, but hypothesis works it out from a codec, which takes seconds in each process.
-    characters = st.characters(exclude_categories=["Cs"])
-    return odd | st.text(characters, min_size=1, max_size=12).filter(lambda name: not name.startswith("/"))
+    return odd | st.text(CHARACTERS, min_size=1, max_size=12).filter(lambda name: not name.startswith("/"))
 
 
 def stamps(low: int = STAMP_MIN, high: int = STAMP_MAX) -> st.SearchStrategy[int]:
@@ -80,7 +82,7 @@ def stamps(low: int = STAMP_MIN, high: int = STAMP_MAX) -> st.SearchStrategy[int
 
 
 def data_stamps() -> st.SearchStrategy[int | Latest]:
-    """What data may carry: a stamp or LATEST."""
+    """The stamps that data may carry: an instant or LATEST."""
     return stamps() | st.just(LATEST)
 
 

@@ -20,7 +20,7 @@ Question = tuple[str, str, int | None]
 
 
 def replies(kernel: str, keep: float | None, samples: list[Sample], questions: list[Question]) -> list[object]:
-    """What a tree on a kernel says to each sample and to each question: values to the last bit, and whole messages."""
+    """The answers of a tree on a kernel to samples and questions: values to the last bit, and whole messages."""
     tfbus = tfbus_on(kernel)
     tree = tfbus.TransformTree(keep)
     said: list[object] = []

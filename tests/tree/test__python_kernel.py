@@ -1,8 +1,9 @@
-"""What both kernels do. The compiled one has to do it with the same bits."""
+"""Both kernels do the same; the compiled one has to do it with the same bits."""
 
 import copy
 import gc
 import math
+import struct
 import threading
 import weakref
 from array import array
@@ -63,6 +64,7 @@ def between(poses: Poses, at: int) -> Row | None:
 def test_an_empty_history_has_no_stamps(kernel: ModuleType) -> None:
     edge = history(kernel, keep=7)
     assert (edge.count, edge.oldest, edge.newest, edge.find(0), edge.keep) == (0, None, None, 0, 7)
+    assert edge.newest_record == b""
     assert (edge.parent, edge.authority, edge.mixed) == ("parent", "", False)
     with pytest.raises(IndexError):
         edge.sample(0)
@@ -122,6 +124,7 @@ def test_a_history_holds_what_was_inserted_last_at_each_stamp_of_its_window(
         last, beyond = max(sum(stamp <= at for stamp in stamps) - 1, 0), sum(stamp < at for stamp in stamps)
         assert edge.between(at, at + 5) == (last, min(sum(stamp < at + 5 for stamp in stamps) + 1, len(stamps)))
         assert edge.between(-99, at) == (0, min(beyond + 1, len(stamps)))
+    assert edge.newest_record == b"".join(struct.pack("q7d", stamp, *row) for stamp, row in kept[-1:])
 
 
 @on_both
@@ -320,6 +323,20 @@ def test_the_row_of_a_chain_is_bit_for_bit_the_product_of_its_interpolated_edges
     if row is None and kernel is COMPILED and widest_gap(up + down) > 2**53:
         return
     assert bits(row) == bits(expected_row(up, down, at))
+
+
+@on_both
+@given(st.lists(st.tuples(transforms(10.0).map(row_of), st.integers(0, 100)), min_size=1, max_size=12))
+def test_composed_paths_are_bit_for_bit_the_products_of_their_rows(
+    kernel: ModuleType, drawn: list[tuple[Row, int]]
+) -> None:
+    origins = [number % max(place, 1) for place, (_, number) in enumerate(drawn)]
+    expected: list[Row] = []
+    for (row, _), origin in zip(drawn, origins, strict=True):
+        expected.append(compose(expected[origin], row) if origin else row)
+    rows = np.array([row for row, _ in drawn]).reshape(-1, 7)
+    kernel.compose_paths(rows, np.array(origins, np.int64))
+    assert rows.tobytes() == np.array(expected).tobytes()
 
 
 @needs_both
@@ -759,6 +776,10 @@ def test_wrong_arguments_raise_and_never_crash() -> None:
         lambda: path.hold().rows(5, 6),
         lambda: path.hold().rows(np.zeros(2, np.int64)),
         lambda: kernel.Held(),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.zeros(3, np.int64)),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.array([0, 1])),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.array([1, 0])),
+        lambda: kernel.compose_paths(np.zeros((2, 7)), np.array([0, -1])),
         lambda: kernel.Paths(5, LATEST, kernel.Sample),
         lambda: kernel.Paths(threading.Lock(), LATEST, int),
         lambda: path.__init__((), ()),

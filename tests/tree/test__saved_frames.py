@@ -22,7 +22,7 @@ COPIES: list[Callable[[TransformTree], TransformTree]] = [
 
 
 def answers(tree: TransformTree, last: int) -> list[object]:
-    """What a tree answers to every question of a small world."""
+    """The answers of a tree to every question of a small world."""
     found: list[object] = [tree.edges(), tree.frames()]
     for target in tree.frames():
         for source in tree.frames():

@@ -268,7 +268,7 @@ def test_a_pure_rotation_moves_only_the_origin_of_an_offset_child(time: float, v
 
 
 def difference(tree: TransformTree, frame: str, reference: str, at: int, step: int = 2_000) -> tuple[Vector, Vector]:
-    """What central differences of the lookup give for the linear and angular velocity, along the reference's axes."""
+    """The linear and angular velocity by central differences of the lookup, along the reference's axes."""
     after = tree.lookup(reference, frame, at + step).transform
     before = tree.lookup(reference, frame, at - step).transform
     rate = SECOND / (2 * step)

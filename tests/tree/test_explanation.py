@@ -1,4 +1,4 @@
-"""What an explanation says is held against the lookups that it explains; its text against the text that people read."""
+"""An explanation is compared with the lookups that it explains, and its text with the text that people read."""
 
 import json
 import pickle

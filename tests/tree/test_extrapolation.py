@@ -36,7 +36,7 @@ def history(samples: Iterable[int] | dict[int, str], keep: int | None = None) ->
 
 
 def samples_around(edge: FrameHistory, asked: list[int]) -> Samples:
-    """What is copied for some questions, by the first and the last."""
+    """The samples that are copied for some questions, by the first and the last."""
     return edge.samples_between(min(asked, default=0), max(asked, default=0))
 
 

@@ -128,3 +128,25 @@ def test_a_reader_follows_frames_that_are_added_reparented_and_removed() -> None
     assert x_in(reader.read("map"), "c") == 6.0
     tree.remove_frame("a")
     assert set(reader.read("map").frames) == {"map", "b", "c"}
+
+
+CHANGES = st.one_of(any_samples("abcd", last=10), st.sampled_from("abcd"), st.none())
+
+
+@given(st.lists(CHANGES, max_size=12), st.sampled_from("abcd"))
+def test_a_reader_that_is_kept_says_the_same_as_lookups_after_any_change(
+    changes: list[TransformStamped | str | None], fixed: str
+) -> None:
+    tree = tree_of(static("a", "b", 1.0), static("b", "c", 1.0), moving("c", "d", 0, 1.0))
+    reader = PoseReader(forest_of(tree))
+    for change in changes:
+        try:
+            if change is None:
+                tree.clear()
+            elif isinstance(change, str):
+                tree.remove_frame(change)
+            else:
+                tree.insert(change)
+            check_against_lookups(tree, reader.read(fixed), fixed, LATEST)
+        except (InvalidTransformError, UnknownFrameError):
+            continue

@@ -166,7 +166,7 @@ class Model:
         return outcome
 
     def forget_empty_circle(self, name: str) -> None:
-        """What was cleared and now contradicts the newest sample is forgotten."""
+        """A frame that was cleared and now contradicts the newest sample is forgotten."""
         parents = {child: known.parent for child, known in self.children.items()}
         walk = climb(parents, name)
         if parents.get(walk[-1]) == name:

@@ -72,6 +72,14 @@ def test_a_watch_without_an_answer_is_woken_by_no_sample() -> None:
     assert watched_frames(live) == set()
 
 
+def test_the_frames_of_watches_without_a_permanent_path_may_change() -> None:
+    live = live_tree(None)
+    live.insert((moving("map", "a", 1),))
+    Watcher(live, "map", "a").read()
+    Watcher(live, "world", "nobody").read()
+    assert live.watching.changing_names == {"world", "nobody"}
+
+
 def test_the_paths_over_both_parents_are_watched_while_both_are_in_the_window() -> None:
     live = live_tree(5e-9)
     live.insert((moving("map", "left", 1), moving("map", "right", 1), moving("left", "box", 1)))

@@ -54,12 +54,18 @@ class LoopAlarms:
 
 
 class _AlarmHeap:
-    """The alarms on one event loop by their times, with one timer for the first."""
+    """The alarms on one event loop by their times, with one timer for the first.
+
+    Attributes
+    ----------
+    cancelled : int
+        The number of alarms that were cancelled and are still here.
+    """
 
     def __init__(self, loop: Any) -> None:
         self.timer = LoopTimer(loop, self._ring)
         self._alarms: list[tuple[float, int, _LoopAlarm]] = []
-        self._cancelled = 0
+        self.cancelled = 0
         self._order = count()
 
     def add(self, seconds: float, callback: Callable[[], object]) -> "_LoopAlarm":
@@ -70,13 +76,12 @@ class _AlarmHeap:
             self.timer.set(due)
         return alarm
 
-    def note_cancelled(self) -> None:
-        """Count an alarm that was cancelled; they are removed when they are most of all."""
-        self._cancelled += 1
-        if self._cancelled > _CANCELLED_KEPT and 2 * self._cancelled > len(self._alarms):
+    def remove_cancelled(self) -> None:
+        """Remove the alarms that were cancelled, if they are most of all."""
+        if 2 * self.cancelled > len(self._alarms):
             self._alarms = [each for each in self._alarms if each[2].callback is not None]
             heapify(self._alarms)
-            self._cancelled = 0
+            self.cancelled = 0
 
     def _ring(self) -> None:
         """Make the calls that are due, and set the timer for the next."""
@@ -86,7 +91,7 @@ class _AlarmHeap:
                 _, _, alarm = heappop(self._alarms)
                 callback, alarm.callback = alarm.callback, None
                 if callback is None:
-                    self._cancelled -= 1
+                    self.cancelled -= 1
                 else:
                     callback()
         finally:
@@ -107,4 +112,7 @@ class _LoopAlarm:
         """Cancel the call, if it has not been made."""
         if self.callback is not None:
             self.callback = None
-            self._heap.note_cancelled()
+            heap = self._heap
+            heap.cancelled += 1
+            if heap.cancelled > _CANCELLED_KEPT:
+                heap.remove_cancelled()

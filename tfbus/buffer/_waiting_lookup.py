@@ -1,4 +1,8 @@
-"""Lookups that wait: parked under the frames that they lack, woken by new samples, and tried again."""
+"""Lookups that wait: parked under the frames that they lack, and woken by new samples.
+
+Whoever inserts the samples hands over the answer. It is given if the tree has not changed until the task runs, one turn
+of the event loop later; otherwise the lookup asks again, and may park again.
+"""
 
 import math
 from collections.abc import Callable
@@ -46,6 +50,7 @@ class _Wait:
         "since",
         "woken",
     )
+    woken: WakeUp
 
     def __init__(
         self,
@@ -64,19 +69,11 @@ class _Wait:
         self.reminder: Alarm | None = None
         self.expired = False
         self.is_long = False
-        self.woken: WakeUp | None = None
 
     def expire(self) -> None:
         """End the wait."""
         self.expired = True
-        if self.woken is not None:
-            self.woken.end()
-
-    def close_alarms(self) -> None:
-        """Cancel the alarms that have not rung."""
-        for alarm in (self.end, self.reminder):
-            if alarm is not None:
-                alarm.close()
+        self.woken.end()
 
 
 class Lookups:
@@ -168,58 +165,63 @@ class Lookups:
         self._check_thread()
         wait = _Wait(question, self._clock.now(), last_reset, blocker, others)
         alarms = self._alarms
-        found = await (self._wait_in_scopes(wait, limit) if alarms is None else self._wait(wait, limit, alarms))
-        if found is None:
-            raise LookupTimeoutError(
-                target=question.target, source=question.source, timeout=limit, missing=wait.blocker
-            ) from wait.blocker
-        return found
+        if alarms is None:
+            found = await self._wait_in_scopes(wait, limit)
+            if found is not None:
+                return found
+            raise _timed_out(wait, limit) from wait.blocker
+        # Here and not in a coroutine of its own, because each would be resumed one by one.
+        self._set_alarms(wait, limit, alarms)
+        waiting, paths = self._live.waiting, self._live.forest.paths
+        try:
+            while True:
+                waiter = self._park(wait)
+                try:
+                    # Timeouts of zero give the others a turn as well.
+                    await (anyio.lowlevel.checkpoint() if wait.expired else wait.woken)
+                except BaseException:
+                    waiting.remove(waiter)
+                    raise
+                found = waiter.answer
+                if found is not None and waiter.version == paths.version:
+                    # As it was when the waiter was woken, and removed.
+                    return found if self._local_names is None else self._local_names.answer(found)
+                waiting.remove(waiter)
+                found = self._ask_again(wait)
+                if found is not None:
+                    return found
+                if wait.expired:
+                    raise _timed_out(wait, limit) from wait.blocker
+                if wait.is_long:
+                    self._remind(wait, alarms)
+        finally:
+            if wait.end is not None:
+                wait.end.close()
+            if wait.reminder is not None:
+                wait.reminder.close()
 
     def report(self, question: Question, since: int, blocker: TransformLookupError) -> float:
         """Log a lookup that has waited for long; return the time, in s, after which to call this again."""
         return self._report.tell(question, since, blocker)
 
-    async def _wait(self, wait: "_Wait", limit: float, alarms: Alarms) -> TransformStamped | None:
-        """Wait for the answer for some time (s); None if there was none."""
+    def _set_alarms(self, wait: "_Wait", limit: float, alarms: Alarms) -> None:
+        """Set the alarms for the end of a wait, after some time (s), and for the log line before it."""
         if limit == 0.0:
             wait.expired = True
         elif limit < math.inf:
             wait.end = alarms.call_after(limit, wait.expire)
         if limit > REPORT_AFTER:
             wait.reminder = alarms.call_after(REPORT_AFTER, partial(self._remind, wait, alarms))
-        try:
-            while True:
-                waiter, woken = self._park(wait)
-                try:
-                    # Timeouts of zero give the others a turn as well.
-                    await (anyio.lowlevel.checkpoint() if wait.expired else woken)
-                finally:
-                    # Cancelled, or out of time. A waiter that a sample has woken was removed before.
-                    self._live.waiting.remove(waiter)
-                found = self._answer_of(waiter, wait)
-                if found is not None or wait.expired:
-                    return found
-                if wait.is_long:
-                    self._remind(wait, alarms)
-        finally:
-            wait.close_alarms()
 
-    def _park(self, wait: "_Wait") -> tuple[Waiter, WakeUp]:
+    def _park(self, wait: "_Wait") -> Waiter:
         """Park a lookup under what it lacks, with a new wake-up."""
         live = self._live
         if live.end_reason is not None:
             raise BusClosedError(live.end_reason) from wait.blocker
-        wait.woken = woken = WakeUp()
-        waiter = Waiter(wait.question, wait.since, woken.end, wait.others)
+        wait.woken = WakeUp()
+        waiter = Waiter(wait.question, wait.since, wait.woken.wake, wait.others)
         live.park(waiter, wait.blocker)
-        return waiter, woken
-
-    def _answer_of(self, waiter: Waiter, wait: "_Wait") -> TransformStamped | None:
-        """The answer that a waiter was woken with if it is still right, else that of now."""
-        found = waiter.answer
-        if found is not None and waiter.version == self._live.forest.version:
-            return found if self._local_names is None else self._local_names.answer(found)
-        return self._ask_again(wait)
+        return waiter
 
     def _ask_again(self, wait: "_Wait") -> TransformStamped | None:
         """The answer, or None; then the error that blocks it is noted."""
@@ -250,12 +252,12 @@ class Lookups:
             while found is None:
                 with self._clock.move_on_after(pause):
                     while found is None:
-                        waiter, woken = self._park(wait)
+                        waiter = self._park(wait)
                         try:
-                            await woken
+                            await wait.woken
                         finally:
                             self._live.waiting.remove(waiter)
-                        found = self._answer_of(waiter, wait)
+                        found = self._ask_again(wait)
                 if found is None:
                     pause = min(self.report(wait.question, wait.since, wait.blocker), REPORT_AFTER)
                     found = self._ask_again(wait)
@@ -273,3 +275,9 @@ class Lookups:
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
                 raise UnknownFrameError(frame=name, known=self._live.forest.known_frames()) from None
+
+
+def _timed_out(wait: _Wait, limit: float) -> LookupTimeoutError:
+    """The error of a wait that had no answer for some time (s)."""
+    question = wait.question
+    return LookupTimeoutError(target=question.target, source=question.source, timeout=limit, missing=wait.blocker)

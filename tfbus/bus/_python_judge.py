@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from tfbus.geometry.stamped import Batch
+from tfbus.stamps import STAMP_MIN
 
 
 class Edge:
@@ -23,35 +24,49 @@ class Edge:
     newest: int | None
 
 
-def judge(edges: Mapping[str, Edge], batch: Batch, horizon: int, square: float) -> bool:
-    """Whether a whole batch continues known edges; then the newest stamps are noted, else nothing.
+class Judge:
+    """The plain judgement of batches by the newest edges of a bus.
 
     Parameters
     ----------
-    edges : mapping of child to Edge
-    batch : Batch
-    horizon : int
-        No stamp may be newer, in ns.
+    edges : dict of str to Edge
+        By child.
     square : float
         No translation may have a greater square, in m^2.
+
+    Attributes
+    ----------
+    horizon : int
+        No stamp may be newer, in ns. At first the least stamp.
     """
-    known = None
-    for sample in batch:
-        parent, child, stamp, (x, y, z, _, _, _, _), authority, static = sample._fields
-        known = edges.get(child)
-        if known is None or known.parent != parent or known.trusted != authority or static or stamp > horizon:
-            return False
-        # Not `>`, which is false for NaN.
-        if not x * x + y * y + z * z <= square:
-            return False
-    if known is not None and len(batch) == 1:
-        # Nearly always so, and a second look costs a quarter of the first.
-        if known.newest is None or stamp > known.newest:
-            known.newest = stamp
+
+    __slots__ = ("_edges", "_square", "horizon")
+
+    def __init__(self, edges: Mapping[str, Edge], square: float) -> None:
+        self._edges = edges
+        self._square = square
+        self.horizon = STAMP_MIN
+
+    def accepts(self, batch: Batch) -> bool:
+        """Whether a whole batch continues known edges; then the newest stamps are noted, else nothing."""
+        edges, square, horizon = self._edges, self._square, self.horizon
+        known = None
+        for sample in batch:
+            parent, child, stamp, (x, y, z, _, _, _, _), authority, static = sample._fields
+            known = edges.get(child)
+            if known is None or known.parent != parent or known.trusted != authority or static or stamp > horizon:
+                return False
+            # Not `>`, which is false for NaN.
+            if not x * x + y * y + z * z <= square:
+                return False
+        if known is not None and len(batch) == 1:
+            # Nearly always so, and a second look costs a quarter of the first.
+            if known.newest is None or stamp > known.newest:
+                known.newest = stamp
+            return True
+        for sample in batch:
+            fields = sample._fields
+            known = edges[fields[1]]
+            if known.newest is None or fields[2] > known.newest:
+                known.newest = fields[2]
         return True
-    for sample in batch:
-        fields = sample._fields
-        known = edges[fields[1]]
-        if known.newest is None or fields[2] > known.newest:
-            known.newest = fields[2]
-    return True

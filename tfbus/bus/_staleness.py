@@ -5,7 +5,7 @@ time that it may have become stale, and nothing for each sample.
 """
 
 from collections.abc import Callable
-from heapq import heapify, heappop, heappush
+from heapq import heapify, heappop, heappush, heapreplace
 
 from tfbus.events import FrameLive, FrameStale
 from tfbus.geometry.stamped import Batch
@@ -66,18 +66,22 @@ class Staleness:
                 self._watch(frame)
                 found.append(FrameLive(now, frame, known.newest, known.authority))
         while self._due and self._due[0][0] < now:
-            due, frame = heappop(self._due)
+            due, frame = self._due[0]
             if self._live.get(frame) != due:
+                heappop(self._due)
                 continue
-            del self._live[frame]
             known = self._newest_edge(frame)
-            if known is None or known.newest is None:
+            newest = None if known is None else known.newest
+            if newest is not None and newest + self._limit != due:
+                # It was heard meanwhile, as nearly all are.
+                self._live[frame] = newest + self._limit
+                heapreplace(self._due, (newest + self._limit, frame))
                 continue
-            if known.newest + self._limit == due:
+            heappop(self._due)
+            del self._live[frame]
+            if known is not None and newest is not None:
                 self._stale.add(frame)
-                found.append(FrameStale(now, frame, known.newest, known.authority))
-            else:
-                self._watch(frame)
+                found.append(FrameStale(now, frame, newest, known.authority))
         return found
 
     def due(self) -> int | None:

@@ -11,6 +11,7 @@ from copy import copy
 from typing import Literal, get_args
 
 from tfbus.bus._announcer import Announcer
+from tfbus.bus._intake import Edge, Judge
 from tfbus.bus._ownership import Ownership
 from tfbus.bus._plausibility import Plausibility
 from tfbus.bus.once_logger import OnceLogger
@@ -25,17 +26,11 @@ from tfbus.events import (
     StampAhead,
 )
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.geometry.which_kernel import kernel
 from tfbus.registration import Registration
 from tfbus.stamps import STAMP_MIN, format_duration
 from tfbus.tree.cycles import NewestEdge, admit
 
 _FORMER_PARENTS = 1_000
-
-if kernel == "python":
-    from tfbus.bus._python_judge import Edge, judge
-else:
-    from tfbus._kernel import Edge, judge  # type: ignore[assignment]
 
 Invalid = Literal["raise", "drop"]
 
@@ -91,6 +86,8 @@ class Topology:
         Number of samples that gave a child another newest parent, another kind, or another authority than before.
     ahead : int
         Accepted samples that were ahead of the clock.
+    judge : Judge
+        Records the samples of a batch if all continue known edges; else `accept` has to look.
     """
 
     def __init__(
@@ -104,13 +101,12 @@ class Topology:
         self._log = log
         self._ownership = ownership
         self._plausibility = plausibility
-        self._square = plausibility.max_translation**2
-        # No stamp up to this one is ahead of the clock, which only goes forward between two calls of `clock_jumped`.
-        self._horizon = STAMP_MIN
         self._announcer = announcer
         self._evict = evict
         self._parents = 0
         self._newest: dict[str, _Edge] = {}
+        # No stamp up to its horizon is ahead of the clock, which only goes forward between two calls of `clock_jumped`.
+        self.judge = Judge(self._newest, plausibility.max_translation**2)
         # Every parent of a newest edge, and some that were one.
         self._named: set[str] = set()
         self.latched: dict[str, TransformStamped] = {}
@@ -171,11 +167,7 @@ class Topology:
             nothing was noted.
         """
         # Nearly always all samples continue known edges, so that only the stamps are new.
-        before = self._horizon
-        if judge(self._newest, batch, before, self._square):
-            return batch
-        horizon = self._renew_horizon()
-        if horizon > before and judge(self._newest, batch, horizon, self._square):
+        if self.judge.accepts(batch) or self._accepts_now(batch):
             return batch
         return self._judge(batch, invalid)
 
@@ -197,7 +189,8 @@ class Topology:
     def clear_moving(self) -> None:
         """Forget every moving child, but keep the right of its first authority."""
         self._ownership.remember({child: known for child, known in self._newest.items() if not known.static})
-        self._newest = {child: known for child, known in self._newest.items() if known.static}
+        for child in self.moving():
+            del self._newest[child]
 
     def reject(self, reason: str, error: Exception) -> None:
         """Count and announce a sample that was refused."""
@@ -217,19 +210,22 @@ class Topology:
             with self._plausibility.recorded_time():
                 yield
         finally:
-            self._horizon = STAMP_MIN
+            self.judge.horizon = STAMP_MIN
 
     def clock_jumped(self) -> None:
         """Note that a jump of the clock was announced."""
         self._plausibility.clock_jumped = True
-        self._horizon = STAMP_MIN
+        self.judge.horizon = STAMP_MIN
 
-    def _renew_horizon(self) -> int:
-        newest = self._plausibility.newest_plausible()
-        # Nothing tells when a clock that nobody has set is advanced for the first time.
-        if self._plausibility.clock_is_set:
-            self._horizon = newest
-        return newest
+    def _accepts_now(self, batch: Batch) -> bool:
+        """Whether the judge accepts a batch by the time that it is now."""
+        judge, horizon = self.judge, self._plausibility.newest_plausible()
+        later, judge.horizon = horizon > judge.horizon, horizon
+        accepted = later and judge.accepts(batch)
+        if not self._plausibility.clock_is_set:
+            # Nothing tells when a clock that nobody has set is advanced for the first time.
+            judge.horizon = STAMP_MIN
+        return accepted
 
     def _judge(self, batch: Batch, invalid: Invalid) -> Batch:
         batch, refused, ahead = self._plausibility.split(batch)

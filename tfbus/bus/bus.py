@@ -12,6 +12,7 @@ from threading import get_ident
 from types import TracebackType
 
 from tfbus.bus._announcer import Announcer
+from tfbus.bus._intake import Intake
 from tfbus.bus._late_buffer import LateBuffer
 from tfbus.bus._owner_thread import OwnerThread
 from tfbus.bus._ownership import OnConflict, Ownership
@@ -100,7 +101,10 @@ class Bus:
         self._late: dict[LiveTree, LateBuffer] = {}
         self._streams: list[Stream] = []
         self._threads: list[ThreadPublisher] = []
-        self._samples = 0
+        listeners = self._subscribers.callbacks, self._streams, self._events, self._late
+        self._intake = Intake(self._topology.judge, TransformStamped, listeners)
+        self._intake.thread = self._owner.thread
+        self._take = self._intake.take
         self._resets = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
@@ -142,6 +146,9 @@ class Bus:
         RuntimeError
             If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
         """
+        # Nearly always samples only continue known edges, and the buffers are all that hears of them.
+        if self._take(samples, invalid):
+            return
         if get_ident() != self._owner.thread:
             self._check_thread()
         if self._closed:
@@ -160,7 +167,7 @@ class Bus:
         batch = self._topology.accept(batch, invalid)
         if not batch:
             return
-        self._samples += len(batch)
+        self._intake.samples += len(batch)
         if self._late:
             self._insert_into_late_buffers(batch)
         else:
@@ -180,6 +187,7 @@ class Bus:
         The first event loop to use a bus that another thread has made takes it over.
         """
         self._owner.check()
+        self._intake.thread = self._owner.thread
 
     def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
@@ -306,11 +314,12 @@ class Bus:
         latched = tuple(self._topology.latched.values())
         late = LateBuffer(buffer, self._topology.moving(), self._topology.newest)
         buffer.is_ahead = self._topology.is_ahead
-        self._buffers[buffer] = self._samples - len(latched)
+        self._buffers[buffer] = self._intake.samples - len(latched)
         if latched:
             late.insert(latched)
         if not late.has_caught_up:
             self._late[buffer] = late
+        self._connect_feeds()
 
     def _detach(self, buffer: LiveTree) -> None:
         """Take a buffer off the bus, if it is on it. Called by `Buffer`."""
@@ -318,6 +327,7 @@ class Bus:
             self._check_thread()
         self._buffers.pop(buffer, None)
         self._late.pop(buffer, None)
+        self._connect_feeds()
 
     def remove_frame(self, frame: str) -> None:
         """Remove a frame from every buffer and from pending batches, and do not give it to later subscribers.
@@ -349,7 +359,7 @@ class Bus:
     def statistics(self) -> BusStatistics:
         """All counters, as they are now."""
         return BusStatistics(
-            samples=self._samples,
+            samples=self._intake.samples,
             rejected=dict(self._topology.rejected),
             reparented=self._topology.reparented,
             kind_changes=self._topology.kind_changes,
@@ -357,7 +367,7 @@ class Bus:
             clock_resets=self._resets,
             callbacks_failed=self._subscribers.failures,
             frames=len(self._topology),
-            buffers=tuple(buffer.statistics(self._samples - before) for buffer, before in self._buffers.items()),
+            buffers=tuple(buffer.statistics(self._intake.samples - before) for buffer, before in self._buffers.items()),
             queues=(
                 *(stream.queue.statistics("stream") for stream in self._streams),
                 *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
@@ -382,6 +392,7 @@ class Bus:
         if any(reader.waiting for reader in readers) or any(buffer.has_waiters for buffer in self._buffers):
             self._check_thread()
         self._closed = True
+        self._intake.open = False
         self._jumps.close()
         for publisher in self._threads:
             publisher.end()
@@ -402,6 +413,9 @@ class Bus:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.close()
+
+    def _connect_feeds(self) -> None:
+        self._intake.feeds = tuple((buffer.feed, buffer.insert_closely) for buffer in self._buffers)
 
     def _check_usable(self) -> None:
         self._check_thread()

@@ -22,7 +22,7 @@ def main() -> None:
 
     if heard:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from tfbus.cli.application import run
+    from tfbus.cli.exit_status import run
 
     try:
         status = run(sys.argv[1:], hear_ctrl_c)

@@ -1,58 +1,17 @@
-"""The command line: the subcommands, the options of all of them, and the exit status for whatever happens."""
+"""The command line in cyclopts: the subcommands, and the options of all of them."""
 
-import os
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from io import TextIOWrapper
 from typing import Annotated, Literal
 
 try:
-    from cyclopts import App, CycloptsError, Group, Parameter
+    from cyclopts import App, Group, Parameter
 except ImportError:
     from tfbus.errors import pip_install
 
     raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
 
-LOOKUP_FAILED = 1
-USAGE_ERROR = 2
-INTERRUPTED = 130
-
-COMMANDS = {
-    "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
-    "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
-    "receives it.",
-    "check": "Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.",
-    "compare": "Compare the trajectory of a frame in two recordings: absolute and relative pose error, aligned and "
-    "not.",
-    "convert": "Write recordings to a new one: in another format, a part of them, renamed, or several merged by their "
-    "log times.",
-    "demo": "Run the tutorial's robot: a 100 Hz broadcaster and a 1 Hz listener in one process, until Ctrl-C.",
-    "echo": "Print the transform of SOURCE in TARGET again and again, until Ctrl-C.",
-    "foxglove": "Show the frames of a domain to the Foxglove application, until Ctrl-C.",
-    "info": "Print the contents of a recording: its topics, its frames with parents, rates, gaps and delays, and its "
-    "senders.",
-    "listen": "Print a point of the tutorial's laser in the frame of the base, again and again, until Ctrl-C.",
-    "monitor": "Measure the rate, the delay, the jitter and the losses of each frame and sender of a domain, until "
-    "Ctrl-C.",
-    "play": "Publish a recording on a domain with its original stamps and timing, static transforms first.",
-    "plot": "Plot the transforms of some frames from a recording over time: FILE TARGET SOURCE...",
-    "query": "Print the transform of SOURCE in TARGET from a recording: the newest, at an instant, or at many.",
-    "record": "Record all transforms of a domain to FILE, in MCAP as ROS 2 and Foxglove read it, until Ctrl-C.",
-    "robot": "Publish the frames of a robot until Ctrl-C, or print them as a tree; joints without a position are at "
-    "zero.",
-    "router": "Pass on what programs of all domains send each other, until Ctrl-C.",
-    "static": "Publish the static transform of CHILD in PARENT, or all that a file holds, until Ctrl-C.",
-    "tree": "Show all frames as a tree, each with its rate, the age and span of its samples, and its authority.",
-    "view": "Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.",
-}
-"""The first line of the help of each subcommand, so that a list of them loads none."""
-
-_EXIT_STATUSES = (
-    "Exit status: 0 success; 1 a lookup or a recording has failed, or a check has found something; 2 wrong usage, or a "
-    "file that cannot be used; 130 ended by Ctrl-C; 143 ended by a termination. Variables of the environment: "
-    "TFBUS_DOMAIN, TFBUS_CONNECT (addresses with blanks between them), NO_COLOR."
-)
+from tfbus.cli._overview import COMMANDS, EXIT_STATUSES
 
 LogLevel = Literal["debug", "info", "warning", "error", "critical"]
 """A level of the module `logging`."""
@@ -81,7 +40,7 @@ def application(command: str | None) -> App:
         name="tfbus",
         help="Stamped coordinate transforms for asyncio and trio.",
         version=_version,
-        help_epilogue=_EXIT_STATUSES,
+        help_epilogue=EXIT_STATUSES,
         # To load a parser of Markdown takes as long as all the rest of the list of commands.
         help_format="plaintext" if command is None else "markdown",
         suppress_keyboard_interrupt=False,
@@ -108,65 +67,8 @@ def application(command: str | None) -> App:
     return app
 
 
-def run(words: Sequence[str], loaded: Callable[[], object] = lambda: None) -> int:
-    """Run the command with arguments, and return its exit status; errors that a user can cause are a line each.
-
-    Parameters
-    ----------
-    words : sequence of str
-        What a user types after ``tfbus``.
-    loaded : callable
-        Called once all modules of the subcommand are there, before it begins.
-    """
-    if isinstance(sys.stdout, TextIOWrapper):
-        # Its encoding may lack the letters of a frame name.
-        sys.stdout.reconfigure(errors="backslashreplace")
-    app = application(next((word for word in words if word in COMMANDS), None))
-    status = 0
-    try:
-        prepare, arguments, _ = app.meta.parse_args(words, exit_on_error=False, print_error=False)
-        program: Program | None = prepare(*arguments.args, **arguments.kwargs)
-        # Help has been printed by now.
-        if program is not None:
-            loaded()
-            program()
-        sys.stdout.flush()
-    except* KeyboardInterrupt:
-        status = INTERRUPTED
-    except* BrokenPipeError:
-        # The reader has closed the pipe; without this, Python would report that again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except* _usage_errors() as errors:
-        status = _report(errors, USAGE_ERROR)
-    except* _lookup_errors() as errors:
-        status = _report(errors, LOOKUP_FAILED)
-    return status
-
-
 def _run_logging(level: LogLevel, program: Program) -> None:
     from tfbus.cli._log_lines import log_lines
 
     with log_lines(level.upper()):
         program()
-
-
-def _report(errors: BaseExceptionGroup[BaseException], status: int) -> int:
-    from tfbus.cli.output import warn
-
-    for error in errors.exceptions:
-        warn(str(error))
-    return status
-
-
-# Their modules take long to load, and most commands end without an error.
-def _usage_errors() -> tuple[type[Exception], ...]:
-    from tfbus.cli.arguments import UsageError
-    from tfbus.errors import RecordingError
-
-    return CycloptsError, UsageError, RecordingError
-
-
-def _lookup_errors() -> type[Exception]:
-    from tfbus.errors import TransformLookupError
-
-    return TransformLookupError

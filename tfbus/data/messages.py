@@ -36,7 +36,7 @@ Data = (
     | LaserScan
     | TransformStamped
 )
-"""What a message can become, and what can become one."""
+"""The types that a message can become, and that can become one."""
 
 
 def from_message(message: object) -> Any:

@@ -20,9 +20,9 @@ Numbers: TypeAlias = Sequence[float] | npt.NDArray[Any]
 Row: TypeAlias = tuple[float, float, float, float, float, float, float]
 
 NORM_TOLERANCE = 0.01
-"""How far the norm of a quaternion may be from one to be accepted, and normalised."""
+"""The largest distance of a quaternion's norm from one that is accepted, and normalised."""
 ROUNDING = 1e-15
-"""How far the squared norm of a quaternion may be from one to be left as it is."""
+"""The largest distance of a quaternion's squared norm from one that is left as it is."""
 IDENTITY: Row = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 Columns: TypeAlias = tuple[Any, Any, Any, Any, Any, Any, Any]

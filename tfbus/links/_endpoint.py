@@ -23,7 +23,7 @@ from tfbus.links._state import CHUNK
 from tfbus.tf_message import MalformedMessageError
 
 CLAIM_PERIOD = 1.0
-LONGEST_CLAIM_PERIOD = 10.0
+LONGEST_CLAIM_PERIOD = 30.0
 """s; a link claims its state so long after it has sent something, and then after twice that time, up to the longest."""
 
 

@@ -10,6 +10,8 @@ from tfbus.plot.series import Floats, Series, read_series
 from tfbus.tree.tree import TransformTree
 
 _NAMES = (("x [m]", "y [m]", "z [m]"), ("roll [deg]", "pitch [deg]", "yaw [deg]"))
+_LEAST_SPAN = 1e-6
+"""m and deg; smaller changes are those of rounding."""
 
 
 def plot_transforms(
@@ -55,6 +57,10 @@ def plot_transforms(
         for column in range(2):
             axes[row, column].set_ylabel(_NAMES[column][row])
             axes[row, column].grid(alpha=0.3)
+            low, high = axes[row, column].get_ylim()
+            if high - low < _LEAST_SPAN:
+                middle = (low + high) / 2.0
+                axes[row, column].set_ylim(middle - _LEAST_SPAN / 2.0, middle + _LEAST_SPAN / 2.0)
     for column in range(2):
         axes[2, column].set_xlabel("time from the start [s]")
     result.suptitle(f"in {target}")

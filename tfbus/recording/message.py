@@ -15,4 +15,4 @@ class RecordedMessage(NamedTuple):
     batch: Batch
     """The valid transforms."""
     errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """Why the other transforms were refused; with ``reason="damaged"``, which part of the file is lost here."""
+    """The reason why others were refused; with ``reason="damaged"``, the part of the file that is lost here."""

@@ -4,8 +4,8 @@ from tfbus.geometry.which_kernel import kernel
 from tfbus.tree._python_kernel import ONE_BY_ONE, Columns, Held
 
 if kernel == "python":
-    from tfbus.tree._python_kernel import Chain, History, Paths, commit
+    from tfbus.tree._python_kernel import Chain, History, Paths, commit, compose_paths
 else:
-    from tfbus._kernel import Chain, History, Paths, commit  # type: ignore[assignment]
+    from tfbus._kernel import Chain, History, Paths, commit, compose_paths  # type: ignore[assignment]
 
-__all__ = ["ONE_BY_ONE", "Chain", "Columns", "Held", "History", "Paths", "commit"]
+__all__ = ["ONE_BY_ONE", "Chain", "Columns", "Held", "History", "Paths", "commit", "compose_paths"]

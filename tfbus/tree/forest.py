@@ -70,6 +70,8 @@ class Forest:
         Frames that have become a parent since `forget_changes`, so that they may have become known.
     looping : list of LoopingSample
         Samples since `forget_changes` that are part of a loop of parents at a past stamp.
+    readers : dict
+        The frames that have changed, for each `read_all` that goes on.
     expired_frames : list of str
         The frame of each sample that expired since `forget_changes`.
     replaced, expired : int
@@ -91,7 +93,7 @@ class Forest:
         self.new_parents: set[str] = set()
         self.looping: list[LoopingSample] = []
         self._suspects: list[TransformStamped] = []
-        self._readers: dict[int, set[str]] = {}
+        self.readers: dict[int, set[str]] = {}
         self.expired_frames: list[str] = []
         self.replaced = 0
         self.expired = 0
@@ -126,7 +128,7 @@ class Forest:
         InvalidTransformError
             If a sample would close a loop of parents, judged after the whole batch.
         """
-        if self.paths.commit(self.frames, self._readers, batch):
+        if self.paths.commit(self.frames, self.readers, batch):
             # Nearly always so: samples that only continue their histories close no loop and change no path.
             return [Outcome.INSERTED] * len(batch)
         with self.lock:
@@ -148,7 +150,7 @@ class Forest:
         bool
             Whether every sample was the next one of its frame, so that nothing but stamps has changed.
         """
-        if self.paths.commit(self.frames, self._readers, batch):
+        if self.paths.commit(self.frames, self.readers, batch):
             return True
         count = len(batch)
         with self.lock:
@@ -163,7 +165,7 @@ class Forest:
                 stored = end
             if self._suspects:
                 self.find_past_loops()
-            if self._readers:
+            if self.readers:
                 self._tell_readers([sample.child for sample in batch])
         return plain
 
@@ -189,7 +191,7 @@ class Forest:
             self.version += 1
             self.frames[child].append_many(stamps, rows)
             self.inserted += len(stamps)
-            if self._readers:
+            if self.readers:
                 self._tell_readers([child])
 
     def insert_judged(self, sample: TransformStamped) -> Outcome:
@@ -359,7 +361,7 @@ class Forest:
         changed: set[str] = set()
         with self.lock:
             ahead = list(self.frames)
-            self._readers[id(changed)] = changed
+            self.readers[id(changed)] = changed
         try:
             for _ in range(_ROUNDS):
                 for first in range(0, len(ahead), AT_A_TIME):
@@ -372,9 +374,9 @@ class Forest:
             with self.lock:
                 self._read(list(changed), read, found, changed)
                 # A later change is no longer of this moment.
-                del self._readers[id(changed)]
+                del self.readers[id(changed)]
         finally:
-            self._readers.pop(id(changed), None)
+            self.readers.pop(id(changed), None)
         return found
 
     def _read(
@@ -456,7 +458,7 @@ class Forest:
 
     def _tell_readers(self, frames: Iterable[str]) -> None:
         """Tell the threads that read all frames which have changed."""
-        for changed in self._readers.values():
+        for changed in self.readers.values():
             changed.update(frames)
 
     def _remove(self, frame: str) -> None:

@@ -1,8 +1,8 @@
 """The poses of all frames in one of them: what a picture of the tree needs, and faster than a lookup for each frame.
 
 The tree is walked from the fixed frame outwards, edges above it upside down, so each edge is read once for each stamp
-at which it is needed, which is usually one. The samples are read under the lock; numpy composes them after that,
-doubling the length of the paths each time.
+at which it is needed, which is usually one. The samples are read under the lock and composed after that. While the
+structure of the tree stays, a picture of the newest samples reads nothing but them.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import TransformLookupError
-from tfbus.geometry.rows import IDENTITY, Row, compose, invert
+from tfbus.geometry.rows import IDENTITY, Row, invert
 from tfbus.stamps import LATEST, STAMP_MIN, Latest
+from tfbus.tree._kernel import compose_paths
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import find
@@ -73,6 +74,7 @@ class PoseReader:
     def __init__(self, forest: Forest) -> None:
         self._forest = forest
         self._plans: dict[str, _Plan] = {}
+        self._newest: _Newest | None = None
         self.topology: object = None
 
     def read(self, fixed: str, at: int | Latest = LATEST) -> Poses:
@@ -83,24 +85,38 @@ class PoseReader:
         UnknownFrameError
             If no sample names `fixed`.
         """
+        if isinstance(at, Latest):
+            newest, records = self._read_newest(fixed)
+            poses = newest.poses(records)
+            if poses is not None:
+                return poses
+        return self._read_any(fixed, at)
+
+    def _read_newest(self, fixed: str) -> tuple["_Newest", list[bytes]]:
+        forest = self._forest
+        with forest.lock:
+            forest.check_known(fixed)
+            state = fixed, forest.structure, len(forest.frames)
+            newest = self._newest
+            if newest is None or newest.state != state:
+                plan = self._plan(fixed, LATEST)
+                newest = self._newest = _Newest(state, plan, [forest.frames.get(child) for child in plan.edges])
+            return newest, [history.newest_record for history in newest.moving]
+
+    def _read_any(self, fixed: str, at: int | Latest) -> Poses:
+        """The poses, whatever stamps and parents the samples have."""
         forest = self._forest
         with forest.lock:
             forest.check_known(fixed)
             plan = self._plan(fixed, at)
-            histories = [None if child == "" else forest.frames[child] for child in plan.edges]
-            together = _gather_newest(plan, histories) if at is LATEST else None
-            gathered = _gather(plan, histories, at) if together is None else together.gathered
-            moved = _moved_to_another_parent(plan, histories) if at is LATEST else []
-            corrections = [(place, _find(forest, fixed, plan.frames[place])) for place in moved]
-            if together is not None and not any(plan.inverted):
-                # Each frame is reached by its own edge.
-                static = np.array(together.static)
-                heard = np.where(static, STAMP_MIN, STAMP_MIN if together.stamp is None else together.stamp)
-                heard[0] = STAMP_MIN
-            else:
-                static, heard = self._own_edges(plan, at)
+            histories = [forest.frames.get(child) for child in plan.edges]
+            gathered = _gather(plan, histories, at)
+            # A frame may have had another parent at the stamp, or two, by which it was in a loop.
+            reparented = any(history.mixed for history in forest.frames.values())
+            corrections = [_find(forest, fixed, frame, at) for frame in plan.frames] if reparented else []
+            static, heard = self._own_edges(plan, at)
         columns, answered = gathered.compose()
-        for place, row in corrections:
+        for place, row in enumerate(corrections):
             answered[place] = row is not None
             if row is not None:
                 columns[:, place] = row
@@ -170,21 +186,70 @@ class _Gathered(NamedTuple):
 
     def compose(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
         """The poses of the frames as columns of shape (7, n), and whether each is answered."""
-        columns = np.frombuffer(self.rows, np.float64).reshape(-1, _WIDTH).T.copy()
+        rows = np.frombuffer(self.rows, np.float64).reshape(-1, _WIDTH)
         inverted = np.array(self.plan.inverted, np.bool_)
-        upside_down = np.flatnonzero(inverted if len(self.places) == len(inverted) else inverted[self.places])
-        if len(upside_down):
-            columns[:, upside_down] = invert((*columns[:, upside_down],))
-        # Each round doubles the part of the path that a column is about: its end is that frame, its beginning the other
-        # one in `above` (pointer jumping; JaJa, "An Introduction to Parallel Algorithms", section 2.2).
-        above = np.array(self.origins, np.intp)
-        rest = np.flatnonzero(above)
-        while len(rest):
-            before = above[rest]
-            columns[:, rest] = compose((*columns[:, before],), (*columns[:, rest],))
-            above[rest] = above[before]
-            rest = rest[above[rest] != 0]
-        return columns[:, self.own], np.array(self.answered, np.bool_)[self.own]
+        _turn_round(rows, np.flatnonzero(inverted[self.places]))
+        compose_paths(rows, np.array(self.origins, np.int64))
+        return rows.T[:, self.own], np.array(self.answered, np.bool_)[self.own]
+
+
+def _turn_round(rows: npt.NDArray[np.float64], places: npt.NDArray[np.intp]) -> None:
+    """Invert the rows at these places."""
+    if len(places):
+        rows[places] = np.stack(invert((*rows[places].T,)), axis=1)
+
+
+class _Newest:
+    """The poses of the newest samples, while no edge but those comes or changes.
+
+    Parameters
+    ----------
+    state : object
+        Another value whenever the structure of the forest may have changed.
+    plan : _Plan
+    histories : sequence of FrameHistory
+        Of each edge of the plan; None for the first.
+
+    Attributes
+    ----------
+    state : object
+    moving : list of FrameHistory
+        Their newest records are what `poses` needs.
+    """
+
+    def __init__(self, state: object, plan: _Plan, histories: Sequence[FrameHistory | None]) -> None:
+        self.state = state
+        self._plan = plan
+        self._frames = tuple(plan.frames)
+        moving = {place: each for place, each in enumerate(histories) if each is not None and not each.static}
+        self.moving = list(moving.values())
+        self._places = np.array(list(moving), np.intp)
+        rows = [history.static_row if history is not None and history.static else IDENTITY for history in histories]
+        self._rows = np.array(rows)
+        self._upside_down = np.flatnonzero(plan.inverted)
+        self._origins = np.array([0, *plan.origins[1:]], np.int64)
+        is_moving = {child: place in moving for place, child in enumerate(plan.edges) if place}
+        self._static = np.array([not is_moving.get(frame, True) for frame in plan.frames])
+        self._heard = np.array([is_moving.get(frame, False) for frame in plan.frames])
+
+    def poses(self, records: Sequence[bytes]) -> Poses | None:
+        """The poses; None if the records have several stamps, or an edge has none.
+
+        At the newest stamp of all edges, the parents are the newest ones.
+        """
+        block = np.frombuffer(b"".join(records)).reshape(-1, 1 + _WIDTH)
+        stamps = block[:, 0].copy().view(np.int64)
+        if len(block) != len(records) or (stamps != stamps[:1]).any():
+            return None
+        rows = self._rows.copy()
+        rows[self._places] = block[:, 1:]
+        _turn_round(rows, self._upside_down)
+        compose_paths(rows, self._origins)
+        heard = np.full(len(self._frames), STAMP_MIN)
+        if len(stamps):
+            heard[self._heard] = stamps[0]
+        answered = np.ones(len(self._frames), np.bool_)
+        return Poses(self._frames, rows.T, self._plan.parents, answered, self._static, heard)
 
 
 def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Latest) -> _Gathered:
@@ -253,52 +318,12 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     return gathered
 
 
-class _Together(NamedTuple):
-    """Edges that were all read at one stamp."""
-
-    gathered: _Gathered
-    static: list[bool]
-    stamp: int | None
-    """The newest stamp of all moving edges, in ns; None if all are static."""
-
-
-def _gather_newest(plan: _Plan, histories: Sequence[FrameHistory | None]) -> _Together | None:
-    """Read every edge at its newest stamp, if that is the same for all moving edges, as it mostly is; else None."""
-    rows = bytearray()
-    static = []
-    common: int | None = None
-    for history in histories:
-        static.append(history is not None and history.static)
-        if history is None:
-            rows += _IDENTITY
-        elif history.static:
-            rows += _pack(*history.static_row)
-        else:
-            newest = history.newest
-            if newest is None or newest != (newest if common is None else common):
-                return None
-            common = newest
-            rows += _pack(*history.sample(history.count - 1)[1])
-    every = list(range(len(histories)))
-    gathered = _Gathered(plan, rows, every, [0, *plan.origins[1:]], [True] * len(every), every)
-    return _Together(gathered, static, common)
-
-
 def _heard(stamp: int | None) -> int:
     return STAMP_MIN if stamp is None else stamp
 
 
-def _moved_to_another_parent(plan: _Plan, histories: Sequence[FrameHistory | None]) -> list[int]:
-    """The places of the frames that had another parent on the way to them inside the window."""
-    moved = [False] * len(histories)
-    for place, history in enumerate(histories):
-        if history is not None:
-            moved[place] = history.mixed or moved[plan.origins[place]]
-    return [place for place, has in enumerate(moved) if has]
-
-
-def _find(forest: Forest, fixed: str, frame: str) -> Row | None:
+def _find(forest: Forest, fixed: str, frame: str, at: int | Latest) -> Row | None:
     try:
-        return find(forest, fixed, frame, LATEST, None)[1]
+        return find(forest, fixed, frame, at, None)[1]
     except TransformLookupError:
         return None

@@ -12,6 +12,7 @@ from tfbus.geometry.stamped import Batch
 from tfbus.registration import Registration
 from tfbus.statistics import BufferStatistics
 from tfbus.tree.forest import Forest, LoopingSample
+from tfbus.waiting._feed import Feed
 from tfbus.waiting._limits import limits_of
 from tfbus.waiting.waiting_index import Waiter, WaitingIndex
 from tfbus.waiting.watch_index import WatchIndex, WatchState
@@ -40,6 +41,8 @@ class LiveTree:
         Says whether the newest stamp of a frame, in ns, from an authority is ahead of the clock. The bus sets it.
     expired_ahead, superseded : int
         As in `BufferStatistics`; the bus counts the superseded ones.
+    feed : Feed
+        Does what `insert` does with a batch, if all of it is plain.
     """
 
     def __init__(self, forest: Forest, on_loop: Callable[[LoopingSample], object] | None = None) -> None:
@@ -55,9 +58,25 @@ class LiveTree:
         self._waiters = self.waiting.by_frame
         self._watches = self.watching.by_frame
         self._end_callbacks: dict[Registration, Callable[[], object]] = {}
+        waiting = self.waiting
+        self.feed = Feed(
+            forest.paths,
+            forest.frames,
+            forest.readers,
+            waiting.by_frame,
+            waiting.parked,
+            waiting.limits,
+            self.watching.by_frame,
+            waiting.forget,
+        )
 
     def insert(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake the lookups and watches that it concerns."""
+        if not self.feed.insert(batch):
+            self.insert_closely(batch)
+
+    def insert_closely(self, batch: Batch) -> None:
+        """As `insert`, for a batch that the feed has left alone because it is not plain."""
         waiters = self._waiters
         plain = self.forest.commit(batch)
         if waiters:
@@ -159,9 +178,8 @@ class LiveTree:
         """Wake waiters, each with its answer if the kernel has one; it counts as long as the forest stays as it is."""
         paths = self.forest.paths
         for waiter in waiters:
-            question = waiter.question
-            if question.is_plain:
-                waiter.answer = paths.answer(question.target, question.source, question.at)
+            if waiter.plain is not None:
+                waiter.answer = paths.answer(*waiter.plain)
                 waiter.version = paths.version
         _wake(waiters)
 
@@ -204,6 +222,6 @@ class LiveTree:
 
 def _wake(waiters: Iterable[Waiter | WatchState]) -> None:
     for waiter in waiters:
-        # The event loop of a waiter that was never cancelled may be gone. The others must be woken all the same.
-        with suppress(RuntimeError):
+        # Its wait was cancelled, or its event loop is gone. The others must be woken all the same.
+        with suppress(Exception):
             waiter.wake()

@@ -3,7 +3,7 @@
 A lookup that cannot be answered is parked under the frame that blocks it: an edge whose newest stamp is too old,
 ordered by the stamp that the lookup needs; an unknown frame; or the roots of two trees. An insertion then finds the
 lookups that it may have unblocked without looking at the others. Nothing here waits or computes an answer: the
-inserting code pops the waiters that may have an answer and wakes them, and each asks the tree again.
+inserting code pops the waiters that may have an answer and wakes them, each with its answer if that is plain.
 
 A lookup also ends when another edge of its path loses the stamp, because its window has slid on. Each of these edges
 has a limit: the newest stamp that it may reach until then. A waiter is kept by its first limit in one list for all
@@ -25,11 +25,10 @@ from tfbus.errors import (
     TransformLookupError,
     UnknownFrameError,
 )
-from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import STAMP_MIN, Latest
 from tfbus.tree.question import Question
-
-_Place = tuple[int, int, "Waiter"]
+from tfbus.waiting._feed import Line, Parked
+from tfbus.waiting._python_feed import Place
 
 _NEVER = 2**64
 
@@ -46,7 +45,7 @@ class PendingLookup:
         return f"{self.question.source!r} in {self.question.target!r}: {self.blocked_by}"
 
 
-class Waiter:
+class Waiter(Parked):
     """A parked lookup.
 
     Parameters
@@ -68,18 +67,14 @@ class Waiter:
     """
 
     __slots__ = (
-        "answer",
         "blocked_by",
         "indexed",
         "limit",
         "limits",
         "names",
         "others",
-        "place",
         "question",
         "since",
-        "version",
-        "wake",
     )
 
     def __init__(
@@ -89,13 +84,15 @@ class Waiter:
         self.since = since
         self.wake = wake
         self.others = others
-        self.answer: TransformStamped | None = None
+        self.plain = (question.target, question.source, question.at) if question.is_plain else None
+        self.answer = None
         self.version = 0
+        self.place = None
+        self.elsewhere = False
         self.blocked_by: TransformLookupError | None = None
         self.names: tuple[str, ...] = ()
-        self.place: _Place | None = None
-        self.limit: _Place | None = None
-        self.limits: list[tuple[str, _Place]] = []
+        self.limit: Place | None = None
+        self.limits: list[tuple[str, Place]] = []
         self.indexed = False
 
     def asked(self) -> set[str]:
@@ -140,45 +137,31 @@ def without_traceback(error: TransformLookupError) -> TransformLookupError:
     return error
 
 
-class _FrameWaiters:
-    """The waiters under one frame: by the stamp that its edge must reach, those that need any sample, and by limit.
-
-    The places are sorted backwards, by negative stamp and negative order, so that the next due waiter is the last.
-    """
-
-    __slots__ = ("for_any", "limits", "places")
-
-    def __init__(self) -> None:
-        self.places: list[_Place] = []
-        self.for_any: dict[Waiter, None] = {}
-        self.limits: list[_Place] = []
-
-    @property
-    def empty(self) -> bool:
-        return not (self.places or self.for_any or self.limits)
-
-
 class WaitingIndex:
     """The parked lookups of one buffer.
 
     Attributes
     ----------
-    by_frame : mapping
+    by_frame : dict of str to Line
         The waiters under each frame that blocks a lookup, or whose next sample may make one hopeless.
+    parked : dict of Waiter to None
+        All waiters in the order in which they came.
+    limits : list of (-stamp, -order, Waiter)
+        The first limit of each waiter that has one, if no frame has passed it, sorted.
     """
 
     def __init__(self) -> None:
-        self.by_frame: dict[str, _FrameWaiters] = {}
-        self._waiters: dict[Waiter, None] = {}
+        self.by_frame: dict[str, Line] = {}
+        self.parked: dict[Waiter, None] = {}
         # Made when it is read, because most waiters are woken by the edge that blocks them: the first ones have their
         # places in it, and those that were parked since have not.
         self._by_name: dict[str, dict[Waiter, None]] = {}
-        self._limits: list[_Place] = []
+        self.limits: list[Place] = []
         self._passed = STAMP_MIN
         self._order = count()
 
     def __len__(self) -> int:
-        return len(self._waiters)
+        return len(self.parked)
 
     @property
     def names(self) -> KeysView[str]:
@@ -188,7 +171,7 @@ class WaitingIndex:
     @property
     def limit(self) -> int:
         """A sample at a newer stamp (ns) may have made a waiter hopeless, whatever its frame."""
-        return -self._limits[-1][0] if self._limits else _NEVER
+        return -self.limits[-1][0] if self.limits else _NEVER
 
     def park(self, waiter: Waiter, error: TransformLookupError, limits: Iterable[tuple[str, int]] = ()) -> None:
         """Put a waiter under the frames that `error` says it lacks.
@@ -220,7 +203,7 @@ class WaitingIndex:
             for name in waiter.names:
                 self._under(name).for_any[waiter] = None
         waiter.blocked_by = error
-        self._waiters[waiter] = None
+        self.parked[waiter] = None
         self.set_limits(waiter, limits)
 
     def set_limits(self, waiter: Waiter, limits: Iterable[tuple[str, int]]) -> None:
@@ -231,25 +214,26 @@ class WaitingIndex:
                 place = (-limit, -next(self._order), waiter)
                 insort(self._under(frame).limits, place)
                 waiter.limits.append((frame, place))
+                waiter.elsewhere = True
             elif limit < first:
                 first = limit
         if first < _NEVER:
             waiter.limit = (-first, -next(self._order), waiter)
-            insort(self._limits, waiter.limit)
+            waiter.elsewhere = True
+            insort(self.limits, waiter.limit)
 
     def remove(self, waiter: Waiter) -> None:
         """Remove one waiter, if it is still parked."""
-        if waiter not in self._waiters:
+        if waiter not in self.parked:
             return
-        self._forget(waiter)
+        self.forget(waiter)
         for name in waiter.names:
             blocked = self.by_frame[name]
             if waiter.place is not None:
                 del blocked.places[bisect_left(blocked.places, waiter.place)]
             else:
                 del blocked.for_any[waiter]
-            if blocked.empty:
-                del self.by_frame[name]
+            self._drop_if_empty(name, blocked)
         waiter.place = None
 
     def pop_unblocked(self, frame: str, stamp: int | None) -> list[Waiter]:
@@ -275,16 +259,15 @@ class WaitingIndex:
                 waiter = places.pop()[2]
                 # The place refers to the waiter: without this line they form a reference cycle.
                 waiter.place = None
-                self._forget(waiter)
+                self.forget(waiter)
                 ready.append(waiter)
-        if blocked.empty:
-            self.by_frame.pop(frame, None)
+        self._drop_if_empty(frame, blocked)
         return ready
 
     def pop_limited(self, stamp: int) -> list[Waiter]:
         """Take the first limit from the waiters, still parked, for which it is older than `stamp`; return them."""
         self._passed = max(self._passed, stamp)
-        limits = self._limits
+        limits = self.limits
         found = []
         while limits and -limits[-1][0] < stamp:
             waiter = limits.pop()[2]
@@ -303,21 +286,21 @@ class WaitingIndex:
 
     def pop_all(self) -> list[Waiter]:
         """Remove and return all waiters."""
-        ready = list(self._waiters)
+        ready = list(self.parked)
         for waiter in ready:
             waiter.place = waiter.limit = None
             waiter.limits.clear()
             waiter.indexed = False
-        self._waiters.clear()
+        self.parked.clear()
         self._by_name.clear()
         self.by_frame.clear()
-        self._limits.clear()
+        self.limits.clear()
         self._passed = STAMP_MIN
         return ready
 
-    def _forget(self, waiter: Waiter) -> None:
+    def forget(self, waiter: Waiter) -> None:
         """Forget a waiter, but for the frames that block it."""
-        del self._waiters[waiter]
+        del self.parked[waiter]
         if waiter.indexed:
             waiter.indexed = False
             for name in waiter.asked():
@@ -326,16 +309,16 @@ class WaitingIndex:
                 if not waiters:
                     del self._by_name[name]
         if waiter.limit is not None:
-            del self._limits[bisect_left(self._limits, waiter.limit)]
+            del self.limits[bisect_left(self.limits, waiter.limit)]
             waiter.limit = None
         if waiter.limits:
             self._forget_limits(waiter)
 
     def _index(self) -> dict[str, dict[Waiter, None]]:
         """The waiters by the frames that their questions name."""
-        fresh = list(takewhile(lambda waiter: not waiter.indexed, reversed(self._waiters)))
+        fresh = list(takewhile(lambda waiter: not waiter.indexed, reversed(self.parked)))
         for waiter in reversed(fresh):
-            waiter.indexed = True
+            waiter.indexed = waiter.elsewhere = True
             for name in waiter.asked():
                 self._by_name.setdefault(name, {})[waiter] = None
         return self._by_name
@@ -345,15 +328,18 @@ class WaitingIndex:
         for frame, place in waiter.limits:
             blocked = self.by_frame[frame]
             del blocked.limits[bisect_left(blocked.limits, place)]
-            if blocked.empty:
-                del self.by_frame[frame]
+            self._drop_if_empty(frame, blocked)
         waiter.limits.clear()
 
-    def _under(self, frame: str) -> _FrameWaiters:
+    def _under(self, frame: str) -> Line:
         blocked = self.by_frame.get(frame)
         if blocked is None:
-            blocked = self.by_frame[frame] = _FrameWaiters()
+            blocked = self.by_frame[frame] = Line()
         return blocked
+
+    def _drop_if_empty(self, frame: str, blocked: Line) -> None:
+        if not (blocked.places or blocked.for_any or blocked.limits):
+            self.by_frame.pop(frame, None)
 
     def pending(self) -> tuple[PendingLookup, ...]:
         """All waiting lookups with the errors that block them."""
@@ -362,6 +348,6 @@ class WaitingIndex:
     def waiting_since(self, stamp: int) -> Iterator[PendingLookup]:
         """The lookups that have waited since a stamp (ns) or longer, with the errors that block them."""
         # Copied first, because another thread may call this while the loop parks and wakes.
-        for waiter in list(self._waiters):
+        for waiter in list(self.parked):
             if waiter.since <= stamp and waiter.blocked_by is not None:
                 yield PendingLookup(waiter.question, waiter.since, waiter.blocked_by)

@@ -32,6 +32,11 @@ def test_what_is_wrong_is_told_with_an_advice_and_status_1(tmp_path: Path, tfbus
     assert tfbus("check", path, "--to", "9", "--max-speed", "0.5").returncode == 1
 
 
+def test_a_file_without_its_end_is_examined_as_far_as_it_goes(tmp_path: Path, tfbus: Command) -> None:
+    path = write_mcap(tmp_path / "run.mcap", LINES, finish=False)
+    assert tfbus("check", path).stderr == f"tfbus: {path} was not finished by its writer: this is what can be read\n"
+
+
 def test_a_domain_is_examined_for_some_time(tfbus: Command) -> None:
     async def robot(bus: Bus) -> None:
         await bus.clock.sleep(0.5)

@@ -114,7 +114,7 @@ def test_a_wrong_call_is_one_line_on_standard_error_and_status_2(
 
 
 def published(tfbus: Command, *arguments: object) -> tuple[list[TransformStamped], str]:
-    """What a command publishes, and what it says."""
+    """The samples that a command publishes, and its output."""
     received: list[TransformStamped] = []
 
     async def join_late(bus: Bus) -> None:

@@ -8,6 +8,7 @@ pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
 from support.processes import until
 from support.samples import moving, static
@@ -34,10 +35,10 @@ pytestmark = pytest.mark.anyio
 class Node:
     """A participant with a broadcaster, as a ROS 2 node has it."""
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, user_data: bytes = b"") -> None:
         self._open = domain(number, CONFIG)
         self._open.__enter__()
-        self.participant = DomainParticipant(number)
+        self.participant = DomainParticipant(number, Qos(Policy.Userdata(user_data)))
         self.writers = {
             name: DataWriter(self.participant, Topic(self.participant, f"rt/{name}", RawTFMessage), qos)
             for name, qos in (("tf", _MOVING), ("tf_static", _STATIC))
@@ -106,6 +107,20 @@ async def test_without_a_name_a_message_waits_only_a_while(domain_number: int) -
     node.end()
     await carrier.close()
     assert items[1].content.authority == items[0].sender
+
+
+@pytest.mark.parametrize(("user_data", "of_ros"), [(b"enclave=/robot;\0", True), (b"other", False), (b"", False)])
+async def test_a_participant_of_ros_is_known_by_its_user_data(
+    domain_number: int, user_data: bytes, of_ros: bool
+) -> None:
+    items: list[Received] = []
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of({"send": False}))
+    await carrier.open(items.append, SendReport(print))
+    node = Node(domain_number, user_data)
+    await until(lambda: len(items) == 1)
+    assert carrier._is_of_ros(items[0].sender) is of_ros
+    node.end()
+    await carrier.close()
 
 
 async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:

@@ -1,7 +1,7 @@
 import pytest
 from support.wires import size_of
 
-from tfbus.links.dds._publishers import MOST_WAITING, PATIENCE, Publishers
+from tfbus.links.dds._publishers import MOST_WAITING, NODE_PATIENCE, PATIENCE, Publishers
 
 
 class Hall:
@@ -10,7 +10,11 @@ class Hall:
     def __init__(self) -> None:
         self.time = 0.0
         self.delivered: list[tuple[str, str, bytes, bool]] = []
-        self.publishers = Publishers(lambda *message: self.delivered.append(message), lambda: self.time)
+        self.publishers = Publishers(
+            lambda *message: self.delivered.append(message),
+            lambda participant: participant == "ros",
+            lambda: self.time,
+        )
 
     def say(self, publisher: str, payload: bytes = b"x", static: bool = False) -> None:
         self.publishers.message(publisher, "p", payload, static)
@@ -47,6 +51,19 @@ def test_without_a_name_the_participant_is_named_after_a_while_and_stays_so() ->
     hall.publishers.nodes("p", [("/a", ["w1"])])
     hall.say("w1")
     assert hall.delivered == [("p", "p", b"x", False)] * 2
+
+
+def test_a_message_of_ros_waits_longer_for_a_name_that_was_lost_on_the_way() -> None:
+    hall = Hall()
+    for publisher in ("w1", "w2"):
+        hall.publishers.message(publisher, "ros", b"x", True)
+    hall.time = NODE_PATIENCE - 0.01
+    hall.publishers.expire()
+    assert hall.delivered == []
+    hall.publishers.nodes("ros", [("/a", ["w1"])])
+    hall.time = NODE_PATIENCE
+    hall.publishers.expire()
+    assert hall.delivered == [("ros", "/a", b"x", True), ("ros", "ros", b"x", True)]
 
 
 def test_so_many_messages_wait_and_then_none_does() -> None:

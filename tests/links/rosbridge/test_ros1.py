@@ -1,7 +1,8 @@
 """Links through rosbridge against a real ROS 1: roscore, rospy and tf2_ros, such as those of Debian 12.
 
 The variable ``ROS1_PYTHON`` names a Python with rospy and tf2_ros, by default ``/usr/bin/python3``; ``ROS1_ROSBRIDGE``
-is a command that serves a rosbridge of ROS 1 at the port that is its last argument.
+is a command that serves a rosbridge of ROS 1 at the port that is its last argument; ``ROS1_ROBOT_STATE_PUBLISHER`` is
+the path of robot_state_publisher, by default that of Debian's package ``ros-robot-state-publisher``.
 """
 
 import json
@@ -11,7 +12,7 @@ import shutil
 import statistics
 import subprocess
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,16 +25,19 @@ pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
 
 from support.both_sides import Program
 from support.processes import free_ports, until
+from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
 from support.roslib_process import install_roslib, roslib_client
 from support.samples import moving, static
 from support.wires import latched
 
-from tfbus import Buffer, Bus
+from tfbus import Buffer, Bus, TransformStamped
 from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.robot import RobotModel, RobotStatePublisher
 
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 
 PEER = Path(__file__).parents[2] / "support" / "ros1_peer.py"
+ROBOT = PEER.with_name("ros1_robot.py")
 SECONDS = 10.0
 MOST_FAILED = 0.01
 
@@ -70,6 +74,19 @@ class Ros1:
         with running(command, self.environment, stdout=subprocess.PIPE) as process:
             yield process
             process.kill()
+
+
+@asynccontextmanager
+async def robot_of(ros: Ros1, folder: Path) -> AsyncIterator[None]:
+    """A robot in ROS, described and moving."""
+    urdf = folder / "arm.urdf"
+    urdf.write_text(URDF)
+    command = [ros.python, str(ROBOT), str(urdf)]
+    with running(command, ros.environment, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert await anyio.to_thread.run_sync(process.stdout.readline) == "up\n"
+        yield
+        process.kill()
 
 
 async def next_line(node: subprocess.Popen[str]) -> dict[str, Any]:
@@ -181,24 +198,67 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path:
     assert facts["wrong"] == 0
 
 
-@pytest.mark.xfail(
-    reason="rosbridge of ROS 1 gives a topic to all its clients as bytes or to none: a link asks for cbor-raw",
-    raises=(TimeoutError, ExceptionGroup),
-)
-async def test_roslib_hears_through_ros_what_a_link_publishes(tmp_path: Path) -> None:
+async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed(tmp_path: Path) -> None:
+    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
+    async with ros1(tmp_path) as ros, robot_of(ros, tmp_path):
+
+        def link(bus: Bus, **options: Any) -> RosbridgeLink:
+            return RosbridgeLink(bus, ros.url, **options)
+
+        await check_clock(link)
+        await check_description_and_joints(link)
+        await check_command(link, ros.url)
+
+
+async def test_the_frames_of_a_robot_are_those_of_the_real_robot_state_publisher(tmp_path: Path) -> None:
+    pytest.importorskip("urdf_parser_py", reason='pip install "tfbus[urdf]"')
+    command = os.environ.get("ROS1_ROBOT_STATE_PUBLISHER", "/usr/lib/robot_state_publisher/robot_state_publisher")
+    if shutil.which(command) is None:
+        pytest.skip("no robot_state_publisher of ROS 1: set ROS1_ROBOT_STATE_PUBLISHER to its path")
+    theirs: dict[tuple[str, int], TransformStamped] = {}
+    ours: dict[tuple[str, int], TransformStamped] = {}
+    async with ros1(tmp_path) as ros, robot_of(ros, tmp_path):
+        with running([command], ros.environment), Bus() as bus, Bus() as own:
+            bus.subscribe(lambda batch: theirs.update({(each.child, each.stamp): each for each in batch}))
+            own.subscribe(lambda batch: ours.update({(each.child, each.stamp): each for each in batch}))
+            robot = RobotStatePublisher(own, RobotModel.from_urdf(URDF))
+            async with RosbridgeLink(bus, ros.url, send=False, joint_states=robot.publish):
+                moving = ("upper", "fore", "finger")
+                await until(lambda: len([key for key in theirs.keys() & ours.keys() if key[0] in moving]) > 90)
+            assert latched(own)["hand"].transform.is_close(latched(bus)["hand"].transform)
+    shared = theirs.keys() & ours.keys()
+    assert {child for child, _ in shared} >= set(moving)
+    for key in shared:
+        assert theirs[key].parent == ours[key].parent
+        assert theirs[key].transform.is_close(ours[key].transform), key
+
+
+@pytest.mark.parametrize("link_first", [True, False])
+async def test_roslib_and_a_link_hear_the_same_topics_of_one_server(tmp_path: Path, link_first: bool) -> None:
     install_roslib(tmp_path)
-    async with ros1(tmp_path) as ros:
-        with Bus() as bus:
-            bus.publish(static("base", "lidar", 2.0))
-            async with RosbridgeLink(bus, ros.url), roslib_client(tmp_path, ros.url) as heard:
-                # The static frame was there before; it takes a moment until the moving one is heard.
-                with anyio.fail_after(30):
-                    stamp = 10**9
-                    while {fact["topic"] for fact in heard} != {"/tf", "/tf_static"}:
-                        bus.publish(moving("map", "base", stamp := stamp + 1, 1.5))
-                        await anyio.sleep(0.02)
-    said = {fact["topic"]: fact["transforms"][0] for fact in heard}
-    assert said["/tf_static"]["child_frame_id"] == "lidar"
-    assert said["/tf_static"]["transform"]["translation"]["x"] == 2.0
-    assert said["/tf"]["header"]["frame_id"] == "map"
-    assert said["/tf"]["transform"]["translation"] == {"x": 1.5, "y": 0.0, "z": 0.0}
+    async with ros1(tmp_path) as ros, AsyncExitStack() as stack:
+        bus = stack.enter_context(Bus())
+        buffer = stack.enter_context(Buffer(bus))
+        bus.publish(static("base", "lidar", 2.0))
+        if link_first:
+            await stack.enter_async_context(RosbridgeLink(bus, ros.url))
+        heard = await stack.enter_async_context(roslib_client(tmp_path, ros.url))
+        if not link_first:
+            await stack.enter_async_context(RosbridgeLink(bus, ros.url))
+        stack.enter_context(ros.node(60.0))
+        # Both hear the node, and roslib the link too: the static frame was there before it, the moving one comes now.
+        await buffer.lookup("odom", "laser", timeout=30.0)
+        with anyio.fail_after(30):
+            stamp = 10**9
+            while not {"base", "laser", "lidar", "arm"} <= {row["child_frame_id"] for row in rows(heard)}:
+                bus.publish(moving("base", "arm", stamp := stamp + 1, 1.5))
+                await anyio.sleep(0.02)
+    said = {row["child_frame_id"]: row for row in rows(heard)}
+    assert said["lidar"]["transform"]["translation"]["x"] == 2.0
+    assert said["arm"]["header"]["frame_id"] == "base"
+    assert said["arm"]["transform"]["translation"] == {"x": 1.5, "y": 0.0, "z": 0.0}
+
+
+def rows(heard: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The transforms of messages that roslib has heard."""
+    return [row for fact in heard for row in fact["transforms"]]

@@ -1,5 +1,6 @@
 import json
-from typing import Any
+from contextlib import AsyncExitStack
+from typing import Any, Literal
 
 import pytest
 
@@ -13,19 +14,30 @@ from support.wires import latched
 
 from tfbus import Buffer, Bus, PeerJoined, PeerLost, SimulatedClock
 from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.links.rosbridge._websocket import WebSocket
 
 pytestmark = pytest.mark.anyio
 
 
-@pytest.mark.parametrize("encodings", [("cbor-raw", "cbor"), ("cbor",), ()])
-async def test_transforms_pass_both_ways_in_the_best_encoding_that_the_server_has(encodings: tuple[str, ...]) -> None:
-    async with rosbridge_server(encodings) as server:
+@pytest.mark.parametrize(
+    ("wanted", "known", "asked"),
+    [
+        ("cbor", ("cbor-raw", "cbor"), "cbor"),
+        ("cbor", (), "cbor"),
+        ("cbor-raw", ("cbor-raw", "cbor"), "cbor-raw"),
+        ("cbor-raw", ("cbor",), "cbor"),
+    ],
+)
+async def test_transforms_pass_both_ways_in_an_encoding_that_the_server_has(
+    wanted: Literal["cbor", "cbor-raw"], known: tuple[str, ...], asked: str
+) -> None:
+    async with rosbridge_server(known) as server:
         server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
         heard: list[Any] = []
         with Bus() as bus:
             bus.publish(static("map", "camera", 1.0, 4))
             bus.subscribe(lambda batch: heard.extend(batch))
-            async with RosbridgeLink(bus, server.url) as link:
+            async with RosbridgeLink(bus, server.url, encoding=wanted) as link:
                 await until(lambda: link.statistics().received_samples == 1)
                 assert link.peers == (server.url,)
                 await until(lambda: len(server.operations("publish")) == 1)
@@ -34,8 +46,7 @@ async def test_transforms_pass_both_ways_in_the_best_encoding_that_the_server_ha
                 bus.publish([moving("base", "arm", 6, 2.5), static("base", "imu", 3.0, 7)])
                 await until(lambda: len(server.operations("publish")) == 3)
                 assert server.operations("subscribe")[:2] == ["/tf_static", "/tf"]
-                best = encodings[0] if encodings else "cbor"
-                await until(lambda: set(server.clients[0].subscriptions.values()) == {best})
+                await until(lambda: set(server.clients[0].subscriptions.values()) == {asked})
                 # The server has given back all three messages.
                 await until(lambda: link.statistics().duplicates >= 4)
                 assert link.statistics().rejected == {}
@@ -48,6 +59,25 @@ async def test_transforms_pass_both_ways_in_the_best_encoding_that_the_server_ha
         # Static frames go before moving ones, as they are fewer and latched.
         assert [[row["child_frame_id"] for row in rows] for rows in said] == [["camera"], ["camera", "imu"], ["arm"]]
         assert sorted(server.operations("advertise")) == ["/tf", "/tf_static"]
+
+
+@pytest.mark.parametrize("first", [True, False])
+async def test_a_client_that_wants_json_hears_the_same_topics_as_a_link(first: bool) -> None:
+    async with rosbridge_server() as server, AsyncExitStack() as stack:
+        bus = stack.enter_context(Bus())
+        if first:
+            link = await stack.enter_async_context(RosbridgeLink(bus, server.url))
+            await until(lambda: len(server.operations("subscribe")) == 2)
+        page = await WebSocket.connect(server.url, 10_000, 5.0)
+        stack.push_async_callback(page.close)
+        await page.send(json.dumps({"op": "subscribe", "topic": "/tf", "compression": "none"}))
+        await until(lambda: "none" in [request.get("compression") for request in server.requests])
+        if not first:
+            link = await stack.enter_async_context(RosbridgeLink(bus, server.url))
+            await until(lambda: len(server.operations("subscribe")) == 3)
+        await server.say(moving("map", "base", 5))
+        assert json.loads(await page.receive())["msg"]["transforms"][0]["child_frame_id"] == "base"
+        await until(lambda: link.statistics().received_samples == 1)
 
 
 @pytest.mark.thorough
@@ -151,6 +181,9 @@ async def test_positions_of_joints_go_to_who_takes_them() -> None:
         with Bus() as bus:
             async with RosbridgeLink(bus, server.url, joint_states=lambda *state: taken.append(state)):
                 await until(lambda: "/joint_states" in server.operations("subscribe"))
+                assert server.clients[0].subscriptions["/joint_states"] == "none", (
+                    "ROS 1 has no arrays of strings in CBOR"
+                )
                 message = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": [0.5]}
                 await server.say_anything(json.dumps({"op": "publish", "topic": "/joint_states", "msg": message}))
                 await until(lambda: taken == [({"a": 0.5}, 5)])
@@ -198,6 +231,9 @@ async def test_what_was_published_before_the_end_still_goes_out(settled: bool) -
 def test_arguments_that_are_not_valid_are_refused(url: Any, error: type[Exception]) -> None:
     with pytest.raises(error):
         RosbridgeLink(Bus(), url, tf="")
+    encoding: Any = "json"
+    with pytest.raises(ValueError, match="'cbor' or 'cbor-raw', not 'json'"):
+        RosbridgeLink(Bus(), "ws://a", encoding=encoding)
 
 
 async def test_a_server_that_is_not_there_is_an_os_error() -> None:

@@ -1,4 +1,4 @@
-"""What another client of rosbridge, npm's roslib, hears of a link."""
+"""Another client of rosbridge, npm's roslib, hears a link."""
 
 from pathlib import Path
 

@@ -7,7 +7,7 @@ class Scene:
         self.dialing = Dialing(lambda: self.time)
 
     def next(self) -> tuple[float, list[tuple[str, str]]]:
-        """How long it takes until somebody is dialled, and who is."""
+        """The time until a peer is dialled, and the choice of the peer."""
         due = self.dialing.next_due()
         assert due is not None
         waited, self.time = due - self.time, due

@@ -36,6 +36,19 @@ def test_the_newest_sample_of_each_moving_frame_is_told_once_with_its_number() -
     assert said([claim]) == {}, "the claim is told all the same"
 
 
+def test_there_is_something_untold_after_a_turn_and_after_a_claim_until_it_is_taken() -> None:
+    newest = NewestSamples()
+    assert not newest.untold
+    newest.note(turn(OutgoingBatch(ORIGIN, 1, [moving("map", "a", 1)])))
+    assert newest.untold
+    newest.take()
+    assert not newest.untold
+    newest.claim(STEP)
+    assert newest.untold
+    assert said(newest.take()) == {}
+    assert not newest.untold
+
+
 def test_what_was_removed_or_is_static_now_or_cannot_be_sent_is_not_told() -> None:
     newest = NewestSamples()
     newest.note(turn(OutgoingBatch(ORIGIN, 1, [moving("map", name, 1) for name in "abcd"])))

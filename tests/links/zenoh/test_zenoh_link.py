@@ -243,7 +243,7 @@ async def test_samples_published_just_before_the_end_still_arrive(place: Place) 
 
 async def test_threads_publish_over_the_link(place: Place) -> None:
     with Bus() as here, Bus() as there:
-        async with joined(place, here, there):
+        async with joined(place, here, there) as (_, link):
             heard = hear(there)
             with here.threadsafe() as publish:
 
@@ -254,11 +254,16 @@ async def test_threads_publish_over_the_link(place: Place) -> None:
                 async with anyio.create_task_group() as tasks:
                     for name in "ab":
                         tasks.start_soon(anyio.to_thread.run_sync, work, name)
-            await until(lambda: len(heard) == 1_000)
+            # It comes whatever became of the live messages before it.
+            here.publish(static("map", "end"))
+            await until(lambda: "end" in frames(there))
+            batches = [batch for batch in heard if batch[0].child != "end"]
             for name in "ab":
-                stamps = [batch[0].stamp for batch in heard if batch[0].child == name]
-                assert stamps == list(range(500))
-            assert all(len(batch) == 2 for batch in heard)
+                stamps = [batch[0].stamp for batch in batches if batch[0].child == name]
+                assert stamps == sorted(set(stamps))
+                # A network that is congested drops live messages, and the link counts them.
+                assert stamps == list(range(500)) or link.statistics().lost
+            assert all(len(batch) == 2 for batch in batches)
 
 
 async def test_a_bridge_between_two_domains_passes_everything_on_once(place: Place) -> None:

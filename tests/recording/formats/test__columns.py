@@ -31,7 +31,7 @@ def payload_of(channel: Channel, samples: Sequence[TransformStamped]) -> bytes:
 def both(
     stored: list[StoredMessage], prefix: str = ""
 ) -> tuple[list[Columns] | None, dict[str, list[TransformStamped]]]:
-    """What is decoded at once, and one by one."""
+    """The samples that are decoded at once, and one by one."""
     decoders = {channel: ChannelDecoder(channel, static=False, prefix=prefix) for channel in (CDR, ROS1, OTHER)}
     one_by_one: dict[str, list[TransformStamped]] = {}
     for _, channel, payload in stored:

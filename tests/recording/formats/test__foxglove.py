@@ -4,6 +4,7 @@ import pytest
 from foxglove.messages import FrameTransform, FrameTransforms, Quaternion, Timestamp, Vector3
 from hypothesis import given
 from hypothesis import strategies as st
+from support.strategies import CHARACTERS
 
 from tfbus.recording.formats._foxglove import foxglove_channel, write_protobuf
 from tfbus.recording.formats._raw_transforms import RawTransform, parser_of
@@ -13,7 +14,7 @@ from tfbus.tf_message import MalformedMessageError
 CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})
 
 numbers = st.lists(st.floats(), min_size=7, max_size=7).map(lambda values: struct.pack("<7d", *values))
-names = st.text(max_size=200).filter(lambda text: text.isprintable()).map(str.encode)
+names = st.text(CHARACTERS, max_size=200).filter(lambda text: text.isprintable()).map(str.encode)
 transforms = st.builds(RawTransform, st.integers(-(2**31), 2**40), st.integers(0, 2**31 - 1), names, names, numbers)
 
 

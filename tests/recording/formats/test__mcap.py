@@ -44,7 +44,7 @@ def damage(path: Path, part: bytes) -> None:
 
 
 def records_in(data: bytes | bytearray) -> Iterator[tuple[int, int]]:
-    """Where each record begins, and its opcode."""
+    """The begin of each record, and its opcode."""
     at = 8
     while at + 8 < len(data):
         yield at, data[at]

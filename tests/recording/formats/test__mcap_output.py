@@ -32,7 +32,7 @@ def written(path: Path, *entries: TimedBatch) -> McapOutput:
 
 
 def readable(path: Path) -> int:
-    """How many messages the official reader finds in a file that may end anywhere."""
+    """The number of messages that the official reader finds in a file that may end anywhere."""
     count = 0
     with path.open("rb") as file:
         try:

@@ -3,6 +3,7 @@ import struct
 import pytest
 from mcap.records import McapRecord
 
+from tfbus.recording.formats import _mcap_records
 from tfbus.recording.formats._mcap_records import Chunk, split_chunk, split_message
 from tfbus.recording.formats._storage import Channel
 from tfbus.recording.formats._unfold import UnfoldError
@@ -62,3 +63,10 @@ def test_a_chunk_has_the_size_and_the_checksum_that_it_claims() -> None:
     assert Chunk.parse(chunk(b"abc", 3)[:-1], torn=True).unfold(torn=True) == b"ab"
     with pytest.raises(ValueError, match="name of the compression"):
         Chunk.parse(chunk(b"", 0, compression=b"x" * 33))
+
+
+def test_a_chunk_of_the_largest_size_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_mcap_records, "MAX_CHUNK", 3)
+    assert Chunk.parse(chunk(b"abc", 3)).unfold() == b"abc"
+    with pytest.raises(UnfoldError, match="it claims 4 bytes, and 3 is the bound"):
+        Chunk.parse(chunk(b"abcd", 4)).unfold()

@@ -93,14 +93,14 @@ def write_bag(
 
 
 def read(path: Path) -> tuple[list[tuple[int, tuple[TransformStamped, ...]]], list[str]]:
-    """What is read of a recording, and what is said to be lost."""
+    """The messages that are read of a recording, and the losses that are reported."""
     messages = messages_in(path)
     batches = [(message.received, message.batch) for message in messages if message.batch]
     return batches, [str(error) for message in messages for error in message.errors]
 
 
 def chunks_in(data: bytes) -> list[int]:
-    """Where the headers of the chunks begin, in a bag by `rosbags`."""
+    """The begins of the chunks' headers, in a bag by `rosbags`."""
     return [
         found.start()
         for found in re.finditer(rb"....\x04\0\0\0op=\x05|....\x10\0\0\0compression=none", data, re.DOTALL)

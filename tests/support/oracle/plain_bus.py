@@ -1,4 +1,4 @@
-"""What a bus has to give each buffer, worked out anew from the list of all that has happened."""
+"""A model of a bus: what it gives each buffer, worked out anew from the list of all that has happened."""
 
 from collections import Counter
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a tree has to answer, worked out from plain lists of samples; nothing is kept from one question to the next.
+"""A model of a tree: answers worked out from plain lists of samples; nothing is kept from one question to the next.
 
 It says what is meant, not how it is done: ways between two frames are all tried, stamps are searched from one end to
 the other, and a window is a condition on a list.

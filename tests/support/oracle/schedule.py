@@ -76,7 +76,7 @@ Happening = Publish | Remove | Jump | Join | Leave | CloseBus | Ask
 
 @dataclass(frozen=True)
 class Burst:
-    """What happens without a task switch, and how long the clock then goes on.
+    """Actions without a task switch, and the time that the clock then goes on.
 
     `cancelled_first` and `cancelled_last` are places among the lookups that wait when the burst begins.
     """

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import anyio
 import anyio.to_thread
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
 from cyclonedds.core import DDSException, Entity, Listener
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
@@ -29,8 +30,10 @@ from tfbus.tf_message import encode
 _CLOSING_TIME = 1.0
 _DEPTH = 100
 _OTHERS = "other topics"
-"""Whoever positions of joints and the time come from."""
+"""The authority of joint positions and of the time."""
 _AT_ONCE = 100
+_MOST_PARTICIPANTS = 1_000
+_OF_ROS = b"enclave="
 # A writer never waits for a reader that is frozen: the event loop would.
 _RELIABLE = (
     Policy.Reliability.Reliable(duration(seconds=0)),
@@ -63,7 +66,8 @@ class DdsCarrier(RosCarrier):
         self._config = config
         self._lock = Lock()
         self._open = ExitStack()
-        self._publishers = Publishers(self._deliver)
+        self._publishers = Publishers(self._deliver, self._is_of_ros)
+        self._participants: BuiltinDataReader | None = None
         self._writers: dict[int, tuple[str, str]] = {}
         self._matched: dict[int, frozenset[str]] = {}
         self._present: frozenset[str] = frozenset()
@@ -88,6 +92,8 @@ class DdsCarrier(RosCarrier):
                 for writer in (self._moving_writer, self._static_writer):
                     self._open.callback(_delete, writer)
             if self.settings.authority is None:
+                self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
+                self._open.callback(_delete, self._participants)
                 info = Topic(participant, "ros_discovery_info", ParticipantEntitiesInfo)
                 self._read(participant, info, _STATICS, self._take_nodes, None)
             for name in self.settings.joint_topic:
@@ -143,7 +149,8 @@ class DdsCarrier(RosCarrier):
         closing = Thread(target=self._open.close, name="tfbus dds close", daemon=True)
         closing.start()
         with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
+            # With a limit, for a worker of asyncio keeps the interpreter.
+            await anyio.to_thread.run_sync(closing.join, _CLOSING_TIME, abandon_on_cancel=True)
 
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
         try:
@@ -178,6 +185,15 @@ class DdsCarrier(RosCarrier):
             return "", ""
         self._writers[handle] = found = publication.key.hex, publication.participant_key.hex
         return found
+
+    def _is_of_ros(self, participant: str) -> bool:
+        """Whether a participant has the user data that ROS 2 gives it."""
+        found: list[Any] = [] if self._participants is None else self._participants.read(N=_MOST_PARTICIPANTS)
+        for each in found:
+            if not isinstance(each, InvalidSample) and each.key.hex == participant:
+                data = each.qos[Policy.Userdata].data if Policy.Userdata in each.qos else b""
+                return data.startswith(_OF_ROS)
+        return False
 
     def _take_nodes(self, reader: DataReader[ParticipantEntitiesInfo]) -> None:
         messages: list[Any] = reader.take(N=_AT_ONCE)

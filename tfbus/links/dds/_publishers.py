@@ -7,6 +7,8 @@ from time import monotonic
 
 PATIENCE = 0.5
 """s; a message waits so long for the name of its node, which ROS 2 tells on another topic."""
+NODE_PATIENCE = 5.0
+"""s; and so long if its participant is known to be of ROS 2: what was lost while two meet is sent again after 3."""
 MOST_WAITING = 1_000
 _MOST_PUBLISHERS = 10_000
 
@@ -18,7 +20,7 @@ class _Publisher:
     """One publisher; `name` is empty until it is known."""
 
     participant: str
-    since: float
+    until: float
     name: str = ""
     waiting: list[tuple[bytes, bool]] = field(default_factory=list)
 
@@ -33,12 +35,17 @@ class Publishers:
     deliver : callable
         Called with the id of the participant, the name of the node, the payload, and whether the topic is one of static
         frames. The name of a publisher that is no node's is the id of its participant.
+    is_of_ros : callable
+        Whether a participant, by its id, is known to be of ROS 2, and so will tell the names of its nodes.
     now : callable
         Returns a monotonic time in s.
     """
 
-    def __init__(self, deliver: Deliver, now: Callable[[], float] = monotonic) -> None:
+    def __init__(
+        self, deliver: Deliver, is_of_ros: Callable[[str], bool], now: Callable[[], float] = monotonic
+    ) -> None:
         self._deliver = deliver
+        self._is_of_ros = is_of_ros
         self._now = now
         self._lock = Lock()
         self._publishers: dict[str, _Publisher] = {}
@@ -51,7 +58,8 @@ class Publishers:
             if known is None:
                 if len(self._publishers) >= _MOST_PUBLISHERS:
                     del self._publishers[next(iter(self._publishers))]
-                known = self._publishers[publisher] = _Publisher(participant, self._now())
+                patience = NODE_PATIENCE if self._is_of_ros(participant) else PATIENCE
+                known = self._publishers[publisher] = _Publisher(participant, self._now() + patience)
                 known.name = self._names.get(participant, {}).get(publisher, "")
             known.waiting.append((payload, static))
             if known.name or len(known.waiting) > MOST_WAITING:
@@ -76,7 +84,7 @@ class Publishers:
         """Deliver what has waited long enough."""
         with self._lock:
             for publisher in self._publishers.values():
-                if publisher.waiting and self._now() - publisher.since >= PATIENCE:
+                if publisher.waiting and self._now() >= publisher.until:
                     self._flush(publisher)
 
     def keep_only(self, participants: set[str]) -> None:

@@ -1,8 +1,8 @@
 """The carrier of links to rmw_zenoh."""
 
-from collections.abc import Callable, Sequence
+import weakref
+from collections.abc import Sequence
 from functools import partial
-from threading import Thread
 from time import time_ns
 from typing import Any
 from uuid import uuid4
@@ -30,11 +30,12 @@ from tfbus.links.rmw_zenoh._wire import (
 )
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
+from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
+from tfbus.links.zenoh._session import directly
 from tfbus.tf_message import MalformedMessageError, encode
 
 MAX_SIZE = 2**22
 """The largest message that is received, in bytes."""
-_CLOSING_TIME = 1.0
 _HEARTBEAT = 0.5
 _AUTHORITY = "rmw_zenoh"
 
@@ -57,6 +58,7 @@ class RmwZenohCarrier(RosCarrier):
         self._node = node
         self._config = config
         self._session: zenoh.Session | None = None
+        self._close_at_exit: weakref.finalize[..., RmwZenohCarrier] | None = None
         self._declared: list[Any] = []
         self._publishers: dict[bool, zenoh.Publisher | zenoh.ext.AdvancedPublisher] = {}
         self._ids = {static: uuid4().bytes for static in (False, True)}
@@ -70,6 +72,8 @@ class RmwZenohCarrier(RosCarrier):
 
     def _join(self) -> None:
         session = self._session = zenoh.open(self._config)
+        # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
+        self._close_at_exit = weakref.finalize(self, close_session, session)
         name = str(session.zid())
         self._token(node_token(self._domain, name, self._node))
         topics = [
@@ -91,7 +95,9 @@ class RmwZenohCarrier(RosCarrier):
             *((topic, CLOCK_TYPE, CLOCK_HASH, self._take_clock) for topic in self.settings.clock_topic),
         )
         for number, (topic, kind, digest, take) in enumerate(others, len(topics) + 1):
-            self._declared.append(session.declare_subscriber(topic_expression(self._domain, topic, kind), take))
+            self._declared.append(
+                session.declare_subscriber(topic_expression(self._domain, topic, kind), directly(take))
+            )
             self._token(other_token(self._domain, name, number, self._node, topic, kind, digest))
 
     def _token(self, key: str) -> None:
@@ -114,7 +120,7 @@ class RmwZenohCarrier(RosCarrier):
 
     def _subscriber(self, session: zenoh.Session, topic: str, static: bool) -> object:
         key = topic_expression(self._domain, topic)
-        take: Callable[[zenoh.Sample], None] = partial(self._take, static)
+        take = directly(partial(self._take, static))
         if not static:
             return session.declare_subscriber(key, take)
         return zenoh.ext.declare_advanced_subscriber(
@@ -128,17 +134,14 @@ class RmwZenohCarrier(RosCarrier):
 
     async def close(self) -> None:
         """Close the session, or give up waiting for that."""
-        closing = Thread(target=self._leave, name="tfbus rmw_zenoh close", daemon=True)
-        closing.start()
-        with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(closing.join, abandon_on_cancel=True)
-
-    def _leave(self) -> None:
         session, self._session = self._session, None
         self._publishers.clear()
-        # Closing the session undeclares all of them.
-        if session is not None:
-            session.close()
+        if self._close_at_exit is not None:
+            self._close_at_exit.detach()
+        # Closing the session undeclares all that was declared.
+        late = await wait_until_closed([begin_to_close(session)])
+        if late is not None:
+            self._report.failed(late)
         self._declared.clear()
 
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:

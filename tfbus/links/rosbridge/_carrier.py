@@ -4,7 +4,7 @@ import random
 from collections import deque
 from collections.abc import Callable, Sequence
 from time import monotonic
-from typing import Any
+from typing import Any, Literal
 from uuid import uuid4
 
 import anyio
@@ -35,7 +35,7 @@ MAX_SIZE = 2**22
 """The largest message that is received, in bytes."""
 MOST_QUEUED = 1_000
 """So many messages wait for a slow server; then the oldest are dropped."""
-ENCODINGS = ("cbor-raw", "cbor", "none")
+Encoding = Literal["cbor", "cbor-raw"]
 CONNECT_TIME = 5.0
 SILENCE = 10.0
 """s; a server that does not even answer a ping for so long is gone."""
@@ -53,16 +53,25 @@ class RosbridgeCarrier(RosCarrier):
     ----------
     url : str
     settings : RosSettings
+    encoding : {"cbor", "cbor-raw"}
+        The encoding that is asked for; a server that does not know it uses another.
     lookup_waits : callable
         Whether a lookup on the bus waits for something.
     """
 
-    def __init__(self, url: str, settings: RosSettings, lookup_waits: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self,
+        url: str,
+        settings: RosSettings,
+        encoding: Encoding = "cbor",
+        lookup_waits: Callable[[], bool] = lambda: False,
+    ) -> None:
         super().__init__(f"rosbridge:{uuid4().hex}", settings)
         self._url = url
+        self._wanted: Encoding = encoding
+        self._encoding: Encoding = encoding
         self._lookup_waits = lookup_waits
         self._socket: WebSocket | None = None
-        self._encoding = 0
         self._moving: deque[tuple[str, int]] = deque()
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
@@ -73,18 +82,19 @@ class RosbridgeCarrier(RosCarrier):
 
     async def _connect(self) -> None:
         self._socket = await WebSocket.connect(self._url, MAX_SIZE, CONNECT_TIME)
-        self._encoding = 0
+        self._encoding = self._wanted
         self._moving.clear()
         self._requests.clear()
         # First of all: what is latched may come only once, and moving frames come again.
         for topic in (*self.settings.tf_static, *self.settings.tf):
-            self._request(subscribe(topic, ENCODINGS[0]))
+            self._request(subscribe(topic, self._encoding))
         for topic in self.settings.joint_topic:
-            self._request(subscribe(topic, ENCODINGS[0], JOINT_TYPE))
+            # In CBOR, a server of ROS 1 fails at the names of the joints, an array of strings.
+            self._request(subscribe(topic, "none" if self._encoding == "cbor" else self._encoding, JOINT_TYPE))
         for topic in self.settings.clock_topic:
-            self._request(subscribe(topic, ENCODINGS[0], CLOCK_TYPE))
+            self._request(subscribe(topic, self._encoding, CLOCK_TYPE))
         for topic in self.settings.description_topic:
-            self._request(subscribe(topic, ENCODINGS[0], TEXT_TYPE))
+            self._request(subscribe(topic, self._encoding, TEXT_TYPE))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
             self._request(advertise(self.settings.tf[0], static=False))
@@ -192,18 +202,17 @@ class RosbridgeCarrier(RosCarrier):
         static = incoming.topic in self.settings.tf_static
         if not static and incoming.topic not in self.settings.tf:
             raise MalformedMessageError("topic", f"a message on {incoming.topic[:100]!r}, which nobody asked for")
-        if ENCODINGS.index(incoming.encoding) > self._encoding:
-            self._ask_for_next_encoding()
+        if self._encoding == "cbor-raw" and incoming.encoding == "none":
+            self._ask_for_cbor()
         content = RosMessage(incoming.content, static, "rosbridge")
         self._receive(Received(self._url, content, size, moving=not static))
 
-    def _ask_for_next_encoding(self) -> None:
-        """The server has answered in JSON, so it may know CBOR by an older name."""
-        self._encoding += 1
-        if self._encoding < len(ENCODINGS) - 1:
-            for topic in (*self.settings.tf_static, *self.settings.tf):
-                self._request(unsubscribe(topic))
-                self._request(subscribe(topic, ENCODINGS[self._encoding]))
+    def _ask_for_cbor(self) -> None:
+        """Subscribe anew: a server that answers ``cbor-raw`` in JSON may know ``cbor``, which is older."""
+        self._encoding = "cbor"
+        for topic in (*self.settings.tf_static, *self.settings.tf):
+            self._request(unsubscribe(topic))
+            self._request(subscribe(topic, self._encoding))
 
     async def _write_all(self, socket: WebSocket) -> None:
         with self._writing:
@@ -215,7 +224,7 @@ class RosbridgeCarrier(RosCarrier):
                 await self._woken.wait()
 
     async def _end_writing(self) -> None:
-        """When all ends, give `_write_all` a little time for what it has begun and what waits."""
+        """Give `_write_all` a little time at the end, for the text that it has begun and for those that wait."""
         try:
             await anyio.sleep_forever()
         finally:
@@ -257,7 +266,7 @@ class RosbridgeCarrier(RosCarrier):
             misses += 1
             for topic in self.settings.tf_static:
                 self._request(unsubscribe(topic))
-                self._request(subscribe(topic, ENCODINGS[min(self._encoding, len(ENCODINGS) - 1)]))
+                self._request(subscribe(topic, self._encoding))
 
     def _request(self, text: str) -> None:
         self._requests.append(text)

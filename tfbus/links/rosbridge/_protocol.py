@@ -32,7 +32,7 @@ class Incoming(NamedTuple):
     topic: str
     """Empty if the server only tells of its status."""
     content: Any
-    """What `decode_content` takes, or the text of the status."""
+    """The argument of `decode_content`, or the text of the status."""
     encoding: str
     """``"cbor-raw"``, ``"cbor"`` or ``"none"``, for a message in JSON."""
 

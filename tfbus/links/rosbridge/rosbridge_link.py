@@ -1,11 +1,11 @@
 """A link through rosbridge: the transforms of ROS 1 or ROS 2 on a bus, and those of the bus there."""
 
-from typing import Unpack
+from typing import Unpack, get_args
 
 from tfbus.bus.bus import Bus
 from tfbus.links.ros.ros_link import RosLink
 from tfbus.links.ros.settings import RosOptions, settings_of
-from tfbus.links.rosbridge._carrier import RosbridgeCarrier
+from tfbus.links.rosbridge._carrier import Encoding, RosbridgeCarrier
 from tfbus.links.rosbridge._websocket import check_url
 
 
@@ -20,6 +20,9 @@ class RosbridgeLink(RosLink):
     bus : Bus
     url : str
         Such as ``ws://192.168.1.5:9090``, which is the port if none is given, or ``wss://...`` for a server with TLS.
+    encoding : {"cbor", "cbor-raw"}
+        The encoding in which messages are asked for; a server that does not know it sends JSON, which is read too. See
+        the notes before you take ``"cbor-raw"``.
     **options
         Those that all links to ROS share: see `tfbus.links.ros.RosLink`. By default, the authority of all samples is
         ``"rosbridge"``, because the server does not tell who has published them.
@@ -34,7 +37,7 @@ class RosbridgeLink(RosLink):
     Raises
     ------
     ValueError
-        If it is no URL of a websocket, or as `tfbus.links.ros.RosLink`.
+        If it is no URL of a websocket, the encoding is neither of the two, or as `tfbus.links.ros.RosLink`.
     TypeError
         If an argument has the wrong type.
     OSError
@@ -46,13 +49,15 @@ class RosbridgeLink(RosLink):
 
     Notes
     -----
-    Messages come as the server can send them: the bytes of ROS (``cbor-raw``), CBOR, or JSON. One larger than 4 MiB
-    ends the connection. The only peer is the server. While a lookup waits on the bus, the static frames are asked for
-    now and then, because a server for ROS 2 may have had them before this link came.
+    One message larger than 4 MiB ends the connection. The only peer is the server. While a lookup waits on the bus, the
+    static frames are asked for now and then, because a server for ROS 2 may have had them before this link came.
 
-    A server asks ROS once for each topic, for all its clients, as the first of them wants it. Where that is this link,
-    with ``cbor-raw``, a client that wants JSON, such as roslib in a browser, hears nothing on the same topics; where it
-    came first, this link hears nothing. Give such clients a server of their own.
+    A server asks ROS once for each topic, for all its clients, as the first of them wants it: decoded, or as bytes.
+    With ``"cbor"`` this link and clients that want JSON, such as roslib in a browser, hear the same topics side by
+    side. ``"cbor-raw"`` passes on the bytes of ROS, which costs the server
+    half as much for messages of 20 transforms, and hardly less for one; but beside a client that wants
+    anything else, whoever came second hears nothing, and no server tells it. Take ``"cbor-raw"`` for a server of your
+    own, or for one whose other clients take it too.
 
     A server keeps one latched message of ``/tf_static`` for all its clients. So of several programs that send static
     frames through one server, late joiners hear only the last.
@@ -60,12 +65,14 @@ class RosbridgeLink(RosLink):
     Whoever reaches the server can publish and read everything.
     """
 
-    def __init__(self, bus: Bus, url: str, **options: Unpack[RosOptions]) -> None:
+    def __init__(self, bus: Bus, url: str, *, encoding: Encoding = "cbor", **options: Unpack[RosOptions]) -> None:
         if not isinstance(url, str):
             raise TypeError(f"a URL must be a str, not {url!r}")
         check_url(url)
+        if encoding not in get_args(Encoding):
+            raise ValueError(f"encoding must be 'cbor' or 'cbor-raw', not {encoding!r}")
         self.url = url
         carrier = RosbridgeCarrier(
-            url, settings_of(options), lambda: any(buffer.waiting for buffer in bus.statistics().buffers)
+            url, settings_of(options), encoding, lambda: any(buffer.waiting for buffer in bus.statistics().buffers)
         )
         super().__init__(bus, url, carrier, **options)

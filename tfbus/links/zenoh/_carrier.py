@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from threading import Thread
 
 import anyio
 import anyio.to_thread
@@ -16,11 +15,10 @@ from tfbus.links._message import Message, MessageWriter, can_hold, read_message,
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import HistoryQuestion, Question, Received
 from tfbus.links._state import StateEntry, StateStep
+from tfbus.links.zenoh._closing import wait_until_closed
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._newest import NewestSamples
 from tfbus.links.zenoh._sessions import ZenohSessions
-
-_CLOSING_TIME = 1.0
 
 
 class ZenohCarrier:
@@ -82,7 +80,7 @@ class ZenohCarrier:
 
     def claim(self, step: StateStep) -> None:
         """Tell all peers the state of this link."""
-        self._newest.step = step
+        self._newest.claim(step)
         self._put(self._writer.claim(step))
 
     def ask(self, peer: str, since: int) -> None:
@@ -120,16 +118,16 @@ class ZenohCarrier:
         while True:
             await anyio.sleep(self._slow_period)
             try:
-                if self._sessions.is_heard_slowly():
+                if self._newest.untold and self._sessions.is_heard_slowly():
                     self._sessions.put_slowly(self._newest.take())
             except zenoh.ZError as error:
                 self._report.failed(error)
 
     async def close(self) -> None:
         """Close the sessions, or give up waiting for them."""
-        closing = self._sessions.close()
-        with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(_join, closing, abandon_on_cancel=True)
+        late = await wait_until_closed(self._sessions.close())
+        if late is not None:
+            self._report.failed(late)
 
     def _put(self, message: Message) -> bool:
         try:
@@ -138,8 +136,3 @@ class ZenohCarrier:
             self._report.failed(error)
             return False
         return True
-
-
-def _join(threads: list[Thread]) -> None:
-    for thread in threads:
-        thread.join()

@@ -18,8 +18,9 @@ import anyio
 import anyio.to_thread
 import zenoh
 
+from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
 from tfbus.links.zenoh._keys import NO_ROBOT, check_domain, check_robot
-from tfbus.links.zenoh._session import as_os_error, close_session, directly
+from tfbus.links.zenoh._session import as_os_error, directly
 from tfbus.links.zenoh._settings import Addresses, settings
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 
@@ -184,8 +185,8 @@ class LookupSession:
         self._sending.put(None)
         with anyio.move_on_after(_CLOSING_TIME, shield=True):
             await anyio.to_thread.run_sync(_end, declared, abandon_on_cancel=True)
-            if self._link is None:
-                await anyio.to_thread.run_sync(close_session, session, abandon_on_cancel=True)
+        if self._link is None:
+            await wait_until_closed([begin_to_close(session)])
 
     def _opened(self) -> zenoh.Session:
         assert self._session is not None

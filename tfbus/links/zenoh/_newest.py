@@ -18,10 +18,13 @@ class NewestSamples:
     ----------
     step : StateStep or None
         The newest claim of the link.
+    untold : bool
+        Whether anything was noted or claimed since the messages were taken last.
     """
 
     def __init__(self) -> None:
         self.step: StateStep | None = None
+        self.untold = False
         self._newest: dict[str, tuple[bytes, int, TransformStamped]] = {}
 
     def note(self, turn: Turn) -> None:
@@ -37,7 +40,12 @@ class NewestSamples:
                         newest.pop(fields[1], None)
             else:
                 newest.pop(entry.frame, None)
-        self.step = turn.step
+        self.claim(turn.step)
+
+    def claim(self, step: StateStep | None) -> None:
+        """Note a claim of the link, which goes out although no sample does."""
+        self.step = step
+        self.untold = True
 
     def take(self) -> list[Message]:
         """Messages with the samples that were noted since this was called last, and the claim."""
@@ -47,6 +55,7 @@ class NewestSamples:
             if can_hold(sample)
         ]
         self._newest.clear()
+        self.untold = False
         if self.step is None:
             return []
         # It tells nothing of the state but its number.

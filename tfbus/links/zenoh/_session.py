@@ -17,6 +17,7 @@ from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._peers import MAX_PEERS
 from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
+from tfbus.links.zenoh._closing import begin_to_close, close_session
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import MalformedMessageError
@@ -259,9 +260,7 @@ class ZenohSession:
             session = self._session
         if self._close_at_exit is not None:
             self._close_at_exit.detach()
-        closing = threading.Thread(target=close_session, args=(session,), daemon=False)
-        closing.start()
-        return closing
+        return begin_to_close(session)
 
     def _receive_live(self, sample: zenoh.Sample) -> None:
         sender = self._sender(sample, "live")
@@ -353,14 +352,6 @@ class ZenohSession:
 
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
         self._receive(Received(sender, MalformedMessageError(reason, detail)))
-
-
-def close_session(session: zenoh.Session | None) -> None:
-    """Close a session, if there is one; a second call does nothing."""
-    if session is not None:
-        # zenoh may give up waiting for a peer; that peer notices the end by itself.
-        with suppress(zenoh.ZError):
-            session.close()
 
 
 def directly(callback: Callable[[Any], object]) -> Any:

@@ -9,10 +9,9 @@ import anyio
 import anyio.to_thread
 import zenoh
 
-from tfbus.links.zenoh._session import as_os_error, close_session
+from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
+from tfbus.links.zenoh._session import as_os_error
 from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, settings
-
-_CLOSING_TIME = 1.0
 
 
 class ZenohRouter:
@@ -71,5 +70,4 @@ class ZenohRouter:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._close_at_exit.detach()
-        with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(close_session, self._session, abandon_on_cancel=True)
+        await wait_until_closed([begin_to_close(self._session)])

@@ -68,7 +68,7 @@ class _Layout(NamedTuple):
     """The bytes that are the same in all messages of a layout, and the transforms between them."""
 
     ranges: Ranges
-    """Where those bytes are."""
+    """The position of those bytes."""
     fixed: npt.NDArray[np.uint64]
     slots: tuple[_Slot, ...]
 

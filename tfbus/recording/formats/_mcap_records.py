@@ -266,7 +266,7 @@ class ChunkMessages(NamedTuple):
     """The log times, in ns."""
     starts: npt.NDArray[np.int64]
     ends: npt.NDArray[np.int64]
-    """Where each payload begins and ends."""
+    """The begin and the end of each payload."""
 
 
 def scan_chunks(

@@ -29,7 +29,7 @@ class Packed(NamedTuple):
     """The log times, in ns."""
     starts: Places
     ends: Places
-    """Where the payload of each begins in the data, and where it ends."""
+    """The begin and the end of the payload of each in the data."""
 
     def counts(self) -> dict[Channel, int]:
         """The number of messages of each channel."""

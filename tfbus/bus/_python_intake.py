@@ -1,0 +1,78 @@
+"""The plain publishing, in Python: the definition of what ``tfbus/_kernel.c`` does in its place."""
+
+from collections.abc import Callable, Sized
+from threading import get_ident
+from typing import Any, Protocol
+
+from tfbus.bus._python_judge import Judge
+from tfbus.geometry.stamped import Batch, TransformStamped
+
+
+class Feed(Protocol):
+    """The plain insertion of a buffer; see `tfbus.waiting.live_tree`."""
+
+    def insert(self, batch: Batch) -> bool:
+        """Insert a batch if it is plain; return whether it was."""
+
+
+class Intake:
+    """The plain way of published samples into the buffers of a bus.
+
+    Parameters
+    ----------
+    judge : Judge
+    kind : type
+        The class of samples.
+    listeners : tuple of containers
+        Whatever is in one of them has to hear of each batch.
+
+    Attributes
+    ----------
+    feeds : tuple of (Feed, callable)
+        One for each buffer, and the function that inserts a batch which is not plain.
+    samples : int
+        Number of samples that were taken.
+    thread : int
+        The only thread that may publish.
+    open : bool
+        Whether anything is taken.
+    """
+
+    __slots__ = ("_judge", "_kind", "_listeners", "feeds", "open", "samples", "thread")
+
+    def __init__(self, judge: Judge, kind: type[TransformStamped], listeners: tuple[Sized, ...]) -> None:
+        self._judge = judge
+        self._kind = kind
+        self._listeners = listeners
+        self.feeds: tuple[tuple[Feed, Callable[[Batch], object]], ...] = ()
+        self.samples = 0
+        self.thread = 0
+        self.open = True
+
+    def take(self, samples: object, invalid: object) -> bool:
+        """Judge a batch and insert it into all buffers, if it is plain and nobody else listens.
+
+        Returns
+        -------
+        bool
+            Whether it was; else nothing was done. Here a batch that is not one sample or a tuple is not plain.
+        """
+        if not self.open or get_ident() != self.thread or (invalid != "raise" and invalid != "drop"):
+            return False
+        for listening in self._listeners:
+            if listening:
+                return False
+        batch: tuple[Any, ...]
+        if type(samples) is self._kind:
+            batch = (samples,)
+        elif type(samples) is tuple and samples and all(type(sample) is self._kind for sample in samples):
+            batch = samples
+        else:
+            return False
+        if not self._judge.accepts(batch):
+            return False
+        self.samples += len(batch)
+        for feed, insert in self.feeds:
+            if not feed.insert(batch):
+                insert(batch)
+        return True

@@ -1,0 +1,57 @@
+"""The end of zenoh's sessions, for which nobody waits for ever.
+
+A session closes within milliseconds; zenoh gives up waiting for a frozen peer after 10 s. The event loop waits a second
+for that, and the interpreter, at its end, a few: a callback of zenoh after that end would abort the process.
+"""
+
+import atexit
+import threading
+from collections.abc import Sequence
+from contextlib import suppress
+from time import monotonic
+
+import anyio
+import anyio.to_thread
+import zenoh
+
+CLOSING_TIME = 1.0
+LONGEST_CLOSE = 15.0
+"""s; so long the event loop and the interpreter wait."""
+_NAME = "tfbus closes a session of zenoh"
+
+
+def close_session(session: zenoh.Session | None) -> None:
+    """Close a session, if there is one; a second call does nothing."""
+    if session is not None:
+        # zenoh may give up waiting for a peer; that peer notices the end by itself.
+        with suppress(zenoh.ZError):
+            session.close()
+
+
+def begin_to_close(session: zenoh.Session | None) -> threading.Thread:
+    """Close a session in a thread of its own; returns the thread."""
+    # Not a thread that the interpreter waits for without a limit.
+    closing = threading.Thread(target=close_session, args=(session,), name=_NAME, daemon=True)
+    closing.start()
+    return closing
+
+
+async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError | None:
+    """Wait a second for such threads, also when cancelled; returns an error if that was too short."""
+    with anyio.move_on_after(CLOSING_TIME, shield=True):
+        # With a limit, for a worker of asyncio keeps the interpreter.
+        await anyio.to_thread.run_sync(_join, closing, CLOSING_TIME, abandon_on_cancel=True)
+    if not any(thread.is_alive() for thread in closing):
+        return None
+    return TimeoutError(f"zenoh has not closed its session within {CLOSING_TIME:g} s, and goes on in the background")
+
+
+def _join(threads: Sequence[threading.Thread], seconds: float) -> None:
+    deadline = monotonic() + seconds
+    for thread in threads:
+        thread.join(max(0.0, deadline - monotonic()))
+
+
+@atexit.register
+def _wait_at_exit() -> None:
+    _join([thread for thread in threading.enumerate() if thread.name == _NAME], LONGEST_CLOSE)
