@@ -227,7 +227,7 @@ class Flood(threading.Thread):
         received = threading.Event()
         self.session.get(
             f"{self.prefix}/*/state/{self.victim}",
-            zenoh.handlers.Callback(lambda reply: None, received.set, indirect=False),
+            zenoh.handlers.Callback(lambda _: None, received.set, indirect=False),
             timeout=PATIENCE,
             congestion_control=zenoh.CongestionControl.BLOCK,
         )

@@ -1,5 +1,6 @@
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -75,7 +76,7 @@ def test_what_rosbags_writes_is_read(tmp_path: Path) -> None:
 
 def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> None:
     running, killed = tmp_path / "running.db3", tmp_path / "killed.db3"
-    with sqlite3.connect(running) as file:
+    with closing(sqlite3.connect(running)) as file:
         file.execute("PRAGMA journal_mode = WAL")
     writer = write(running)
     # What is on the disk while it runs is what a killed one leaves.
@@ -90,7 +91,7 @@ def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> Non
 
 def test_reading_leaves_nothing_beside_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.db3"
-    with sqlite3.connect(path) as file:
+    with closing(sqlite3.connect(path)) as file:
         file.execute("PRAGMA journal_mode = WAL")
     write(path).close()
     batches_in(path)
