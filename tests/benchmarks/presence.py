@@ -1,4 +1,4 @@
-"""What it costs a process to know peers that do nothing: one link, and some peers in two other processes.
+"""The cost to a process of peers that do nothing: one link, and some peers in two other processes.
 
 ``python tests/benchmarks/presence.py --peers 50`` measures links, and with ``--bare`` zenoh's sessions with the same
 settings and nothing on them: the floor. ``--router`` has the links meet as clients of a router. The peers know the
@@ -44,7 +44,7 @@ async def join(
 
 
 def known(end: Any) -> int:
-    """How many others an end knows."""
+    """The number of others that an end knows."""
     return len(list(end.info.peers_zid())) if isinstance(end, zenoh.Session) else len(end.peers)
 
 
