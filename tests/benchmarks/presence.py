@@ -1,4 +1,4 @@
-"""The cost to a process of peers that do nothing: one link, and some peers in two other processes.
+"""The cost of knowing peers that do nothing: one link, and some peers in two other processes.
 
 ``python tests/benchmarks/presence.py --peers 50`` measures links, and with ``--bare`` zenoh's sessions with the same
 settings and nothing on them: the floor. ``--router`` has the links meet as clients of a router. The peers know the

@@ -882,15 +882,14 @@ async def test_leaving_the_filter_drops_the_remaining_messages_and_ends_its_task
 
 
 async def test_a_filter_that_was_left_is_freed(buffer: Buffer, streams: Streams) -> None:
-    pairs = MessageFilter(streams[1], buffer, "map")
-
-    async def enter_and_leave() -> None:
-        async with pairs:
+    async def enter_and_leave(entered: MessageFilter[Scan, TransformStamped]) -> None:
+        async with entered:
             await settle()
 
+    pairs = MessageFilter(streams[1], buffer, "map")
     # In another task, because asyncio's keep their last cancellation with its frames (Python 3.12).
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(enter_and_leave)
+        tasks.start_soon(enter_and_leave, pairs)
     held = weakref.ref(pairs)
     del pairs
     gc.collect()
