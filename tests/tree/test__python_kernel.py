@@ -325,20 +325,6 @@ def test_the_row_of_a_chain_is_bit_for_bit_the_product_of_its_interpolated_edges
     assert bits(row) == bits(expected_row(up, down, at))
 
 
-@on_both
-@given(st.lists(st.tuples(transforms(10.0).map(row_of), st.integers(0, 100)), min_size=1, max_size=12))
-def test_composed_paths_are_bit_for_bit_the_products_of_their_rows(
-    kernel: ModuleType, drawn: list[tuple[Row, int]]
-) -> None:
-    origins = [number % max(place, 1) for place, (_, number) in enumerate(drawn)]
-    expected: list[Row] = []
-    for (row, _), origin in zip(drawn, origins, strict=True):
-        expected.append(compose(expected[origin], row) if origin else row)
-    rows = np.array([row for row, _ in drawn]).reshape(-1, 7)
-    kernel.compose_paths(rows, np.array(origins, np.int64))
-    assert rows.tobytes() == np.array(expected).tobytes()
-
-
 @needs_both
 @given(drawn_chains(), st.data())
 def test_many_rows_are_bit_for_bit_the_single_ones(drawn: Drawn, data: st.DataObject) -> None:
@@ -688,7 +674,7 @@ def test_the_compiled_kernel_commits_nothing_while_somebody_holds_the_lock() -> 
 @on_both
 def test_a_sample_without_fields_has_none(kernel: ModuleType) -> None:
     empty = sample_class(kernel)()
-    for name in ("_fields", "_row", "parent", "child", "stamp", "authority", "static"):
+    for name in ("_fields", "_row", "_square", "parent", "child", "stamp", "authority", "static"):
         with pytest.raises(AttributeError):
             getattr(empty, name)
 
@@ -700,7 +686,7 @@ def test_the_fields_of_a_sample_can_be_set_again_and_read_twice(kernel: ModuleTy
     assert bits(made._row) == bits(x(-0.0))
     made._fields = "q", "b", STAMP_MAX, x(2.0), "me", False
     assert (made.parent, made.child, made.stamp, made.authority, made.static) == ("q", "b", STAMP_MAX, "me", False)
-    assert made._row == x(2.0)
+    assert (made._row, made._square) == (x(2.0), 4.0)
     for name in ("parent", "child", "stamp", "authority", "static"):
         with pytest.raises(AttributeError):
             setattr(made, name, None)
