@@ -53,7 +53,7 @@ class World:
         """Note what a call returns or raises."""
         try:
             self.said.append(call())
-        except (self.tfbus.TransformError, TypeError, ValueError, RuntimeError, KeyError) as error:
+        except (self.tfbus.TransformError, TypeError, ValueError, RuntimeError) as error:
             self.said.append(error_of(error))
 
     # Drawn things
@@ -246,7 +246,7 @@ def run(seed: int, steps: int) -> None:
 
 @needs_both
 @pytest.mark.thorough
-@pytest.mark.parametrize("first", range(0, 20, 5))
+@pytest.mark.parametrize("first", [*range(0, 20, 5), 3025])
 def test_random_traffic_does_the_same_on_both_kernels(first: int) -> None:
     for seed in range(first, first + 5):
         run(seed, 250)

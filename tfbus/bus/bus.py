@@ -442,7 +442,8 @@ class Bus:
                 continue
             late.insert(batch)
             if late.has_caught_up:
-                del self._late[buffer]
+                # A wake-up that publishes may have been first.
+                self._late.pop(buffer, None)
 
     def _remove_if_known(self, frame: str) -> None:
         with suppress(UnknownFrameError):
