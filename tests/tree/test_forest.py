@@ -42,11 +42,11 @@ def test_a_path_that_depends_on_the_stamp_is_searched_each_time() -> None:
 
 
 def test_the_cache_of_paths_is_bounded() -> None:
-    known = forest(*(static("root", f"frame {number}") for number in range(110)))
-    for target in range(110):
-        for source in range(110):
+    known = forest(*(static("root", f"frame {number}") for number in range(145)))
+    for target in range(145):
+        for source in range(145):
             known.find_path(f"frame {target}", f"frame {source}", LATEST)
-            assert len(known.paths) <= 10_000
+        assert len(known.paths) <= 20_000
 
 
 def test_a_changing_newest_path_is_kept_until_the_topology_changes() -> None:
