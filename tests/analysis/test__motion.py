@@ -19,3 +19,14 @@ def test_without_arrivals_the_order_is_not_judged() -> None:
     received = stamps + 5 * 10**9
     late = MovingSamples("base", stamps, np.array([ROW] * 3), none, none, received)
     assert [(finding.kind, finding.count) for finding in late.findings(Limits())] == [("stamps go back", 2)]
+
+
+def test_a_rate_breaks_down_where_fewer_than_half_of_the_samples_come() -> None:
+    for left, kinds in ((5, []), (4, ["rate"])):
+        # Ten samples in each tenth of 100 s, and fewer in the fifth one, at even distances.
+        counts = [10, 10, 10, 10, left, 10, 10, 10, 10, 10]
+        seconds = [10 * tenth + 10 * number / count for tenth, count in enumerate(counts) for number in range(count)]
+        stamps = (np.array([*seconds, 100.0]) * 10**9).astype(np.int64)
+        none = np.zeros(len(stamps), np.int64)
+        samples = MovingSamples("base", stamps, np.array([ROW] * len(stamps)), none, none, None)
+        assert [finding.kind for finding in samples.findings(Limits())] == kinds

@@ -46,6 +46,7 @@ def test_a_new_cause_is_told_once_some_seconds_have_passed(caplog: pytest.LogCap
     clock = SimulatedClock(5 * SECOND)
     report = HangingReport(WaitingIndex(), clock)
     assert tell(report, "a") == math.inf
+    assert tell(report, "b") == 5.0
     clock.set(7 * SECOND)
     assert tell(report, "b") == 3.0
     clock.set(10 * SECOND)

@@ -1,4 +1,4 @@
-"""Which batches both kernels take, and what they do with them."""
+"""The batches that both kernels take, and their effects."""
 
 import threading
 from types import SimpleNamespace

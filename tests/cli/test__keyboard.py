@@ -27,6 +27,18 @@ def test_letters_and_arrows_are_told_apart() -> None:
     ]
 
 
+@pytest.mark.anyio
+async def test_the_keys_end_with_the_terminal() -> None:
+    terminal, typist = os.pipe()
+    os.write(typist, b"q")
+    os.close(typist)
+    try:
+        keys = Keyboard(terminal).keys()
+        assert [key async for key in keys] == ["q"]
+    finally:
+        os.close(terminal)
+
+
 def test_there_is_no_keyboard_where_standard_input_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     with Path(os.devnull).open(encoding="utf-8") as nothing:
         monkeypatch.setattr(sys, "stdin", nothing)

@@ -18,6 +18,19 @@ def test_a_layout_can_be_written_and_read_in_either_byte_order(dtype: type) -> N
         assert again.fields["i"].tolist() == [0, 1, 2, 3]
 
 
+def test_every_datatype_of_a_field_is_read() -> None:
+    # The constants of sensor_msgs/PointField: INT8 is 1, and so on up to FLOAT64.
+    kinds = [np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.float32, np.float64]
+    for datatype, kind in enumerate(kinds, 1):
+        message = new_layout(PointCloud("a", 5, np.zeros((1, 3), np.float32)))
+        value = np.array([100], kind)
+        message["fields"].append({"name": "v", "offset": 12, "datatype": datatype, "count": 1})
+        step = 12 + value.itemsize
+        message.update(point_step=step, row_step=step, height=1, width=1, data=bytes(12) + value.tobytes())
+        found = read_cloud(message, "a", 5).fields["v"]
+        assert (found.dtype, found.tolist()) == (value.dtype, [100])
+
+
 def test_a_coordinate_is_one_number() -> None:
     message = new_layout(PointCloud("a", 5, np.ones((1, 3))))
     message["fields"][0]["count"] = 3

@@ -325,20 +325,6 @@ def test_the_row_of_a_chain_is_bit_for_bit_the_product_of_its_interpolated_edges
     assert bits(row) == bits(expected_row(up, down, at))
 
 
-@on_both
-@given(st.lists(st.tuples(transforms(10.0).map(row_of), st.integers(0, 100)), min_size=1, max_size=12))
-def test_composed_paths_are_bit_for_bit_the_products_of_their_rows(
-    kernel: ModuleType, drawn: list[tuple[Row, int]]
-) -> None:
-    origins = [number % max(place, 1) for place, (_, number) in enumerate(drawn)]
-    expected: list[Row] = []
-    for (row, _), origin in zip(drawn, origins, strict=True):
-        expected.append(compose(expected[origin], row) if origin else row)
-    rows = np.array([row for row, _ in drawn]).reshape(-1, 7)
-    kernel.compose_paths(rows, np.array(origins, np.int64))
-    assert rows.tobytes() == np.array(expected).tobytes()
-
-
 @needs_both
 @given(drawn_chains(), st.data())
 def test_many_rows_are_bit_for_bit_the_single_ones(drawn: Drawn, data: st.DataObject) -> None:

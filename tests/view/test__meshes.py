@@ -130,9 +130,10 @@ def test_shapes_with_the_same_triangles_have_the_same_key(box: Path) -> None:
 
 
 def test_the_colour_is_that_of_the_urdf_else_of_the_file_else_grey(box: Path) -> None:
-    painted = trimesh.creation.box((1.0, 1.0, 1.0))
-    painted.visual.face_colors = (10, 20, 30, 255)
-    painted.export(box / "painted.obj")
+    # By hand, because trimesh wants SciPy to write colours.
+    corners = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
+    lines = [f"v {corner} {10 / 255} {20 / 255} {30 / 255}" for corner in corners]
+    (box / "painted.obj").write_text("\n".join([*lines, "f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"]))
     files = MeshFiles([box], box)
     assert solid(Mesh("painted.obj"), files, colour=(1.0, 0.5, 0.0, 0.25)).colour == (255, 128, 0)
     assert solid(Mesh("painted.obj"), files, colour=(1.0, 0.5, 0.0, 0.25)).opacity == 0.25
