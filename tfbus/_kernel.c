@@ -173,6 +173,13 @@ sample_row(Sample *self, void *Py_UNUSED(closure))
 }
 
 static PyObject *
+sample_square(Sample *self, void *Py_UNUSED(closure))
+{
+    const double *row = self->row;
+    return sample_is_set(self) ? PyFloat_FromDouble(row[0] * row[0] + row[1] * row[1] + row[2] * row[2]) : NULL;
+}
+
+static PyObject *
 sample_fields(Sample *self, void *Py_UNUSED(closure))
 {
     if (!sample_is_set(self)) {
@@ -265,6 +272,7 @@ static PyGetSetDef sample_getset[] = {
     {"_fields", (getter)sample_fields, (setter)sample_set_fields,
      PyDoc_STR("Parent, child, stamp, row, authority and static."), NULL},
     {"_row", (getter)sample_row, NULL, PyDoc_STR("The transform as seven floats."), NULL},
+    {"_square", (getter)sample_square, NULL, PyDoc_STR("The square of the magnitude of the translation, in m2."), NULL},
     {"stamp", (getter)sample_stamp, NULL, PyDoc_STR("Nanoseconds; never `LATEST`."), NULL},
     {"static", (getter)sample_static, NULL, PyDoc_STR("Whether it holds at every stamp."), NULL},
     {NULL}

@@ -6,7 +6,7 @@ import anyio.lowlevel
 import pytest
 from support.asking import settle
 
-from tfbus._aio.wake_up import WakeUp
+from tfbus._aio.wake_up import wake_up
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
@@ -15,8 +15,13 @@ class Waiting:
     """A task that waits, and how that ended."""
 
     def __init__(self) -> None:
-        self.woken = WakeUp()
+        self.woken, self.wake = wake_up()
         self.ended: str = ""
+
+    def end(self) -> None:
+        """End the wait, whether it has ended or not."""
+        with suppress(Exception):
+            self.wake()
 
     async def run(self) -> None:
         try:
@@ -33,17 +38,17 @@ async def test_the_task_goes_on_once_the_wait_is_ended_and_not_before() -> None:
         tasks.start_soon(waiting.run)
         await settle()
         assert waiting.ended == ""
-        waiting.woken.end()
+        waiting.end()
         # Again, before the task has run and after it.
-        waiting.woken.end()
+        waiting.end()
         await settle()
         assert str(waiting.ended) == "woken"
-        waiting.woken.end()
+        waiting.end()
 
 
 async def test_a_wait_that_was_ended_before_is_none() -> None:
     waiting = Waiting()
-    waiting.woken.end()
+    waiting.end()
     await waiting.run()
     assert waiting.ended == "woken"
 
@@ -55,31 +60,8 @@ async def test_a_cancelled_wait_may_be_ended() -> None:
         await settle()
         tasks.cancel_scope.cancel()
     assert waiting.ended == "cancelled"
-    waiting.woken.end()
+    waiting.end()
     await settle()
-
-
-async def test_the_faster_way_ends_the_wait_and_does_no_harm_afterwards() -> None:
-    woken, cancelled = Waiting(), Waiting()
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(woken.run)
-        await settle()
-        woken.woken.wake()
-        for _ in range(2):
-            with suppress(Exception):
-                woken.woken.wake()
-            woken.woken.end()
-            await settle()
-        assert woken.ended == "woken"
-        tasks.start_soon(cancelled.run)
-        await settle()
-        tasks.cancel_scope.cancel()
-        with suppress(Exception):
-            cancelled.woken.wake()
-    assert cancelled.ended in ("cancelled", "woken")
-    with suppress(Exception):
-        cancelled.woken.wake()
-    await anyio.lowlevel.checkpoint()
 
 
 @pytest.mark.parametrize("end_first", [True, False])
@@ -89,7 +71,7 @@ async def test_ended_and_cancelled_in_one_turn_the_task_ends_once(end_first: boo
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(waiting.run)
             await settle()
-            steps: list[Callable[[], object]] = [waiting.woken.end, tasks.cancel_scope.cancel]
+            steps: list[Callable[[], object]] = [waiting.end, tasks.cancel_scope.cancel]
             for step in steps if end_first else reversed(steps):
                 step()
     assert waiting.ended in ("woken", "cancelled")

@@ -5,12 +5,14 @@ import platform
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from statistics import median
+from typing import Any
 
 import cases
 import pytest
 from cases import AUTHORITY, Case, Vector
 
-from tfbus import Transform, TransformStamped
+import tfbus
+from tfbus import TransformStamped
 
 Ask = Callable[[Case], tuple[float, Vector]]
 """Has a peer measure one round of a case."""
@@ -61,6 +63,10 @@ def version_of(package: str) -> str:
         return "not installed"
 
 
-def build(sample: cases.Sample) -> TransformStamped:
-    transform = Transform(sample.translation, sample.rotation)
-    return TransformStamped(sample.parent, sample.child, sample.stamp, transform, AUTHORITY, sample.static)
+def build(sample: cases.Sample, package: Any = tfbus) -> TransformStamped:
+    """A sample of ours; of another copy of the package, if one is given."""
+    transform = package.Transform(sample.translation, sample.rotation)
+    made: TransformStamped = package.TransformStamped(
+        sample.parent, sample.child, sample.stamp, transform, AUTHORITY, sample.static
+    )
+    return made

@@ -58,6 +58,8 @@ def history(chain: str) -> list[Sample]:
 def questions(kind: str) -> list[int]:
     """Stamps at which every moving edge of a `history` has to interpolate."""
     rng = random.Random(3)
+    if kind == "lookup newest":
+        return [rng.randrange(START + 990 * PERIOD, START + 999 * PERIOD) for _ in range(2_000)]
     count = MANY if kind.startswith("many") else 2_000
     stamps = [rng.randrange(START + PERIOD, START + 999 * PERIOD) for _ in range(count)]
     return sorted(stamps) if kind == "many, sorted" else stamps

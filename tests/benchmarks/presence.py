@@ -7,6 +7,7 @@ measured link, but not each other, so that the machine carries them.
 
 import argparse
 import json
+import socket
 import subprocess
 import sys
 import time
@@ -17,7 +18,6 @@ from uuid import uuid4
 import anyio
 import anyio.to_thread
 import zenoh
-from support.processes import free_ports
 
 from tfbus import Bus
 from tfbus.links.zenoh import ZenohLink, ZenohRouter
@@ -83,6 +83,12 @@ async def be_measured(task: dict[str, Any]) -> None:
         print(json.dumps({"cores": cores, "peers": known(ends[0])}), flush=True)
 
 
+def free_address() -> str:
+    """An address of the loopback at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
 def measure(
     peers: int = 50,
     seconds: float = 30.0,
@@ -93,7 +99,7 @@ def measure(
 ) -> float:
     """The user and system time of the measured process, in cores."""
     task = {
-        "address": f"tcp/127.0.0.1:{free_ports(1)[0]}",
+        "address": free_address(),
         "domain": f"presence-{uuid4().hex}",
         "config": (config or {}) | ({"mode": "client"} if router else {}),
         "peers": peers,

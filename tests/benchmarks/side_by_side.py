@@ -1,6 +1,7 @@
 """The fixtures of the benchmarks: a plugin, so that all files fill one table and ask one tf2."""
 
 import json
+import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,12 +23,23 @@ def table(request: pytest.FixtureRequest) -> Table:
 
 @pytest.fixture(scope="session")
 def tf2() -> Iterator[Ask | str]:
-    """Has the real tf2, in a process of its own, measure one round of a case; or says why there is none."""
-    if not Path(SYSTEM_PYTHON).exists():
-        yield f"no {SYSTEM_PYTHON}"
+    """Has the real tf2 of ROS 1, in a process of its own, measure one round of a case; or says why there is none."""
+    yield from _peer(SYSTEM_PYTHON)
+
+
+@pytest.fixture(scope="session")
+def tf2_of_ros_2() -> Iterator[Ask | str]:
+    """As `tf2`, of ROS 2."""
+    yield from _peer(os.environ.get("ROS2_PYTHON", "the Python that ROS2_PYTHON names"), "ros2")
+
+
+def _peer(python: str, *arguments: str) -> Iterator[Ask | str]:
+    if not Path(python).exists():
+        yield f"no {python}"
         return
     script = Path(__file__).with_name("tf2_peer.py")
-    with subprocess.Popen([SYSTEM_PYTHON, script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    command = [python, str(script), *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         requests, replies = process.stdin, process.stdout
         assert requests is not None
         assert replies is not None
@@ -38,4 +50,4 @@ def tf2() -> Iterator[Ask | str]:
             return seconds, answer
 
         greeting = replies.readline().strip()
-        yield ask if greeting == "ready" else f"{SYSTEM_PYTHON}: {greeting}"
+        yield ask if greeting == "ready" else f"{python}: {greeting}"

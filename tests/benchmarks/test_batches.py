@@ -19,7 +19,9 @@ import numpy.typing as npt
 import pytest
 from beside import Ask, Table, build, show
 from cases import BASE, MANY, PERIOD, START, Case
+from support.both_kernels import COMPILED, tfbus_on
 
+import tfbus
 from tfbus import SECOND, PointCloud, Transform, TransformArray, TransformStamped, TransformTree, do_transform
 
 pytest_plugins = ["side_by_side"]
@@ -29,6 +31,7 @@ POINTS = 100_000
 SWEEP = SECOND // 10
 HANDFUL = 5
 WANTED = {1: "<= 250 ns", 3: "<= 650 ns"}
+TO_REACH = {10: "<= 0.7", 1_000: "<= 0.7", 100_000: "<= 0.5"}
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
@@ -166,6 +169,40 @@ def test_many_stamps(benchmark: Any, table: Table, tf2: Ask | str, edges: int, o
         table.compare("", ours, name, rounds, "<= 0.125" if name == "tf2 in a loop" else "", unit="ns")
     for name in absent:
         table.add("", "", f"{name} is not there")
+
+
+@pytest.mark.parametrize("count", [10, 1_000, 100_000])
+@pytest.mark.parametrize("read", [False, True])
+def test_stamps_in_order_on_both_kernels(benchmark: Any, table: Table, count: int, read: bool) -> None:
+    """`read` makes the arrays of the answer as well, which are else made when somebody reads them."""
+    chain = "mmm"
+    matrices = transform_tree(chain)
+    if matrices is None:
+        pytest.skip("no transform-tree to measure beside")
+    stamps = np.sort(np.random.default_rng(6).integers(START + PERIOD, START + 999 * PERIOD, count))
+    repeats = max(1, 3_000 // count)
+
+    def on(package: Any) -> Turn:
+        tree = package.TransformTree(keep=2.0 * cases.KEEP)
+        tree.insert_many(build(sample, package) for sample in cases.history(chain))
+
+        def ask() -> None:
+            for _ in range(repeats):
+                found = tree.lookup_many(BASE, "f2", stamps)
+                if read:
+                    _ = found.translations, found.rotations
+
+        return timed(ask, count * repeats)
+
+    other = "python" if tfbus.kernel == "compiled" else "compiled"
+    peers = [timed(lambda: [matrices(stamps) for _ in range(repeats)], count * repeats)]
+    if other == "python" or COMPILED is not None:
+        peers.append(on(tfbus_on(other)))
+    ours, theirs = take_turns(benchmark, on(tfbus), peers)
+    label = f"lookup_many, {count:,} in order" + ", arrays read" * read
+    table.compare(label, ours, "transform-tree", theirs[0], "" if read else TO_REACH[count], unit="ns")
+    for rounds in theirs[1:]:
+        table.compare(f"  on the {other} kernel", rounds, "transform-tree", theirs[0], unit="ns")
 
 
 @pytest.mark.parametrize("edges", [1, 3])

@@ -19,8 +19,10 @@ import cases
 import pytest
 from beside import Ask, Table, build, show
 from cases import AUTHORITY, BASE, START, Case, Pass, Vector
+from support.both_kernels import COMPILED, tfbus_on
 
-from tfbus import LATEST, Buffer, Bus, Transform, TransformStamped
+import tfbus
+from tfbus import Buffer, Bus, Transform, TransformStamped
 
 pytest_plugins = ["side_by_side"]
 
@@ -36,43 +38,55 @@ Calls = Sequence[TransformStamped | Sequence[TransformStamped]]
 
 def publish_all(bus: Bus, calls: Calls) -> float:
     """Seconds in all."""
-    publish = bus.publish
+    return call_with_each(bus.publish, calls)
+
+
+def call_with_each(call: Callable[[Any], object], calls: Calls) -> float:
+    """Seconds in all."""
     start = perf_counter()
     for samples in calls:
-        publish(samples)
+        call(samples)
     return perf_counter() - start
 
 
-def publish_stamped(bus: Bus, parts: list[tuple[int, Transform]]) -> float:
+def publish_stamped(bus: Bus, parts: list[tuple[int, Transform]], stamped: type[TransformStamped]) -> float:
     """As `publish_all`, with the making of the samples."""
     publish = bus.publish
     start = perf_counter()
     for stamp, transform in parts:
-        publish(TransformStamped(BASE, "f0", stamp, transform, AUTHORITY))
+        publish(stamped(BASE, "f0", stamp, transform, AUTHORITY))
     return perf_counter() - start
 
 
-def insert(kind: str) -> Pass:
-    samples = [build(sample) for sample in cases.insertions(kind)]
+def insert(kind: str, package: Any = tfbus) -> Pass:
+    """One pass on the kernel of this process, or on that of another copy of the package."""
+    samples = [build(sample, package) for sample in cases.insertions(kind)]
     parts = [(sample.stamp, sample.transform) for sample in samples]
     calls: Calls = samples
     if kind == "insert batches":
         calls = [samples[i : i + cases.BATCH] for i in range(0, len(samples), cases.BATCH)]
 
     def one_pass() -> tuple[float, Vector]:
-        bus = Bus()
-        buffer = Buffer(bus, cases.KEEP)
-        seconds = publish_stamped(bus, parts) if kind == "insert stamped" else publish_all(bus, calls)
+        bus = package.Bus()
+        buffer = package.Buffer(bus, cases.KEEP)
+        if kind == "insert into the tree":
+            tree = package.TransformTree(cases.KEEP)
+            return call_with_each(tree.insert, calls) / len(samples), tree.lookup(BASE, "f0").transform.translation
+        if kind == "insert stamped":
+            seconds = publish_stamped(bus, parts, package.TransformStamped)
+        else:
+            seconds = publish_all(bus, calls)
         return seconds / len(samples), buffer.lookup_nowait(BASE, "f0").transform.translation
 
     return one_pass
 
 
-def lookup(case: Case) -> Pass:
-    bus = Bus()
-    buffer = Buffer(bus, 2 * cases.KEEP)
-    bus.publish(build(sample) for sample in cases.history(case.chain))
-    stamps = [LATEST if case.kind == "lookup latest" else stamp for stamp in cases.questions(case.kind)]
+def lookup(case: Case, package: Any = tfbus) -> Pass:
+    """As `insert`."""
+    bus = package.Bus()
+    buffer = package.Buffer(bus, 2 * cases.KEEP)
+    bus.publish(build(sample, package) for sample in cases.history(case.chain))
+    stamps = [package.LATEST if case.kind == "lookup latest" else stamp for stamp in cases.questions(case.kind)]
     source = f"f{len(case.chain) - 1}"
 
     def one_pass() -> tuple[float, Vector]:
@@ -91,9 +105,9 @@ def lookup(case: Case) -> Pass:
         ("publish 1, built beforehand", Case("insert"), "<= 0.4"),
         ("publish 1, stamped in the timing", Case("insert stamped"), "<= 1.0"),
         ("publish 20, each", Case("insert batches"), "<= 1.0"),
-        ("lookup, 1 edge", Case("lookup", "m"), "<= 0.5"),
-        ("lookup, 3 edges", Case("lookup", "mmm"), "<= 1.1"),
-        ("lookup, 10 edges", Case("lookup", "mmmmmmmmmm"), "<= 2.7"),
+        ("lookup, 1 edge", Case("lookup", "m"), "<= 0.07"),
+        ("lookup, 3 edges", Case("lookup", "mmm"), "<= 0.08"),
+        ("lookup, 10 edges", Case("lookup", "mmmmmmmmmm"), "<= 0.15"),
         ("lookup, 10 edges, 7 of them static", Case("lookup", "msssmsssms"), ""),
         ("lookup LATEST, 1 edge", Case("lookup latest", "m"), ""),
         ("lookup LATEST, 3 edges", Case("lookup latest", "mmm"), ""),
@@ -101,11 +115,44 @@ def lookup(case: Case) -> Pass:
     ],
 )
 def test_beside_tf2(benchmark: Any, table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
-    one_pass = lookup(case) if case.chain else insert(case.kind)
+    if isinstance(tf2, str):
+        tf2 = f"no tf2 to measure beside ({tf2}); on Debian: apt-get install python3-tf2-ros"
+    beside(benchmark, table, tf2, label, case, wanted)
+
+
+@pytest.mark.parametrize(
+    ("label", "case", "wanted"),
+    [
+        ("lookup in the newest 0.1 s, 10 edges", Case("lookup newest", "m" * 10), "<= 0.15"),
+        ("lookup LATEST, 10 edges", Case("lookup latest", "m" * 10), "<= 0.15"),
+        ("insert 1 into a tree", Case("insert into the tree"), "<= 0.4"),
+        ("publish 1, built beforehand", Case("insert"), "<= 0.4"),
+    ],
+)
+def test_beside_tf2_of_ros_2(
+    benchmark: Any, table: Table, tf2_of_ros_2: Ask | str, label: str, case: Case, wanted: str
+) -> None:
+    if isinstance(tf2_of_ros_2, str):
+        pytest.skip(f"no tf2 of ROS 2 to measure beside: {tf2_of_ros_2}")
+    beside(benchmark, table, tf2_of_ros_2, f"ROS 2: {label}", case, wanted)
+
+
+def beside(benchmark: Any, table: Table, tf2: Ask | str, label: str, case: Case, wanted: str) -> None:
+    """Measure a case on both kernels beside a tf2, or say why there is none."""
+
+    def passes_on(package: Any) -> Pass:
+        return lookup(case, package) if case.chain else insert(case.kind, package)
+
+    other = "python" if tfbus.kernel == "compiled" else "compiled"
+    one_pass = passes_on(tfbus)
+    other_pass = passes_on(tfbus_on(other)) if other == "python" or COMPILED is not None else None
+    others: list[float] = []
     peer: list[float] = []
     expected: list[Vector] = []
 
     def peers_turn() -> None:
+        if other_pass is not None:
+            others.append(other_pass()[0])
         if not isinstance(tf2, str):
             seconds, translation = tf2(case)
             peer.append(seconds)
@@ -121,8 +168,12 @@ def test_beside_tf2(benchmark: Any, table: Table, tf2: Ask | str, label: str, ca
     answer = benchmark.pedantic(our_turn, setup=peers_turn, rounds=ROUNDS)
     if isinstance(tf2, str):
         table.add(label, show(ours, "us"), "no tf2")
-        pytest.skip(f"no tf2 to measure beside ({tf2}); on Debian: apt-get install python3-tf2-ros")
-    table.compare(label, ours, "tf2", peer, wanted)
+    else:
+        table.compare(label, ours, "tf2", peer, wanted)
+    if others:
+        table.compare(f"  on the {other} kernel", others, f"the {tfbus.kernel} one", ours)
+    if isinstance(tf2, str):
+        pytest.skip(tf2)
     assert answer == pytest.approx(expected[-1], abs=1e-6)
 
 

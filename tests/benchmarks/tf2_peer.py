@@ -1,4 +1,4 @@
-"""The real tf2's side of the benchmarks, under the Python that has `tf2_py` (Debian: python3-tf2-ros).
+"""The real tf2's side of the benchmarks, under the Python that has `tf2_py`, of ROS 1 or of ROS 2.
 
 Says ``ready``, or what is missing; then answers each `Case`, a JSON line, with what one pass gives.
 """
@@ -11,9 +11,14 @@ from typing import Any
 from cases import AUTHORITY, BASE, KEEP, Case, Pass, Sample, Vector, history, insertions, questions
 
 try:
-    import rospy  # type: ignore[import-not-found]
     import tf2_py  # type: ignore[import-not-found]
     from geometry_msgs.msg import TransformStamped  # type: ignore[import-not-found]
+
+    if len(sys.argv) > 1:
+        from rclpy.duration import Duration
+        from rclpy.time import Time
+    else:
+        from rospy import Duration, Time  # type: ignore[import-not-found]
 except ImportError as error:
     print(error)
     sys.exit()
@@ -23,10 +28,20 @@ def time_parts(stamp: int) -> tuple[int, int]:
     return divmod(stamp, 1_000_000_000)
 
 
+def seconds_of(seconds: int) -> Any:
+    return Duration(seconds) if len(sys.argv) == 1 else Duration(seconds=seconds)
+
+
+def time(*parts: int) -> Any:
+    """What a question is asked with; in ROS 1 a message has it too."""
+    return Time(*parts) if len(sys.argv) == 1 else Time(seconds=parts[0], nanoseconds=parts[1]) if parts else Time()
+
+
 def build(sample: Sample) -> Any:
     message = TransformStamped()
     message.header.frame_id = sample.parent
-    message.header.stamp = rospy.Time(*time_parts(sample.stamp))
+    stamp = time(*time_parts(sample.stamp))
+    message.header.stamp = stamp.to_msg() if hasattr(stamp, "to_msg") else stamp
     message.child_frame_id = sample.child
     translation, rotation = message.transform.translation, message.transform.rotation
     translation.x, translation.y, translation.z = sample.translation
@@ -44,12 +59,12 @@ def insert(kind: str) -> Pass:
     parts = [(message, *time_parts(sample.stamp)) for message, sample in zip(messages, insertions(kind), strict=True)]
 
     def one_pass() -> tuple[float, Vector]:
-        core = tf2_py.BufferCore(rospy.Duration(KEEP))
-        set_transform, time = core.set_transform, rospy.Time
+        core = tf2_py.BufferCore(seconds_of(KEEP))
+        set_transform = core.set_transform
         start = perf_counter()
         if kind == "insert stamped":
             for message, seconds, nanoseconds in parts:
-                message.header.stamp = time(seconds, nanoseconds)
+                message.header.stamp = Time(seconds, nanoseconds)
                 set_transform(message, AUTHORITY)
         else:
             for message in messages:
@@ -61,11 +76,11 @@ def insert(kind: str) -> Pass:
 
 
 def lookup(case: Case) -> Pass:
-    core = tf2_py.BufferCore(rospy.Duration(2 * KEEP))
+    core = tf2_py.BufferCore(seconds_of(2 * KEEP))
     for sample in history(case.chain):
         (core.set_transform_static if sample.static else core.set_transform)(build(sample), AUTHORITY)
     stamps = questions(case.kind)
-    times = [rospy.Time() if case.kind == "lookup latest" else rospy.Time(*time_parts(stamp)) for stamp in stamps]
+    times = [time() if case.kind == "lookup latest" else time(*time_parts(stamp)) for stamp in stamps]
     source = f"f{len(case.chain) - 1}"
 
     def one_pass() -> tuple[float, Vector]:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.asking import HandClock
 
 from tfbus import SimulatedClock, SystemClock
-from tfbus.buffer._alarms import LoopAlarms, _AlarmHeap, alarms_of
+from tfbus.buffer._alarms import LoopAlarms, SimulatedAlarms, _AlarmHeap, alarms_of
 
 
 class HandLoop:
@@ -67,8 +67,8 @@ def test_each_alarm_that_is_not_closed_rings_at_its_time_and_in_order(steps: lis
             alarms.append(heap.add(number, partial(lambda place: rung.append((loop.now, place)), place)))
         elif step == "close" and alarms:
             place = int(number) % len(alarms)
-            alarms[place].close()
-            alarms[place].close()
+            alarms[place]()
+            alarms[place]()
             waiting.pop(place, None)
         elif step == "move":
             due = sorted((at, place) for place, at in waiting.items() if at <= loop.now + number)
@@ -83,7 +83,7 @@ def test_one_timer_serves_all_alarms_that_follow_each_other() -> None:
     loop = HandLoop()
     heap = _AlarmHeap(loop)
     for _ in range(10_000):
-        heap.add(60.0, list).close()
+        heap.add(60.0, list)()
         loop.move(0.001)
     assert loop.set == 1
     assert len(heap._alarms) < 200
@@ -107,7 +107,7 @@ def test_an_alarm_that_raises_keeps_the_later_ones() -> None:
 
 @pytest.mark.parametrize(
     ("clock", "kind"),
-    [(SystemClock(), LoopAlarms), (SimulatedClock(), SimulatedClock), (HandClock(), type(None))],
+    [(SystemClock(), LoopAlarms), (SimulatedClock(), SimulatedAlarms), (HandClock(), type(None))],
 )
 def test_only_clocks_whose_time_is_known_have_alarms(clock: Any, kind: type) -> None:
     assert type(alarms_of(clock)) is kind
@@ -129,7 +129,7 @@ def test_alarms_on_one_loop_ring_although_another_one_ran_meanwhile() -> None:
         await done.wait()
 
     async def on_the_other() -> None:
-        alarms.call_after(60.0, partial(rung.append, "never")).close()
+        alarms.call_after(60.0, partial(rung.append, "never"))()
 
     anyio.run(on_the_first)
     assert rung == ["first"]

@@ -13,6 +13,7 @@ FAR = Transform((1e308, 0.0, 0.0))
 def test_a_translation_of_just_the_bound_is_within_and_a_longer_one_is_not() -> None:
     sample = TransformStamped("a", "b", 0, Transform((3.0, -4.0, 12.0)))
     assert is_within(sample, 13.0)
+    assert is_within(sample, 14.0)
     assert not is_within(sample, math.nextafter(13.0, 0.0))
 
 

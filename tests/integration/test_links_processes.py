@@ -11,6 +11,7 @@ from typing import Any
 from uuid import uuid4
 
 import pytest
+from start_together import measure
 from support.processes import PATIENCE, Crowd, PeerProcess, crowd, free_ports, new_domain
 
 pytestmark = pytest.mark.thorough
@@ -478,6 +479,10 @@ def test_two_that_lose_each_other_while_both_hear_a_third_are_together_again(hos
     one.ask("stream", authority="wheels", batches=10, rate=100.0)
     other.ask("until", last={"wheels": 9})
     assert other.ask("facts")["tallies"]["wheels"]["missing"] == 0
+
+
+def test_processes_that_start_together_all_have_every_static_frame() -> None:
+    assert max(measure(processes=12)) < PATIENCE
 
 
 def test_hosts_without_an_address_hear_only_themselves(hosts: Hosts, processes: Crowd) -> None:

@@ -159,7 +159,9 @@ def test_no_publish_and_no_wake_up_leaks_memory_or_references() -> None:
         judge.horizon = 1_000
         paths = kernel.Paths(threading.Lock(), LATEST, kernel.Sample)
         paths.recent[parent] = {child: kernel.Chain((history,), ())}
-        lines, parked, limits = {child: kernel.Line()}, {}, []
+        lines: dict[str, Any] = {child: kernel.Line()}
+        parked: dict[Any, Any] = {}
+        limits: list[Any] = []
         lines[child].__init__()
         woken: list[Any] = []
         for stamp in (30, 20, 10):

@@ -40,7 +40,7 @@ def main() -> None:
             found = buffer.lookup_transform("odom", "tool", rospy.Time())
         except tf2_ros.TransformException:
             return None
-        return found.header.stamp.to_sec(), found.transform.translation.x
+        return found.header.stamp.to_nsec(), found.transform.translation.x
 
     rospy.Subscriber("/tf", TFMessage, hear, queue_size=100, tcp_nodelay=True)
     moving, static = tf2_ros.TransformBroadcaster(), tf2_ros.StaticTransformBroadcaster()

@@ -46,7 +46,7 @@ def main() -> None:
         except tf2_ros.TransformException:
             return None
         stamp = found.header.stamp
-        return stamp.sec + stamp.nanosec / 1e9, found.transform.translation.x
+        return stamp.sec * 10**9 + stamp.nanosec, found.transform.translation.x
 
     node.create_subscription(TFMessage, "/tf", hear, 100)
     moving, static = tf2_ros.TransformBroadcaster(node), tf2_ros.StaticTransformBroadcaster(node)

@@ -26,15 +26,28 @@ def test_a_path_is_found_again_until_all_are_forgotten() -> None:
 def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() -> None:
     cache, kept = PathCache(Lock()), path()
     cache.keep("a", "wanted", kept)
-    for number in range(30_000):
+    for number in range(50_000):
         cache.keep("a", str(number), kept)
-        assert len(cache) <= 10_000
         if number % 1_000 == 0:
+            assert len(cache) <= 20_000
             assert cache.find("a", "wanted") is kept
     assert cache.find("a", "0") is None
-    assert cache.find("a", "29999") is kept
-    assert [cache.holds("a", name) for name in ("0", "26000", "29999", "wanted")] == [False, True, True, True]
+    assert cache.find("a", "49999") is kept
+    assert [cache.holds("a", name) for name in ("0", "41000", "49999", "wanted")] == [False, True, True, True]
     assert not cache.holds("b", "wanted")
+
+
+def test_as_many_pairs_as_a_generation_has_stay_known_however_often_they_are_asked_for_in_turn() -> None:
+    cache, kept = PathCache(Lock()), path()
+    names = [str(number) for number in range(9_999)]
+    found = 0
+    for _ in range(3):
+        for name in names:
+            if cache.find("a", name) is kept:
+                found += 1
+            else:
+                cache.keep("a", name, kept)
+    assert found == 2 * len(names)
 
 
 class Name(str):

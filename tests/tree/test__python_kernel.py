@@ -674,7 +674,7 @@ def test_the_compiled_kernel_commits_nothing_while_somebody_holds_the_lock() -> 
 @on_both
 def test_a_sample_without_fields_has_none(kernel: ModuleType) -> None:
     empty = sample_class(kernel)()
-    for name in ("_fields", "_row", "parent", "child", "stamp", "authority", "static"):
+    for name in ("_fields", "_row", "_square", "parent", "child", "stamp", "authority", "static"):
         with pytest.raises(AttributeError):
             getattr(empty, name)
 
@@ -686,7 +686,7 @@ def test_the_fields_of_a_sample_can_be_set_again_and_read_twice(kernel: ModuleTy
     assert bits(made._row) == bits(x(-0.0))
     made._fields = "q", "b", STAMP_MAX, x(2.0), "me", False
     assert (made.parent, made.child, made.stamp, made.authority, made.static) == ("q", "b", STAMP_MAX, "me", False)
-    assert made._row == x(2.0)
+    assert (made._row, made._square) == (x(2.0), 4.0)
     for name in ("parent", "child", "stamp", "authority", "static"):
         with pytest.raises(AttributeError):
             setattr(made, name, None)

@@ -5,6 +5,7 @@ it is set for the first alarm, and stays as it is when that is cancelled, becaus
 """
 
 from collections.abc import Callable
+from functools import partial
 from heapq import heapify, heappop, heappush
 from itertools import count
 from typing import Any, Protocol
@@ -15,18 +16,15 @@ from tfbus.clock import Clock, SimulatedClock, SystemClock
 _CANCELLED_KEPT = 64
 
 
-class Alarm(Protocol):
-    """A call that may be cancelled."""
-
-    def close(self) -> None:
-        """Cancel the call, if it has not been made."""
+Cancel = Callable[[], object]
+"""Cancels a call, if it has not been made."""
 
 
 class Alarms(Protocol):
     """Calls functions after a duration on some clock."""
 
-    def call_after(self, seconds: float, callback: Callable[[], object]) -> Alarm:
-        """Call a function on the event loop after a duration in s; it must not raise."""
+    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
+        """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
 
 
 def alarms_of(clock: Clock) -> Alarms | None:
@@ -34,7 +32,18 @@ def alarms_of(clock: Clock) -> Alarms | None:
     # Not isinstance: a class derived from a clock may tell the time in another way.
     if type(clock) is SystemClock:
         return LoopAlarms()
-    return clock if type(clock) is SimulatedClock else None
+    return SimulatedAlarms(clock) if type(clock) is SimulatedClock else None
+
+
+class SimulatedAlarms:
+    """Alarms by a simulated clock, which keeps them with its other timers."""
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self._clock = clock
+
+    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
+        """Call a function after a simulated duration in s, unless it is cancelled; it must not raise."""
+        return self._clock.call_after(seconds, callback).close
 
 
 class LoopAlarms:
@@ -43,8 +52,8 @@ class LoopAlarms:
     def __init__(self) -> None:
         self._heap: _AlarmHeap | None = None
 
-    def call_after(self, seconds: float, callback: Callable[[], object]) -> Alarm:
-        """Call a function on the event loop after a duration in s; it must not raise."""
+    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
+        """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
         loop = running_loop()
         heap = self._heap
         if heap is None or heap.timer.loop is not loop:
@@ -54,65 +63,37 @@ class LoopAlarms:
 
 
 class _AlarmHeap:
-    """The alarms on one event loop by their times, with one timer for the first.
-
-    Attributes
-    ----------
-    cancelled : int
-        The number of alarms that were cancelled and are still here.
-    """
+    """The alarms on one event loop by their times, with one timer for the first."""
 
     def __init__(self, loop: Any) -> None:
         self.timer = LoopTimer(loop, self._ring)
-        self._alarms: list[tuple[float, int, _LoopAlarm]] = []
-        self.cancelled = 0
-        self._order = count()
+        self._alarms: list[tuple[float, int]] = []
+        # The callbacks of those that were neither made nor cancelled, by number.
+        self._callbacks: dict[int, Callable[[], object]] = {}
+        self._numbers = count()
 
-    def add(self, seconds: float, callback: Callable[[], object]) -> "_LoopAlarm":
+    def add(self, seconds: float, callback: Callable[[], object]) -> Cancel:
         due = self.timer.now() + seconds
-        alarm = _LoopAlarm(self, callback)
-        heappush(self._alarms, (due, next(self._order), alarm))
+        number = next(self._numbers)
+        callbacks = self._callbacks
+        callbacks[number] = callback
+        if len(self._alarms) > 2 * len(callbacks) + _CANCELLED_KEPT:
+            self._alarms = [alarm for alarm in self._alarms if alarm[1] in callbacks]
+            heapify(self._alarms)
+        heappush(self._alarms, (due, number))
         if due < self.timer.due:
             self.timer.set(due)
-        return alarm
-
-    def remove_cancelled(self) -> None:
-        """Remove the alarms that were cancelled, if they are most of all."""
-        if 2 * self.cancelled > len(self._alarms):
-            self._alarms = [each for each in self._alarms if each[2].callback is not None]
-            heapify(self._alarms)
-            self.cancelled = 0
+        # No function of Python, because nearly every wait cancels its alarms before it gives its answer.
+        return partial(callbacks.pop, number, None)
 
     def _ring(self) -> None:
         """Make the calls that are due, and set the timer for the next."""
         now = self.timer.now()
         try:
-            while self._alarms and (self._alarms[0][2].callback is None or self._alarms[0][0] <= now):
-                _, _, alarm = heappop(self._alarms)
-                callback, alarm.callback = alarm.callback, None
-                if callback is None:
-                    self.cancelled -= 1
-                else:
+            while self._alarms and (self._alarms[0][0] <= now or self._alarms[0][1] not in self._callbacks):
+                callback = self._callbacks.pop(heappop(self._alarms)[1], None)
+                if callback is not None:
                     callback()
         finally:
             if self._alarms and self._alarms[0][0] < self.timer.due:
                 self.timer.set(self._alarms[0][0])
-
-
-class _LoopAlarm:
-    """A call at a time; no callback is left once it was made or cancelled."""
-
-    __slots__ = ("_heap", "callback")
-
-    def __init__(self, heap: _AlarmHeap, callback: Callable[[], object]) -> None:
-        self._heap = heap
-        self.callback: Callable[[], object] | None = callback
-
-    def close(self) -> None:
-        """Cancel the call, if it has not been made."""
-        if self.callback is not None:
-            self.callback = None
-            heap = self._heap
-            heap.cancelled += 1
-            if heap.cancelled > _CANCELLED_KEPT:
-                heap.remove_cancelled()

@@ -5,15 +5,15 @@ of the event loop later; otherwise the lookup asks again, and may park again.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from functools import partial
 
 import anyio
 import anyio.lowlevel
 
-from tfbus._aio.wake_up import WakeUp
-from tfbus.buffer._alarms import Alarm, Alarms, alarms_of
+from tfbus._aio.wake_up import wake_up
+from tfbus.buffer._alarms import Alarms, Cancel, alarms_of
 from tfbus.buffer._hanging_report import REPORT_AFTER, HangingReport
 from tfbus.buffer._local_names import LocalNames
 from tfbus.clock import Clock
@@ -40,17 +40,19 @@ class _Wait:
 
     __slots__ = (
         "blocker",
-        "end",
+        "cancel_end",
+        "cancel_reminder",
         "expired",
         "is_long",
         "last_reset",
         "others",
         "question",
-        "reminder",
         "since",
+        "wake",
         "woken",
     )
-    woken: WakeUp
+    woken: Awaitable[None]
+    wake: Callable[[], object]
 
     def __init__(
         self,
@@ -65,15 +67,17 @@ class _Wait:
         self.last_reset = last_reset
         self.blocker = blocker
         self.others = others
-        self.end: Alarm | None = None
-        self.reminder: Alarm | None = None
+        self.cancel_end: Cancel | None = None
+        self.cancel_reminder: Cancel | None = None
         self.expired = False
         self.is_long = False
 
     def expire(self) -> None:
         """End the wait."""
         self.expired = True
-        self.woken.end()
+        # Woken or cancelled already.
+        with suppress(Exception):
+            self.wake()
 
 
 class Lookups:
@@ -195,10 +199,10 @@ class Lookups:
                 if wait.is_long:
                     self._remind(wait, alarms)
         finally:
-            if wait.end is not None:
-                wait.end.close()
-            if wait.reminder is not None:
-                wait.reminder.close()
+            if wait.cancel_end is not None:
+                wait.cancel_end()
+            if wait.cancel_reminder is not None:
+                wait.cancel_reminder()
 
     def report(self, question: Question, since: int, blocker: TransformLookupError) -> float:
         """Log a lookup that has waited for long; return the time, in s, after which to call this again."""
@@ -209,17 +213,17 @@ class Lookups:
         if limit == 0.0:
             wait.expired = True
         elif limit < math.inf:
-            wait.end = alarms.call_after(limit, wait.expire)
+            wait.cancel_end = alarms.call_after(limit, wait.expire)
         if limit > REPORT_AFTER:
-            wait.reminder = alarms.call_after(REPORT_AFTER, partial(self._remind, wait, alarms))
+            wait.cancel_reminder = alarms.call_after(REPORT_AFTER, partial(self._remind, wait, alarms))
 
     def _park(self, wait: "_Wait") -> Waiter:
         """Park a lookup under what it lacks, with a new wake-up."""
         live = self._live
         if live.end_reason is not None:
             raise BusClosedError(live.end_reason) from wait.blocker
-        wait.woken = WakeUp()
-        waiter = Waiter(wait.question, wait.since, wait.woken.wake, wait.others)
+        wait.woken, wait.wake = wake_up()
+        waiter = Waiter(wait.question, wait.since, wait.wake, wait.others)
         live.park(waiter, wait.blocker)
         return waiter
 
@@ -240,9 +244,9 @@ class Lookups:
         wait.is_long = True
         pause = self.report(wait.question, wait.since, wait.blocker)
         if pause < math.inf:
-            if wait.reminder is not None:
-                wait.reminder.close()
-            wait.reminder = alarms.call_after(pause, partial(self._remind, wait, alarms))
+            if wait.cancel_reminder is not None:
+                wait.cancel_reminder()
+            wait.cancel_reminder = alarms.call_after(pause, partial(self._remind, wait, alarms))
 
     async def _wait_in_scopes(self, wait: "_Wait", limit: float) -> TransformStamped | None:
         """As `_wait`, by a clock that knows no alarms."""

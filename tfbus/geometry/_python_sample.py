@@ -30,6 +30,11 @@ class Sample:
         return self._fields[3]
 
     @property
+    def _square(self) -> float:
+        x, y, z, *_ = self._fields[3]
+        return x * x + y * y + z * z
+
+    @property
     def authority(self) -> str:
         """The sender; empty in an answer."""
         return self._fields[4]

@@ -9,7 +9,6 @@ A transform holds one tuple of seven floats, a row; `tfbus.geometry.rows` has th
 
 import math
 from collections.abc import Mapping, Sequence
-from math import isfinite
 from typing import Any, overload
 
 import numpy as np
@@ -71,8 +70,9 @@ class Transform:
             i, j, k, w = rotation
             if type(x) is type(y) is type(z) is type(i) is type(j) is type(k) is type(w) is float:
                 # Nearly always so. `as_vector` and `as_rotation` check the same, and take eight times as long.
-                square = i * i + j * j + k * k + w * w
-                if abs(square - 1.0) <= ROUNDING and isfinite(x) and isfinite(y) and isfinite(z):
+                # Zero times a float is zero unless it is infinite or NaN, which takes no call to find out.
+                error = i * i + j * j + k * k + w * w - 1.0
+                if -ROUNDING <= error <= ROUNDING and 0.0 * x + 0.0 * y + 0.0 * z == 0.0:
                     self._row = x, y, z, i, j, k, w
                     return
         self._row = (*as_vector(translation, "translation"), *as_rotation(rotation, "rotation"))

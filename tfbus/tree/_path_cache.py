@@ -8,13 +8,14 @@ from tfbus.stamps import LATEST
 from tfbus.tree._kernel import Paths
 from tfbus.tree.path import Path
 
-_GENERATION = 5_000
+_GENERATION = 10_000
 
 
 class PathCache(Paths):
     """The permanent paths that were asked for lately.
 
-    When a generation of 5,000 is complete, those of the one before it that nobody has asked for since are forgotten.
+    When a generation of 10,000 is complete, those of the one before it that nobody has asked for since are forgotten:
+    so up to 10,000 pairs in use stay known, and at most 20,000 are kept.
 
     Parameters
     ----------

@@ -1,9 +1,17 @@
+import json
 import os
 
+import anyio
+import anyio.to_thread
 import pytest
 from support.commands import Command, check_wrong_call
-from support.processes import new_domain
-from support.programs import start_tfbus
+from support.processes import new_domain, until
+from support.programs import free_address, start_tfbus
+from support.samples import moving, static
+from support.wires import latched
+
+from tfbus import Bus, PeerLost, PeerRejected
+from tfbus.links.ros._transforms import as_mapping
 
 
 @pytest.mark.thorough
@@ -23,6 +31,77 @@ def test_frames_pass_from_ros_to_a_domain_and_back(backend: str) -> None:
             for echo in (here, there):
                 assert echo.output.expect("Translation") == "- Translation: [2.000000, 2.000000, 3.000000] m"
         assert bridge.end() == 130
+
+
+@pytest.mark.thorough
+@pytest.mark.anyio
+async def test_a_bridge_between_rosbridge_and_rmw_zenoh_tells_what_is_refused_and_comes_back() -> None:
+    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
+    pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+    from support.rosbridge import rosbridge_server
+
+    from tfbus.links.rmw_zenoh import RmwZenohLink
+    from tfbus.links.zenoh import ZenohRouter
+
+    address = free_address()
+    async with rosbridge_server() as server, ZenohRouter(address):
+        server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
+        place = f"zenoh:{address.removeprefix('tcp/')}"
+        with Bus() as bus, start_tfbus("bridge", server.url, place) as bridge:
+            await anyio.to_thread.run_sync(bridge.errors.expect, "passing on")
+            async with RmwZenohLink(bus, address) as link:
+                await until(lambda: "lidar" in latched(bus))
+                bus.publish(static("map", "camera", 1.0, 4))
+                await until(lambda: "/tf_static" in server.operations("publish"))
+                for _ in range(2):
+                    await server.say_anything("nonsense")
+                told = await anyio.to_thread.run_sync(bridge.errors.expect, "refused what peer")
+                assert told.endswith(
+                    "it is neither JSON nor CBOR: JSONDecodeError('Expecting value: line 1 column 1 (char 0)')"
+                )
+                # The server goes, and comes back with another static frame.
+                server.latched["/tf_static"] = (static("map", "radar", 2.0, 3),)
+                await server.cut()
+                await anyio.to_thread.run_sync(bridge.errors.expect, "the connection is gone")
+                await until(lambda: "radar" in latched(bus))
+                await until(lambda: server.operations("publish").count("/tf_static") == 2)
+                stamp = 0
+                while not link.statistics().received_samples > 2:
+                    await server.say(moving("map", "base", stamp := stamp + 1))
+                    await anyio.sleep(0.02)
+            assert await anyio.to_thread.run_sync(bridge.end) == 130
+            assert bridge.errors.text.count("refused what peer") == 1
+
+
+@pytest.mark.anyio
+async def test_two_links_of_a_bus_pass_on_and_tell_of_a_refused_sample_and_a_lost_peer_once() -> None:
+    pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
+    from support.rosbridge import rosbridge_server
+
+    from tfbus.links.rosbridge import RosbridgeLink
+
+    async with rosbridge_server() as one, rosbridge_server() as two:
+        with Bus() as bus, bus.events() as events:
+            async with RosbridgeLink(bus, one.url) as first, RosbridgeLink(bus, two.url) as second:
+                await until(lambda: len(one.operations("advertise")) == len(two.operations("advertise")) == 2)
+                await one.say(moving("map", "base", 5))
+                await until(lambda: "/tf" in two.operations("publish"))
+                row = as_mapping(moving("map", "base", 6))
+                row["child_frame_id"] = "map"
+                message = json.dumps({"op": "publish", "topic": "/tf", "msg": {"transforms": [row]}})
+                await two.say_anything(message, message)
+                await until(lambda: second.statistics().rejected == {"self transform": 2})
+                await two.cut()
+                await until(lambda: second.peers == ())
+                assert first.peers == (one.url,)
+                assert first.statistics().rejected == {}
+        told = [
+            (type(event), event.peer)
+            for event in iter(events.queue.get, None)
+            if isinstance(event, PeerRejected | PeerLost)
+        ]
+        assert told[:2] == [(PeerRejected, two.url), (PeerLost, two.url)]
+        assert "/tf" not in one.operations("publish"), "nothing goes back"
 
 
 def test_a_bridge_has_two_ends(tfbus: Command) -> None:

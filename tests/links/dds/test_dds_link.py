@@ -1,8 +1,12 @@
+import math
+import struct
 from typing import Any
 
 import anyio
+import anyio.to_thread
 import pytest
 from support.processes import until
+from support.ros import named
 from support.samples import moving, static
 from support.wires import latched
 
@@ -14,9 +18,11 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
-from tfbus import Bus, PeerJoined, PeerLost, SimulatedClock
+from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus.links.dds import DdsLink
-from tfbus.links.dds._types import Header, RawClock, RawJointState, RawString, Time
+from tfbus.links.dds._carrier import MAX_SIZE
+from tfbus.links.dds._types import Header, RawClock, RawJointState, RawString, RawTFMessage, Time
+from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio
 
@@ -93,6 +99,32 @@ async def test_positions_of_joints_go_to_who_takes_them(domain_number: int) -> N
             writer.__del__()
             participant.__del__()
     assert taken[0] == ({"a": 0.5, "b": 1.5}, 5)
+
+
+@pytest.mark.thorough
+async def test_garbage_is_counted_by_reason_and_ends_nothing(domain_number: int) -> None:
+    with Bus() as bus, bus.events() as events:
+        async with DdsLink(bus, domain_number) as link:
+            participant = DomainParticipant(domain_number)
+            reliable = Qos(Policy.Reliability.Reliable(duration(seconds=10)), Policy.History.KeepAll)
+            writer = DataWriter(participant, Topic(participant, "rt/tf", RawTFMessage), reliable)
+            await until(lambda: link.peers != ())
+            # Cyclone DDS itself drops what has not the layout of the type.
+            bad = encode([moving("map", "base", 1, 1.5)])
+            own_parent = named(encode([moving("self", "also", 1)]), "also", "self")
+            not_finite = bad.replace(struct.pack("<d", 1.5), struct.pack("<d", math.nan))
+            large = encode([moving("map", f"{number:0100d}", 1) for number in range(25_000)])
+            assert len(large) > MAX_SIZE
+            for payload in (own_parent, not_finite, large) * 2:
+                await anyio.to_thread.run_sync(writer.write, RawTFMessage.of(payload))
+            writer.write(RawTFMessage.of(encode([moving("map", "base", 5)])))
+            await until(lambda: link.statistics().received_samples == 1)
+            rejected = link.statistics().rejected
+            writer.__del__()
+            participant.__del__()
+        told = [event.reason for event in iter(events.queue.get, None) if isinstance(event, PeerRejected)]
+    assert rejected == {"self transform": 2, "not finite": 2, "oversized": 2}
+    assert told == list(rejected)
 
 
 @pytest.mark.thorough

@@ -1,10 +1,11 @@
 import importlib.util
 import json
 import os
+import struct
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,15 +14,17 @@ import anyio
 import anyio.to_thread
 import pytest
 import zenoh
+import zenoh.ext
 from support.joint_messages import joint_state
 from support.processes import free_ports, until
 from support.samples import moving, static
 from support.wires import latched
 
-from tfbus import Bus
+from tfbus import Bus, PeerRejected
 from tfbus.links.rmw_zenoh import RmwZenohLink
-from tfbus.links.rmw_zenoh._wire import JOINT_HASH, JOINT_TYPE
+from tfbus.links.rmw_zenoh._wire import HASH, JOINT_HASH, JOINT_TYPE, TEXT_HASH, TEXT_TYPE, TYPE
 from tfbus.links.zenoh import ZenohRouter
+from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio
 
@@ -81,6 +84,24 @@ async def test_two_buses_hear_each_other_and_a_late_one_the_static_frames() -> N
 
 
 @pytest.mark.thorough
+async def test_links_hear_each_other_again_when_their_router_is_back() -> None:
+    (port,) = free_ports(1)
+    address = f"tcp/127.0.0.1:{port}"
+    with Bus() as near, Bus() as far, Bus() as late:
+        async with AsyncExitStack() as first:
+            await first.enter_async_context(ZenohRouter(address))
+            async with RmwZenohLink(near, address, DOMAIN), RmwZenohLink(far, address, DOMAIN):
+                near.publish(static("map", "lidar", 1.0))
+                await until(lambda: "lidar" in latched(far))
+                await first.aclose()
+                near.publish([static("map", "camera", 2.0)])
+                async with ZenohRouter(address):
+                    await until(lambda: "camera" in latched(far))
+                    async with RmwZenohLink(late, address, DOMAIN):
+                        await until(lambda: latched(late).keys() == {"lidar", "camera"})
+
+
+@pytest.mark.thorough
 async def test_a_node_of_another_program_and_a_link_hear_each_other() -> None:
     with Bus() as bus:
         heard: list[float] = []
@@ -111,13 +132,54 @@ async def test_positions_of_joints_go_to_who_takes_them() -> None:
     async with router() as address:
         with Bus() as bus:
             async with RmwZenohLink(bus, address, DOMAIN, joint_states=lambda *state: taken.append(state)):
-                config = zenoh.Config()
-                config.insert_json5("mode", '"client"')
-                config.insert_json5("connect/endpoints", json.dumps([address]))
-                with zenoh.open(config) as session:
+                with stranger(address) as session:
                     key = f"{DOMAIN}/joint_states/{JOINT_TYPE}/{JOINT_HASH}"
                     session.put(key, joint_state(5, {"a": 0.5}))
                     await until(lambda: taken == [({"a": 0.5}, 5)])
+
+
+@pytest.mark.thorough
+async def test_the_description_of_a_robot_is_latched() -> None:
+    taken: list[str] = []
+    async with router() as address:
+        with Bus() as bus, stranger(address) as session:
+            latched = zenoh.ext.declare_advanced_publisher(
+                session,
+                f"{DOMAIN}/robot_description/{TEXT_TYPE}/{TEXT_HASH}",
+                cache=zenoh.ext.CacheConfig(max_samples=1),
+                publisher_detection=True,
+            )
+            # Long before the link.
+            latched.put(b"\0\1\0\0" + struct.pack("<I", 9) + b"<robot/>\0")
+            async with RmwZenohLink(bus, address, DOMAIN, robot_description=taken.append):
+                await until(lambda: taken == ["<robot/>"])
+
+
+@pytest.mark.thorough
+async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
+    async with router() as address:
+        with Bus() as bus, bus.events() as events, stranger(address) as session:
+            async with RmwZenohLink(bus, address, DOMAIN) as link:
+                key = f"{DOMAIN}/tf/{TYPE}/{HASH}"
+                for payload in (b"", b"garbage", b"\0\1\0\0\xff\xff\xff\xff", bytes(5_000_000)) * 2:
+                    session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+                for attachment in (b"", b"x", bytes(33)):
+                    session.put(key, encode([moving("map", f"f{len(attachment)}", 1)]), attachment=attachment)
+                await until(lambda: link.statistics().received_samples == 3)
+                assert link.statistics().rejected == {"truncated": 6, "oversized": 2}
+            told = [event.reason for event in iter(events.queue.get, None) if isinstance(event, PeerRejected)]
+            assert told == ["truncated", "oversized"]
+
+
+@contextmanager
+def stranger(address: str) -> Iterator[zenoh.Session]:
+    """A session of zenoh that may say anything."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("timestamping/enabled", "true")
+    config.insert_json5("connect/endpoints", json.dumps([address]))
+    with zenoh.open(config) as session:
+        yield session
 
 
 @pytest.mark.thorough
@@ -138,7 +200,6 @@ async def test_links_begin_and_end_again_and_again() -> None:
         ({"node": "a b"}, ValueError, "name of a node"),
         ({"config": {"no/such": 1}}, ValueError, "setting"),
         ({"tf": "a b"}, ValueError, "topic"),
-        ({"robot_description": print}, ValueError, "only over DDS"),
     ],
 )
 def test_arguments_that_are_not_valid_are_refused(arguments: Any, error: type[Exception], said: str) -> None:

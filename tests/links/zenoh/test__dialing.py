@@ -64,3 +64,19 @@ def test_all_addresses_of_a_peer_are_tried_in_turn_the_newest_first() -> None:
     scene.dialing.left("a")
     tried = [address for _ in range(4) for _, address in scene.next()[1]]
     assert [address[-1] for address in tried] == ["3", "1", "2", "3"]
+
+
+def test_a_peer_is_dialled_no_more_where_somebody_else_listens_now() -> None:
+    scene = Scene()
+    for address in ("tcp/there:1", "tcp/there:2"):
+        scene.dialing.reached("a", address)
+    assert not scene.dialing.is_dialled("a")
+    scene.dialing.left("a")
+    assert scene.dialing.is_dialled("a")
+    scene.dialing.taken("a", "tcp/there:2")
+    scene.dialing.taken("a", "tcp/there:3")
+    scene.dialing.taken("nobody", "tcp/there:1")
+    assert [scene.next()[1] for _ in range(2)] == [[("a", "tcp/there:1")]] * 2
+    scene.dialing.taken("a", "tcp/there:1")
+    assert scene.dialing.next_due() is None
+    assert not scene.dialing.is_dialled("a")

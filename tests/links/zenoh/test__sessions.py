@@ -92,9 +92,10 @@ async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
         here.dialing.left(gone.id)
         # It has seen the patch, which has noticed the mistake when it goes.
         assert await there.next() == Received(here.id, Presence.JOINED)
-        here.dialing.joined(gone.id)
         assert await there.next() == Received(here.id, Presence.LEFT)
         assert here.items.empty()
+        # It is dialled no more.
+        assert here.dialing.next_due() is None
 
 
 @pytest.mark.thorough
@@ -106,6 +107,26 @@ async def test_nobody_at_the_address_is_tried_again() -> None:
         assert here.items.empty()
         here.lose(there)
         assert await here.next() == Received(there.id, Presence.JOINED)
+
+
+@pytest.mark.thorough
+async def test_an_end_that_does_not_hear_those_who_ask_it_dials_them() -> None:
+    async with ends(1) as (here,):
+        joining = End(here.domain, connect=here.address)
+        await anyio.to_thread.run_sync(joining.sessions.open)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(joining.sessions.keep_connected)
+            assert await joining.next() == Received(here.id, Presence.JOINED)
+            assert await here.next() == Received(joining.id, Presence.JOINED)
+            # As if zenoh had never told of it. The other end has accepted the connection, and cannot dial this one.
+            joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
+            joining.sessions._changes.clear()
+            assert await joining.next() == Received(here.id, Presence.LEFT)
+            assert await joining.next() == Received(here.id, Presence.JOINED)
+            assert here.items.empty()
+            tasks.cancel_scope.cancel()
+        for closing in joining.sessions.close():
+            await anyio.to_thread.run_sync(closing.join)
 
 
 @pytest.mark.thorough

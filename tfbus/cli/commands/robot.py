@@ -55,7 +55,7 @@ def robot(
     Parameters
     ----------
     file
-        A URDF. Without one, --follow takes that of /robot_description of ROS, over DDS or rosbridge.
+        A URDF. Without one, --follow takes that of /robot_description of ROS.
     position
         As NAME=NUMBER, the position of a joint in rad or m; for a planar joint x,y,angle, for a floating one
         x,y,z,qx,qy,qz,qw.

@@ -25,8 +25,10 @@ from tfbus.links.dds._publishers import PATIENCE, Publishers
 from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawString, RawTFMessage
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
-from tfbus.tf_message import encode
+from tfbus.tf_message import MalformedMessageError, encode
 
+MAX_SIZE = 2**22
+"""The largest message that is received, in bytes."""
 _CLOSING_TIME = 1.0
 _DEPTH = 100
 _OTHERS = "other topics"
@@ -208,7 +210,7 @@ class DdsCarrier(RosCarrier):
                 other = {kind: True}
                 content = RosMessage(message.payload, static=False, authority="", **other)
                 # What is latched comes once.
-                self._receive(Received(_OTHERS, content, len(message.payload), moving=kind != "description"))
+                self._pass_on(_OTHERS, content, moving=kind != "description")
 
     def _match(self, number: int, reader: DataReader[RawTFMessage]) -> None:
         with self._lock:
@@ -224,7 +226,14 @@ class DdsCarrier(RosCarrier):
             self._present = present
 
     def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
-        self._receive(Received(participant, RosMessage(payload, static, authority), len(payload), moving=not static))
+        self._pass_on(participant, RosMessage(payload, static, authority), moving=not static)
+
+    def _pass_on(self, sender: str, message: RosMessage, moving: bool) -> None:
+        size = len(message.payload)
+        if size > MAX_SIZE:
+            self._receive(Received(sender, MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")))
+        else:
+            self._receive(Received(sender, message, size, moving=moving))
 
 
 def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:

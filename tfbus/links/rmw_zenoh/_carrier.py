@@ -1,7 +1,7 @@
 """The carrier of links to rmw_zenoh."""
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from time import time_ns
 from typing import Any
@@ -19,6 +19,8 @@ from tfbus.links.rmw_zenoh._wire import (
     CLOCK_TYPE,
     JOINT_HASH,
     JOINT_TYPE,
+    TEXT_HASH,
+    TEXT_TYPE,
     Attachment,
     endpoint_token,
     node_token,
@@ -87,18 +89,19 @@ class RmwZenohCarrier(RosCarrier):
             if publishes:
                 self._publishers[static] = self._publisher(session, topic, static)
             else:
-                self._declared.append(self._subscriber(session, topic, static))
+                key = topic_expression(self._domain, topic)
+                self._declared.append(self._subscriber(session, key, static, partial(self._take, static)))
             self._token(endpoint_token(self._domain, name, number, self._node, topic, static, publishes))
 
         others = (
-            *((topic, JOINT_TYPE, JOINT_HASH, self._take_joints) for topic in self.settings.joint_topic),
-            *((topic, CLOCK_TYPE, CLOCK_HASH, self._take_clock) for topic in self.settings.clock_topic),
+            *((topic, JOINT_TYPE, JOINT_HASH, False, self._take_joints) for topic in self.settings.joint_topic),
+            *((topic, CLOCK_TYPE, CLOCK_HASH, False, self._take_clock) for topic in self.settings.clock_topic),
+            *((topic, TEXT_TYPE, TEXT_HASH, True, self._take_text) for topic in self.settings.description_topic),
         )
-        for number, (topic, kind, digest, take) in enumerate(others, len(topics) + 1):
-            self._declared.append(
-                session.declare_subscriber(topic_expression(self._domain, topic, kind), directly(take))
-            )
-            self._token(other_token(self._domain, name, number, self._node, topic, kind, digest))
+        for number, (topic, kind, digest, latched, take) in enumerate(others, len(topics) + 1):
+            key = topic_expression(self._domain, topic, kind)
+            self._declared.append(self._subscriber(session, key, latched, take))
+            self._token(other_token(self._domain, name, number, self._node, topic, kind, digest, latched))
 
     def _token(self, key: str) -> None:
         assert self._session is not None
@@ -118,15 +121,15 @@ class RmwZenohCarrier(RosCarrier):
             publisher_detection=True,
         )
 
-    def _subscriber(self, session: zenoh.Session, topic: str, static: bool) -> object:
-        key = topic_expression(self._domain, topic)
-        take = directly(partial(self._take, static))
-        if not static:
-            return session.declare_subscriber(key, take)
+    def _subscriber(
+        self, session: zenoh.Session, key: str, latched: bool, take: Callable[[zenoh.Sample], None]
+    ) -> object:
+        if not latched:
+            return session.declare_subscriber(key, directly(take))
         return zenoh.ext.declare_advanced_subscriber(
             session,
             key,
-            take,
+            directly(take),
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             subscriber_detection=True,
@@ -172,10 +175,14 @@ class RmwZenohCarrier(RosCarrier):
         """Take the time, in zenoh's threads."""
         self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, clock=True))
 
+    def _take_text(self, sample: zenoh.Sample) -> None:
+        """Take the description of a robot, in zenoh's threads."""
+        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, description=True))
+
     def _pass_on(self, message: RosMessage) -> None:
         size = len(message.payload)
         if size > MAX_SIZE:
             error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
             self._receive(Received(_AUTHORITY, error))
         else:
-            self._receive(Received(_AUTHORITY, message, size, moving=not message.static))
+            self._receive(Received(_AUTHORITY, message, size, moving=not (message.static or message.description)))

@@ -17,6 +17,9 @@ JOINT_HASH: Final = "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c58
 CLOCK_TYPE: Final = "rosgraph_msgs::msg::dds_::Clock_"
 CLOCK_HASH: Final = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564"
 """Of ``rosgraph_msgs/msg/Clock``."""
+TEXT_TYPE: Final = "std_msgs::msg::dds_::String_"
+TEXT_HASH: Final = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+"""Of ``std_msgs/msg/String``."""
 NODE_ID: Final = 0
 
 _ATTACHMENT = struct.Struct("<qqB16s")
@@ -71,7 +74,9 @@ def endpoint_token(domain: int, session: str, number: int, node: str, topic: str
     return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/{kind}/%/%/{node}/{name}/{TYPE}/{HASH}/{qos}"
 
 
-def other_token(domain: int, session: str, number: int, node: str, topic: str, kind: str, digest: str) -> str:
+def other_token(
+    domain: int, session: str, number: int, node: str, topic: str, kind: str, digest: str, latched: bool = False
+) -> str:
     """The liveliness token of a subscription to messages of another type, with the hash of that."""
-    name = topic.replace("/", "%")
-    return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/MS/%/%/{node}/{name}/{kind}/{digest}/{_MOVING_QOS}"
+    name, qos = topic.replace("/", "%"), _STATIC_QOS if latched else _MOVING_QOS
+    return f"@ros2_lv/{domain}/{session}/{NODE_ID}/{number}/MS/%/%/{node}/{name}/{kind}/{digest}/{qos}"

@@ -76,8 +76,6 @@ class RmwZenohLink(RosLink):
             raise TypeError(f"a router must be a str, not {router!r}")
         if not isinstance(node, str) or not _NODE.fullmatch(node):
             raise ValueError(f"{node!r} cannot be the name of a node: letters, digits and _")
-        if options.get("robot_description") is not None:
-            raise ValueError("robot_description is not taken over rmw_zenoh, only over DDS and through rosbridge")
         self.domain = as_domain(domain)
         carrier = RmwZenohCarrier(self.domain, node, _config(router, config or {}), settings_of(options))
         super().__init__(bus, carrier.id, carrier, **options)

@@ -39,7 +39,7 @@ class RosLink(Link):
         The topic of these, by default ``/joint_states``.
     robot_description : callable, optional
         Takes the URDF of the robot, a str, where ROS has it as a topic, as ``robot_state_publisher`` does in ROS 2.
-        What it raises is counted in `LinkStatistics.rejected`. `tfbus.links.rmw_zenoh.RmwZenohLink` refuses it.
+        What it raises is counted in `LinkStatistics.rejected`.
     description_topic : str
         The topic of that, by default ``/robot_description``.
     clock : SimulatedClock, optional

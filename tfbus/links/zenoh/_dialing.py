@@ -54,6 +54,19 @@ class Dialing:
         if len(known) > 1 and address in known:
             known.remove(address)
 
+    def taken(self, peer: str, address: str) -> None:
+        """Somebody else listens at an address, so this peer does so no more: forget it."""
+        known = self._addresses.get(peer, [])
+        if address in known:
+            known.remove(address)
+            if not known:
+                del self._addresses[peer]
+                self._lost.pop(peer, None)
+
+    def is_dialled(self, peer: str) -> bool:
+        """Whether a peer is lost, and dialled now and then."""
+        return peer in self._lost
+
     def joined(self, peer: str) -> None:
         """A peer is there."""
         self._lost.pop(peer, None)

@@ -2,11 +2,13 @@
 
 Peers in a mesh hear each other over direct connections only. When one of these breaks, while both ends are well with
 others, zenoh does not dial again. Then a session of its own does, the *patch*, which is connected to nobody else. The
-same mends a connection of which only one end hears the other; see `tfbus.links.zenoh._hearing`.
+same mends a connection of which only one end hears the other; see `tfbus.links.zenoh._hearing`. Both ends dial then:
+one of them has accepted the connection, and knows no address at which the other one listens.
 """
 
 import re
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import partial
 from time import monotonic
@@ -19,7 +21,7 @@ import zenoh
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._dialing import Dialing
-from tfbus.links.zenoh._hearing import Hearing
+from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
 
@@ -76,6 +78,7 @@ class ZenohSessions:
         self._connected: set[str] = set()
         self._asking: list[zenoh.Query] = []
         self._heard_by: list[tuple[str, list[str] | None]] = []
+        self._unheard: Counter[str] = Counter()
         self._closing: list[threading.Thread] = []
 
     @property
@@ -152,6 +155,7 @@ class ZenohSessions:
                 for peer, names in heard_by:
                     self._judge(peer, names)
                 if answers:
+                    await self._note_unheard(answers)
                     # zenoh may wait for a peer that is frozen.
                     await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
                 for peer in self._hearing.take_due():
@@ -201,6 +205,25 @@ class ZenohSessions:
             self._deaf.add(peer)
             self._drop_patch(peer)
             self._dialing.left(peer)
+
+    async def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
+        """Dial those that have asked several times whether they are heard, and are not."""
+        unheard: set[str] = set()
+        for query, names in answers:
+            asker = self._asker(query)
+            if asker is None or names:
+                self._unheard.pop(asker or "", None)
+            else:
+                self._unheard[asker] += 1
+                if self._unheard[asker] >= DEAF and not self._dialing.is_dialled(asker):
+                    unheard.add(asker)
+        if unheard:
+            addresses = await anyio.to_thread.run_sync(self._main.addresses)
+            for asker in unheard & addresses.keys():
+                self._dialing.reached(asker, addresses[asker])
+                self._dialing.left(asker)
+        if len(self._unheard) > _MOST_ASKING:
+            self._unheard.clear()
 
     def _names_heard(self, query: zenoh.Query) -> list[str]:
         """The sessions, by their names, that are heard of the link that asks; the lock is held."""
@@ -255,6 +278,10 @@ class ZenohSessions:
         with anyio.move_on_after(_MEETING_TIME):
             while peer not in self._present:  # noqa: ASYNC110 - zenoh's threads wake no event here
                 await anyio.sleep(0.05)
+        if peer not in self._present:
+            found = await anyio.to_thread.run_sync(patch.addresses)
+            if found and peer not in found:
+                self._dialing.taken(peer, address)
         if peer not in self._present or (self._is_direct(peer) and peer not in self._deaf):
             self._drop_patch(peer)
 

@@ -1,0 +1,106 @@
+"""Many processes with a link each that start at once: how long until every bus has every static frame.
+
+``python tests/benchmarks/start_together.py --processes 50`` tells the seconds from the last start, of each process when
+it has all of them. Each has some static frames, and as many moving ones, which it publishes all the while.
+"""
+
+import argparse
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from typing import Any
+from uuid import uuid4
+
+import anyio
+
+from tfbus import Bus, Transform, TransformBroadcaster, TransformStamped
+from tfbus.links.zenoh import ZenohLink
+
+PATIENCE = 120.0
+"""Seconds from the last start; who has not all frames by then is counted as without them."""
+
+
+async def live(number: int, processes: int, frames: int, rate: float, domain: str, address: str) -> None:
+    """Be one of the processes."""
+    wanted = processes * frames
+    held: set[str] = set()
+    side = {"listen": address} if number == 0 else {"connect": address}
+
+    def note(batch: tuple[TransformStamped, ...]) -> None:
+        before = len(held)
+        held.update(sample.child for sample in batch if sample.static)
+        if before < len(held) == wanted:
+            print("all", flush=True)
+
+    with Bus() as bus:
+        bus.subscribe(note)
+        broadcaster = TransformBroadcaster(bus, authority=f"p{number}")
+        for frame in range(frames):
+            broadcaster.send_static("map", f"static {number} {frame}", Transform())
+        async with ZenohLink(bus, domain, **side):  # type: ignore[arg-type]
+            async for _ in bus.clock.ticks(rate):
+                broadcaster.send_all([("map", f"moving {number} {frame}", Transform()) for frame in range(frames)])
+
+
+def free_address() -> str:
+    """An address of the loopback at which nobody listens."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def measure(processes: int = 50, frames: int = 20, rate: float = 20.0) -> list[float]:
+    """Seconds from the last start until each process has all static frames; infinite for one that has not."""
+    task: dict[str, Any] = {
+        "processes": processes,
+        "frames": frames,
+        "rate": rate,
+        "domain": f"start-{uuid4().hex}",
+        "address": free_address(),
+    }
+    ends = [float("inf")] * processes
+    started: list[subprocess.Popen[str]] = []
+
+    def read(number: int, process: subprocess.Popen[str]) -> None:
+        assert process.stdout is not None
+        if process.stdout.readline():
+            ends[number] = time.monotonic()
+
+    readers = []
+    try:
+        for number in range(processes):
+            command = [sys.executable, __file__, "--be", json.dumps(task | {"number": number})]
+            started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            readers.append(threading.Thread(target=read, args=(number, started[-1])))
+            readers[-1].start()
+        last = time.monotonic()
+        for reader in readers:
+            reader.join(max(0.0, last + PATIENCE - time.monotonic()))
+    finally:
+        for process in started:
+            process.kill()
+        for process in started:
+            process.wait()
+        for reader in readers:
+            reader.join()
+        for process in started:
+            assert process.stdout is not None
+            process.stdout.close()
+    return [end - last for end in ends]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--processes", type=int, default=50)
+    parser.add_argument("--frames", type=int, default=20)
+    parser.add_argument("--rate", type=float, default=20.0, help="Hz")
+    parser.add_argument("--be", type=json.loads, help=argparse.SUPPRESS)
+    arguments = vars(parser.parse_args())
+    one = arguments.pop("be")
+    if one is not None:
+        anyio.run(lambda: live(**one))
+    else:
+        times = sorted(measure(**arguments))
+        print(f"half of them after {times[len(times) // 2]:.1f} s, the last after {times[-1]:.1f} s")
