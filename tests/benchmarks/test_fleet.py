@@ -1,4 +1,4 @@
-"""What thousands of static frames, of robots and of remote lookups cost a link over zenoh."""
+"""The cost of thousands of static frames, robots and remote lookups for a link over zenoh."""
 
 import subprocess
 import sys
@@ -161,7 +161,7 @@ def test_remote_lookup(table: Table) -> None:
 
 
 def test_one_robot_of_many(table: Table) -> None:
-    """What is subscribed costs, and not what exists: user and system time with the subscription less that without."""
+    """A subscription costs, and not what exists: user and system time with it less that without."""
 
     def measure(robots: int) -> tuple[float, float]:
         domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
