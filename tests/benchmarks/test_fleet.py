@@ -147,7 +147,9 @@ def test_remote_lookup(table: Table) -> None:
                 ours.append(time.perf_counter() - began)
                 ended = threading.Event()
                 began = time.perf_counter()
-                take = zenoh.handlers.Callback(lambda _: None, ended.set, indirect=False)
+                take: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
+                    lambda _: None, ended.set, indirect=False
+                )
                 client._session._opened().get(f"bare/{domain}", take, payload=bytes(300), express=True)
                 assert ended.wait(10)
                 bare.append(time.perf_counter() - began)
