@@ -22,7 +22,8 @@ def test_without_arrivals_the_order_is_not_judged() -> None:
 
 
 def test_a_rate_breaks_down_where_fewer_than_half_of_the_samples_come() -> None:
-    for left, kinds in ((5, []), (4, ["rate"])):
+    expected: list[tuple[int, list[str]]] = [(5, []), (4, ["rate"])]
+    for left, kinds in expected:
         # Ten samples in each tenth of 100 s, and fewer in the fifth one, at even distances.
         counts = [10, 10, 10, 10, left, 10, 10, 10, 10, 10]
         seconds = [10 * tenth + 10 * number / count for tenth, count in enumerate(counts) for number in range(count)]

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,7 @@ def test_a_layout_can_be_written_and_read_in_either_byte_order(dtype: type) -> N
 
 def test_every_datatype_of_a_field_is_read() -> None:
     # The constants of sensor_msgs/PointField: INT8 is 1, and so on up to FLOAT64.
-    kinds = [np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.float32, np.float64]
+    kinds: list[Any] = [np.int8, np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.float32, np.float64]
     for datatype, kind in enumerate(kinds, 1):
         message = new_layout(PointCloud("a", 5, np.zeros((1, 3), np.float32)))
         value = np.array([100], kind)
