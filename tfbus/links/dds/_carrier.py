@@ -25,10 +25,8 @@ from tfbus.links.dds._publishers import PATIENCE, Publishers
 from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawString, RawTFMessage
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
-from tfbus.tf_message import MalformedMessageError, encode
+from tfbus.tf_message import encode
 
-MAX_SIZE = 2**22
-"""The largest message that is received, in bytes."""
 _CLOSING_TIME = 1.0
 _DEPTH = 100
 _OTHERS = "other topics"
@@ -208,9 +206,7 @@ class DdsCarrier(RosCarrier):
         for message in messages:
             if not isinstance(message, InvalidSample):
                 other = {kind: True}
-                content = RosMessage(message.payload, static=False, authority="", **other)
-                # What is latched comes once.
-                self._pass_on(_OTHERS, content, moving=kind != "description")
+                self._pass_on(_OTHERS, RosMessage(message.payload, static=False, authority="", **other))
 
     def _match(self, number: int, reader: DataReader[RawTFMessage]) -> None:
         with self._lock:
@@ -226,14 +222,7 @@ class DdsCarrier(RosCarrier):
             self._present = present
 
     def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
-        self._pass_on(participant, RosMessage(payload, static, authority), moving=not static)
-
-    def _pass_on(self, sender: str, message: RosMessage, moving: bool) -> None:
-        size = len(message.payload)
-        if size > MAX_SIZE:
-            self._receive(Received(sender, MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")))
-        else:
-            self._receive(Received(sender, message, size, moving=moving))
+        self._pass_on(participant, RosMessage(payload, static, authority))
 
 
 def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:

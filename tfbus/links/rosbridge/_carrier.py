@@ -13,7 +13,7 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.ros._carrier import RosCarrier, RosMessage
+from tfbus.links.ros._carrier import MAX_SIZE, RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.links.rosbridge._protocol import (
     CLOCK_TYPE,
@@ -31,8 +31,6 @@ from tfbus.links.rosbridge._protocol import (
 from tfbus.links.rosbridge._websocket import WebSocket
 from tfbus.tf_message import Decoded, MalformedMessageError
 
-MAX_SIZE = 2**22
-"""The largest message that is received, in bytes."""
 MOST_QUEUED = 1_000
 """So many messages wait for a slow server; then the oldest are dropped."""
 Encoding = Literal["cbor", "cbor-raw"]
