@@ -5,7 +5,7 @@ import random
 import sys
 import threading
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -81,6 +81,15 @@ def grown(call: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
+def check_leaves_nothing(use: Callable[[], object], shared: Sequence[object]) -> None:
+    """Check that calls leave neither memory behind nor references to the things that they share."""
+    gc.collect()
+    before = [sys.getrefcount(thing) for thing in shared]
+    # The smallest object that a call could leak would make 8,000.
+    assert grown(use) < 4_000
+    assert [sys.getrefcount(thing) for thing in shared] == before
+
+
 @needs_both
 def test_no_call_leaks_memory_or_references() -> None:
     kernel: Any = COMPILED
@@ -130,11 +139,7 @@ def test_no_call_leaks_memory_or_references() -> None:
         del held
 
     use()
-    gc.collect()
-    before = [sys.getrefcount(thing) for thing in shared]
-    # The smallest object that a call could leak would make 8,000.
-    assert grown(use) < 4_000
-    assert [sys.getrefcount(thing) for thing in shared] == before
+    check_leaves_nothing(use, shared)
 
 
 @needs_both
@@ -222,10 +227,7 @@ def test_no_publish_and_no_wake_up_leaks_memory_or_references() -> None:
         parked[intake] = intake
 
     use()
-    gc.collect()
-    before = [sys.getrefcount(thing) for thing in shared]
-    assert grown(use) < 4_000
-    assert [sys.getrefcount(thing) for thing in shared] == before
+    check_leaves_nothing(use, shared)
 
 
 @needs_both
