@@ -9,7 +9,7 @@ from typing import Any, Literal
 import anyio
 import anyio.to_thread
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
-from cyclonedds.core import DDSException, Entity
+from cyclonedds.core import DDSException
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -21,6 +21,7 @@ from cyclonedds.util import duration
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds._domains import domain
+from tfbus.links.dds._joining import delete, is_of_ros, join, read
 from tfbus.links.dds._publishers import PATIENCE, Publishers
 from tfbus.links.dds._reader_thread import ReaderThread
 from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawString, RawTFMessage
@@ -33,8 +34,6 @@ _DEPTH = 100
 _OTHERS = "other topics"
 """The authority of joint positions and of the time."""
 _AT_ONCE = 100
-_MOST_PARTICIPANTS = 1_000
-_OF_ROS = b"enclave="
 # A writer never waits for a reader that is frozen: the event loop would.
 _RELIABLE = (
     Policy.Reliability.Reliable(duration(seconds=0)),
@@ -80,8 +79,7 @@ class DdsCarrier(RosCarrier):
     def _join(self) -> None:
         try:
             self._open.enter_context(domain(self._number, self._config))
-            participant = DomainParticipant(self._number)
-            self._open.callback(_delete, participant)
+            participant = join(self._number, self._open)
             topics = {
                 name: Topic(participant, f"rt{name}", RawTFMessage)
                 for name in (*self.settings.tf, *self.settings.tf_static)
@@ -90,11 +88,11 @@ class DdsCarrier(RosCarrier):
                 self._moving_writer = DataWriter(participant, topics[self.settings.tf[0]], _MOVING)
                 self._static_writer = DataWriter(participant, topics[self.settings.tf_static[0]], _STATIC)
                 for writer in (self._moving_writer, self._static_writer):
-                    self._open.callback(_delete, writer)
+                    self._open.callback(delete, writer)
             thread = ReaderThread(participant, self._misread)
             if self.settings.authority is None:
                 self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
-                self._open.callback(_delete, self._participants)
+                self._open.callback(delete, self._participants)
                 info = Topic(participant, "ros_discovery_info", ParticipantEntitiesInfo)
                 thread.watch(self._reader(participant, info, _STATICS), self._take_nodes)
             for name in self.settings.joint_topic:
@@ -118,7 +116,7 @@ class DdsCarrier(RosCarrier):
 
     def _reader(self, participant: DomainParticipant, topic: Topic[Any], qos: Qos) -> DataReader[Any]:
         reader: DataReader[Any] = DataReader(participant, topic, qos)
-        self._open.callback(_delete, reader)
+        self._open.callback(delete, reader)
         return reader
 
     async def run(self) -> None:
@@ -171,12 +169,9 @@ class DdsCarrier(RosCarrier):
 
     def _is_of_ros(self, participant: str) -> bool:
         """Whether a participant has the user data that ROS 2 gives it."""
-        found: list[Any] = [] if self._participants is None else self._participants.read(N=_MOST_PARTICIPANTS)
-        for each in found:
-            if not isinstance(each, InvalidSample) and each.key.hex == participant:
-                data = each.qos[Policy.Userdata].data if Policy.Userdata in each.qos else b""
-                return data.startswith(_OF_ROS)
-        return False
+        if self._participants is None:
+            return False
+        return any(is_of_ros(each) for each in read(self._participants) if each.key.hex == participant)
 
     def _take_nodes(self, reader: DataReader[ParticipantEntitiesInfo]) -> None:
         messages: list[Any] = reader.take(N=_AT_ONCE)
@@ -220,8 +215,3 @@ def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:
         )
         for node in info.node_entities_info_seq
     ]
-
-
-def _delete(entity: Entity) -> None:
-    # By itself, the library deletes an entity when nothing refers to it any more, in any order.
-    entity.__del__()

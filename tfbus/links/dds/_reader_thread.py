@@ -68,19 +68,24 @@ class ReaderThread:
         self._stopped.__del__()
 
     def _run(self) -> None:
+        # A reader that had data before it was watched tells of no more until these are taken.
+        self._serve_all(DDSStatus.All)
         while True:
             self._waiting.wait(_FOR_EVER)
             if self._stopped.read():
                 return
-            for watched in self._watched:
-                try:
-                    self._serve(watched)
-                except Exception as error:  # noqa: BLE001 - nothing that others send may end the thread
-                    self._failed(error)
+            self._serve_all()
 
-    def _serve(self, watched: _Watched) -> None:
+    def _serve_all(self, anyway: int = 0) -> None:
+        for watched in self._watched:
+            try:
+                self._serve(watched, anyway)
+            except Exception as error:  # noqa: BLE001 - nothing that others send may end the thread
+                self._failed(error)
+
+    def _serve(self, watched: _Watched, anyway: int) -> None:
         # Before the data are taken: what comes later is told again.
-        told = watched.reader.take_status()
+        told = watched.reader.take_status() | anyway
         if watched.match is not None and told & DDSStatus.SubscriptionMatched:
             watched.match(watched.reader)
         if told & DDSStatus.DataAvailable:
