@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, asynccontextmanager, contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ from support.processes import free_ports, until
 from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
 from support.wires import latched
 
-from tfbus import Buffer, Bus
+from tfbus import SECOND, Buffer, Bus
 from tfbus.links.ros import RosLink
 
 pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
@@ -250,6 +251,28 @@ async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(kind:
                     async with link_of(late_bus):
                         await late.lookup("base", "laser", timeout=40.0)
                         await late.lookup("arm", "tool", timeout=40.0)
+
+
+async def test_a_link_to_rosbridge_whose_connection_broke_hears_moving_frames_again_and_is_heard() -> None:
+    domain = next(_next_domain)
+    async with links("rosbridge", domain) as (link_of, peer_of):
+        with Bus() as bus, Buffer(bus) as buffer:
+            program = Program(bus, buffer)
+            async with link_of(bus) as link, anyio.create_task_group() as tasks:
+                tasks.start_soon(program.send)
+                with peer_of(domain, 25.0) as ros:
+                    assert (await ros.next_line())["event"] == "up"
+                    await buffer.lookup("odom", "tool", timeout=20.0)
+                    # The server still has our publisher, beside which it subscribes to what is latched only.
+                    await link._carrier._socket.close()  # type: ignore[attr-defined]
+                    await until(lambda: link.peers == ())
+                    await until(lambda: link.peers != ())
+                    await buffer.lookup("odom", "tool", time.time_ns() + SECOND, timeout=40.0)
+                    facts = await ros.next_line()
+                tasks.cancel_scope.cancel()
+    # Some 11 s of 25 are lost for moving frames.
+    assert facts["received"]["arm"] > 900
+    assert facts["wrong"] == 0
 
 
 def test_messages_of_rclpy_become_data_and_messages_again() -> None:
