@@ -77,6 +77,26 @@ async def test_two_buses_hear_each_other_and_a_late_one_the_static_frames() -> N
 
 
 @pytest.mark.thorough
+async def test_several_topics_are_heard_and_the_first_is_spoken_to() -> None:
+    with Bus() as near, Bus() as far:
+        async with (
+            router() as address,
+            RmwZenohLink(near, address, DOMAIN, tf="/robot1/tf", tf_static="/robot1/tf_static") as here,
+            RmwZenohLink(
+                far, address, DOMAIN, tf=["/tf", "/robot1/tf"], tf_static=["/s", "/robot1/tf_static"]
+            ) as there,
+        ):
+            heard: list[str] = []
+            far.subscribe(lambda batch: heard.extend(sample.child for sample in batch))
+            near.publish(static("map", "lidar"))
+            await until(lambda: heard == ["lidar"])
+            far.publish(moving("map", "far", 1))
+            near.publish(moving("map", "near", 1))
+            await until(lambda: heard == ["lidar", "far", "near"])
+            assert (here.statistics().received_samples, there.statistics().received_samples) == (0, 2)
+
+
+@pytest.mark.thorough
 async def test_links_hear_each_other_again_when_their_router_is_back() -> None:
     (port,) = free_ports(1)
     address = f"tcp/127.0.0.1:{port}"
