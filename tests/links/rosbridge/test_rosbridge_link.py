@@ -130,6 +130,7 @@ async def test_a_server_that_sends_huge_messages_is_cut_off_and_asked_again() ->
                 await until(lambda: link.statistics().received_samples == 1)
 
 
+@pytest.mark.thorough
 async def test_after_a_break_ros_2_forgets_the_former_publisher_before_moving_frames_go_out_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
