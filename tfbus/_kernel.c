@@ -1042,12 +1042,9 @@ find_turns(const Segment *segments, Turn *turns, Py_ssize_t count)
     }
     for (Py_ssize_t i = 0; i < count; i++) {
         if (turns[i].turns) {
-            turns[i].angle = acos(turns[i].angle);
-        }
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        if (turns[i].turns) {
-            turns[i].scale = 1.0 / sin(turns[i].angle);
+            const double cosine = turns[i].angle;
+            turns[i].scale = 1.0 / sqrt((1.0 - cosine) * (1.0 + cosine));
+            turns[i].angle = acos(cosine);
         }
     }
 }
