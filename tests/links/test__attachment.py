@@ -186,6 +186,12 @@ def test_too_much_for_one_attachment_is_refused(entries: list[Entry]) -> None:
         pack(1, entries)
 
 
+def test_the_error_names_the_size() -> None:
+    with pytest.raises(ValueError) as raised:
+        pack(1, [RemovedFrame(ONE, n, "x" * 1_000) for n in range(2_000)])
+    assert str(raised.value) == f"too much for one attachment: {50 + 16 + 2_000 * 1_012} bytes, more than 1048576"
+
+
 @pytest.mark.parametrize(
     "entries",
     [
