@@ -90,7 +90,7 @@ class Outbox:
         if self._follow(batch, echo) or not echo:
             self._notify()
 
-    def add_removal(self, removal: RemovedFrame, echo: bool) -> None:
+    def add_removal(self, removal: RemovedFrame, echo: bool = False) -> None:
         """Add the removal of a frame; an echo only changes what is kept, as in `add_batch`."""
         frame = removal.frame
         if self._frames is not None and frame not in self._frames:
