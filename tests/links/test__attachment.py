@@ -3,7 +3,7 @@ import struct
 from itertools import islice
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from support.allocations import peak_of
 from support.strategies import CHARACTERS
@@ -85,7 +85,6 @@ def test_the_limits_are_those_of_all_releases() -> None:
 
 
 @given(number=NUMBERS, entries=entries_of_any_kind, step=st.none() | STEPS, time=TIMES)
-@settings(max_examples=40)
 def test_unpacking_gives_back_what_was_packed(
     number: int, entries: list[Entry], step: StateStep | None, time: int | None
 ) -> None:
@@ -310,7 +309,6 @@ def test_random_bytes_behind_a_good_header_raise_nothing_else(
 
 
 @given(entries=entries_of_any_kind, data=st.data())
-@settings(max_examples=40)
 def test_a_damaged_attachment_raises_nothing_else(entries: list[Entry], data: st.DataObject) -> None:
     damaged = bytearray(pack(1, entries))
     for _ in range(data.draw(st.integers(1, 3))):
