@@ -12,7 +12,7 @@ from tfbus.links._peers import Peer
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.tf_message import decode, encode
 
-PROVENANCE = Provenance(b"0123456789abcdef", 7, object(), Peer("other"))
+PROVENANCE = Provenance(b"0123456789abcdef", 7, None, Peer("other"))
 SHARED: list[Callable[[TransformStamped], TransformStamped]] = [
     copy.copy,
     copy.deepcopy,
