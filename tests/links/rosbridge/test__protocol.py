@@ -19,6 +19,7 @@ from tfbus.links.rosbridge._protocol import (
     advertise,
     decode_content,
     decode_joints,
+    is_of_ros2,
     publish,
     read,
     subscribe,
@@ -77,6 +78,23 @@ def test_bytes_of_ros_1_are_told_from_those_of_ros_2() -> None:
         rows = [moving(sample.parent, sample.child, 0) for sample in samples]
         assert decode_content(ros1(*map(ros1_of, rows))).samples == rows
         assert decode_content(encode(rows)).samples == rows
+
+
+@pytest.mark.parametrize(
+    ("content", "ros2"),
+    [
+        (encode([moving("map", "base", 5)]), True),
+        ({"transforms": [{"header": {"stamp": {"sec": 5, "nanosec": 0}}}]}, True),
+        (json.loads(publish("/tf", [moving("map", "base", 5)]))["msg"], False),
+        (ros1(ros1_of(moving("map", "base", 5))), False),
+        (ros1(), False),
+        ({"transforms": []}, False),
+        ({"transforms": [5]}, False),
+        (5, False),
+    ],
+)
+def test_the_content_of_a_message_tells_whether_it_is_of_ros_2(content: Any, ros2: bool) -> None:
+    assert is_of_ros2(content) is ros2
 
 
 def test_the_status_of_a_server_has_no_topic() -> None:

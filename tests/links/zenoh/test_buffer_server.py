@@ -6,7 +6,7 @@ import anyio
 import anyio.to_thread
 import pytest
 import zenoh
-from support.processes import until
+from support.processes import PATIENCE, until
 from support.samples import static
 
 from tfbus import LATEST, Buffer, Bus, RemoteLookupError, TransformStamped
@@ -55,7 +55,7 @@ async def test_what_is_no_question_is_refused_and_harms_nobody(address: str, dom
             def ask() -> list[Any]:
                 replies = []
                 for payload in bad:
-                    replies += list(session.get(f"tfbus/{domain}/~/lookup", payload=payload, timeout=5.0))
+                    replies += list(session.get(f"tfbus/{domain}/~/lookup", payload=payload, timeout=PATIENCE))
                 return replies
 
             try:
