@@ -233,6 +233,9 @@ class Link:
             return
 
     def _handle_received(self) -> None:
+        if self._receive_queue.drop_late(monotonic()):
+            why = "they come faster than the event loop reads them"
+            self._log.warning("late", "live messages are dropped by the link %s: %s", self._name, why)
         cost = 0
         while self._attached and cost < _BYTES_PER_TURN:
             item = self._receive_queue.get()
