@@ -13,7 +13,7 @@ from random import Random
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 300.0
 """s between two questions to one peer: at first, and then twice that time, up to the longest."""
-SETTLED_PAUSE = 16.0
+SETTLED_PAUSE = 60.0
 """s; after a peer has told that it hears this link."""
 SECOND_PAUSE = 0.5
 """s; after an answer that the link is not heard, for its presence may be on its way."""
