@@ -223,6 +223,15 @@ def test_a_turn_without_a_message_uses_no_number() -> None:
         assert [unpack(message.attachment).number for message in writer.write()] == [number]
 
 
+def test_a_turn_that_is_skipped_has_a_number_and_its_time_is_told_later() -> None:
+    writer = MessageWriter(SendReport([].append))
+    writer.skip(5)
+    writer.skip()
+    (message,) = writer.write([RemovedFrame(ORIGIN, 1, "a")])
+    received = read_message(message.payload, message.attachment)
+    assert (received.number, received.time) == (3, 5)
+
+
 @pytest.mark.parametrize("frame", ["\ud800", "x" * (MAX_NAME + 1)])
 def test_removals_that_no_message_can_hold_are_counted_and_not_sent(frame: str) -> None:
     writer = Writer()

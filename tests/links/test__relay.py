@@ -535,6 +535,20 @@ def test_schedules_after_which_a_frame_once_stayed_away_for_good(graph: Graph, s
         Model(net).live(steps)
 
 
+def test_a_bus_that_has_taken_a_frame_from_a_bridge_keeps_it_when_another_peer_brings_it_instead() -> None:
+    steps = [
+        ("part", 4, 0, [5]),
+        ("part", 2, 0, [0]),
+        ("publish", 2, 0, [11]),
+        ("send", 2, 0, [0]),
+        ("deliver", 2, 0, [11]),
+        ("send", 1, 0, [0]),
+        ("part", 0, 3, [7]),
+    ]
+    with Network(TWO_BRIDGES) as net:
+        Model(net).live(steps)
+
+
 def test_an_owner_says_a_frame_again_once_for_each_loss_that_it_has_not_answered() -> None:
     with Network(PAIR) as net:
         owner, other = net.domains[0].ends

@@ -17,7 +17,7 @@ when it is started again holds against what it has said before, although it know
 What has gone is remembered with its number; see `tfbus.links._removals`.
 """
 
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
 from itertools import groupby
 from time import time_ns
 from uuid import uuid4
@@ -33,8 +33,13 @@ from tfbus.links._provenance import LOWEST, Provenance, Rank, ReceivedTransform
 from tfbus.links._removals import Removals
 from tfbus.registration import Registration
 
+Brings = Callable[[str, Peer | None], bool]
 LARGEST_JUMP = 2**52
 """A number may be so far ahead of all that came before: 142 years in us, for some machines begin in 1970."""
+
+
+def _nobody(_frame: str, _peer: Peer | None) -> bool:
+    return False
 
 
 class Relay:
@@ -62,6 +67,7 @@ class Relay:
         self._number = number
         self._bus = bus
         self._outboxes: list[Outbox] = []
+        self._brings: dict[Outbox, Brings] = {}
         self._newest: dict[bytes, dict[str, int]] = {}
         self._brought_by: dict[tuple[bytes, str], Peer] = {}
         self._removals = Removals()
@@ -71,7 +77,7 @@ class Relay:
         self._removing: tuple[str, Provenance] | None = None
         self._passed: PassedSamples | None = None
 
-    def attach(self, outbox: Outbox, foreign: bool = False) -> None:
+    def attach(self, outbox: Outbox, foreign: bool = False, brings: Brings = _nobody) -> None:
         """Give a link all that is latched, and all that is published from now on.
 
         Parameters
@@ -79,6 +85,8 @@ class Relay:
         outbox : Outbox
         foreign : bool
             Whether it is a link to a world whose samples have no origin.
+        brings : callable, optional
+            Whether any peer of the link but a given one brings a frame.
 
         Raises
         ------
@@ -90,10 +98,12 @@ class Relay:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
         self._bus.subscribe(lambda batch: self._send_latched(batch, outbox)).close()
         self._outboxes.append(outbox)
+        self._brings[outbox] = brings
 
     def detach(self, outbox: Outbox) -> None:
         """Give a link nothing any more; its peers must be lost before, with `lose`."""
         self._outboxes.remove(outbox)
+        del self._brings[outbox]
         if not self._outboxes:
             self._registration.close()
             for memory in (self._newest, self._brought_by, self._removals):
@@ -174,6 +184,9 @@ class Relay:
             news = latest is not None and latest.peer is provenance.peer
             if latest is not None and not news:
                 self._answer_loss(provenance, frame, latest)
+            elif latest is not None and provenance.sequence <= latest.sequence:
+                # The peer has left the frame to another one; for this bus it is lost.
+                provenance = Provenance(self.origin, self._next_number(), provenance.outbox, provenance.peer, lost=True)
         else:
             newest = self._newest.get(provenance.origin, {}).get(frame, -1)
             news = newest < provenance.sequence and not self._removals.is_late(provenance, frame)
@@ -320,11 +333,14 @@ class Relay:
             provenance = self._removing[1]
         else:
             provenance = Provenance(self.origin, self._next_number(), None, None)
-        self._latest.pop(frame, None)
+        latest = self._latest.pop(frame, None)
+        lost_static = provenance.lost and latest is not None and self._settled.get(frame) == latest.rank
         self._forget_frame(frame, provenance)
         removal = RemovedFrame(provenance.origin, provenance.sequence, frame, provenance.lost)
         for outbox in self._outboxes:
-            outbox.add_removal(removal, echo=outbox is provenance.outbox)
+            # Those who brought it as well have to hear that it was taken from somebody else.
+            asks = lost_static and self._brings[outbox](frame, provenance.peer)
+            outbox.add_removal(removal, echo=outbox is provenance.outbox and not asks)
 
     def _forget_frame(self, frame: str, provenance: Provenance) -> None:
         self._settled.pop(frame, None)
@@ -345,11 +361,12 @@ class Relay:
             return
         if latest.origin == self.origin:
             self._say_again([frame])
-        elif latest.outbox is not loss.outbox and latest.outbox in self._outboxes:
-            # Several peers may pass on the same.
-            if loss.sequence > self._losses_passed_on.get(frame, -1):
-                self._losses_passed_on[frame] = loss.sequence
-                latest.outbox.add_removal(RemovedFrame(loss.origin, loss.sequence, frame, lost=True))
+            return
+        # Several peers may pass on the same.
+        is_new = loss.sequence > self._losses_passed_on.get(frame, -1)
+        if is_new and latest.outbox is not loss.outbox and latest.outbox in self._outboxes:
+            self._losses_passed_on[frame] = loss.sequence
+            latest.outbox.add_removal(RemovedFrame(loss.origin, loss.sequence, frame, lost=True))
 
     def _tell_loss_again(self, copy: Provenance, frame: str) -> None:
         """Tell those who have brought a copy of a static frame that it is not taken, unless the bus has the frame."""

@@ -29,11 +29,12 @@ class Removals:
     the bus that has published it, is lost. No bus can tell these apart but by the owner, as in DSDV (Perkins and
     Bhagwat, "Highly dynamic destination-sequenced distance-vector routing", 1994). So this is the rule:
 
-    1. A bus that hears of a loss lets the frame go if the teller was the last to bring it. If it has the frame on
-       another way, it keeps it, and tells of the loss there, towards the owner.
+    1. A bus that hears of a loss lets the frame go if the teller was the last to bring it, and tells of the loss
+       itself. If it has the frame on another way, it keeps it, and passes the loss on there, towards the owner.
     2. The number that was lost is news again from the peer that told of the loss and from peers met later, for those
        have it anew. From all others it counts as a late copy.
-    3. A bus that refuses a static sample as a late copy tells of the loss again, to those who have brought the copy.
+    3. A bus that refuses a static sample as a late copy tells of the loss again, to those who have brought the copy;
+       and to those who have told it a copy before, when it loses the frame.
     4. An owner that hears of a loss with a higher number than that of its static sample says the sample again, with a
        number above that of the loss; so it is news to all.
 

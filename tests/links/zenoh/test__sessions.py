@@ -164,6 +164,21 @@ async def test_a_peer_that_does_not_hear_this_end_is_dialled_until_it_does() -> 
         assert here.items.empty()
 
 
+async def test_whoever_asks_and_hears_directly_tells_so() -> None:
+    async with ends(1) as (here,), joined_to(here) as joining:
+        told: Queue[bytes] = Queue()
+        here.sessions._main._note_heard = told.put
+        joining.sessions.ask(here.id, 0)
+        await here.next()
+        token = told.get_nowait()
+        assert here.sessions._peer_of(token) == joining.id
+        assert here.sessions._peer_of(b"\xff") is None
+        joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
+        joining.sessions.ask(here.id, 0)
+        await here.next()
+        assert told.empty()
+
+
 async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:
     closed = f"127.0.0.1:{free_ports(1)[0]}"
     assert await _is_reachable(f"quic/{closed}")
