@@ -277,18 +277,21 @@ def test_remote_waits(table: Table) -> None:
                         with running(ASKER, domain, address, ASKED) as asker:
                             pipe = asker.stdin
                             assert pipe is not None
-                            answered = server.statistics().answered + ASKED
+                            whole = server.statistics().answered + ASKED
 
                             def begin_remote(pipe: IO[str] = pipe, stamp: int = stamp) -> None:
                                 pipe.write(f"{stamp + 500_000}\n")
                                 pipe.flush()
+
+                            def all_answered(whole: int = whole) -> bool:
+                                return server.statistics().answered == whole
 
                             await spend(
                                 "remote",
                                 stamp + 500_000,
                                 begin_remote,
                                 lambda: server.statistics().waiting == ASKED,
-                                lambda answered=answered: server.statistics().answered == answered,
+                                all_answered,
                             )
 
     anyio.run(main)

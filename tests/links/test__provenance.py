@@ -8,11 +8,12 @@ from support import strategies as some
 from support.samples import moving
 
 from tfbus import SECOND, Buffer, Bus, SimulatedClock, TransformStamped
+from tfbus.links._outbox import Outbox
 from tfbus.links._peers import Peer
 from tfbus.links._provenance import Provenance, ReceivedTransform
 from tfbus.tf_message import decode, encode
 
-PROVENANCE = Provenance(b"0123456789abcdef", 7, object(), Peer("other"))
+PROVENANCE = Provenance(b"0123456789abcdef", 7, Outbox(None, lambda: None), Peer("other"))
 SHARED: list[Callable[[TransformStamped], TransformStamped]] = [
     copy.copy,
     copy.deepcopy,
