@@ -40,7 +40,8 @@ def test_requests_are_those_of_the_protocol() -> None:
     assert json.loads(unsubscribe("/tf")) == {"op": "unsubscribe", "id": "tfbus:/tf", "topic": "/tf"}
     latched = json.loads(advertise("/tf_static", static=True))
     assert (latched["op"], latched["latch"], latched["queue_size"]) == ("advertise", True, 1)
-    assert json.loads(advertise("/tf", static=False))["latch"] is False
+    each = json.loads(advertise("/tf", static=False))
+    assert (each["latch"], each["queue_size"]) == (False, 100)
 
 
 def test_a_published_message_has_the_fields_of_ros() -> None:

@@ -18,6 +18,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+from tfbus._aio.threads import wait_for_all
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds._domains import domain
@@ -129,9 +130,7 @@ class DdsCarrier(RosCarrier):
         """Leave the domain, or give up waiting for that."""
         closing = Thread(target=self._open.close, name="tfbus dds close", daemon=True)
         closing.start()
-        with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            # With a limit, for a worker of asyncio keeps the interpreter.
-            await anyio.to_thread.run_sync(closing.join, _CLOSING_TIME, abandon_on_cancel=True)
+        await wait_for_all([closing], _CLOSING_TIME)
 
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
         try:

@@ -139,9 +139,7 @@ class RosbridgeCarrier(RosCarrier):
             self._report.refused("not connected", error, len(samples))
             return False
         elif monotonic() < self._held_until:
-            error = ConnectionError(
-                f"{self._url} was away, and would hear nobody else for the former publisher of ours"
-            )
+            error = ConnectionError(f"{self._url} was away, and still has a publisher of that time, which hides others")
             self._report.refused("rejoining", error, len(samples))
             return False
         else:
