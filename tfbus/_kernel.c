@@ -36,8 +36,9 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 #define EXACT_GAP ((uint64_t)1 << 53) /* ns; beyond, a difference of stamps is no exact float, and Python divides */
 
 static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
-static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType;
-static PyObject *empty_string, *raise_string, *drop_string;
+static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
+static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
+static PyObject *bound_method; /* types.MethodType */
 
 static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
@@ -1042,12 +1043,9 @@ find_turns(const Segment *segments, Turn *turns, Py_ssize_t count)
     }
     for (Py_ssize_t i = 0; i < count; i++) {
         if (turns[i].turns) {
-            turns[i].angle = acos(turns[i].angle);
-        }
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        if (turns[i].turns) {
-            turns[i].scale = 1.0 / sin(turns[i].angle);
+            const double cosine = turns[i].angle;
+            turns[i].scale = 1.0 / sqrt((1.0 - cosine) * (1.0 + cosine));
+            turns[i].angle = acos(cosine);
         }
     }
 }
@@ -2045,6 +2043,190 @@ static PyType_Spec paths_spec = {
     "tfbus._kernel.Paths", sizeof(Paths), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, paths_slots
 };
 
+/* Method: a method in Python that runs only if there is no plain answer ----------------------------------------------- */
+
+typedef struct Method {
+    PyObject_HEAD
+    PyObject *function; /* the method in Python */
+    PyObject *many;     /* the class of the answers at many stamps; NULL if it asks for one */
+    PyObject *(*vectorcall)(struct Method *, PyObject *const *, size_t, PyObject *);
+} Method;
+
+/* Py_TPFLAGS_HAVE_VECTORCALL, which has this value since 3.8, and is in the limited API since 3.12. */
+#define HAVE_VECTORCALL (1UL << 11)
+
+static PyObject *method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names);
+
+static int
+method_traverse(Method *self, visitproc visit, void *arg)
+{
+    Py_VISIT(Py_TYPE(OBJECT(self)));
+    Py_VISIT(self->function);
+    Py_VISIT(self->many);
+    return 0;
+}
+
+static int
+method_clear(Method *self)
+{
+    Py_CLEAR(self->function);
+    Py_CLEAR(self->many);
+    return 0;
+}
+
+static void
+method_dealloc(Method *self)
+{
+    PyTypeObject *type = Py_TYPE(OBJECT(self));
+    PyObject_GC_UnTrack(self);
+    method_clear(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static PyObject *
+method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
+{
+    PyObject *function, *many;
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "Method takes no keyword arguments");
+        return NULL;
+    }
+    if (!PyArg_ParseTuple(args, "OO:Method", &function, &many)) {
+        return NULL;
+    }
+    if (many != Py_None && !PyType_Check(many)) {
+        PyErr_SetString(PyExc_TypeError, "the answers at many stamps need a class, or None");
+        return NULL;
+    }
+    Method *self = (Method *)PyType_GenericAlloc(type, 0);
+    if (self != NULL) {
+        Py_INCREF(function);
+        self->function = function;
+        self->vectorcall = method_vectorcall;
+        Py_XINCREF(many == Py_None ? NULL : many);
+        self->many = many == Py_None ? NULL : many;
+    }
+    return OBJECT(self);
+}
+
+/* The plain answer to whoever asks for source in target; None if there is none. Without stamps it is the latest. */
+static PyObject *
+method_answer(const Method *self, PyObject *asker, PyObject *target, PyObject *source, PyObject *at)
+{
+    PyObject *paths = PyObject_GetAttr(asker, paths_string);
+    if (paths == NULL || !PyObject_TypeCheck(paths, PathsType)) {
+        PyErr_Clear();
+        Py_XDECREF(paths);
+        Py_RETURN_NONE;
+    }
+    PyObject *question[3] = {target, source, at == NULL ? ((Paths *)paths)->latest : at};
+    PyObject *found = self->many == NULL ? paths_answer((Paths *)paths, question, 3)
+                                         : paths_answer_many((Paths *)paths, question, 3);
+    Py_DECREF(paths);
+    if (self->many == NULL || found == NULL || found == Py_None) {
+        return found;
+    }
+    PyObject *answers = PyType_GenericAlloc((PyTypeObject *)self->many, 0);
+    if (answers != NULL && PyObject_SetAttr(answers, memory_string, found) < 0) {
+        Py_CLEAR(answers);
+    }
+    Py_DECREF(found);
+    return answers;
+}
+
+/* The call of the method in Python, with `count` arguments and as many more as there are names. */
+static PyObject *
+method_run(const Method *self, PyObject *const *args, Py_ssize_t count, PyObject *names)
+{
+    PyObject *first = PyTuple_New(count), *result = NULL;
+    PyObject *named = first == NULL || names == NULL ? NULL : PyDict_New();
+    int failed = first == NULL || (names != NULL && named == NULL);
+    for (Py_ssize_t i = 0; !failed && i < count; i++) {
+        Py_INCREF(args[i]);
+        failed = PyTuple_SetItem(first, i, args[i]) < 0;
+    }
+    for (Py_ssize_t i = 0; !failed && names != NULL && i < PyTuple_Size(names); i++) {
+        failed = PyDict_SetItem(named, PyTuple_GetItem(names, i), args[count + i]) < 0;
+    }
+    if (!failed) {
+        result = PyObject_Call(self->function, first, named);
+    }
+    Py_XDECREF(first);
+    Py_XDECREF(named);
+    return result;
+}
+
+/* By PEP 590. Plain are only the object, target, source, and the stamp or stamps. */
+static PyObject *
+method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names)
+{
+    const Py_ssize_t count = (Py_ssize_t)(flagged & ~((size_t)1 << (8 * sizeof(size_t) - 1)));
+    const Py_ssize_t named = names == NULL ? 0 : PyTuple_Size(names);
+    const int at_is_named = count == 3 && named == 1 && PyTuple_GetItem(names, 0) == at_string;
+    if ((count == 4 && named == 0) || (self->many == NULL && count == 3 && (named == 0 || at_is_named))) {
+        PyObject *found = method_answer(self, args[0], args[1], args[2], count + named == 4 ? args[3] : NULL);
+        if (found != Py_None) {
+            return found;
+        }
+        Py_DECREF(found);
+    }
+    return method_run(self, args, count, names);
+}
+
+static PyObject *
+method_call(Method *self, PyObject *args, PyObject *kwargs)
+{
+    return PyObject_Call(self->function, args, kwargs);
+}
+
+static PyObject *
+method_bind(PyObject *self, PyObject *instance, PyObject *Py_UNUSED(owner))
+{
+    if (instance == NULL || instance == Py_None) {
+        Py_INCREF(self);
+        return self;
+    }
+    return PyObject_CallFunctionObjArgs(bound_method, self, instance, NULL);
+}
+
+/* It looks like the method in Python, so that its signature and its documentation are found. */
+static PyObject *
+method_attribute(Method *self, PyObject *name)
+{
+    PyObject *found = self->function == NULL ? NULL : PyObject_GetAttr(self->function, name);
+    if (found == NULL) {
+        PyErr_Clear();
+        found = PyObject_GenericGetAttr(OBJECT(self), name);
+    }
+    return found;
+}
+
+static PyMemberDef method_members[] = {
+    {"__wrapped__", T_OBJECT_EX, offsetof(Method, function), READONLY, PyDoc_STR("The method in Python.")},
+    {"__vectorcalloffset__", T_PYSSIZET, offsetof(Method, vectorcall), READONLY, NULL},
+    {NULL}
+};
+
+static PyType_Slot method_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("Method(function, many): a method that runs only if there is no plain answer.")},
+    {Py_tp_new, method_new},
+    {Py_tp_dealloc, method_dealloc},
+    {Py_tp_traverse, method_traverse},
+    {Py_tp_clear, method_clear},
+    {Py_tp_call, method_call},
+    {Py_tp_descr_get, method_bind},
+    {Py_tp_getattro, method_attribute},
+    {Py_tp_members, method_members},
+    {0, NULL}
+};
+
+static PyType_Spec method_spec = {
+    "tfbus._kernel.Method", sizeof(Method), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_METHOD_DESCRIPTOR | HAVE_VECTORCALL | Py_TPFLAGS_IMMUTABLETYPE,
+    method_slots
+};
+
 /* Edge: the newest edge of a frame on a bus, and the plain judgement of a batch --------------------------------------- */
 
 typedef struct {
@@ -3026,10 +3208,23 @@ module_exec(PyObject *module)
         PyErr_SetString(PyExc_ImportError, "the compiled kernel of tfbus runs in the main interpreter only");
         return -1;
     }
-    if ((empty_string == NULL && (empty_string = PyUnicode_InternFromString("")) == NULL)
-        || (raise_string == NULL && (raise_string = PyUnicode_InternFromString("raise")) == NULL)
-        || (drop_string == NULL && (drop_string = PyUnicode_InternFromString("drop")) == NULL)) {
-        return -1;
+    const struct {
+        const char *text;
+        PyObject **place;
+    } strings[] = {{"", &empty_string}, {"raise", &raise_string}, {"drop", &drop_string},
+                   {"at", &at_string}, {"_paths", &paths_string}, {"_memory", &memory_string}};
+    for (size_t i = 0; i < sizeof strings / sizeof *strings; i++) {
+        if (*strings[i].place == NULL && (*strings[i].place = PyUnicode_InternFromString(strings[i].text)) == NULL) {
+            return -1;
+        }
+    }
+    if (bound_method == NULL) {
+        PyObject *types = PyImport_ImportModule("types");
+        bound_method = types == NULL ? NULL : PyObject_GetAttrString(types, "MethodType");
+        Py_XDECREF(types);
+        if (bound_method == NULL) {
+            return -1;
+        }
     }
     if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
         || add_type(module, "Block", &block_spec, &BlockType) < 0
@@ -3040,7 +3235,8 @@ module_exec(PyObject *module)
         || add_type(module, "Edge", &edge_spec, &EdgeType) < 0 || add_type(module, "Judge", &judge_spec, &JudgeType) < 0
         || add_type(module, "Parked", &parked_spec, &ParkedType) < 0
         || add_type(module, "Line", &line_spec, &LineType) < 0 || add_type(module, "Feed", &feed_spec, &FeedType) < 0
-        || add_type(module, "Intake", &intake_spec, &IntakeType) < 0) {
+        || add_type(module, "Intake", &intake_spec, &IntakeType) < 0
+        || add_type(module, "Method", &method_spec, &MethodType) < 0) {
         return -1;
     }
     return 0;

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from itertools import groupby
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
 from support.samples import moving, static
@@ -159,7 +159,6 @@ def test_a_message_is_published_batch_by_batch_with_everything_that_was_said() -
 
 
 @given(samples=st.lists(some.samples(names=st.sampled_from("abc"), at=some.stamps(0, 2**60)), min_size=1, max_size=6))
-@settings(max_examples=25)
 def test_received_samples_are_published_to_the_bit(samples: list[TransformStamped]) -> None:
     with receiver() as here, Bus(SimulatedClock()) as there:
         heard: list[Batch] = []
@@ -718,7 +717,6 @@ any_removal = st.builds(RemovedFrame, st.sampled_from((ORIGIN, OTHER)), st.integ
     ),
     data=st.data(),
 )
-@settings(max_examples=20)
 def test_messages_of_any_content_do_no_harm(messages: list[tuple[list[Entry], int, str]], data: st.DataObject) -> None:
     with receiver(max_frames=2) as here:
         for entries, number, sender in messages:

@@ -114,6 +114,18 @@ async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
         assert here.dialing.next_due() is None
 
 
+async def test_an_address_at_which_nobody_listens_is_forgotten_if_there_is_another() -> None:
+    here, peer = End(new_domain()), f"{1 << 127:032x}"
+    first, second = (f"tcp/127.0.0.1:{port}" for port in free_ports(2))
+    for address in (first, second):
+        here.dialing.reached(peer, address)
+    for _ in range(2):
+        await here.sessions._patch(peer, first)
+    assert here.dialing._addresses == {peer: [second]}
+    await here.sessions._patch(peer, second)
+    assert here.dialing._addresses == {peer: [second]}
+
+
 @pytest.mark.thorough
 async def test_nobody_at_the_address_is_tried_again() -> None:
     async with ends() as (here, there):

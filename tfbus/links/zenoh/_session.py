@@ -128,8 +128,11 @@ class ZenohSession:
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, close_session, session)
         drop, remote, keys = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE, self._keys
-        self._live = session.declare_publisher(keys.own("live"), congestion_control=drop)
-        self._slow = session.declare_publisher(keys.own("slow"), congestion_control=drop)
+        # The link's own subscriptions must not count for somebody who hears it.
+        self._live, self._slow = (
+            session.declare_publisher(keys.own(kind), congestion_control=drop, allowed_destination=remote)
+            for kind in ("live", "slow")
+        )
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
         self._declared = [
             *(
@@ -166,6 +169,10 @@ class ZenohSession:
     def put_slowly(self, message: Message) -> None:
         """Send a message by the slow key, or drop it while the network is congested."""
         self._slow.put(message.payload, attachment=message.attachment)
+
+    def is_heard(self) -> bool:
+        """Whether anybody subscribes to the live key; also if the session has ended, for that has to be reported."""
+        return bool(self._live.matching_status.matching or self.session.is_closed())  # type: ignore[attr-defined]
 
     def is_heard_slowly(self) -> bool:
         """Whether anybody subscribes to the slow key."""

@@ -110,6 +110,10 @@ class ZenohSessions:
             for session in hearing:
                 session.put_slowly(message)
 
+    def is_heard(self) -> bool:
+        """Whether anybody subscribes to the live key; raises `zenoh.ZError`."""
+        return any(session.is_heard() for session in self._open())
+
     def is_heard_slowly(self) -> bool:
         """Whether anybody subscribes to the slow key."""
         return any(session.is_heard_slowly() for session in self._open())
