@@ -2841,7 +2841,12 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
             }
             Py_XDECREF(done);
         } else if (PyDict_DelItem(self->parts[PARKED], item) < 0) {
-            set_aside(trouble);
+            if (PyErr_ExceptionMatches(PyExc_KeyError)) {
+                /* It could not be removed whole, for want of memory. */
+                PyErr_Clear();
+            } else {
+                set_aside(trouble);
+            }
         }
         feed_answer(self, waiter);
         if (waiter->wake != NULL) {
