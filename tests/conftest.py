@@ -50,7 +50,7 @@ LIMIT, THOROUGH_LIMIT = 60.0, 280.0
 """The longest that a test of each suite may take, in s."""
 
 EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("default", EXAMPLES, max_examples=15, derandomize=True)
+settings.register_profile("default", EXAMPLES, max_examples=10, derandomize=True)
 settings.register_profile("thorough", EXAMPLES, max_examples=100, derandomize="CI" in os.environ)
 
 

@@ -29,13 +29,10 @@ def test_that_ends() -> None:
 """
 LEAVING = """
 import subprocess
-import sys
 from pathlib import Path
 
 def test_that_leaves_a_process() -> None:
-    process = subprocess.Popen([sys.executable, "-c", "import signal; print('up', flush=True); signal.pause()"],
-                               stdout=subprocess.PIPE)
-    process.stdout.readline()
+    process = subprocess.Popen(["sleep", "1000"])
     Path(__file__).with_name("left").write_text(str(process.pid))
 """
 AFTER_IT = """

@@ -9,6 +9,8 @@ from typing import Any
 from tfbus.statistics import QueueStatistics
 
 MAX_BYTES = 64 * 2**20
+CATCH_UP = 1.0
+"""s; a reader that has read for so long and has not caught up is behind."""
 _OVERHEAD = 256
 """Bytes that an item takes besides its content."""
 
@@ -78,7 +80,10 @@ class Received:
 
 
 class ReceiveQueue:
-    """Holds what threads have received until the event loop reads it, in order.
+    """Holds what threads have received until the event loop reads it.
+
+    What brings two ends to agree is read first: questions, answers, and that a peer has joined. All else is read in
+    order; so is the end of a peer, for its last messages come before it.
 
     Parameters
     ----------
@@ -90,20 +95,26 @@ class ReceiveQueue:
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._lock = threading.Lock()
+        self._urgent: deque[Received] = deque()
         # Items that do not move and were passed over in a search for the oldest moving one.
         self._kept: deque[Received] = deque()
         self._pending: deque[Received] = deque()
         self._bytes = 0
         self._moving = 0
+        self._ends = 0
         self._dropped = 0
+        self._reading_since: float | None = None
+        self._waited_then = 0
+        self._old = 0
 
     def __len__(self) -> int:
-        return len(self._kept) + len(self._pending)
+        return len(self._urgent) + len(self._kept) + len(self._pending)
 
     def put(self, item: Received) -> None:
         """Append an item, from any thread."""
         with self._lock:
-            self._pending.append(item)
+            (self._urgent if self._is_urgent(item) else self._pending).append(item)
+            self._ends += item.content is Presence.LEFT
             self._bytes += _footprint(item)
             self._moving += item.moving
             while self._moving > self._capacity or self._bytes > MAX_BYTES:
@@ -112,10 +123,38 @@ class ReceiveQueue:
     def get(self) -> Received | None:
         """Remove and return the oldest item; None if the queue is empty."""
         with self._lock:
-            for queue in (self._kept, self._pending):
+            for queue in (self._urgent, self._kept, self._pending):
                 if queue:
                     return self._pop(queue)
+            self._reading_since = None
         return None
+
+    def drop_late(self, now: float) -> int:
+        """Drop the moving items that a reader does not get to; to be called before each turn of reading.
+
+        Those are the ones that have waited for `CATCH_UP` while it read, if no fewer wait now than then. So a burst is
+        read to its end, and what comes faster than it is read for a long time is not read ever later.
+
+        Parameters
+        ----------
+        now : float
+            A monotonic time in s.
+
+        Returns
+        -------
+        int
+            How many were dropped.
+        """
+        with self._lock:
+            late = 0
+            if self._reading_since is not None:
+                if now - self._reading_since < CATCH_UP:
+                    return 0
+                late = self._old if self._moving >= self._waited_then else 0
+            for _ in range(late):
+                self._drop_oldest()
+            self._reading_since, self._waited_then, self._old = now, self._moving, self._moving
+            return late
 
     def discard_moving(self) -> None:
         """Drop all moving items, because the clock has jumped back."""
@@ -123,8 +162,8 @@ class ReceiveQueue:
             kept = [item for item in (*self._kept, *self._pending) if not item.moving]
             self._dropped += self._moving
             self._kept, self._pending = deque(kept), deque()
-            self._bytes = sum(map(_footprint, kept))
-            self._moving = 0
+            self._bytes = sum(map(_footprint, (*self._urgent, *kept)))
+            self._moving = self._old = 0
 
     def statistics(self) -> QueueStatistics:
         """The queue's counters, in items."""
@@ -134,14 +173,23 @@ class ReceiveQueue:
     def _drop_oldest(self) -> None:
         while self._pending and not self._pending[0].moving:
             self._kept.append(self._pending.popleft())
-        self._pop(self._pending or self._kept)
+        self._pop(self._pending or self._kept or self._urgent)
         self._dropped += 1
 
     def _pop(self, queue: deque[Received]) -> Received:
         item = queue.popleft()
         self._bytes -= _footprint(item)
         self._moving -= item.moving
+        # Moving items leave in order, so the first ones are those that waited before.
+        self._old -= item.moving and self._old > 0
+        self._ends -= item.content is Presence.LEFT
         return item
+
+    def _is_urgent(self, item: Received) -> bool:
+        if item.content is Presence.JOINED:
+            # A peer that comes back comes after its end.
+            return not self._ends
+        return isinstance(item.content, Question | Answer)
 
 
 def _footprint(item: Received) -> int:

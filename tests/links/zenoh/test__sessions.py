@@ -114,6 +114,18 @@ async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
         assert here.dialing.next_due() is None
 
 
+async def test_an_address_at_which_nobody_listens_is_forgotten_if_there_is_another() -> None:
+    here, peer = End(new_domain()), f"{1 << 127:032x}"
+    first, second = (f"tcp/127.0.0.1:{port}" for port in free_ports(2))
+    for address in (first, second):
+        here.dialing.reached(peer, address)
+    for _ in range(2):
+        await here.sessions._patch(peer, first)
+    assert here.dialing._addresses == {peer: [second]}
+    await here.sessions._patch(peer, second)
+    assert here.dialing._addresses == {peer: [second]}
+
+
 @pytest.mark.thorough
 async def test_nobody_at_the_address_is_tried_again() -> None:
     async with ends() as (here, there):
@@ -150,6 +162,21 @@ async def test_a_peer_that_does_not_hear_this_end_is_dialled_until_it_does() -> 
         here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.JOINED)
         await until(lambda: {name for _, name in here.sessions._present[joining.id]} == {FIRST_SESSION})
         assert here.items.empty()
+
+
+async def test_whoever_asks_and_hears_directly_tells_so() -> None:
+    async with ends(1) as (here,), joined_to(here) as joining:
+        told: Queue[bytes] = Queue()
+        here.sessions._main._note_heard = told.put
+        joining.sessions.ask(here.id, 0)
+        await here.next()
+        token = told.get_nowait()
+        assert here.sessions._peer_of(token) == joining.id
+        assert here.sessions._peer_of(b"\xff") is None
+        joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
+        joining.sessions.ask(here.id, 0)
+        await here.next()
+        assert told.empty()
 
 
 async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:

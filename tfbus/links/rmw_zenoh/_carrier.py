@@ -33,6 +33,7 @@ from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
 from tfbus.links.zenoh._session import directly
+from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import encode
 
 _HEARTBEAT = 0.5
@@ -68,7 +69,7 @@ class RmwZenohCarrier(RosCarrier):
         try:
             await anyio.to_thread.run_sync(self._join)
         except zenoh.ZError as error:
-            raise ConnectionError(f"no router of rmw_zenoh: {error}") from error
+            raise ConnectionError(f"no router of rmw_zenoh: {without_source_location(error)}") from error
 
     def _join(self) -> None:
         session = self._session = zenoh.open(self._config)

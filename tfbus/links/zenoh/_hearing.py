@@ -13,6 +13,8 @@ from random import Random
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 300.0
 """s between two questions to one peer: at first, and then twice that time, up to the longest."""
+SETTLED_PAUSE = 60.0
+"""s; after a peer has told that it hears this link."""
 SECOND_PAUSE = 0.5
 """s; after an answer that the link is not heard, for its presence may be on its way."""
 DEAF = 2
@@ -62,6 +64,14 @@ class Hearing:
             check.due = now + self._jitter(check.pause)
         return due
 
+    def is_heard(self, peer: str) -> None:
+        """Note that a peer has told by itself that it hears this link: it need not be asked soon."""
+        check = self._checks.get(peer)
+        if check is not None:
+            check.unheard = 0
+            check.pause = max(check.pause, SETTLED_PAUSE)
+            check.due = max(check.due, self._now() + self._jitter(SETTLED_PAUSE))
+
     def is_deaf(self, peer: str, hears: bool) -> bool:
         """Note a peer's answer; returns whether it does not hear this link, and will not by itself."""
         check = self._checks.get(peer)
@@ -84,7 +94,10 @@ class Hearing:
         check = self._checks.get(peer)
         if check is None or check.silent >= MOST_SILENT:
             return False
+        pause, due = check.pause, check.due
         deaf = self.is_deaf(peer, hears=False)
+        # An end that has no time to answer must not be asked more often for it.
+        check.pause, check.due = pause, max(due, check.due)
         check.silent += deaf
         return deaf
 

@@ -56,11 +56,13 @@ class ZenohLink(Link):
         Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
     lease : float
         Seconds of silence after which others take this link for lost, when it is frozen or cut off, and it takes them
-        for lost by theirs; a process that dies is lost at once.
+        for lost by theirs; a process that dies is lost at once. A sign of life goes out every half a lease, so to be
+        held up for less than that loses nobody.
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
-        How many live messages may wait for the event loop; then the oldest are dropped and counted.
+        How many live messages may wait for the event loop; then the oldest are dropped and counted. So are those that
+        have waited for a second while the loop read, and has not caught up.
     history : float, optional
         Ask each peer once, when it is met, for the last so many seconds of its moving frames, as far as buffers on its
         bus hold them: 2,000 samples of each frame at most. They are published before what it sends live, so lookups at
