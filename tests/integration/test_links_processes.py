@@ -187,7 +187,7 @@ def test_a_frozen_process_is_lost_and_comes_back_with_its_static_frames(processe
     frozen.ask("until", static=["meanwhile"], peers=2)
 
 
-def test_a_process_that_is_held_up_for_less_than_half_a_lease_is_not_lost(processes: Crowd, place: Place) -> None:
+def test_a_process_that_is_held_up_for_a_part_of_its_lease_is_not_lost(processes: Crowd, place: Place) -> None:
     listener = processes.add(place.first(lease=4.0, drop_lost=True))
     held_up = processes.add(place.other(lease=4.0))
     held_up.ask("statics", names=["lidar"], authority="urdf")

@@ -87,11 +87,6 @@ def test_the_lease_is_in_milliseconds() -> None:
     assert read("transport/link/tx/lease", lease=1e-9) == 1
 
 
-def test_two_signs_of_life_go_out_in_each_lease_unless_told_otherwise() -> None:
-    assert read("transport/link/tx/keep_alive") == 2
-    assert read("transport/link/tx/keep_alive", config={"transport/link/tx/keep_alive": 8}) == 8
-
-
 @pytest.mark.parametrize("lease", [0.0, -1.0, math.nan, math.inf])
 def test_a_lease_is_a_time_that_passes(lease: float) -> None:
     with pytest.raises(ValueError, match="lease"):

@@ -66,9 +66,6 @@ def settings(
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
         "scouting/delay": 100,
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
-        # Half a lease apart, where zenoh has a quarter: TCP loses none, and with many peers they are all that a link
-        # costs at rest. A process that is held up for less than half a lease is still not taken for lost.
-        "transport/link/tx/keep_alive": 2,
         # It would leave a file open for each link that has ended.
         "transport/shared_memory/enabled": False,
         # Larger messages are not even assembled.
