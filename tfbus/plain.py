@@ -28,7 +28,7 @@ class PlainData:
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain data for JSON, with the name of the class as ``"type"``; stamps are ``int`` of ns."""
         values: dict[str, Any] = {"type": type(self).__name__}
-        for name in _kinds_of_fields(type(self)):
+        for name in _kinds_of_fields(type(self)):  # type: ignore[arg-type]
             value = getattr(self, name)
             values[name] = value if type(value) in _PLAIN else to_plain(value)
         return values

@@ -224,7 +224,8 @@ def test_a_turn_without_a_message_uses_no_number() -> None:
 
 
 def test_a_turn_that_is_skipped_has_a_number_and_its_time_is_told_later() -> None:
-    writer = MessageWriter(SendReport([].append))
+    refused: list[Exception] = []
+    writer = MessageWriter(SendReport(refused.append))
     writer.skip(5)
     writer.skip()
     (message,) = writer.write([RemovedFrame(ORIGIN, 1, "a")])

@@ -83,6 +83,7 @@ async def test_what_is_known_is_answered_while_the_event_loop_is_busy(address: s
                 # Nothing is awaited here, so the event loop stands still until the answer has come.
                 for asked, kind in ((question, TransformStamped), (replace(question, source_at=5), Exception)):
                     (reply,) = session.get(f"tfbus/{domain}/~/lookup", payload=write_question(asked), timeout=30.0)
+                    assert reply.ok is not None
                     assert isinstance(read_answer(reply.ok.payload.to_bytes(), domain, None), kind)
             finally:
                 await anyio.to_thread.run_sync(session.close)
