@@ -174,16 +174,22 @@ async def test_after_a_break_moving_frames_go_out_when_those_of_ros_2_come_in(mo
 
 
 @pytest.mark.thorough
-async def test_while_a_lookup_waits_the_static_frames_are_asked_for_again() -> None:
+@pytest.mark.parametrize(("sends", "asked"), [(False, ["/tf_static", "/tf"]), (True, ["/tf_static"])])
+async def test_while_a_lookup_waits_the_static_frames_are_asked_for_again(sends: bool, asked: list[str]) -> None:
     async with rosbridge_server() as server:
         with Bus() as bus, Buffer(bus) as buffer:
             async with RosbridgeLink(bus, server.url):
                 await until(lambda: len(server.operations("subscribe")) == 2)
+                if sends:
+                    # A server that does not give it back.
+                    server.clients[0].subscriptions.pop("/tf")
+                    bus.publish(moving("map", "base", 5))
+                    await until(lambda: "/tf" in server.operations("publish"))
                 # It had come before this link did.
                 server.latched["/tf_static"] = (static("map", "lidar", 2.0, 3),)
                 found = await buffer.lookup("map", "lidar", timeout=10)
         assert found.transform.translation == (2.0, 0.0, 0.0)
-        assert server.operations("unsubscribe") == ["/tf_static", "/tf"]
+        assert server.operations("unsubscribe") == asked
 
 
 @pytest.mark.thorough

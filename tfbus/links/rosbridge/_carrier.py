@@ -225,9 +225,10 @@ class RosbridgeCarrier(RosCarrier):
         if self._encoding == "cbor-raw" and incoming.encoding == "none":
             self._ask_for_cbor()
         self._of_ros2 = self._of_ros2 or is_of_ros2(incoming.content)
-        if not static and monotonic() > self._connected_at + ECHO_TIME:
+        if not static:
             self._heard_moving = True
-            self._held_until = -inf
+            if monotonic() > self._connected_at + ECHO_TIME:
+                self._held_until = -inf
         content = RosMessage(incoming.content, static, "rosbridge")
         self._receive(Received(self._url, content, size, moving=not static))
 
@@ -287,7 +288,8 @@ class RosbridgeCarrier(RosCarrier):
                 continue
             misses += 1
             self._subscribe_again(self.settings.tf_static)
-            if not self._heard_moving:
+            # Beside a publisher of this link, the new subscription would hear nobody else.
+            if not (self._heard_moving or self._advertised):
                 self._subscribe_again(self.settings.tf)
 
     async def _end_holding(self) -> None:
