@@ -42,6 +42,66 @@ static PyObject *bound_method; /* types.MethodType */
 
 static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
+/* References ------------------------------------------------------------------------------------------------------- */
+
+/* What the garbage collector needs of a type whose first fields are references: `fields` of them. */
+#define REFERENCES(name, fields)                                                                        \
+    static int name##_traverse(PyObject *self, visitproc visit, void *arg)                              \
+    {                                                                                                   \
+        return visit_references(self, fields, visit, arg);                                              \
+    }                                                                                                   \
+    static int name##_clear(PyObject *self)                                                             \
+    {                                                                                                   \
+        return clear_references(self, fields);                                                          \
+    }                                                                                                   \
+    static void name##_dealloc(PyObject *self)                                                          \
+    {                                                                                                   \
+        PyObject_GC_UnTrack(self);                                                                      \
+        clear_references(self, fields);                                                                 \
+        let_go_of(self);                                                                                \
+    }
+
+static int
+visit_references(PyObject *self, int fields, visitproc visit, void *arg)
+{
+    PyObject **references = (PyObject **)(self + 1);
+    Py_VISIT(Py_TYPE(self));
+    for (int i = 0; i < fields; i++) {
+        Py_VISIT(references[i]);
+    }
+    return 0;
+}
+
+static int
+clear_references(PyObject *self, int fields)
+{
+    PyObject **references = (PyObject **)(self + 1);
+    for (int i = 0; i < fields; i++) {
+        Py_CLEAR(references[i]);
+    }
+    return 0;
+}
+
+/* The end of each deallocation. */
+static void
+let_go_of(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+/* Whether a call has no keyword arguments; else there is an error. */
+static int
+has_no_keywords(PyObject *kwargs)
+{
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "this takes no keyword arguments");
+        return 0;
+    }
+    return 1;
+}
+
 /* Rows ------------------------------------------------------------------------------------------------------------ */
 
 static PyObject *
@@ -257,13 +317,11 @@ sample_static(Sample *self, void *Py_UNUSED(closure))
 static void
 sample_dealloc(Sample *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     Py_XDECREF(self->parent);
     Py_XDECREF(self->child);
     Py_XDECREF(self->authority);
     Py_XDECREF(self->fields);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyMemberDef sample_members[] = {
@@ -344,9 +402,7 @@ block_releasebuffer(Block *self, Py_buffer *Py_UNUSED(view))
 static void
 block_dealloc(PyObject *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyType_Slot block_slots[] = {
@@ -499,8 +555,7 @@ history_init(History *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *parent, *keep;
     int64_t window = -1;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "History takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "UO:History", &parent, &keep)) {
@@ -907,12 +962,10 @@ history_set_string(PyObject *self, PyObject *value, void *closure)
 static void
 history_dealloc(History *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     Py_XDECREF(self->parent);
     Py_XDECREF(self->authority);
     Py_XDECREF(OBJECT(self->block));
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyObject *history_row(History *self, PyObject *number);
@@ -1148,8 +1201,7 @@ static int
 chain_init(Chain *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *sides[2];
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Chain takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
@@ -1538,14 +1590,12 @@ held_traverse(Held *self, visitproc visit, void *arg)
 static void
 held_dealloc(Held *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     PyObject_GC_UnTrack(self);
     if (self->seen != NULL) {
         let_go(self->seen, self->count);
     }
     Py_XDECREF(OBJECT(self->chain));
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyMethodDef held_methods[] = {
@@ -1602,11 +1652,9 @@ chain_traverse(Chain *self, visitproc visit, void *arg)
 static void
 chain_dealloc(Chain *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     PyObject_GC_UnTrack(self);
     chain_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyMethodDef chain_methods[] = {
@@ -1739,43 +1787,13 @@ paths_are_free(const Paths *self)
     return held == Py_False;
 }
 
-static int
-paths_traverse(Paths *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->recent);
-    Py_VISIT(self->lock_is_held);
-    Py_VISIT(self->latest);
-    Py_VISIT(self->kind);
-    return 0;
-}
-
-static int
-paths_clear(Paths *self)
-{
-    Py_CLEAR(self->recent);
-    Py_CLEAR(self->lock_is_held);
-    Py_CLEAR(self->latest);
-    Py_CLEAR(self->kind);
-    return 0;
-}
-
-static void
-paths_dealloc(Paths *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    paths_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(paths, 4)
 
 static int
 paths_init(Paths *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *lock, *latest, *kind;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Paths takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "OOO!:Paths", &lock, &latest, &PyType_Type, &kind)) {
@@ -1791,7 +1809,7 @@ paths_init(Paths *self, PyObject *args, PyObject *kwargs)
         Py_XDECREF(is_held);
         return -1;
     }
-    paths_clear(self);
+    paths_clear(OBJECT(self));
     self->recent = recent;
     self->lock_is_held = is_held;
     Py_INCREF(latest);
@@ -2057,39 +2075,13 @@ typedef struct Method {
 
 static PyObject *method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names);
 
-static int
-method_traverse(Method *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->function);
-    Py_VISIT(self->many);
-    return 0;
-}
-
-static int
-method_clear(Method *self)
-{
-    Py_CLEAR(self->function);
-    Py_CLEAR(self->many);
-    return 0;
-}
-
-static void
-method_dealloc(Method *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    method_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(method, 2)
 
 static PyObject *
 method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
 {
     PyObject *function, *many;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Method takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return NULL;
     }
     if (!PyArg_ParseTuple(args, "OO:Method", &function, &many)) {
@@ -2141,7 +2133,7 @@ method_run(const Method *self, PyObject *const *args, Py_ssize_t count, PyObject
 {
     PyObject *first = PyTuple_New(count), *result = NULL;
     PyObject *named = first == NULL || names == NULL ? NULL : PyDict_New();
-    int failed = first == NULL || (names != NULL && named == NULL);
+    int failed = first == NULL || (names != NULL && named == NULL) || self->function == NULL;
     for (Py_ssize_t i = 0; !failed && i < count; i++) {
         Py_INCREF(args[i]);
         failed = PyTuple_SetItem(first, i, args[i]) < 0;
@@ -2151,6 +2143,8 @@ method_run(const Method *self, PyObject *const *args, Py_ssize_t count, PyObject
     }
     if (!failed) {
         result = PyObject_Call(self->function, first, named);
+    } else if (!PyErr_Occurred()) {
+        PyErr_SetString(PyExc_RuntimeError, "the garbage collector has taken the method");
     }
     Py_XDECREF(first);
     Py_XDECREF(named);
@@ -2177,6 +2171,9 @@ method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject 
 static PyObject *
 method_call(Method *self, PyObject *args, PyObject *kwargs)
 {
+    if (self->function == NULL) {
+        return method_run(self, NULL, 0, NULL);
+    }
     return PyObject_Call(self->function, args, kwargs);
 }
 
@@ -2302,11 +2299,9 @@ edge_set_newest(Edge *self, PyObject *value, void *Py_UNUSED(closure))
 static void
 edge_dealloc(Edge *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     Py_XDECREF(self->parent);
     Py_XDECREF(self->trusted);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyGetSetDef edge_getset[] = {
@@ -2339,45 +2334,21 @@ typedef struct {
     int64_t horizon; /* ns */
 } Judge;
 
-static int
-judge_traverse(Judge *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->edges);
-    return 0;
-}
-
-static int
-judge_clear(Judge *self)
-{
-    Py_CLEAR(self->edges);
-    return 0;
-}
-
-static void
-judge_dealloc(Judge *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    judge_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(judge, 1)
 
 static int
 judge_init(Judge *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *edges;
     double square;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Judge takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!d:Judge", &PyDict_Type, &edges, &square)) {
         return -1;
     }
     Py_INCREF(edges);
-    judge_clear(self);
+    judge_clear(OBJECT(self));
     self->edges = edges;
     self->square = square;
     self->horizon = INT64_MIN;
@@ -2493,36 +2464,7 @@ typedef struct {
     char elsewhere;    /* whether it is noted elsewhere than in a line and among all that are parked */
 } Parked;
 
-static int
-parked_traverse(Parked *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->plain);
-    Py_VISIT(self->wake);
-    Py_VISIT(self->place);
-    Py_VISIT(self->answer);
-    return 0;
-}
-
-static int
-parked_clear(Parked *self)
-{
-    Py_CLEAR(self->plain);
-    Py_CLEAR(self->wake);
-    Py_CLEAR(self->place);
-    Py_CLEAR(self->answer);
-    return 0;
-}
-
-static void
-parked_dealloc(Parked *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    parked_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(parked, 4)
 
 static PyMemberDef parked_members[] = {
     {"plain", T_OBJECT, offsetof(Parked, plain), 0, PyDoc_STR("Target, source and at of a plain question, or None.")},
@@ -2556,44 +2498,17 @@ typedef struct {
     PyObject *limits;  /* list of (-stamp, -order, Parked), sorted */
 } Line;
 
-static int
-line_traverse(Line *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->places);
-    Py_VISIT(self->for_any);
-    Py_VISIT(self->limits);
-    return 0;
-}
-
-static int
-line_clear(Line *self)
-{
-    Py_CLEAR(self->places);
-    Py_CLEAR(self->for_any);
-    Py_CLEAR(self->limits);
-    return 0;
-}
-
-static void
-line_dealloc(Line *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    line_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(line, 3)
 
 static int
 line_init(Line *self, PyObject *Py_UNUSED(args), PyObject *Py_UNUSED(kwargs))
 {
-    line_clear(self);
+    line_clear(OBJECT(self));
     self->places = PyList_New(0);
     self->for_any = PyDict_New();
     self->limits = PyList_New(0);
     if (self->places == NULL || self->for_any == NULL || self->limits == NULL) {
-        line_clear(self);
+        line_clear(OBJECT(self));
         return -1;
     }
     return 0;
@@ -2634,41 +2549,13 @@ typedef struct {
     PyObject *parts[PARTS];
 } Feed;
 
-static int
-feed_traverse(Feed *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    for (int i = 0; i < PARTS; i++) {
-        Py_VISIT(self->parts[i]);
-    }
-    return 0;
-}
-
-static int
-feed_clear(Feed *self)
-{
-    for (int i = 0; i < PARTS; i++) {
-        Py_CLEAR(self->parts[i]);
-    }
-    return 0;
-}
-
-static void
-feed_dealloc(Feed *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    feed_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(feed, PARTS)
 
 static int
 feed_init(Feed *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *parts[PARTS];
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Feed takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!O!O!O!O!O!O!O:Feed", PathsType, &parts[PATHS], &PyDict_Type, &parts[FRAMES],
@@ -2841,7 +2728,12 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
             }
             Py_XDECREF(done);
         } else if (PyDict_DelItem(self->parts[PARKED], item) < 0) {
-            set_aside(trouble);
+            if (PyErr_ExceptionMatches(PyExc_KeyError)) {
+                /* It could not be removed whole, for want of memory. */
+                PyErr_Clear();
+            } else {
+                set_aside(trouble);
+            }
         }
         feed_answer(self, waiter);
         if (waiter->wake != NULL) {
@@ -2929,53 +2821,23 @@ static PyType_Spec feed_spec = {
 
 typedef struct {
     PyObject_HEAD
+    /* A tuple of (Feed, callable that takes a batch which is not plain). It is cleared first: nothing is taken then. */
+    PyObject *feeds;
     PyObject *judge;      /* Judge */
     PyObject *kind;       /* the class of samples */
     PyObject *listeners;  /* a tuple of containers; whatever is in one has to hear of each batch */
-    PyObject *feeds;      /* a tuple of (Feed, callable that takes a batch which is not plain) */
     long long samples;    /* how many were taken */
     unsigned long thread; /* the only one that may publish */
     char open;
 } Intake;
 
-static int
-intake_traverse(Intake *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->judge);
-    Py_VISIT(self->kind);
-    Py_VISIT(self->listeners);
-    Py_VISIT(self->feeds);
-    return 0;
-}
-
-static int
-intake_clear(Intake *self)
-{
-    /* First, because nothing is taken without it. */
-    Py_CLEAR(self->feeds);
-    Py_CLEAR(self->judge);
-    Py_CLEAR(self->kind);
-    Py_CLEAR(self->listeners);
-    return 0;
-}
-
-static void
-intake_dealloc(Intake *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    intake_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(intake, 4)
 
 static int
 intake_init(Intake *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *judge, *kind, *listeners;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Intake takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type, &listeners)) {

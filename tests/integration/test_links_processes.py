@@ -188,16 +188,16 @@ def test_a_frozen_process_is_lost_and_comes_back_with_its_static_frames(processe
 
 
 def test_a_process_that_is_held_up_for_less_than_half_a_lease_is_not_lost(processes: Crowd, place: Place) -> None:
-    listener = processes.add(place.first(lease=2.0, drop_lost=True))
-    held_up = processes.add(place.other(lease=2.0))
+    listener = processes.add(place.first(lease=4.0, drop_lost=True))
+    held_up = processes.add(place.other(lease=4.0))
     held_up.ask("statics", names=["lidar"], authority="urdf")
     listener.ask("until", static=["lidar"], peers=1)
-    for _ in range(4):
+    for _ in range(2):
         held_up.signal(signal.SIGSTOP)
-        time.sleep(0.8)
+        time.sleep(1.5)
         held_up.signal(signal.SIGCONT)
         # The next one begins at another moment between two signs of life.
-        time.sleep(0.3)
+        time.sleep(0.7)
     held_up.ask("statics", names=["camera"])
     listener.ask("until", static=["lidar", "camera"], peers=1)
     assert not listener.said(event="PeerLost")
@@ -502,11 +502,6 @@ def test_two_that_lose_each_other_while_both_hear_a_third_are_together_again(hos
 
 def test_processes_that_start_together_all_have_every_static_frame() -> None:
     assert max(measure(processes=8)) < PATIENCE
-
-
-def test_static_frames_get_through_where_live_samples_leave_no_time() -> None:
-    # 16 x 15 x 20 x 200 are 960,000 samples a second, many times what two cores decode.
-    assert max(measure(processes=16, rate=200.0)) < PATIENCE
 
 
 def test_hosts_without_an_address_hear_only_themselves(hosts: Hosts, processes: Crowd) -> None:

@@ -46,6 +46,17 @@ def test_questions_answers_and_those_who_join_overtake_what_waits() -> None:
     assert drained(queue) == [*urgent, 1, 2]
 
 
+def test_what_overtakes_has_a_bound_too() -> None:
+    queue = ReceiveQueue(10)
+    queue.put(kept(Answer("large"), MAX_BYTES + 1))
+    assert (len(queue), queue.statistics().dropped) == (0, 1)
+    queue.put(kept(Answer("small"), MIB))
+    queue.put(moving(1, MIB))
+    queue.put(kept(Answer("nearly all"), MAX_BYTES - 2 * MIB))
+    assert drained(queue) == [Answer("small"), Answer("nearly all")], "moving items make room first"
+    assert queue.statistics().dropped == 2
+
+
 def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() -> None:
     queue = ReceiveQueue(10)
     items = [moving(1), kept(Presence.LEFT), moving(2), kept(Presence.JOINED)]

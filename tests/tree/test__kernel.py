@@ -138,7 +138,8 @@ def random_rotation(rng: random.Random, before: tuple[float, ...] | None) -> tup
 
 @needs_both
 @pytest.mark.parametrize(
-    ("seed", "count"), [(1, 60), *(pytest.param(seed, TREES // 5, marks=pytest.mark.thorough) for seed in range(2, 7))]
+    ("seed", "count"),
+    [(1, 60), *(pytest.param(seed, TREES // 20, marks=pytest.mark.thorough) for seed in range(2, 22))],
 )
 def test_both_kernels_say_the_same_of_random_trees(seed: int, count: int) -> None:
     rng = random.Random(seed)

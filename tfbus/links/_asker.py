@@ -15,7 +15,7 @@ LONGEST_PATIENCE = 16.0
 A peer that has no time would else be asked again for what it is about to answer, and have less time for that.
 """
 MOST_OPEN = 64
-"""So many questions are open at once: where nobody has time each takes seconds, and few at a time would take minutes."""
+"""So many questions are open at once: where nobody has time each takes seconds, and few at a time take minutes."""
 
 
 @dataclass(slots=True)

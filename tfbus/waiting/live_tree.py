@@ -78,7 +78,7 @@ class LiveTree:
         """As `insert`, for a batch that the feed has left alone because it is not plain."""
         waiters = self._waiters
         plain = self.forest.commit(batch)
-        if waiters:
+        if waiters or self.waiting.limits:
             limit = self.waiting.limit
             passed = None
             for sample in batch:

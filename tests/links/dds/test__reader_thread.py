@@ -59,10 +59,10 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(domain
         topic = Topic(participant, "rt/text", RawString)
         thread = ReaderThread(participant, fail)
         reader: DataReader[Any] = DataReader(participant, topic)
-        thread.watch(reader, take, match)
         writer = DataWriter(participant, topic)
-        # Before it has started: told all the same.
+        # Before it is watched: told all the same.
         writer.write(RawString("first"))
+        thread.watch(reader, take, match)
         thread.start()
         wait_for(2)
         for number, text in enumerate(("bad", "last")):

@@ -15,6 +15,8 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.sub import DataReader
 from cyclonedds.util import duration
 
+from tfbus.links.dds._joining import delete
+
 _FOR_EVER = duration(infinite=True)
 
 
@@ -64,29 +66,27 @@ class ReaderThread:
         self._stopped.set(True)
         self._thread.join()
         self._watched.clear()
-        self._waiting.__del__()
-        self._stopped.__del__()
+        delete(self._waiting)
+        # When it is collected, it would detach whatever has their numbers by then.
+        self._waiting.attached.clear()
+        delete(self._stopped)
 
     def _run(self) -> None:
-        # A reader that had data before it was watched tells of no more until these are taken.
-        self._serve_all(DDSStatus.All)
         while True:
             self._waiting.wait(_FOR_EVER)
             if self._stopped.read():
                 return
-            self._serve_all()
+            for watched in self._watched:
+                try:
+                    _serve(watched)
+                except Exception as error:  # noqa: BLE001 - nothing that others send may end the thread
+                    self._failed(error)
 
-    def _serve_all(self, anyway: int = 0) -> None:
-        for watched in self._watched:
-            try:
-                self._serve(watched, anyway)
-            except Exception as error:  # noqa: BLE001 - nothing that others send may end the thread
-                self._failed(error)
 
-    def _serve(self, watched: _Watched, anyway: int) -> None:
-        # Before the data are taken: what comes later is told again.
-        told = watched.reader.take_status() | anyway
-        if watched.match is not None and told & DDSStatus.SubscriptionMatched:
-            watched.match(watched.reader)
-        if told & DDSStatus.DataAvailable:
-            watched.take(watched.reader)
+def _serve(watched: _Watched) -> None:
+    # Before the data are taken: what comes later is told again.
+    told = watched.reader.take_status()
+    if watched.match is not None and told & DDSStatus.SubscriptionMatched:
+        watched.match(watched.reader)
+    if told & DDSStatus.DataAvailable:
+        watched.take(watched.reader)
