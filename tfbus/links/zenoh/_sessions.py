@@ -111,8 +111,8 @@ class ZenohSessions:
                 session.put_slowly(message)
 
     def is_heard(self) -> bool:
-        """Whether anybody subscribes to the live key; raises `zenoh.ZError`."""
-        return any(session.is_heard() for session in self._open())
+        """Whether a peer is there, or anybody else subscribes to the live key; raises `zenoh.ZError`."""
+        return bool(self._present) or any(session.is_heard() for session in self._open())
 
     def is_heard_slowly(self) -> bool:
         """Whether anybody subscribes to the slow key."""
