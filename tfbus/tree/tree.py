@@ -45,7 +45,8 @@ class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
     Any thread may read it while another one inserts. A copy, and what `edges` and the texts show, is the tree at one
-    moment; an explanation reads its edges one after the other.
+    moment; an explanation reads its edges one after the other. A finaliser (``__del__``) or a signal handler must not
+    use it: if it interrupts a call of its own thread that holds the lock of the tree, it would wait for ever.
 
     Parameters
     ----------
