@@ -239,8 +239,9 @@ def test_a_live_message_that_an_answer_has_overtaken_does_not_change_what_is_kno
         mirror.moving("b")
         mirror.answered(StateStep(0, 3, digest_moving("b")))
         assert mirror.agrees
-        late = [ReceivedBatch([], [], ORIGIN, 1), MovingFrame("a"), RemovedFrame(ORIGIN, 1, "b", lost=True)]
-        here.inbox.receive("peer", ReceivedMessage([*late], 1, step=StateStep(0, 2, digest_moving("a"), message=1)))
+        late: list[ReceivedBatch | RemovedFrame | MovingFrame] = [ReceivedBatch([], [], ORIGIN, 1), MovingFrame("a")]
+        late.append(RemovedFrame(ORIGIN, 1, "b", lost=True))
+        here.inbox.receive("peer", ReceivedMessage(late, 1, step=StateStep(0, 2, digest_moving("a"), message=1)))
         assert (mirror.agrees, "a" in mirror, "b" in mirror) == (True, False, True)
         # What an answer has not told yet is noted.
         now = StateStep(3, 4, digest_moving("a") ^ digest_moving("b"), message=2)

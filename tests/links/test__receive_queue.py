@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.links._receive_queue import CATCH_UP, MAX_BYTES, Answer, Presence, Question, Received, ReceiveQueue
+from tfbus.links._receive_queue import CATCH_UP, MANY, MAX_BYTES, Answer, Presence, Question, Received, ReceiveQueue
 from tfbus.statistics import QueueStatistics
 
 MIB = 2**20
@@ -37,13 +37,15 @@ def test_items_are_read_in_the_order_in_which_they_came() -> None:
     assert (len(queue), queue.get()) == (0, None)
 
 
-def test_questions_answers_and_those_who_join_overtake_what_waits() -> None:
-    queue = ReceiveQueue(10)
+@pytest.mark.parametrize("waiting", [MANY, MANY + 1])
+def test_questions_answers_and_those_who_join_overtake_what_waits_if_that_is_much(waiting: int) -> None:
+    queue = ReceiveQueue(1_000)
     urgent = [Presence.JOINED, Question(0, None), Answer(None)]
-    for content in (1, *urgent, 2):
+    before, behind = list(range(waiting)), [-1]
+    for content in (*before, *urgent, *behind):
         queue.put(moving(content) if isinstance(content, int) else kept(content))
-    assert len(queue) == 5
-    assert drained(queue) == [*urgent, 1, 2]
+    assert len(queue) == waiting + 4
+    assert drained(queue) == ([*urgent, *before] if waiting > MANY else [*before, *urgent]) + behind
 
 
 def test_what_overtakes_has_a_bound_too() -> None:
@@ -58,15 +60,16 @@ def test_what_overtakes_has_a_bound_too() -> None:
 
 
 def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() -> None:
-    queue = ReceiveQueue(10)
-    items = [moving(1), kept(Presence.LEFT), moving(2), kept(Presence.JOINED)]
+    queue = ReceiveQueue(1_000)
+    items = [*map(moving, range(MANY + 1)), kept(Presence.LEFT), moving(-1), kept(Presence.JOINED)]
     for item in items:
         queue.put(item)
     assert drained(queue) == [item.content for item in items]
     # Once the end was read, nothing holds those who join.
-    for item in (moving(3), kept(Presence.JOINED)):
+    many = list(range(MANY + 1))
+    for item in (*map(moving, many), kept(Presence.JOINED)):
         queue.put(item)
-    assert drained(queue) == [Presence.JOINED, 3]
+    assert drained(queue) == [Presence.JOINED, *many]
 
 
 def test_a_reader_that_does_not_catch_up_is_spared_what_has_waited_too_long() -> None:

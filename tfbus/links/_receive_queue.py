@@ -11,6 +11,8 @@ from tfbus.statistics import QueueStatistics
 MAX_BYTES = 64 * 2**20
 CATCH_UP = 1.0
 """s; a reader that has read for so long and has not caught up is behind."""
+MANY = 100
+"""Moving items that wait, beyond which questions and answers overtake them."""
 _OVERHEAD = 256
 """Bytes that an item takes besides its content."""
 
@@ -82,8 +84,9 @@ class Received:
 class ReceiveQueue:
     """Holds what threads have received until the event loop reads it.
 
-    What brings two ends to agree is read first: questions, answers, and that a peer has joined. All else is read in
-    order; so is the end of a peer, for its last messages come before it.
+    Items are read in order, so that batches stay whole. But while more than `MANY` moving items wait, what brings two
+    ends to agree is read first: questions, answers, and that a peer has joined. The end of a peer is always read in
+    order, for its last messages come before it.
 
     Parameters
     ----------
@@ -186,6 +189,8 @@ class ReceiveQueue:
         return item
 
     def _is_urgent(self, item: Received) -> bool:
+        if self._moving <= MANY:
+            return False
         if item.content is Presence.JOINED:
             # A peer that comes back comes after its end.
             return not self._ends
