@@ -30,7 +30,7 @@ _ANSWER_TIME = 10.0
 """s; an answer that comes late is as good, so it is longer than the asker's patience."""
 _HEARING_TIME = 1.0
 _URGENT = zenoh.Priority.INTERACTIVE_HIGH
-"""Of questions, and so of their answers: zenoh has them overtake live messages that wait, and drops them last."""
+"""Of questions whether a link is heard, and so of their answers: they overtake live messages, and are dropped last."""
 _TOGETHER = 0.02
 _EARLY = 0.9
 """s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
@@ -219,7 +219,7 @@ class ZenohSession:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
-                priority=_URGENT,
+                # At the priority of live messages, for an answer that overtook one would split its batch.
                 attachment=self._keys.token(FIRST_SESSION) if heard else None,
             )
         except zenoh.ZError:
