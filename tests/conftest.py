@@ -47,7 +47,7 @@ DEFAULT_SUITE = "not thorough"
 """The expression of marks that pyproject.toml gives."""
 
 LIMIT, THOROUGH_LIMIT = 60.0, 280.0
-"""The longest that a test of each suite may take, in s."""
+"""The longest that a test of each suite may take, in s; benchmarks have the time of thorough tests."""
 
 EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("default", EXAMPLES, max_examples=10, derandomize=True)
@@ -168,7 +168,8 @@ def end_in_time(item: pytest.Item) -> Iterator[None]:
     if not hasattr(signal, "setitimer"):
         yield
         return
-    limit = LIMIT if item.get_closest_marker("thorough") is None else THOROUGH_LIMIT
+    slow = item.get_closest_marker("thorough") is not None or "benchmarks" in item.path.parts
+    limit = THOROUGH_LIMIT if slow else LIMIT
 
     def end(*_: object) -> None:
         pytest.fail(f"it has not ended within {limit:g} s")

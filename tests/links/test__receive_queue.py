@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.links._receive_queue import CATCH_UP, MANY, MAX_BYTES, Answer, Presence, Question, Received, ReceiveQueue
+from tfbus.links._receive_queue import MANY, MAX_BYTES, Answer, Presence, Question, Received, ReceiveQueue
 from tfbus.statistics import QueueStatistics
 
 MIB = 2**20
@@ -70,42 +70,6 @@ def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() 
     for item in (*map(moving, many), kept(Presence.JOINED)):
         queue.put(item)
     assert drained(queue) == [Presence.JOINED, *many]
-
-
-def test_a_reader_that_does_not_catch_up_is_spared_what_has_waited_too_long() -> None:
-    queue = ReceiveQueue(100)
-    for number in range(10):
-        queue.put(moving(number))
-    queue.put(kept("state"))
-    assert queue.drop_late(50.0) == 0
-    for number in range(10, 16):
-        queue.put(moving(number))
-    assert [item.content for _ in range(4) if (item := queue.get())] == [0, 1, 2, 3]
-    assert queue.drop_late(50.0 + 0.9 * CATCH_UP) == 0
-    # Six of the first ten were not read, and twelve wait.
-    assert queue.drop_late(50.0 + CATCH_UP) == 6
-    assert queue.statistics().dropped == 6
-    assert drained(queue) == ["state", *range(10, 16)]
-
-
-def test_a_burst_is_read_to_its_end_and_a_reader_that_has_caught_up_begins_anew() -> None:
-    queue = ReceiveQueue(100)
-    for number in range(10):
-        queue.put(moving(number))
-    assert queue.drop_late(0.0) == 0
-    assert queue.get() == moving(0)
-    # Fewer wait than a while ago.
-    assert queue.drop_late(CATCH_UP) == 0
-    assert drained(queue) == [*range(1, 10)]
-    # The event loop was held up for long, and this is its first turn.
-    for number in range(20):
-        queue.put(moving(number))
-    assert queue.drop_late(10 * CATCH_UP) == 0
-    queue.discard_moving()
-    for number in range(20):
-        queue.put(moving(number))
-    assert queue.drop_late(20 * CATCH_UP) == 0, "what waits now was not there before"
-    assert drained(queue) == [*range(20)]
 
 
 def test_beyond_the_capacity_the_oldest_moving_items_are_dropped_and_the_others_stay_in_order() -> None:

@@ -9,8 +9,6 @@ from typing import Any
 from tfbus.statistics import QueueStatistics
 
 MAX_BYTES = 64 * 2**20
-CATCH_UP = 1.0
-"""s; a reader that has read for so long and has not caught up is behind."""
 MANY = 100
 """Moving items that wait, beyond which questions and answers overtake them."""
 _OVERHEAD = 256
@@ -106,9 +104,6 @@ class ReceiveQueue:
         self._moving = 0
         self._ends = 0
         self._dropped = 0
-        self._reading_since: float | None = None
-        self._waited_then = 0
-        self._old = 0
 
     def __len__(self) -> int:
         return len(self._urgent) + len(self._kept) + len(self._pending)
@@ -129,35 +124,7 @@ class ReceiveQueue:
             for queue in (self._urgent, self._kept, self._pending):
                 if queue:
                     return self._pop(queue)
-            self._reading_since = None
         return None
-
-    def drop_late(self, now: float) -> int:
-        """Drop the moving items that a reader does not get to; to be called before each turn of reading.
-
-        Those are the ones that have waited for `CATCH_UP` while it read, if no fewer wait now than then. So a burst is
-        read to its end, and what comes faster than it is read for a long time is not read ever later.
-
-        Parameters
-        ----------
-        now : float
-            A monotonic time in s.
-
-        Returns
-        -------
-        int
-            How many were dropped.
-        """
-        with self._lock:
-            late = 0
-            if self._reading_since is not None:
-                if now - self._reading_since < CATCH_UP:
-                    return 0
-                late = self._old if self._moving >= self._waited_then else 0
-            for _ in range(late):
-                self._drop_oldest()
-            self._reading_since, self._waited_then, self._old = now, self._moving, self._moving
-            return late
 
     def discard_moving(self) -> None:
         """Drop all moving items, because the clock has jumped back."""
@@ -166,7 +133,7 @@ class ReceiveQueue:
             self._dropped += self._moving
             self._kept, self._pending = deque(kept), deque()
             self._bytes = sum(map(_footprint, (*self._urgent, *kept)))
-            self._moving = self._old = 0
+            self._moving = 0
 
     def statistics(self) -> QueueStatistics:
         """The queue's counters, in items."""
@@ -183,8 +150,6 @@ class ReceiveQueue:
         item = queue.popleft()
         self._bytes -= _footprint(item)
         self._moving -= item.moving
-        # Moving items leave in order, so the first ones are those that waited before.
-        self._old -= item.moving and self._old > 0
         self._ends -= item.content is Presence.LEFT
         return item
 

@@ -51,8 +51,7 @@ class Link:
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
-        How many live messages may wait for the event loop; beyond that the oldest are dropped and counted, and those
-        that have waited for a second while the loop read, and has not caught up.
+        How many live messages may wait for the event loop; beyond that the oldest are dropped and counted.
     history : float, optional
         Ask each new peer once for the last so many seconds of its moving frames, if the carrier can.
     clock : SimulatedClock, optional
@@ -234,9 +233,6 @@ class Link:
             return
 
     def _handle_received(self) -> None:
-        if self._receive_queue.drop_late(monotonic()):
-            why = "they come faster than the event loop reads them"
-            self._log.warning("late", "live messages are dropped by the link %s: %s", self._name, why)
         cost = 0
         while self._attached and cost < _BYTES_PER_TURN:
             item = self._receive_queue.get()

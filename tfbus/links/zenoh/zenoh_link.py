@@ -61,8 +61,7 @@ class ZenohLink(Link):
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
-        How many live messages may wait for the event loop; then the oldest are dropped and counted. So are those that
-        have waited for a second while the loop read, and has not caught up.
+        How many live messages may wait for the event loop; then the oldest are dropped and counted.
     history : float, optional
         Ask each peer once, when it is met, for the last so many seconds of its moving frames, as far as buffers on its
         bus hold them: 2,000 samples of each frame at most. They are published before what it sends live, so lookups at
