@@ -199,6 +199,7 @@ def children_left() -> list[int]:
     for children in Path("/proc/self/task").glob("*/children"):
         for process in children.read_text().split():
             with suppress(OSError):
+                # A process that ends, or is just beginning, has none.
                 command = Path("/proc", process, "cmdline").read_bytes()
                 if command and not any(word in command for word in (b"execnet", b"resource_tracker", b"forkserver")):
                     found.append(int(process))

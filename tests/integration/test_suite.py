@@ -32,7 +32,8 @@ import subprocess
 from pathlib import Path
 
 def test_that_leaves_a_process() -> None:
-    process = subprocess.Popen(["sleep", "1000"])
+    process = subprocess.Popen(["sh", "-c", "echo up; read end"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    process.stdout.readline()
     Path(__file__).with_name("left").write_text(str(process.pid))
 """
 AFTER_IT = """
