@@ -44,11 +44,11 @@ class Staleness:
         if stale:
             for sample in batch:
                 if sample.child in stale:
-                    self._noted[sample.child] = None
+                    self.note(sample.child)
         return bool(self._noted)
 
     def note(self, frame: str) -> None:
-        """Note a frame that is new, or has become static or moving."""
+        """Note a frame that is new, has become static or moving, or may be live again."""
         self._noted[frame] = None
 
     def changes(self, now: int) -> list[FrameStale | FrameLive]:
@@ -58,15 +58,14 @@ class Staleness:
         for frame in noted:
             known = self._newest_edge(frame)
             newest = None if known is None else known.newest
-            if frame not in self._stale:
-                self._unwatch(frame)
-                if newest is not None:
-                    self._watch(frame, newest + self._limit)
-            elif known is not None and (newest is None or newest + self._limit >= now):
+            if frame in self._stale:
+                if known is None or (newest is not None and newest + self._limit < now):
+                    continue
                 self._stale.discard(frame)
-                if newest is not None:
-                    self._watch(frame, newest + self._limit)
                 found.append(FrameLive(now, frame, newest, known.authority))
+            self._unwatch(frame)
+            if newest is not None:
+                self._watch(frame, newest + self._limit)
         while self._due and self._due[0] < now:
             due = heappop(self._due)
             for frame in sorted(self._due_at.pop(due, ())):

@@ -77,29 +77,34 @@ class Hearing:
         check = self._checks.get(peer)
         if check is None:
             return False
-        check.unheard = 0 if hears else check.unheard + 1
         if hears:
+            check.unheard = 0
             return False
+        deaf = _count_unheard(check)
         check.pause = FIRST_PAUSE
-        check.due = self._now() + self._jitter(SECOND_PAUSE)
-        if check.unheard < DEAF:
-            return False
-        # Time for what is done about it.
-        check.unheard = 0
-        check.due = self._now() + self._jitter(2 * FIRST_PAUSE)
-        return True
+        check.due = self._ask_again(deaf)
+        return deaf
 
     def is_silent(self, peer: str) -> bool:
         """Note that a peer has not answered; returns whether it is taken for deaf."""
         check = self._checks.get(peer)
         if check is None or check.silent >= MOST_SILENT:
             return False
-        pause, due = check.pause, check.due
-        deaf = self.is_deaf(peer, hears=False)
+        deaf = _count_unheard(check)
         # An end that has no time to answer must not be asked more often for it.
-        check.pause, check.due = pause, max(due, check.due)
+        check.due = max(check.due, self._ask_again(deaf))
         check.silent += deaf
         return deaf
 
+    def _ask_again(self, deaf: bool) -> float:
+        """The time of the next question; there is time for what is done about a deaf peer."""
+        return self._now() + self._jitter(2 * FIRST_PAUSE if deaf else SECOND_PAUSE)
+
     def _jitter(self, seconds: float) -> float:
         return seconds * self._random.uniform(0.8, 1.2)
+
+
+def _count_unheard(check: _Check) -> bool:
+    """Count an answer that the link is not heard, or none; returns whether that makes the peer deaf."""
+    check.unheard = (check.unheard + 1) % DEAF
+    return check.unheard == 0
