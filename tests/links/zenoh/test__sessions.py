@@ -13,7 +13,7 @@ from tfbus.links._message import Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links.zenoh._dialing import Dialing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
-from tfbus.links.zenoh._sessions import ZenohSessions, _is_reachable
+from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
 
 pytestmark = pytest.mark.anyio
@@ -177,11 +177,3 @@ async def test_whoever_asks_and_hears_directly_tells_so() -> None:
         joining.sessions.ask(here.id, 0)
         await here.next()
         assert told.empty()
-
-
-async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:
-    closed = f"127.0.0.1:{free_ports(1)[0]}"
-    assert await _is_reachable(f"quic/{closed}")
-    for protocol in ("tcp", "tls"):
-        with pytest.raises(ConnectionRefusedError):
-            await _is_reachable(f"{protocol}/{closed}")
