@@ -201,6 +201,7 @@ class ZenohSessions:
                         tasks.start_soon(self._patch, peer, address)
 
     def _hear_unserved(self) -> None:
+        """Hear the live keys of peers that do not serve this link's filter, by the last answer of each."""
         with self._lock:
             self._unserved &= self._present.keys()
             unserved = frozenset(self._unserved)
