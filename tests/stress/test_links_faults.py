@@ -4,7 +4,8 @@ The last process publishes nothing, and hears only some frames; it holds those, 
 
 `FAULT_SECONDS` and `FAULT_SEED` in the environment make it last longer, or begin otherwise; `FAULT_KINDS` has the names
 of the faults: a process is killed and another one takes its place, one is stopped for a while, a pair of hosts is cut
-off from each other, one host from all others, or all from all. `FAULT_LIMIT` is the time until all are equal.
+off from each other, one host from all others, or all from all. `FAULT_LIMIT` is the time until all are equal. More than
+four minutes need longer limits: ``THOROUGH_LIMIT=800 FAULT_SECONDS=600 pytest -o faulthandler_timeout=900 ...``
 """
 
 import os
