@@ -194,6 +194,9 @@ def test_the_copy_of_a_history_is_independent(kernel: ModuleType) -> None:
     edge.put(0, 20, x(-1.0))
     edge.push(100, x(10.0))
     assert contents(twin) == [(20, x(2.0)), (90, x(9.0))]
+    longer = history(kernel, keep=1_000)
+    longer.take(edge)
+    assert [longer.append("parent", stamp, x(1.0), "") for stamp in (100, 101)] == [False, True]
     twin.take(twin)
     twin.clear()
     assert (twin.count, contents(edge)) == (0, [(90, x(9.0)), (100, x(10.0))])
