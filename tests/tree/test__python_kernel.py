@@ -202,6 +202,29 @@ def test_the_copy_of_a_history_is_independent(kernel: ModuleType) -> None:
     assert (twin.count, contents(edge)) == (0, [(90, x(9.0)), (100, x(10.0))])
 
 
+@needs_both
+def test_a_sample_is_whole_though_the_garbage_collector_clears_the_history_meanwhile() -> None:
+    assert COMPILED is not None
+    edge = history(COMPILED, [(0, x(1.0)), (10, x(2.0))])
+
+    def clear(_phase: str, _info: dict[str, int]) -> None:
+        edge.clear()
+
+    # Until they are used up, tuples come from a store of old ones, and begin no collection.
+    tuples = [(number,) * 7 for number in range(3_000)]
+    threshold = gc.get_threshold()
+    gc.callbacks.append(clear)
+    try:
+        # From here on, the next object that can be collected begins a collection.
+        gc.set_threshold(1)
+        found = edge.sample(1)
+    finally:
+        gc.set_threshold(*threshold)
+        gc.callbacks.remove(clear)
+    assert found == (10, x(2.0))
+    assert (edge.count, len(tuples)) == (0, 3_000)
+
+
 @on_both
 def test_no_change_of_a_history_changes_its_columns_that_somebody_holds(kernel: ModuleType) -> None:
     edge = history(kernel, [(stamp, x(stamp)) for stamp in range(100)], keep=99)
