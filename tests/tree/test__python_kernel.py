@@ -210,12 +210,13 @@ def test_a_sample_is_whole_though_the_garbage_collector_clears_the_history_meanw
     def clear(_phase: str, _info: dict[str, int]) -> None:
         edge.clear()
 
+    threshold = gc.get_threshold()
+    gc.set_threshold(1_000_000)
     # Until they are used up, tuples come from a store of old ones, and begin no collection.
     tuples = [(number,) * 7 for number in range(3_000)]
-    threshold = gc.get_threshold()
     gc.callbacks.append(clear)
     try:
-        # From here on, the next object that can be collected begins a collection.
+        # These were so many that the next one begins a collection.
         gc.set_threshold(1)
         found = edge.sample(1)
     finally:
