@@ -136,7 +136,7 @@ def test_a_connected_session_of_another_domain_or_of_a_robot_that_is_not_heard_i
     here = Keys(domain, first, robots=("r$*",))
     others = [Keys(domain, ids[0], "r1"), Keys(domain, ids[1], "s1"), Keys(f"{domain}/b", ids[2], "r1")]
     with ExitStack() as stack:
-        opened = []
+        opened: list[ZenohSession] = []
         for keys in (here, *others):
             config = settings([] if opened else address, address if opened else None, {"id": keys.link}, 2.0)
             opened.append(ZenohSession(config, keys, Queue[Received]().put, lambda *_: None))

@@ -140,11 +140,10 @@ class ZenohSession:
         self._close_at_exit = weakref.finalize(self, close_session, session)
         remote, keys = zenoh.Locality.REMOTE, self._keys
         self.publishers = Publishers(session, keys)
-        receive_live = self._receive_part if keys.filter else self._receive_live
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
         self._declared = [
             *(
-                session.declare_subscriber(key, directly(receive_live), allowed_origin=remote)
+                session.declare_subscriber(key, directly(self._receive_live), allowed_origin=remote)
                 for key in keys.heard("live")
             ),
             *(
@@ -179,7 +178,7 @@ class ZenohSession:
             del self._unfiltered[peer]
         for peer in peers - self._unfiltered.keys():
             self._unfiltered[peer] = self.session.declare_subscriber(
-                self._keys.of("live", peer), directly(self._receive_live), allowed_origin=zenoh.Locality.REMOTE
+                self._keys.of("live", peer), directly(self._receive_all), allowed_origin=zenoh.Locality.REMOTE
             )
 
     def addresses(self) -> dict[str, str]:
@@ -286,8 +285,7 @@ class ZenohSession:
             # A peer that has gone needs no answer.
             with suppress(zenoh.ZError):
                 kind = str(query.key_expr).rsplit("/", 2)[1]
-                key = self._keys.own(kind)
-                query.reply(key, message.payload, attachment=message.attachment, encoding=encoding)
+                query.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
             query.drop()
             with self._lock:
                 self._questions -= 1
@@ -308,13 +306,14 @@ class ZenohSession:
         return begin_to_close(session)
 
     def _receive_live(self, sample: zenoh.Sample) -> None:
-        sender = self._sender(sample, "live")
-        if sender is not None and sample.kind == zenoh.SampleKind.PUT:
+        # A peer that does not serve this link's filter is heard by its live key.
+        sender = self._sender(sample, "only" if self._keys.filter else "live")
+        if sender is not None and sample.kind == zenoh.SampleKind.PUT and sender not in self._unfiltered:
             self._receive_message(sender, sample)
 
-    def _receive_part(self, sample: zenoh.Sample) -> None:
-        sender = self._sender(sample, "only")
-        if sender is not None and sample.kind == zenoh.SampleKind.PUT and sender not in self._unfiltered:
+    def _receive_all(self, sample: zenoh.Sample) -> None:
+        sender = self._sender(sample, "live")
+        if sender is not None and sample.kind == zenoh.SampleKind.PUT:
             self._receive_message(sender, sample)
 
     def _receive_slow(self, rate: float) -> Callable[[zenoh.Sample], None]:
