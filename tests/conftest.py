@@ -46,7 +46,7 @@ BACKENDS = [
 DEFAULT_SUITE = "not thorough"
 """The expression of marks that pyproject.toml gives."""
 
-LIMIT, THOROUGH_LIMIT = 60.0, 280.0
+LIMIT, THOROUGH_LIMIT = 60.0, float(os.environ.get("THOROUGH_LIMIT", "280"))
 """The longest that a test of each suite may take, in s; benchmarks have the time of thorough tests."""
 
 EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])

@@ -18,7 +18,7 @@ from support.wires import (
     latched,
 )
 
-from tfbus import Buffer
+from tfbus import Buffer, Bus, SimulatedClock
 
 pytestmark = pytest.mark.thorough
 
@@ -97,6 +97,28 @@ def test_whatever_is_lost_late_repeated_cut_frozen_removed_by_others_or_contende
 ) -> None:
     with Network(graph, drop_lost) as net:
         Model(net).live(steps)
+
+
+@given(
+    graph=LOSSY,
+    steps=steps_of("part", "meet", "overtake", "drop", "repeat", "join", "freeze", "expel", "contend"),
+    drop_lost=st.booleans(),
+)
+@settings(suppress_health_check=[HealthCheck.too_slow])
+def test_links_that_hear_only_some_frames_hold_exactly_these_in_the_end(
+    graph: Graph, steps: list[Step], drop_lost: bool
+) -> None:
+    chosen = [{"0.0", "1.1", "2.2", "contended"}, {"0.0", "0.1", "0.2", "3.0"}, set[str]()]
+    with Network(graph, drop_lost) as net:
+        leaves = [Bus(SimulatedClock()) for _ in chosen]
+        for leaf, frames in zip(leaves, chosen, strict=True):
+            net.domains[0].join(leaf, frames, drop_lost=drop_lost)
+        Model(net).live(steps)
+        first = net.buses[0]
+        for leaf, frames in zip(leaves, chosen, strict=True):
+            assert frames_of(leaf) == frames_of(first) & frames
+            assert latched(leaf) == {child: sample for child, sample in latched(first).items() if child in frames}
+            assert leaf.statistics().rejected == {}
 
 
 @given(

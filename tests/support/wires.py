@@ -1,7 +1,7 @@
 """Links without network and event loop: buses joined by wires, on which a test delivers, delays or loses packets."""
 
 from collections import deque
-from collections.abc import Callable, Collection, Sequence, Sized
+from collections.abc import Callable, Collection, Sequence, Set, Sized
 from types import TracebackType
 from typing import Any
 
@@ -12,6 +12,7 @@ from tfbus.links._endpoint import LONGEST_CLAIM_PERIOD, Endpoint
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
 from tfbus.links._outbox import Turn
+from tfbus.links._part_writer import PartWriter
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links._relay import relay_of
@@ -41,12 +42,15 @@ class WireCarrier:
         id: str,  # noqa: A002 - the protocol calls it so
         put: Callable[[Message], object],
         put_to: Callable[[str, Packet], object],
+        wanted: Callable[[], dict[str, Set[str]]],
     ) -> None:
         self.id = id
         self.refused: list[Exception] = []
         self._put = put
         self._put_to = put_to
+        self._wanted = wanted
         self._writer = MessageWriter(SendReport(self.refused.append))
+        self._parts = PartWriter(SendReport(self.refused.append))
 
     async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
         """A wire needs no opening."""
@@ -54,6 +58,9 @@ class WireCarrier:
     def send(self, turn: Turn) -> None:
         for message in self._writer.write(turn.entries, turn.step, turn.time):
             self._put(message)
+        self._parts.serve(self._wanted())
+        for peer, message in self._parts.write(turn):
+            self._put_to(peer, message)
 
     def read(self, content: Any) -> ReceivedMessage:
         return read_message(content.payload, content.attachment)
@@ -63,6 +70,9 @@ class WireCarrier:
 
     def claim(self, step: StateStep) -> None:
         self._put(self._writer.claim(step))
+        self._parts.serve(self._wanted())
+        for peer, message in self._parts.claim(step):
+            self._put_to(peer, message)
 
     def ask(self, peer: str, since: int) -> None:
         self._put_to(peer, Question(since, self.id))
@@ -97,8 +107,12 @@ class End:
     ) -> None:
         self.id = name
         self.bus = bus
+        self.frames = None if frames is None else frozenset(frames)
         self.carrier = WireCarrier(
-            name, lambda message: domain.put(self, message), lambda peer, packet: domain.put_to(self, peer, packet)
+            name,
+            lambda message: domain.put(self, message),
+            lambda peer, packet: domain.put_to(self, peer, packet),
+            lambda: domain.wanted(self),
         )
         self.endpoint = Endpoint(
             bus,
@@ -182,9 +196,15 @@ class Domain:
                 del self.wires[sender, receiver]
 
     def put(self, sender: End, message: Message) -> None:
+        """Send a live message to those that hear all."""
         for wire in self.wires.values():
-            if wire.sender is sender:
+            if wire.sender is sender and wire.receiver.frames is None:
                 wire.packets.append(message)
+
+    def wanted(self, sender: End) -> dict[str, Set[str]]:
+        """The frames that each of the others wants, of those that want only some."""
+        ends = (receiver for one, receiver in self.wires if one is sender)
+        return {end.id: end.frames for end in ends if end.frames is not None}
 
     def put_to(self, sender: End, receiver: str, packet: Packet) -> None:
         for wire in self.wires.values():
@@ -263,8 +283,8 @@ class Network:
     def settle(self) -> None:
         """Send and deliver everything until nothing moves any more; an echo would go on for ever."""
         for _ in range(1_000):
-            for bus in self.buses:
-                self.send(bus)
+            for end in self.ends:
+                end.endpoint.send()
             for wire in self.wires:
                 while wire.packets:
                     wire.deliver()

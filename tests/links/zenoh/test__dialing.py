@@ -1,4 +1,15 @@
-from tfbus.links.zenoh._dialing import FIRST_PAUSE, LONG_PAUSE, MOST_PEERS, SHORT_PAUSE, SHORT_TIME, Dialing
+import pytest
+from support.processes import free_ports
+
+from tfbus.links.zenoh._dialing import (
+    FIRST_PAUSE,
+    LONG_PAUSE,
+    MOST_PEERS,
+    SHORT_PAUSE,
+    SHORT_TIME,
+    Dialing,
+    is_reachable,
+)
 
 
 class Scene:
@@ -80,3 +91,12 @@ def test_a_peer_is_dialled_no_more_where_somebody_else_listens_now() -> None:
     scene.dialing.taken("a", "tcp/there:1")
     assert scene.dialing.next_due() is None
     assert not scene.dialing.is_dialled("a")
+
+
+@pytest.mark.anyio
+async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:
+    closed = f"127.0.0.1:{free_ports(1)[0]}"
+    assert await is_reachable(f"quic/{closed}")
+    for protocol in ("tcp", "tls"):
+        with pytest.raises(ConnectionRefusedError):
+            await is_reachable(f"{protocol}/{closed}")

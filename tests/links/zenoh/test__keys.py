@@ -1,6 +1,7 @@
 import pytest
 import zenoh
 
+from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
 
 A, B = "a" * 32, "b" * 32
@@ -80,3 +81,22 @@ def test_a_robot_that_can_be_no_part_of_a_key_is_named(robot: str) -> None:
     if robot != "*":
         with pytest.raises(ValueError, match="robot"):
             robots_expression(robot)
+
+
+def test_a_link_with_a_filter_hears_its_parts_of_the_robots_that_it_hears_and_tells_the_filter_by_a_token() -> None:
+    chunk = write_filter(["r$*"], ["base"])
+    mine, robot, other = Keys("yard", A, robots=("r$*",), filter=chunk), Keys("yard", B, "r1"), Keys("yard", B, "x1")
+    (heard,) = map(zenoh.KeyExpr, mine.heard("live"))
+    part = robot.part(name_of(chunk))
+    assert heard.intersects(zenoh.KeyExpr(part))
+    assert robot.sender(part.rpartition("/")[0], "only") == B
+    for key in (robot.own("live"), robot.part(name_of("another")), other.part(name_of(chunk))):
+        assert not heard.intersects(zenoh.KeyExpr(key))
+    for session in ("0", "c" * 32):
+        token = mine.filter_token(session)
+        assert zenoh.KeyExpr(robot.filter_tokens()).includes(zenoh.KeyExpr(token))
+        assert not zenoh.KeyExpr(Keys("yard/r1", B).filter_tokens()).intersects(zenoh.KeyExpr(token))
+        assert robot.filter_of(token) == (A, session, chunk)
+    token = mine.filter_token("0")
+    for key in (f"{token}/0", token.replace(A, "a"), token.replace("/0/", "/1/"), f"{token}{{}}", mine.token("0")):
+        assert robot.filter_of(key) is None

@@ -1,11 +1,13 @@
+import pytest
 from support.samples import moving, static
 
 from tfbus.links._entries import OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch
 from tfbus.links._message import Message, read_message
 from tfbus.links._outbox import Turn
+from tfbus.links._peers import MAX_PEERS
 from tfbus.links._state import StateStep
-from tfbus.links.zenoh._newest import NewestSamples
+from tfbus.links.zenoh._newest import NewestSamples, Thinning
 
 ORIGIN = b"0123456789abcdef"
 STEP = StateStep(3, 5, 99, message=7)
@@ -67,3 +69,24 @@ def test_very_many_frames_are_told_in_several_messages() -> None:
 
 def test_before_the_first_claim_there_is_nothing_to_tell() -> None:
     assert NewestSamples().take() == []
+
+
+@pytest.mark.parametrize(
+    ("time", "taken"), [(0.0, True), (0.02, True), (0.03, False), (0.44, False), (0.46, True), (0.5, True)]
+)
+def test_of_each_sender_as_much_is_taken_as_the_rate_allows_and_what_comes_together(time: float, taken: bool) -> None:
+    now = [100.0]
+    thinning = Thinning(2.0, lambda: now[0])
+    assert thinning.takes("a")
+    now[0] += time
+    assert thinning.takes("a") is taken
+    assert thinning.takes("b"), "each sender has its own time"
+    now[0] = 100.8
+    assert thinning.takes("a") is (time < 0.45), "the time counts from the last message that was taken"
+
+
+def test_the_memory_of_senders_is_bounded() -> None:
+    thinning = Thinning(1.0, lambda: 5.0)
+    for number in range(MAX_PEERS + 1):
+        assert thinning.takes(f"{number}")
+    assert len(thinning._taken) == 1

@@ -94,9 +94,9 @@ def test_each_end_receives_that_the_other_has_joined_and_left(join: Join) -> Non
 def test_a_live_message_is_received_as_payload_and_attachment_with_its_size(join: Join) -> None:
     first, second = join(A), join(B)
     meet(first, second)
-    first.session.put(Message(b"payload", b"beside", 1))
+    first.session.publishers.put(Message(b"payload", b"beside", 1))
     assert second.next() == Received(A, (b"payload", b"beside"), 13, moving=True)
-    second.session.put(Message(b"", b"", 0))
+    second.session.publishers.put(Message(b"", b"", 0))
     # Its own message did not come back.
     assert first.next() == Received(B, (b"", b""), 0, moving=True)
 
@@ -136,7 +136,7 @@ def test_a_connected_session_of_another_domain_or_of_a_robot_that_is_not_heard_i
     here = Keys(domain, first, robots=("r$*",))
     others = [Keys(domain, ids[0], "r1"), Keys(domain, ids[1], "s1"), Keys(f"{domain}/b", ids[2], "r1")]
     with ExitStack() as stack:
-        opened = []
+        opened: list[ZenohSession] = []
         for keys in (here, *others):
             config = settings([] if opened else address, address if opened else None, {"id": keys.link}, 2.0)
             opened.append(ZenohSession(config, keys, Queue[Received]().put, lambda *_: None))
@@ -167,7 +167,7 @@ def test_the_end_does_not_overtake_a_live_message(join: Join) -> None:
     first, second = join(A), join(B)
     meet(first, second)
     for number in range(200):
-        first.session.put(Message(b"%d" % number, b"", 1))
+        first.session.publishers.put(Message(b"%d" % number, b"", 1))
     first.session.close()
     came = [item.content for item in second.up_to(A, Presence.LEFT)[:-1]]
     assert came == [(b"%d" % number, b"") for number in range(200)]

@@ -1,4 +1,4 @@
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from queue import Queue
 from time import monotonic
@@ -12,8 +12,9 @@ from support.processes import free_ports, new_domain, until
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links.zenoh._dialing import Dialing
+from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
-from tfbus.links.zenoh._sessions import ZenohSessions, _is_reachable
+from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
 
 pytestmark = pytest.mark.anyio
@@ -22,15 +23,16 @@ pytestmark = pytest.mark.anyio
 class End:
     """The sessions of one link, which listen at an address of their own and connect to nobody."""
 
-    def __init__(self, domain: str, connect: str | None = None) -> None:
+    def __init__(self, domain: str, connect: str | None = None, frames: Collection[str] | None = None) -> None:
         self.domain = domain
         self.id = f"{uuid4().int | 1 << 127:032x}"
         self.address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
         self.items: Queue[Received] = Queue()
         self.dialing = Dialing(monotonic)
         config = settings(self.address, connect or [], {"id": self.id}, 2.0)
+        keys = Keys(domain, self.id, filter="" if frames is None else write_filter(["*"], frames))
         self.sessions = ZenohSessions(
-            config, lambda where: patch_settings(where, None, 2.0), Keys(domain, self.id), self.items.put, self.dialing
+            config, lambda where: patch_settings(where, None, 2.0), keys, self.items.put, self.dialing
         )
 
     async def next(self) -> Received:
@@ -90,6 +92,24 @@ async def test_a_lost_peer_is_reached_again_by_a_patch_that_carries_everything()
             answers = [(question.handle, Message(b"answer", b"", 0))]
             await anyio.to_thread.run_sync(asked.sessions.answer, answers)
             assert await asking.next() == Received(asked.id, Answer((b"answer", b"")), 6)
+
+
+@pytest.mark.thorough
+async def test_a_patch_carries_what_a_filter_wants_and_its_end_ends_that() -> None:
+    domain = new_domain()
+    here, there = End(domain), End(domain, frames=["base", "lidar"])
+    async with running(here, there):
+        here.lose(there)
+        assert await here.next() == Received(there.id, Presence.JOINED)
+        assert await there.next() == Received(here.id, Presence.JOINED)
+        ((name, frames),) = here.sessions.filters.items()
+        assert frames == {"base", "lidar"}
+        assert not here.sessions.is_heard()
+        here.sessions.put(Message(b"all", b"", 1))
+        here.sessions.put_part(name, Message(b"part", b"", 1))
+        assert await there.next() == Received(here.id, (b"part", b""), 4, moving=True)
+        here.sessions._drop_patch(there.id)
+        assert here.sessions.filters == {}
 
 
 async def test_a_patch_ends_with_its_peer_and_is_made_again() -> None:
@@ -193,11 +213,3 @@ async def test_whoever_asks_and_hears_directly_tells_so() -> None:
         joining.sessions.ask(here.id, 0)
         await here.next()
         assert told.empty()
-
-
-async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:
-    closed = f"127.0.0.1:{free_ports(1)[0]}"
-    assert await _is_reachable(f"quic/{closed}")
-    for protocol in ("tcp", "tls"):
-        with pytest.raises(ConnectionRefusedError):
-            await _is_reachable(f"{protocol}/{closed}")

@@ -1,5 +1,6 @@
 import asyncio
 import gc
+import math
 import socket
 import subprocess
 import sys
@@ -7,12 +8,15 @@ import weakref
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
+from time import time_ns
 from typing import Any
+from uuid import uuid4
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+import zenoh
 from support.processes import PATIENCE, free_ports, new_domain, until
 from support.samples import moving, static
 
@@ -27,7 +31,13 @@ from tfbus import (
     TransformBroadcaster,
     TransformStamped,
 )
+from tfbus.links._carrier import SendReport
+from tfbus.links._entries import MovingFrame, OutgoingBatch
+from tfbus.links._message import MessageWriter, write_answer
+from tfbus.links._state import LinkState, StateStep
 from tfbus.links.zenoh import ZenohLink
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._settings import settings
 
 pytestmark = pytest.mark.anyio
 
@@ -51,6 +61,42 @@ class Place:
         self._taken = True
         options["listen" if first else "connect"] = self.address
         return ZenohLink(bus, options.pop("domain", self.domain), **options)
+
+
+class OlderLink:
+    """A link from before there were filters: it sends by its live key only, and its answers tell of nothing else."""
+
+    def __init__(self, place: Place) -> None:
+        self.id = f"{uuid4().int | 1 << 127:032x}"
+        self._origin = uuid4().bytes
+        self._state = LinkState()
+        self._writer = MessageWriter(SendReport(lambda _: None))
+        keys = Keys(place.domain, self.id)
+        self._session = zenoh.open(settings([], place.address, {"id": self.id}, 2.0))
+        self._live = self._session.declare_publisher(keys.own("live"), allowed_destination=zenoh.Locality.REMOTE)
+        self._queryable = self._session.declare_queryable(keys.own("state"), self._answer)
+        self._token = self._session.liveliness().declare_token(keys.token("0"))
+
+    def publish(self, *samples: TransformStamped) -> None:
+        since, number = self._state.number, self._state.number + 1
+        for sample in samples:
+            if sample.static or not self._state.brings(sample.child):
+                batch = OutgoingBatch(self._origin, number, (sample,))
+                self._state.change(sample.child, batch if sample.static else MovingFrame(sample.child))
+        step = StateStep(since, self._state.number, self._state.digest)
+        sequence = time_ns() // 1_000
+        for message in self._writer.write([OutgoingBatch(self._origin, sequence, samples)], step):
+            self._live.put(message.payload, attachment=message.attachment)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        assert query.payload is not None
+        since = int.from_bytes(query.payload.to_bytes(), "little")
+        message = write_answer(*self._state.changes(since))
+        query.reply(query.key_expr, message.payload, attachment=message.attachment)
+        query.drop()
+
+    def close(self) -> None:
+        self._session.close()
 
 
 @pytest.fixture
@@ -679,3 +725,146 @@ async def test_without_the_extra_the_error_names_it() -> None:
     assert done.returncode == 1
     assert 'pip install "tfbus[zenoh]"' in done.stderr.splitlines()[-1]
     assert "Error: No module" not in done.stderr
+
+
+async def test_of_frames_that_nobody_wants_nothing_is_sent_but_that_they_are_there(place: Place) -> None:
+    with Bus() as here, Bus() as there:
+        here.publish([static("map", "lidar"), static("map", "camera")])
+        async with place.link(here) as sender, place.link(there, frames=iter(["base", "tool", "lidar"])) as link:
+            await meet(sender, link)
+            await until(lambda: frames(there) == {"lidar"})
+            heard = hear(there)
+            heard.clear()
+            batches = [
+                tuple(moving("map", name, stamp) for name in ("base", "elbow", "tool", "wheel"))
+                for stamp in range(1, 51)
+            ]
+            for batch in batches:
+                here.publish(batch)
+                await anyio.lowlevel.checkpoint()
+            await until(lambda: len(heard) == 50)
+            assert heard == [(batch[0], batch[2]) for batch in batches], "in order, of each batch what is wanted"
+            for stamp in range(50):
+                here.publish(moving("map", "wheel", 100 + stamp))
+                await anyio.lowlevel.checkpoint()
+            here.publish(static("map", "tool", 3.0))
+            here.remove_frame("lidar")
+            await until(lambda: frames(there) == {"tool"})
+            assert sender.statistics().sent_samples == 101
+            assert there.statistics().frames == 2
+            assert link.statistics().rejected == sender.statistics().rejected == {}
+            assert link.statistics().lost == 0
+
+
+@pytest.mark.thorough
+async def test_links_with_filters_and_without_hear_what_they_want_at_once(place: Place) -> None:
+    with Bus() as here, Bus() as arm, Bus() as base, Bus() as everything:
+        async with (
+            place.link(here) as sender,
+            place.link(arm, frames=["hand", "elbow"]) as one,
+            place.link(base, frames=["base", "elbow"], robots={"*": math.inf, "x*": 1.0}) as two,
+        ):
+            await meet(sender, one, two)
+
+            async def publish(stamp: int) -> None:
+                here.publish([moving("map", name, stamp) for name in ("hand", "elbow", "base", "wheel")])
+                for heard, names in ((arms, ["hand", "elbow"]), (bases, ["elbow", "base"])):
+                    expected = [(name, stamp) for name in names]
+                    await until(lambda: [(s.child, s.stamp) for b in heard[-1:] for s in b] == expected)  # noqa: B023
+
+            arms, bases = hear(arm), hear(base)
+            await publish(1)
+            assert sender.statistics().sent_samples == 4
+            async with place.link(everything) as three:
+                await meet(sender, three)
+                await publish(2)
+                await until(lambda: everything.statistics().frames == 4)
+                assert sender.statistics().sent_samples == 12
+            await until(lambda: len(sender.peers) == 2)
+            await until(lambda: not sender._zenoh._sessions.is_heard())
+            await publish(3)
+            assert sender.statistics().sent_samples == 16
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("drop_lost", [True, False])
+async def test_a_link_with_a_filter_follows_a_sender_that_ends_and_comes_again(place: Place, drop_lost: bool) -> None:
+    with Bus() as there:
+        async with place.link(there, frames=["base", "lidar"], drop_lost=drop_lost) as link:
+            for x in (1.0, 2.0):
+                with Bus() as here:
+                    async with place.link(here) as sender:
+                        await meet(sender, link)
+                        here.publish([static("map", "lidar", x), static("map", "camera"), moving("map", "base", 1, x)])
+                        await until(lambda x=x: [s.transform.translation[0] for s in known(there)] == [x])  # type: ignore[misc]
+                        assert there.statistics().frames == 2
+                await until(lambda: not link.peers)
+                assert there.statistics().frames == (0 if drop_lost else 2)
+                assert frames(there) == (set() if drop_lost else {"lidar"})
+
+
+@pytest.mark.thorough
+async def test_an_older_link_that_knows_no_filters_is_heard_by_its_live_key(place: Place) -> None:
+    with Bus() as there, Bus() as newer:
+        async with place.link(there, frames=["base", "lidar", "new"]) as link, place.link(newer) as other:
+            await meet(link, other)
+            older = OlderLink(place)
+            try:
+                older.publish(static("map", "lidar"), static("map", "camera"), moving("map", "base", 1))
+                await until(lambda: frames(there) == {"lidar"})
+                await until(lambda: older.id in link._zenoh._sessions._main._unfiltered)
+                stamps: list[int] = []
+                there.subscribe(lambda batch: stamps.extend(sample.stamp for sample in batch if sample.child == "base"))
+                for stamp in range(2, 5):
+                    await anyio.sleep(0.01)
+                    older.publish(moving("map", "base", stamp), moving("map", "wheel", stamp))
+                await until(lambda: 4 in stamps)
+                older.publish(static("map", "lidar", 7.0))
+                await until(lambda: [sample.transform.translation[0] for sample in known(there)] == [7.0])
+                newer.publish([moving("map", "new", 1), moving("map", "wheel", 9)])
+                await until(lambda: there.statistics().frames == 3)
+                assert other.statistics().sent_samples == 3, "the older one hears all"
+                assert link.statistics().lost == 0
+                assert link.statistics().rejected == {}
+            finally:
+                older.close()
+            await until(lambda: not link._zenoh._sessions._main._unfiltered)
+
+
+@pytest.mark.thorough
+async def test_while_a_filter_makes_no_sense_those_that_do_hear_all_and_nothing_is_missing(place: Place) -> None:
+    with Bus() as here, Bus() as there:
+        async with place.link(here) as sender, place.link(there, frames=["base", "lidar"]) as link:
+            await meet(sender, link)
+            sessions = link._zenoh._sessions
+            stranger = zenoh.open(settings([], place.address, None, 2.0))
+            # The first one is not even a filter by its looks, and is no link's token.
+            prefix = f"tfbus/{place.domain}/~/@only/{uuid4().hex}/0"
+            tokens = [stranger.liveliness().declare_token(f"{prefix}/{chunk}") for chunk in ("{}", "garbage")]
+            await until(lambda: sender.statistics().rejected.keys() == {"key", "filter"})
+
+            async def publish(stamp: int) -> None:
+                here.publish([moving("map", "base", stamp), moving("map", "wheel", stamp)])
+                await anyio.sleep(0.01)
+
+            # It is told with the next answer.
+            here.publish(static("map", "lidar"))
+            here.publish(static("map", "camera"))
+            await until(lambda: set(sessions._main._unfiltered) == {sender.id})
+            stamps: list[int] = []
+            there.subscribe(lambda batch: stamps.extend(sample.stamp for sample in batch if sample.child == "base"))
+            await until(sender._zenoh._sessions._main.publishers.is_heard)
+            for stamp in range(1, 4):
+                await publish(stamp)
+            await until(lambda: stamps == [1, 2, 3])
+            for token in tokens:
+                token.undeclare()
+            await until(lambda: sender._zenoh._sessions._filters.are_served)
+            with Bus() as late:
+                async with place.link(late, frames=["base"]) as another:
+                    await meet(sender, link, another)
+                    await publish(4)
+                    await until(lambda: late.statistics().frames == 1 and stamps == [1, 2, 3, 4])
+                    assert not another._zenoh._sessions._main._unfiltered
+            stranger.close()
+            assert frames(there) == {"lidar"}

@@ -1,7 +1,8 @@
 """The carrier of links over zenoh."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
+from functools import partial
 
 import anyio
 import anyio.to_thread
@@ -13,6 +14,7 @@ from tfbus.links._carrier import SendReport
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._message import Message, MessageWriter, can_hold, read_message, write_answer
 from tfbus.links._outbox import Turn
+from tfbus.links._part_writer import PartWriter
 from tfbus.links._receive_queue import HistoryQuestion, Question, Received
 from tfbus.links._state import StateEntry, StateStep
 from tfbus.links.zenoh._closing import wait_until_closed
@@ -59,6 +61,8 @@ class ZenohCarrier:
         """Open the session; raises `OSError` if it cannot listen where it should, or as a client reaches nobody."""
         self._report = report
         self._writer = MessageWriter(report)
+        self._parts = PartWriter(report)
+        self._filters: Mapping[str, Set[str]] = {}
         self._sessions = ZenohSessions(self._config, self._patch_config, self._keys, receive)
         # The session closes itself if it is abandoned before it is open.
         await anyio.to_thread.run_sync(self._sessions.open, abandon_on_cancel=True)
@@ -66,6 +70,10 @@ class ZenohCarrier:
     def send(self, turn: Turn) -> None:
         """Send live messages at once, if anybody hears them; while the network is congested, zenoh drops them."""
         self._newest.note(turn)
+        self._serve_filters()
+        for name, message in self._parts.write(turn):
+            if self._put_part(name, message):
+                self._report.sent(message.samples)
         if not self._is_heard():
             self._writer.skip(turn.time)
             return
@@ -84,6 +92,9 @@ class ZenohCarrier:
     def claim(self, step: StateStep) -> None:
         """Tell all peers the state of this link."""
         self._newest.claim(step)
+        self._serve_filters()
+        for name, message in self._parts.claim(step):
+            self._put_part(name, message)
         self._put(self._writer.claim(step))
 
     def ask(self, peer: str, since: int) -> None:
@@ -139,9 +150,22 @@ class ZenohCarrier:
             # What is sent fails as well, and that is reported.
             return True
 
+    def _serve_filters(self) -> None:
+        filters = self._sessions.filters
+        if filters is not self._filters:
+            self._filters = filters
+            self._parts.serve(filters)
+            self._sessions.serve(filters)
+
     def _put(self, message: Message) -> bool:
+        return self._try(partial(self._sessions.put, message))
+
+    def _put_part(self, name: str, message: Message) -> bool:
+        return self._try(partial(self._sessions.put_part, name, message))
+
+    def _try(self, put: Callable[[], object]) -> bool:
         try:
-            self._sessions.put(message)
+            put()
         except zenoh.ZError as error:
             self._report.failed(error)
             return False

@@ -1,7 +1,10 @@
 """The times at which a link dials peers that it has lost, at the addresses where it had reached them."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
+
+import anyio
 
 FIRST_PAUSE = 0.3
 SHORT_PAUSE = 2.0
@@ -12,6 +15,8 @@ SHORT_TIME = 120.0
 MOST_PEERS = 1_000
 """So many lost peers are remembered, the newest."""
 _MOST_ADDRESSES = 4
+_PROBE_TIME = 1.0
+_TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
 
 
 @dataclass(slots=True)
@@ -91,3 +96,25 @@ class Dialing:
             lost.due = now + lost.pause
             self._addresses[peer].append(self._addresses[peer].pop(0))
         return [(peer, self._addresses[peer][-1]) for peer in due]
+
+
+async def is_reachable(address: str) -> bool:
+    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try.
+
+    Raises
+    ------
+    ConnectionRefusedError
+        If nobody does, rather than that the address cannot be reached.
+    """
+    found = _TCP.match(address)
+    if found is None:
+        return True
+    try:
+        with anyio.fail_after(_PROBE_TIME):
+            stream = await anyio.connect_tcp(found["six"] or found["four"], int(found["port"]))
+    except OSError as error:
+        if isinstance(error.__cause__, ConnectionRefusedError):
+            raise ConnectionRefusedError from error
+        return False
+    await stream.aclose()
+    return True

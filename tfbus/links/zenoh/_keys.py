@@ -3,16 +3,22 @@
 Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digits that each link draws at random::
 
     tfbus/domain/robot/live/link      all that is published and removed, one message a turn of the link's event loop
+    tfbus/domain/robot/only/link/name
+                                      what is published and removed of the frames of one filter, by the filter's name
     tfbus/domain/robot/slow/link      the newest sample of each moving frame, now and then, while somebody subscribes
     tfbus/domain/robot/state/link     a queryable: the link's state, or what has changed of it since a number
     tfbus/domain/robot/history/link   a queryable: the last seconds of the link's moving frames
     tfbus/domain/robot/hears/link     a queryable: whom the link hears; see `tfbus.links.zenoh._hearing`
     tfbus/domain/robot/@alive/link/session
                                       a liveliness token for each session of the link; the first session is ``0``
+    tfbus/domain/robot/@only/link/session/filter
+                                      another one, of a link that hears only some frames: its filter
 """
 
 import re
 from dataclasses import dataclass
+
+from tfbus.links.zenoh._filters import name_of
 
 NO_ROBOT = "~"
 FIRST_SESSION = "0"
@@ -20,6 +26,7 @@ LONGEST_NAME = 200
 
 _ID = re.compile("[0-9a-f]{32}")
 _SESSION = re.compile("0|[0-9a-f]{32}")
+_FILTER = re.compile(r"[\w-]+=*", re.ASCII)
 _NAME = re.compile(r"[\w.-]+", re.ASCII)
 
 
@@ -36,6 +43,8 @@ class Keys:
         The robots of those that the link hears, as zenoh's key expressions of one chunk.
     slow_robots : tuple of (str, float)
         The same for those of which it hears the slow key, at most so many times a second.
+    filter : str
+        What it tells of the frames that it hears, by `tfbus.links.zenoh._filters`; empty if it hears all.
     """
 
     domain: str
@@ -43,6 +52,7 @@ class Keys:
     robot: str = NO_ROBOT
     robots: tuple[str, ...] = ("*",)
     slow_robots: tuple[tuple[str, float], ...] = ()
+    filter: str = ""
 
     def own(self, kind: str) -> str:
         """The key of this link for one of the kinds above."""
@@ -52,8 +62,22 @@ class Keys:
         """The key of the liveliness token of one of this link's sessions."""
         return f"{self.own('@alive')}/{session}"
 
+    def part(self, name: str) -> str:
+        """The key of this link for what is about the frames of one filter."""
+        return f"{self.own('only')}/{name}"
+
+    def filter_token(self, session: str) -> str:
+        """The key of the liveliness token by which one of this link's sessions tells its filter."""
+        return f"{self.own('@only')}/{session}/{self.filter}"
+
+    def filter_tokens(self) -> str:
+        """The key expression of such tokens of all links of the domain."""
+        return f"tfbus/{self.domain}/*/@only/*/*/*"
+
     def heard(self, kind: str) -> list[str]:
         """The key expressions of a kind of all links that this one hears."""
+        if self.filter and kind == "live":
+            return [f"tfbus/{self.domain}/{robot}/only/*/{name_of(self.filter)}" for robot in self.robots]
         end = "*/*" if kind == "@alive" else "*"
         slow = [robot for robot, _ in self.slow_robots] if kind == "@alive" else []
         return [f"tfbus/{self.domain}/{robot}/{kind}/{end}" for robot in dict.fromkeys([*self.robots, *slow])]
@@ -71,6 +95,14 @@ class Keys:
         rest, _, session = key.rpartition("/")
         link = self.sender(rest, "@alive")
         return (link, session) if link is not None and _SESSION.fullmatch(session) else None
+
+    def filter_of(self, key: str) -> tuple[str, str, str] | None:
+        """The link, the session and the filter that such a token's key belongs to; None if it names none."""
+        rest, _, chunk = key.rpartition("/")
+        rest, _, session = rest.rpartition("/")
+        link = self.sender(rest, "@only")
+        named = link is not None and _SESSION.fullmatch(session) and _FILTER.fullmatch(chunk)
+        return (link, session, chunk) if link is not None and named else None
 
     def sender(self, key: str, kind: str) -> str | None:
         """The link that a key of one kind belongs to; None if it names none."""

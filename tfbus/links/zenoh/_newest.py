@@ -1,12 +1,19 @@
 """The newest sample of each moving frame that a link has sent, for peers to which less than all is enough."""
 
+import math
+from collections.abc import Callable
+
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._message import Message, can_hold, write_answer
 from tfbus.links._outbox import Turn
+from tfbus.links._peers import MAX_PEERS
 from tfbus.links._state import StateStep
 
 _PER_MESSAGE = 1_000
+_TOGETHER = 0.02
+_EARLY = 0.9
+"""s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
 
 
 class NewestSamples:
@@ -62,3 +69,33 @@ class NewestSamples:
         claim = StateStep(self.step.number, self.step.number, self.step.digest)
         parts = [entries[start : start + _PER_MESSAGE] for start in range(0, len(entries), _PER_MESSAGE)]
         return [write_answer(part, claim) for part in parts or [[]]]
+
+
+class Thinning:
+    """Decides which messages with newest samples a link takes: those of each sender at a rate.
+
+    Parameters
+    ----------
+    rate : float
+        In Hz.
+    now : callable
+        Returns a monotonic time in s.
+    """
+
+    def __init__(self, rate: float, now: Callable[[], float]) -> None:
+        self._period = 1 / rate
+        self._now = now
+        self._taken: dict[str, float] = {}
+
+    def takes(self, sender: str) -> bool:
+        """Whether a message that has come now is taken."""
+        now = self._now()
+        # What belongs together comes in several messages at once.
+        since = now - self._taken.get(sender, -math.inf)
+        if _TOGETHER < since < _EARLY * self._period:
+            return False
+        if since > _TOGETHER:
+            if len(self._taken) >= MAX_PEERS:
+                self._taken.clear()
+            self._taken[sender] = now
+        return True

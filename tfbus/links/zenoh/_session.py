@@ -1,11 +1,10 @@
 """One zenoh session of a link: its keys, and what zenoh's threads receive."""
 
-import math
 import re
 import struct
 import threading
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from concurrent.futures import Future
 from contextlib import suppress
 from time import monotonic
@@ -15,10 +14,12 @@ import zenoh
 
 from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._peers import MAX_PEERS
 from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links.zenoh._closing import begin_to_close, close_session
+from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._newest import Thinning
+from tfbus.links.zenoh._publishers import Publishers
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import MalformedMessageError
 
@@ -31,16 +32,15 @@ _ANSWER_TIME = 10.0
 _HEARING_TIME = 1.0
 _URGENT = zenoh.Priority.INTERACTIVE_HIGH
 """Of questions whether a link is heard, and so of their answers: they overtake live messages, and are dropped last."""
-_TOGETHER = 0.02
-_EARLY = 0.9
-"""s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
 _SINCE = struct.Struct("<Q")
 _SECONDS = struct.Struct("<d")
 _LONGEST_NAME = 2**16
+_SERVES_FILTERS = "tfbus/state;filters"
+"""The encoding of answers of a link that sends those who hear only some frames no more than these."""
 
 
 class ZenohSession:
-    """A session and its keys: `open` and `answer` block; `put`, `ask` and `close` do not.
+    """A session and its keys: `open` and `answer` block; `ask` and `close` do not.
 
     Parameters
     ----------
@@ -57,12 +57,18 @@ class ZenohSession:
         Called in zenoh's threads with the id of a session to which a connection was made or has broken.
     note_heard : callable, optional
         Called in zenoh's threads with the token of each link that tells that it hears this one.
+    filters : Filters, optional
+        Is told of the filters of other links.
+    note_served : callable, optional
+        Called in zenoh's threads with each link that has answered a question, and whether it serves this link's filter.
     name : str
         The name of this session among those of the link.
 
     Attributes
     ----------
     is_open : bool
+    publishers : Publishers
+        While it is open.
     """
 
     def __init__(
@@ -75,12 +81,17 @@ class ZenohSession:
         note_asked: Callable[[zenoh.Query], object] | None = None,
         note_connection: Callable[[str], object] | None = None,
         note_heard: Callable[[bytes], object] | None = None,
+        filters: Filters | None = None,
+        note_served: Callable[[str, bool], object] = lambda *_: None,
     ) -> None:
         self._config = config
         self._note_presence = note_presence
         self._note_asked = note_asked
         self._note_connection = note_connection
         self._note_heard = note_heard
+        self._filters = Filters(keys.robot) if filters is None else filters
+        self._note_served = note_served
+        self._unfiltered: dict[str, zenoh.Subscriber[None]] = {}
         self._name = name
         self._keys = keys
         self._receive = receive
@@ -127,12 +138,8 @@ class ZenohSession:
             return
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, close_session, session)
-        drop, remote, keys = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE, self._keys
-        # The link's own subscriptions must not count for somebody who hears it.
-        self._live, self._slow = (
-            session.declare_publisher(keys.own(kind), congestion_control=drop, allowed_destination=remote)
-            for kind in ("live", "slow")
-        )
+        remote, keys = zenoh.Locality.REMOTE, self._keys
+        self.publishers = Publishers(session, keys)
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
         self._declared = [
             *(
@@ -143,6 +150,8 @@ class ZenohSession:
                 session.declare_subscriber(key, directly(self._receive_slow(rate)), allowed_origin=remote)
                 for key, rate in keys.slow()
             ),
+            # Before presence, so that what goes to a peer is known when the peer is.
+            session.liveliness().declare_subscriber(keys.filter_tokens(), directly(self._receive_filter), history=True),
             *(
                 session.liveliness().declare_subscriber(key, directly(self._receive_presence), history=True)
                 for key in keys.heard("@alive")
@@ -150,6 +159,7 @@ class ZenohSession:
             session.declare_queryable(keys.own("state"), directly(self._receive_question)),
             session.declare_queryable(keys.own("history"), directly(self._receive_history_question)),
             *([session.declare_queryable(keys.own("hears"), directly(self._note_asked))] if self._note_asked else []),
+            *([session.liveliness().declare_token(keys.filter_token(self._name))] if keys.filter else []),
             session.liveliness().declare_token(keys.token(self._name)),
         ]
         if self._note_connection is not None:
@@ -162,21 +172,14 @@ class ZenohSession:
         assert self._session is not None
         return self._session
 
-    def put(self, message: Message) -> None:
-        """Send a live message, or drop it while the network is congested."""
-        self._live.put(message.payload, attachment=message.attachment)
-
-    def put_slowly(self, message: Message) -> None:
-        """Send a message by the slow key, or drop it while the network is congested."""
-        self._slow.put(message.payload, attachment=message.attachment)
-
-    def is_heard(self) -> bool:
-        """Whether anybody subscribes to the live key; also if the session has ended, for that has to be reported."""
-        return bool(self._live.matching_status.matching or self.session.is_closed())  # type: ignore[attr-defined]
-
-    def is_heard_slowly(self) -> bool:
-        """Whether anybody subscribes to the slow key."""
-        return bool(self._slow.matching_status.matching)  # type: ignore[attr-defined]
+    def hear_all_of(self, peers: Set[str]) -> None:
+        """Hear the live keys of some peers, and of no others; for a link with a filter."""
+        for peer in self._unfiltered.keys() - peers:
+            del self._unfiltered[peer]
+        for peer in peers - self._unfiltered.keys():
+            self._unfiltered[peer] = self.session.declare_subscriber(
+                self._keys.of("live", peer), directly(self._receive_all), allowed_origin=zenoh.Locality.REMOTE
+            )
 
     def addresses(self) -> dict[str, str]:
         """The address at which each directly connected session is reached, by the id of the session; may block."""
@@ -220,6 +223,8 @@ class ZenohSession:
             nonlocal answered
             if reply.ok is not None and not answered:
                 answered = True
+                if answer is Answer:
+                    self._note_served(peer, str(reply.ok.encoding) == _SERVES_FILTERS)
                 self._receive_message(peer, reply.ok, answer)
 
         def end() -> None:
@@ -275,11 +280,12 @@ class ZenohSession:
 
     def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
         """Answer questions; for a worker thread, because zenoh waits for a peer whose queue is full."""
+        encoding = zenoh.Encoding(_SERVES_FILTERS) if self._filters.are_served else None
         for query, message in answers:
             # A peer that has gone needs no answer.
             with suppress(zenoh.ZError):
                 kind = str(query.key_expr).rsplit("/", 2)[1]
-                query.reply(self._keys.own(kind), message.payload, attachment=message.attachment)
+                query.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
             query.drop()
             with self._lock:
                 self._questions -= 1
@@ -300,28 +306,23 @@ class ZenohSession:
         return begin_to_close(session)
 
     def _receive_live(self, sample: zenoh.Sample) -> None:
+        # A peer that does not serve this link's filter is heard by its live key.
+        sender = self._sender(sample, "only" if self._keys.filter else "live")
+        if sender is not None and sample.kind == zenoh.SampleKind.PUT and sender not in self._unfiltered:
+            self._receive_message(sender, sample)
+
+    def _receive_all(self, sample: zenoh.Sample) -> None:
         sender = self._sender(sample, "live")
         if sender is not None and sample.kind == zenoh.SampleKind.PUT:
             self._receive_message(sender, sample)
 
     def _receive_slow(self, rate: float) -> Callable[[zenoh.Sample], None]:
-        period = 1 / rate
-        taken: dict[str, float] = {}
+        thinning = Thinning(rate, monotonic)
 
         def receive(sample: zenoh.Sample) -> None:
             sender = self._sender(sample, "slow")
-            if sender is None or sample.kind != zenoh.SampleKind.PUT:
-                return
-            now = monotonic()
-            # What belongs together comes in several messages at once.
-            since = now - taken.get(sender, -math.inf)
-            if _TOGETHER < since < _EARLY * period:
-                return
-            if since > _TOGETHER:
-                if len(taken) >= MAX_PEERS:
-                    taken.clear()
-                taken[sender] = now
-            self._receive_message(sender, sample)
+            if sender is not None and sample.kind == zenoh.SampleKind.PUT and thinning.takes(sender):
+                self._receive_message(sender, sample)
 
         return receive
 
@@ -347,6 +348,18 @@ class ZenohSession:
         elif found[0] != self._keys.link:
             present = sample.kind == zenoh.SampleKind.PUT
             self._note_presence(*found, Presence.JOINED if present else Presence.LEFT)
+
+    def _receive_filter(self, sample: zenoh.Sample) -> None:
+        found = self._keys.filter_of(str(sample.key_expr))
+        if found is None:
+            self._refuse_key(sample)
+        elif found[0] != self._keys.link and not self._closed:
+            link, name, chunk = found
+            present = sample.kind == zenoh.SampleKind.PUT
+            try:
+                (self._filters.joined if present else self._filters.left)((link, self, name), chunk)
+            except ValueError as error:
+                self._refuse(link, "filter", str(error))
 
     def _receive_connection(self, event: zenoh.LinkEvent) -> None:
         if self._note_connection is not None:
@@ -380,7 +393,8 @@ class ZenohSession:
 
     def _sender(self, sample: zenoh.Sample, kind: str) -> str | None:
         """The peer that a sample is from; None for this link's own, and for a key without an id, which is refused."""
-        sender = self._keys.sender(str(sample.key_expr), kind)
+        key = str(sample.key_expr)
+        sender = self._keys.sender(key.rpartition("/")[0] if kind == "only" else key, kind)
         if sender is None:
             self._refuse_key(sample)
         return None if sender == self._keys.link else sender

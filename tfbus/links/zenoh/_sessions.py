@@ -6,10 +6,10 @@ same mends a connection of which only one end hears the other; see `tfbus.links.
 one of them has accepted the connection, and knows no address at which the other one listens.
 """
 
-import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable, Mapping, Set
+from contextlib import suppress
 from functools import partial
 from time import monotonic
 from uuid import uuid4
@@ -20,16 +20,15 @@ import zenoh
 
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.zenoh._dialing import Dialing
+from tfbus.links.zenoh._dialing import Dialing, is_reachable
+from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._unmet import Unmet
 
-_PROBE_TIME = 1.0
 _MEETING_TIME = 3.0
 _MOST_ASKING = 1_000
-_TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
 
 _Way = tuple[ZenohSession | None, str]
 """A connection between two links: the patch here, or None for the first session, and the name of the session there."""
@@ -62,6 +61,8 @@ class ZenohSessions:
         self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
+        self._filters = Filters(keys.robot)
+        self._unserved: set[str] = set()
         self._main = ZenohSession(
             config,
             keys,
@@ -70,6 +71,8 @@ class ZenohSessions:
             note_asked=self._note_asked,
             note_connection=self._note_connection,
             note_heard=self._note_heard,
+            filters=self._filters,
+            note_served=self._note_served,
         )
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
@@ -103,22 +106,39 @@ class ZenohSessions:
     def put(self, message: Message) -> None:
         """Send a live message, or drop it while the network is congested; raises `zenoh.ZError`."""
         for session in self._open():
-            session.put(message)
+            session.publishers.put(message)
+
+    @property
+    def filters(self) -> Mapping[str, Set[str]]:
+        """The frames that peers with a filter want, by the name of the filter; another object after each change."""
+        return self._filters.wanted
+
+    def put_part(self, name: str, message: Message) -> None:
+        """Send a live message to the peers that have the filter of a name; raises `zenoh.ZError`."""
+        for session in self._open():
+            session.publishers.put_part(name, message)
+
+    def serve(self, names: Container[str]) -> None:
+        """Send nothing any more for filters but those of some names."""
+        for session in self._open():
+            session.publishers.serve(names)
 
     def put_slowly(self, messages: Iterable[Message]) -> None:
         """Send messages by the slow key of each session that somebody hears there; raises `zenoh.ZError`."""
-        hearing = [session for session in self._open() if session.is_heard_slowly()]
+        hearing = [session for session in self._open() if session.publishers.is_heard_slowly()]
         for message in messages:
             for session in hearing:
-                session.put_slowly(message)
+                session.publishers.put_slowly(message)
 
     def is_heard(self) -> bool:
-        """Whether a peer is there, or anybody else subscribes to the live key; raises `zenoh.ZError`."""
-        return bool(self._present) or any(session.is_heard() for session in self._open())
+        """Whether a peer without a filter is there, or anybody subscribes to the live key; raises `zenoh.ZError`."""
+        with self._lock:
+            heard = bool(self._present) and not self._filters.cover(self._present)
+        return heard or any(session.publishers.is_heard() for session in self._open())
 
     def is_heard_slowly(self) -> bool:
         """Whether anybody subscribes to the slow key."""
-        return any(session.is_heard_slowly() for session in self._open())
+        return any(session.publishers.is_heard_slowly() for session in self._open())
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
@@ -175,6 +195,8 @@ class ZenohSessions:
                     await self._note_unheard(answers)
                     # zenoh may wait for a peer that is frozen.
                     await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
+                if self._keys.filter:
+                    self._hear_unserved()
                 for peer in self._hearing.take_due():
                     self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
@@ -185,6 +207,16 @@ class ZenohSessions:
                 for peer, address in dialled:
                     if peer not in self._patches:
                         tasks.start_soon(self._patch, peer, address)
+
+    def _hear_unserved(self) -> None:
+        """Hear the live keys of peers that do not serve this link's filter, by the last answer of each."""
+        with self._lock:
+            self._unserved &= self._present.keys()
+            unserved = frozenset(self._unserved)
+        for session in self._open():
+            # What cannot be declared is declared later, or the session has ended.
+            with suppress(zenoh.ZError):
+                session.hear_all_of(unserved)
 
     async def _note(self, changes: list[tuple[str, Presence]]) -> None:
         for peer, presence in changes:
@@ -286,7 +318,7 @@ class ZenohSessions:
 
     async def _patch(self, peer: str, address: str) -> None:
         try:
-            reachable = await _is_reachable(address)
+            reachable = await is_reachable(address)
         except ConnectionRefusedError:
             self._dialing.refused(peer, address)
             return
@@ -298,6 +330,8 @@ class ZenohSessions:
             lambda item: self._receive_by_patch(item, peer),
             lambda link, name, presence: self._note_by_patch(link, name, presence, peer, patch),
             uuid4().hex,
+            filters=self._filters,
+            note_served=self._note_served,
         )
         self._patches[peer] = patch
         try:
@@ -325,6 +359,7 @@ class ZenohSessions:
             for way in ways:
                 # It will not tell any more.
                 self._note_presence(peer, way, Presence.LEFT)
+            self._filters.lose(patch)
 
     def _receive_by_patch(self, item: Received, peer: str) -> None:
         # Somebody else may be at that address now.
@@ -334,6 +369,10 @@ class ZenohSessions:
     def _note_by_patch(self, link: str, name: str, presence: Presence, peer: str, patch: ZenohSession) -> None:
         if link == peer and (presence is Presence.LEFT or self._patches.get(peer) is patch):
             self._note_presence(peer, (patch, name), presence)
+
+    def _note_served(self, peer: str, served: bool) -> None:
+        with self._lock:
+            (self._unserved.discard if served else self._unserved.add)(peer)
 
     def _note_directly(self, link: str, name: str, presence: Presence) -> None:
         self._note_presence(link, (None, name), presence)
@@ -353,25 +392,3 @@ class ZenohSessions:
                 self._receive(Received(peer, presence))
             if is_present is not was_present or way == (None, FIRST_SESSION):
                 self._changes.append((peer, presence))
-
-
-async def _is_reachable(address: str) -> bool:
-    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try.
-
-    Raises
-    ------
-    ConnectionRefusedError
-        If nobody does, rather than that the address cannot be reached.
-    """
-    found = _TCP.match(address)
-    if found is None:
-        return True
-    try:
-        with anyio.fail_after(_PROBE_TIME):
-            stream = await anyio.connect_tcp(found["six"] or found["four"], int(found["port"]))
-    except OSError as error:
-        if isinstance(error.__cause__, ConnectionRefusedError):
-            raise ConnectionRefusedError from error
-        return False
-    await stream.aclose()
-    return True

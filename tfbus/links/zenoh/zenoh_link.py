@@ -16,6 +16,7 @@ from tfbus.clock import SimulatedClock
 from tfbus.links._clock_follower import HearsTime
 from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
+from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
 from tfbus.links.zenoh._settings import Addresses, patch_settings, settings
 
@@ -51,7 +52,9 @@ class ZenohLink(Link):
     slow_rate : float
         How often this link sends the newest sample of each moving frame to those that asked for less than all, in Hz.
     frames : iterable of str, optional
-        Send and take only these children; by default all.
+        Send and take only these children; by default all. Peers send this link no moving samples of others, but for
+        those that it hears by a rate, while the names take less than 12 kB and a peer has at most a hundred different
+        filters to serve.
     drop_lost : bool
         Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
     lease : float
@@ -133,6 +136,9 @@ class ZenohLink(Link):
         if slow_rate == math.inf:
             raise ValueError("slow_rate must be finite")
         heard = {robots_expression(robot): rate for robot, rate in rates.items()}
+        in_full = tuple(robot for robot, rate in heard.items() if rate == math.inf)
+        # One name is refused below.
+        chosen = frames if frames is None or isinstance(frames, str) else frozenset(frames)
         self.domain = check_domain(domain)
         self.robot = robot
         # Peers tell by the id of a session at which address they have reached a link. It must not begin with 0.
@@ -145,8 +151,9 @@ class ZenohLink(Link):
                 domain,
                 link,
                 NO_ROBOT if robot is None else check_robot(robot),
-                tuple(robot for robot, rate in heard.items() if rate == math.inf),
+                in_full,
                 tuple((robot, rate) for robot, rate in heard.items() if rate < math.inf),
+                "" if chosen is None or not in_full else write_filter(in_full, chosen),
             ),
             slow_rate,
         )
@@ -154,7 +161,7 @@ class ZenohLink(Link):
             bus,
             domain,
             carrier,
-            frames=frames,
+            frames=chosen,
             drop_lost=drop_lost,
             max_frames=max_frames,
             capacity=capacity,
