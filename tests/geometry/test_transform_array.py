@@ -15,7 +15,7 @@ from support.strategies import rotations, transforms, vectors
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformArray
 from tfbus.geometry.rows import Quaternion, Vector
-from tfbus.tree._lookup_many import ONE_BY_ONE
+from tfbus.tree._kernel import ONE_BY_ONE
 
 ONE = (0.0, 0.0, 0.0, 1.0)
 HALF_TURN_ABOUT_Z = (0.0, 0.0, 1.0, 0.0)

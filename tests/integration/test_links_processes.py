@@ -482,7 +482,7 @@ def test_two_that_lose_each_other_while_both_hear_a_third_are_together_again(hos
 
 
 def test_processes_that_start_together_all_have_every_static_frame() -> None:
-    assert max(measure(processes=12)) < PATIENCE
+    assert max(measure(processes=8)) < PATIENCE
 
 
 def test_hosts_without_an_address_hear_only_themselves(hosts: Hosts, processes: Crowd) -> None:

@@ -25,8 +25,8 @@ SECONDS = float(os.environ.get("FAULT_SECONDS", "60"))
 SEED = int(os.environ.get("FAULT_SEED", "1"))
 KINDS = os.environ.get("FAULT_KINDS", "kill stop cut isolate all").split()
 HOSTS = 4
-WHOLE_AGAIN = float(os.environ.get("FAULT_LIMIT", "30"))
-"""s; so long after a fault all buses are equal. They are after 10, if no other tests run beside."""
+WHOLE_AGAIN = float(os.environ.get("FAULT_LIMIT", "10"))
+"""s; so long after a fault all buses are equal."""
 LEASE = 2.0
 
 

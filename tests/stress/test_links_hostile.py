@@ -225,9 +225,10 @@ class Flood(threading.Thread):
         """Wait until the victim has received all: what is still on its way when a session closes is lost."""
         # The victim drops a question that it cannot read, and that is the end of its answers.
         received = threading.Event()
+        end: Any = zenoh.handlers.Callback(lambda _: None, received.set, indirect=False)
         self.session.get(
             f"{self.prefix}/*/state/{self.victim}",
-            zenoh.handlers.Callback(lambda _: None, received.set, indirect=False),
+            end,
             timeout=PATIENCE,
             congestion_control=zenoh.CongestionControl.BLOCK,
         )

@@ -36,7 +36,8 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree._lookup_many import ONE_BY_ONE, OutOfRange
+from tfbus.tree._kernel import ONE_BY_ONE
+from tfbus.tree._lookup_many import OutOfRange
 from tfbus.tree.tree import forest_of
 
 FRAMES = "rsabcdef"

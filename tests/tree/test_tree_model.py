@@ -32,7 +32,7 @@ from tfbus import (
     TransformTree,
     UnknownFrameError,
 )
-from tfbus.tree._lookup_many import ONE_BY_ONE
+from tfbus.tree._kernel import ONE_BY_ONE
 
 Matrix = npt.NDArray[np.float64]
 At = int | Latest

@@ -177,7 +177,7 @@ async def test_both_ways_with_every_answer_right(tmp_path: Path) -> None:
                 tasks.cancel_scope.cancel()
     facts |= {"in_ms": statistics.median(program.latencies), "asked": program.answered + program.failed}
     print(facts)
-    assert program.answered > 100
+    assert program.answered > 50
     assert facts["answered"] > 300
     assert (program.wrong, facts["wrong"]) == (0, 0)
     assert program.failed <= MOST_FAILED * facts["asked"]
@@ -217,7 +217,7 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(tmp_path:
 
 async def test_a_link_comes_back_to_a_server_that_was_killed(tmp_path: Path) -> None:
     async with ros1(tmp_path) as ros:
-        with ros.node(60.0), Bus() as bus, Buffer(bus) as buffer:
+        with ros.node(300.0), Bus() as bus, Buffer(bus) as buffer:
             program = Program(bus, buffer)
             async with RosbridgeLink(bus, ros.url) as link, anyio.create_task_group() as tasks:
                 tasks.start_soon(program.send)
@@ -227,7 +227,7 @@ async def test_a_link_comes_back_to_a_server_that_was_killed(tmp_path: Path) -> 
                 with running(ros.serve, ros.environment):
                     await until(lambda: link.peers != ())
                     # The node is heard again, and who joins late has the static frames of both.
-                    await buffer.lookup("odom", "tool", time.time_ns(), timeout=20.0)
+                    await buffer.lookup("odom", "tool", time.time_ns(), timeout=60.0)
                     with Bus() as late_bus, Buffer(late_bus) as late:
                         async with RosbridgeLink(late_bus, ros.url, send=False):
                             await late.lookup("base", "laser", timeout=20.0)

@@ -230,7 +230,7 @@ async def test_nobody_joins_over_tls_without_a_certificate(certificates: Path) -
             # It comes behind the other and gets in.
             ZenohLink(guest, domain, connect=address, config=tls(certificates, "guest")) as welcome,
         ):
-            await until(lambda: welcome.peers == (link.id,))
+            await until(lambda: welcome.peers == (link.id,) and link.peers != ())
             assert refused.peers == ()
             assert link.peers == (welcome.id,)
 

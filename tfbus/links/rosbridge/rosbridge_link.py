@@ -54,10 +54,10 @@ class RosbridgeLink(RosLink):
 
     A server asks ROS once for each topic, for all its clients, as the first of them wants it: decoded, or as bytes.
     With ``"cbor"`` this link and clients that want JSON, such as roslib in a browser, hear the same topics side by
-    side. ``"cbor-raw"`` passes on the bytes of ROS, which costs the server
-    half as much for messages of 20 transforms, and hardly less for one; but beside a client that wants
-    anything else, whoever came second hears nothing, and no server tells it. Take ``"cbor-raw"`` for a server of your
-    own, or for one whose other clients take it too.
+    side. ``"cbor-raw"`` passes on the bytes of ROS, which costs the server half as much for messages of 20 transforms,
+    and hardly less for one; but beside a client that wants anything else, whoever came second hears nothing, and no
+    server tells it. Take ``"cbor-raw"`` for a server of your own, or for one whose other clients take it too. Positions
+    of joints are asked for in JSON, unless you take it, because a server of ROS 1 cannot put their names into CBOR.
 
     A server keeps one latched message of ``/tf_static`` for all its clients. So of several programs that send static
     frames through one server, late joiners hear only the last.
