@@ -204,9 +204,8 @@ def test_no_module_has_more_than_300_lines_of_code() -> None:
 
 def options_of_dataclasses(module: str) -> Iterator[tuple[str, dict[str, object]]]:
     """The name of each dataclass of a module, with the options that it is made with."""
-    for node in ast.walk(parsed(module)):
-        if not isinstance(node, ast.ClassDef):
-            continue
+    classes = [node for node in ast.walk(parsed(module)) if isinstance(node, ast.ClassDef)]
+    for node in classes:
         for decorator in node.decorator_list:
             if isinstance(decorator, ast.Call) and getattr(decorator.func, "id", "") == "dataclass":
                 options = {str(option.arg): getattr(option.value, "value", None) for option in decorator.keywords}

@@ -190,7 +190,13 @@ sample_fields(Sample *self, void *Py_UNUSED(closure))
         PyObject *stamp = PyLong_FromLongLong(self->stamp);
         if (row != NULL && stamp != NULL) {
             PyObject *is_static = self->is_static ? Py_True : Py_False;
-            self->fields = PyTuple_Pack(6, self->parent, self->child, stamp, row, self->authority, is_static);
+            PyObject *made = PyTuple_Pack(6, self->parent, self->child, stamp, row, self->authority, is_static);
+            /* The garbage collector may have let another thread make it. */
+            if (self->fields == NULL) {
+                self->fields = made;
+            } else {
+                Py_XDECREF(made);
+            }
         }
         Py_XDECREF(row);
         Py_XDECREF(stamp);
@@ -1151,10 +1157,6 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
     if (!PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
         return -1;
     }
-    if (self->steps != NULL) {
-        PyErr_SetString(PyExc_RuntimeError, "a Chain is initialised once, because another thread may read it");
-        return -1;
-    }
     const Py_ssize_t up = PyTuple_Size(sides[0]), down = PyTuple_Size(sides[1]);
     Step *steps = PyMem_Calloc((size_t)(up + down + 1), sizeof(Step));
     if (steps == NULL) {
@@ -1171,6 +1173,12 @@ chain_init(Chain *self, PyObject *args, PyObject *kwargs)
             PyMem_Free(steps);
             return -1;
         }
+    }
+    /* Not before, because reading a row may run Python code. */
+    if (self->steps != NULL) {
+        PyMem_Free(steps);
+        PyErr_SetString(PyExc_RuntimeError, "a Chain is initialised once, because another thread may read it");
+        return -1;
     }
     Py_INCREF(sides[0]);
     Py_INCREF(sides[1]);
@@ -1296,6 +1304,7 @@ typedef struct {
     PyObject_HEAD
     Chain *chain;
     Seen *seen; /* one a step */
+    Py_ssize_t count; /* of these; the garbage collector may have cleared the chain before this ends */
     char busy;  /* whether a thread is at work on what is seen */
 } Held;
 
@@ -1534,7 +1543,7 @@ held_dealloc(Held *self)
     PyTypeObject *type = Py_TYPE(OBJECT(self));
     PyObject_GC_UnTrack(self);
     if (self->seen != NULL) {
-        let_go(self->seen, self->chain->up + self->chain->down);
+        let_go(self->seen, self->count);
     }
     Py_XDECREF(OBJECT(self->chain));
     ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
@@ -1570,6 +1579,7 @@ chain_hold(Chain *self, PyObject *Py_UNUSED(ignored))
     }
     Py_INCREF(OBJECT(self));
     held->chain = self;
+    held->count = self->up + self->down;
     held->seen = chain_look(self);
     if (held->seen == NULL) {
         Py_DECREF(OBJECT(held));
@@ -2400,7 +2410,11 @@ line_init(Line *self, PyObject *Py_UNUSED(args), PyObject *Py_UNUSED(kwargs))
     self->places = PyList_New(0);
     self->for_any = PyDict_New();
     self->limits = PyList_New(0);
-    return self->places == NULL || self->for_any == NULL || self->limits == NULL ? -1 : 0;
+    if (self->places == NULL || self->for_any == NULL || self->limits == NULL) {
+        line_clear(self);
+        return -1;
+    }
+    return 0;
 }
 
 static int
@@ -2480,7 +2494,10 @@ feed_init(Feed *self, PyObject *args, PyObject *kwargs)
                           &PyList_Type, &parts[LIMITS], &PyDict_Type, &parts[WATCHES], &parts[FORGET])) {
         return -1;
     }
-    feed_clear(self);
+    if (self->parts[PATHS] != NULL) {
+        PyErr_SetString(PyExc_RuntimeError, "a Feed is initialised once, because it may be at work");
+        return -1;
+    }
     for (int i = 0; i < PARTS; i++) {
         Py_INCREF(parts[i]);
         self->parts[i] = parts[i];
@@ -2511,13 +2528,15 @@ static int
 feed_is_plain(const Feed *self, PyObject *batch)
 {
     PyObject *lines = self->parts[LINES], *limits = self->parts[LIMITS];
-    const Py_ssize_t size = PyTuple_Size(batch), limited = PyList_Size(limits);
+    const Py_ssize_t size = PyTuple_Size(batch);
     for (Py_ssize_t i = 0; i < size; i++) {
         PyObject *item = PyTuple_GetItem(batch, i);
         const Sample *sample = (const Sample *)item;
         if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL) {
             return 0;
         }
+        /* Anew each time, because comparing names may run Python code. */
+        const Py_ssize_t limited = PyList_Size(limits);
         if (limited > 0) {
             const int reached = sample->stamp == INT64_MIN
                 ? 0 : is_reached(PyList_GetItem(limits, limited - 1), sample->stamp - 1);
@@ -2541,76 +2560,127 @@ feed_is_plain(const Feed *self, PyObject *batch)
     return 1;
 }
 
-/* Wake those that a sample at a stamp has unblocked, each with its answer if that is plain. */
+/* The first error of several, kept while the others go on. */
+typedef struct {
+    PyObject *type, *value, *traceback;
+} Trouble;
+
+static void
+set_aside(Trouble *trouble)
+{
+    if (trouble->type == NULL) {
+        PyErr_Fetch(&trouble->type, &trouble->value, &trouble->traceback);
+    } else {
+        PyErr_Clear();
+    }
+}
+
+/* Whether there was an error, which is then raised. */
 static int
-feed_wake(Feed *self, PyObject *child, int64_t stamp)
+raise_trouble(const Trouble *trouble)
+{
+    if (trouble->type == NULL) {
+        return 0;
+    }
+    PyErr_Restore(trouble->type, trouble->value, trouble->traceback);
+    return 1;
+}
+
+/* Take the last waiter out of its line; a new reference. NULL for an error, and then it still waits. */
+static PyObject *
+feed_pop(PyObject *lines, PyObject *child, Line *line, Py_ssize_t last)
+{
+    PyObject *item = PyTuple_GetItem(PyList_GetItem(line->places, last), 2);
+    if (!PyObject_TypeCheck(item, ParkedType)) {
+        PyErr_SetString(PyExc_TypeError, "only what is parked has a place");
+        return NULL;
+    }
+    Py_INCREF(item);
+    if (PyList_SetSlice(line->places, last, last + 1, NULL) < 0) {
+        Py_DECREF(item);
+        return NULL;
+    }
+    /* The place refers to the waiter. */
+    Py_CLEAR(((Parked *)item)->place);
+    if (last == 0 && line_has_places_only(line) && PyDict_DelItem(lines, child) < 0) {
+        PyErr_Clear();
+    }
+    return item;
+}
+
+/* Give a waiter its answer, if that is plain. */
+static void
+feed_answer(const Feed *self, Parked *waiter)
+{
+    PyObject *plain = waiter->plain;
+    if (plain == NULL || !PyTuple_CheckExact(plain) || PyTuple_Size(plain) != 3) {
+        return;
+    }
+    Paths *paths = (Paths *)self->parts[PATHS];
+    PyObject *asked[3] = {PyTuple_GetItem(plain, 0), PyTuple_GetItem(plain, 1), PyTuple_GetItem(plain, 2)};
+    Py_INCREF(plain);
+    PyObject *old = waiter->answer, *answer = paths_answer(paths, asked, 3);
+    waiter->answer = answer;
+    waiter->version = paths->version;
+    if (answer == NULL) {
+        /* Out of memory: then it asks itself. */
+        PyErr_Clear();
+    }
+    Py_XDECREF(old);
+    Py_DECREF(plain);
+}
+
+/* Wake those that a sample at a stamp has unblocked, each with its answer if that is plain. An error of one keeps no
+ * other from being woken. */
+static void
+feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
 {
     PyObject *lines = self->parts[LINES];
     for (;;) {
         /* Looked up each time, because to wake is to run the code of an event loop. */
         PyObject *known = PyDict_GetItemWithError(lines, child);
         if (known == NULL || !PyObject_TypeCheck(known, LineType)) {
-            return PyErr_Occurred() ? -1 : 0;
+            break;
         }
         Line *line = (Line *)known;
         const Py_ssize_t last = line->places == NULL ? -1 : PyList_Size(line->places) - 1;
-        if (last < 0) {
-            return 0;
+        if (last < 0 || is_reached(PyList_GetItem(line->places, last), stamp) <= 0) {
+            break;
         }
-        PyObject *place = PyList_GetItem(line->places, last);
-        const int reached = is_reached(place, stamp);
-        if (reached <= 0) {
-            return reached;
-        }
-        PyObject *item = PyTuple_GetItem(place, 2);
-        if (!PyObject_TypeCheck(item, ParkedType)) {
-            PyErr_SetString(PyExc_TypeError, "only what is parked has a place");
-            return -1;
+        PyObject *item = feed_pop(lines, child, line, last);
+        if (item == NULL) {
+            break;
         }
         Parked *waiter = (Parked *)item;
-        Py_INCREF(item);
-        /* The place refers to the waiter. */
-        PyObject *own = waiter->place;
-        waiter->place = NULL;
-        Py_XDECREF(own);
-        int failed = PyList_SetSlice(line->places, last, last + 1, NULL) < 0
-            || (last == 0 && line_has_places_only(line) && PyDict_DelItem(lines, child) < 0);
-        if (!failed && waiter->elsewhere) {
+        if (waiter->elsewhere) {
             PyObject *done = PyObject_CallFunctionObjArgs(self->parts[FORGET], item, NULL);
-            failed = done == NULL;
+            if (done == NULL) {
+                set_aside(trouble);
+            }
             Py_XDECREF(done);
-        } else if (!failed) {
-            failed = PyDict_DelItem(self->parts[PARKED], item) < 0;
+        } else if (PyDict_DelItem(self->parts[PARKED], item) < 0) {
+            set_aside(trouble);
         }
-        if (failed) {
-            Py_DECREF(item);
-            return -1;
-        }
-        if (waiter->plain != NULL && PyTuple_CheckExact(waiter->plain) && PyTuple_Size(waiter->plain) == 3) {
-            Paths *paths = (Paths *)self->parts[PATHS];
-            PyObject *asked[3] = {
-                PyTuple_GetItem(waiter->plain, 0), PyTuple_GetItem(waiter->plain, 1), PyTuple_GetItem(waiter->plain, 2)
-            };
-            PyObject *old = waiter->answer;
-            waiter->answer = paths_answer(paths, asked, 3);
-            waiter->version = paths->version;
-            Py_XDECREF(old);
-            if (waiter->answer == NULL) {
-                /* Out of memory: then it asks itself. */
-                PyErr_Clear();
+        feed_answer(self, waiter);
+        if (waiter->wake != NULL) {
+            PyObject *wake = waiter->wake;
+            Py_INCREF(wake);
+            PyObject *woken = PyObject_CallNoArgs(wake);
+            Py_DECREF(wake);
+            if (woken == NULL) {
+                if (PyErr_ExceptionMatches(PyExc_Exception)) {
+                    /* Its wait was cancelled, or its event loop is gone. */
+                    PyErr_Clear();
+                } else {
+                    set_aside(trouble);
+                }
             }
+            Py_XDECREF(woken);
         }
-        PyObject *woken = waiter->wake == NULL ? NULL : PyObject_CallNoArgs(waiter->wake);
-        if (woken == NULL && PyErr_Occurred()) {
-            if (!PyErr_ExceptionMatches(PyExc_Exception)) {
-                Py_DECREF(item);
-                return -1;
-            }
-            /* Its wait was cancelled, or its event loop is gone. The others must be woken all the same. */
-            PyErr_Clear();
-        }
-        Py_XDECREF(woken);
         Py_DECREF(item);
+    }
+    if (PyErr_Occurred()) {
+        set_aside(trouble);
     }
 }
 
@@ -2636,13 +2706,17 @@ feed_insert(Feed *self, PyObject *batch)
     if (stored != Py_True || !waits) {
         return stored;
     }
+    Trouble trouble = {NULL};
     const Py_ssize_t size = PyTuple_Size(batch);
     for (Py_ssize_t i = 0; i < size; i++) {
         const Sample *sample = (const Sample *)PyTuple_GetItem(batch, i);
-        if (feed_wake(self, sample->child, sample->stamp) < 0) {
-            Py_DECREF(stored);
-            return NULL;
-        }
+        PyObject *child = sample->child;
+        Py_INCREF(child);
+        feed_wake(self, child, sample->stamp, &trouble);
+        Py_DECREF(child);
+    }
+    if (raise_trouble(&trouble)) {
+        Py_CLEAR(stored);
     }
     return stored;
 }
@@ -2696,10 +2770,11 @@ intake_traverse(Intake *self, visitproc visit, void *arg)
 static int
 intake_clear(Intake *self)
 {
+    /* First, because nothing is taken without it. */
+    Py_CLEAR(self->feeds);
     Py_CLEAR(self->judge);
     Py_CLEAR(self->kind);
     Py_CLEAR(self->listeners);
-    Py_CLEAR(self->feeds);
     return 0;
 }
 
@@ -2724,6 +2799,10 @@ intake_init(Intake *self, PyObject *args, PyObject *kwargs)
     if (!PyArg_ParseTuple(args, "O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type, &listeners)) {
         return -1;
     }
+    if (self->feeds != NULL) {
+        PyErr_SetString(PyExc_RuntimeError, "an Intake is initialised once, because it may be at work");
+        return -1;
+    }
     PyObject *feeds = PyTuple_New(0);
     if (feeds == NULL) {
         return -1;
@@ -2731,7 +2810,6 @@ intake_init(Intake *self, PyObject *args, PyObject *kwargs)
     Py_INCREF(judge);
     Py_INCREF(kind);
     Py_INCREF(listeners);
-    intake_clear(self);
     self->judge = judge;
     self->kind = kind;
     self->listeners = listeners;
@@ -2801,23 +2879,24 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
     PyObject *feeds = self->feeds;
     Py_INCREF(feeds);
     const Py_ssize_t count = PyTuple_Size(feeds);
-    int failed = 0;
-    for (Py_ssize_t i = 0; !failed && i < count; i++) {
+    Trouble trouble = {NULL};
+    /* An error of one buffer keeps no other from the batch, which the bus has judged. */
+    for (Py_ssize_t i = 0; i < count; i++) {
         PyObject *pair = PyTuple_GetItem(feeds, i), *feed, *insert;
-        failed = !PyArg_ParseTuple(pair, "O!O", FeedType, &feed, &insert);
-        PyObject *done = failed ? NULL : feed_insert((Feed *)feed, batch);
+        PyObject *done = PyArg_ParseTuple(pair, "O!O", FeedType, &feed, &insert) ? feed_insert((Feed *)feed, batch) : NULL;
         if (done == Py_False) {
             Py_DECREF(done);
             done = PyObject_CallFunctionObjArgs(insert, batch, NULL);
         }
-        failed = done == NULL;
+        if (done == NULL) {
+            set_aside(&trouble);
+        }
         Py_XDECREF(done);
     }
     Py_DECREF(feeds);
     Py_DECREF(batch);
-    if (failed) {
-        Py_DECREF(accepted);
-        return NULL;
+    if (raise_trouble(&trouble)) {
+        Py_CLEAR(accepted);
     }
     return accepted;
 }

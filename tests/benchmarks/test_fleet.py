@@ -1,4 +1,4 @@
-"""The cost of thousands of static frames, of robots and of remote lookups for a link over zenoh."""
+"""The cost of thousands of static frames, robots and remote lookups for a link over zenoh."""
 
 import subprocess
 import sys
@@ -147,7 +147,7 @@ def test_remote_lookup(table: Table) -> None:
                 ours.append(time.perf_counter() - began)
                 ended = threading.Event()
                 began = time.perf_counter()
-                take: Any = zenoh.handlers.Callback(lambda _: None, ended.set, indirect=False)
+                take = zenoh.handlers.Callback(lambda _: None, ended.set, indirect=False)
                 client._session._opened().get(f"bare/{domain}", take, payload=bytes(300), express=True)
                 assert ended.wait(10)
                 bare.append(time.perf_counter() - began)
@@ -161,7 +161,7 @@ def test_remote_lookup(table: Table) -> None:
 
 
 def test_one_robot_of_many(table: Table) -> None:
-    """Only a subscribed robot costs anything: user and system time with the subscription less that without."""
+    """A subscription costs, and not what exists: user and system time with it less that without."""
 
     def measure(robots: int) -> tuple[float, float]:
         domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"

@@ -33,7 +33,7 @@ def seconds_of(seconds: int) -> Any:
 
 
 def time(*parts: int) -> Any:
-    """The stamp in the type that a question takes; in ROS 1 a message has it too."""
+    """The time of a question; in ROS 1 that of a message, too."""
     return Time(*parts) if len(sys.argv) == 1 else Time(seconds=parts[0], nanoseconds=parts[1]) if parts else Time()
 
 

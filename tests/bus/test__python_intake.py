@@ -109,15 +109,19 @@ def test_whatever_else_is_left_alone(kernel: Any) -> None:
 
 
 @on_both
-def test_an_error_of_a_buffer_is_raised(kernel: Any) -> None:
+def test_an_error_of_a_buffer_is_raised_after_all_others_have_the_batch(kernel: Any) -> None:
     stage = Stage(kernel)
 
     def fail(_batch: object) -> None:
         raise MemoryError
 
-    stage.intake.feeds = ((stage.intake.feeds[1][0], fail),)
+    other = stage.intake.feeds[1]
+    stage.intake.feeds = ((other[0], fail), stage.intake.feeds[0], other)
+    sample = stage.sample(20)
     with pytest.raises(MemoryError):
-        stage.intake.take(stage.sample(20), "raise")
+        stage.intake.take(sample, "raise")
+    # The others have what the bus has judged.
+    assert (stage.history.newest, stage.closely) == (20, [(sample,)])
 
 
 @needs_both
@@ -134,6 +138,8 @@ def test_wrong_arguments_raise() -> None:
     ):
         with pytest.raises(TypeError):
             call()
+    with pytest.raises(RuntimeError):
+        stage.intake.__init__(stage.judge, stage.kind, ())
     stage.intake.feeds = ((5, list),)
     with pytest.raises(TypeError):
         stage.intake.take(sample, "raise")

@@ -1,5 +1,6 @@
 """The plain insertion and the plain wake-ups of both kernels."""
 
+import sys
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -201,11 +202,45 @@ def test_a_wake_up_that_raises_keeps_no_other_from_being_woken(kernel: Any) -> N
     assert stage.woken == [waiting]
 
     def stop() -> None:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt("the first")
 
     stage.park(30).wake = stop
-    with pytest.raises(KeyboardInterrupt):
+    stage.park(30).wake = partial(sys.exit, 5)
+    last, later = stage.park(30), stage.park(40)
+    with pytest.raises(KeyboardInterrupt, match="the first"):
         stage.feed.insert((stage.sample(30),))
+    assert stage.woken == [waiting, last]
+    assert last.answer.stamp == 30
+    assert list(stage.parked) == [later]
+
+
+@on_both
+def test_one_that_cannot_be_forgotten_is_woken_all_the_same(kernel: Any) -> None:
+    stage = Stage(kernel)
+    lost, other = stage.park(20), stage.park(20)
+    lost.elsewhere = True
+    del stage.parked[other]
+    lines, parked = stage.lines, stage.parked
+    feed = stage.kernel.Feed(stage.paths, stage.frames, {}, lines, parked, [], {}, partial(int, "no"))
+    with pytest.raises(TypeError):
+        feed.insert((stage.sample(20),))
+    assert stage.woken == [lost, other]
+    assert lines == {}
+
+
+@on_both
+def test_a_wake_up_may_change_what_it_belongs_to(kernel: Any) -> None:
+    stage = Stage(kernel)
+    waiter = stage.park(20)
+
+    def change() -> None:
+        waiter.wake, waiter.plain, waiter.answer = None, None, None
+        stage.woken.append(waiter)
+
+    waiter.wake = change
+    del change
+    assert stage.feed.insert((stage.sample(20),))
+    assert stage.woken == [waiter]
 
 
 @on_both
@@ -236,10 +271,11 @@ def test_wrong_arguments_raise() -> None:
         lambda: kernel.Feed(*parts[:-1]),
         lambda: kernel.Feed(5, *parts[1:]),
         lambda: kernel.Feed(*parts, forget=list),
+        lambda: stage.feed.__init__(*parts),
         lambda: setattr(stage.waiter(), "version", "5"),
         lambda: setattr(kernel.Line(), "places", []),
     ):
-        with pytest.raises((TypeError, AttributeError)):
+        with pytest.raises((TypeError, AttributeError, RuntimeError)):
             call()
     assert not stage.feed.insert((5,))
     for place in (5, (1, 2), ("x", 0, stage.waiter()), (-5, 0, "nobody")):

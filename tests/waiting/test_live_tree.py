@@ -488,3 +488,20 @@ def test_forgetting_edges_without_samples_that_form_a_loop_wakes_the_waiters_bel
     live.insert((moving("a", "b", 10),))
     assert tree_over(live).can_transform("c", "b")
     assert woken == ["b"]
+
+
+def test_an_interrupt_of_one_wake_up_keeps_no_other_from_being_woken() -> None:
+    live = live_tree(None)
+    woken: list[str] = []
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(UnknownFrameError) as caught:
+        tree_over(live).lookup("map", "a", 5)
+    live.park(Waiter(Question("map", "a", 5), 0, interrupt), caught.value)
+    park(live, "map", "a", 5, woken)
+    with pytest.raises(KeyboardInterrupt):
+        live.insert((moving("map", "a", 5),))
+    assert woken == ["a"]
+    assert live.waiting.pending() == ()

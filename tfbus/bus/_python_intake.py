@@ -56,6 +56,11 @@ class Intake:
         -------
         bool
             Whether it was; else nothing was done. Here a batch that is not one sample or a tuple is not plain.
+
+        Raises
+        ------
+        BaseException
+            The first that a buffer raises, after all others have the batch.
         """
         if not self.open or get_ident() != self.thread or (invalid != "raise" and invalid != "drop"):
             return False
@@ -72,7 +77,13 @@ class Intake:
         if not self._judge.accepts(batch):
             return False
         self.samples += len(batch)
+        errors = []
         for feed, insert in self.feeds:
-            if not feed.insert(batch):
-                insert(batch)
+            try:
+                if not feed.insert(batch):
+                    insert(batch)
+            except BaseException as error:  # noqa: BLE001 - the first one is raised after all have the batch
+                errors.append(error)
+        if errors:
+            raise errors[0]
         return True

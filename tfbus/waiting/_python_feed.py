@@ -5,7 +5,6 @@ waits whatever its stamp, and one that has passed a limit.
 """
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from typing import Any, Protocol
 
 from tfbus.geometry.stamped import Batch, TransformStamped
@@ -124,6 +123,11 @@ class Feed:
         -------
         bool
             Whether it was; else nothing was done.
+
+        Raises
+        ------
+        BaseException
+            The first that `forget` raises, or a waiter if it is no `Exception`, after all have been woken.
         """
         lines = self._lines
         if (lines or self._watches or self._limits) and not self._is_plain(batch):
@@ -131,8 +135,11 @@ class Feed:
         if not self._paths.commit(self._frames, self._readers, batch):
             return False
         if lines:
+            errors: list[BaseException] = []
             for sample in batch:
-                self._wake(sample.child, sample.stamp)
+                self._wake(sample.child, sample.stamp, errors)
+            if errors:
+                raise errors[0]
         return True
 
     def _is_plain(self, batch: Batch) -> bool:
@@ -146,7 +153,7 @@ class Feed:
                 return False
         return True
 
-    def _wake(self, child: str, stamp: int) -> None:
+    def _wake(self, child: str, stamp: int, errors: list[BaseException]) -> None:
         """Wake those that a sample at a stamp has unblocked."""
         # Looked up each time, because to wake is to run the code of an event loop.
         while (line := self._lines.get(child)) is not None and line.places and -line.places[-1][0] <= stamp:
@@ -155,13 +162,20 @@ class Feed:
             waiter.place = None
             if not (line.places or line.for_any or line.limits):
                 del self._lines[child]
-            if waiter.elsewhere:
-                self._forget(waiter)
-            else:
-                del self._parked[waiter]
+            try:
+                if waiter.elsewhere:
+                    self._forget(waiter)
+                else:
+                    del self._parked[waiter]
+            except BaseException as error:  # noqa: BLE001 - the first one is raised after all have been woken
+                # It must be woken all the same.
+                errors.append(error)
             if waiter.plain is not None:
                 waiter.answer = self._paths.answer(*waiter.plain)
                 waiter.version = self._paths.version
-            # Its wait was cancelled, or its event loop is gone.
-            with suppress(Exception):
+            try:
                 waiter.wake()
+            except BaseException as error:  # noqa: BLE001 - the first one is raised after all have been woken
+                # Else its wait was cancelled, or its event loop is gone.
+                if not isinstance(error, Exception):
+                    errors.append(error)

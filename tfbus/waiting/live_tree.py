@@ -221,7 +221,13 @@ class LiveTree:
 
 
 def _wake(waiters: Iterable[Waiter | WatchState]) -> None:
+    interrupt: BaseException | None = None
     for waiter in waiters:
         # Its wait was cancelled, or its event loop is gone. The others must be woken all the same.
         with suppress(Exception):
-            waiter.wake()
+            try:
+                waiter.wake()
+            except (KeyboardInterrupt, SystemExit) as error:
+                interrupt = interrupt or error
+    if interrupt is not None:
+        raise interrupt

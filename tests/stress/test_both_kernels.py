@@ -1,0 +1,253 @@
+"""Whole buses on both kernels: random traffic leaves the same state, the same wake-ups and the same errors."""
+
+import math
+import random
+import struct
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from support.both_kernels import needs_both, tfbus_on
+
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+
+FRAMES = ("map", "odom", "base", "arm", "r1/base", "r1/arm", "x")
+EDGES = (("map", "odom"), ("odom", "base"), ("base", "arm"), ("map", "r1/base"), ("r1/base", "r1/arm"))
+LIMITS = (STAMP_MIN, STAMP_MIN + 1, -(2**62), 2**53 + 1, 2**62, STAMP_MAX - 1, STAMP_MAX)
+
+
+def bits_of(sample: Any) -> object:
+    if sample is None:
+        return None
+    return sample.parent, sample.child, sample.stamp, sample.authority, sample.static, struct.pack("7d", *sample._row)
+
+
+def error_of(error: BaseException) -> object:
+    return type(error).__name__, str(error)
+
+
+class World:
+    """A bus on one kernel, with some buffers and with lookups that wait."""
+
+    def __init__(self, kernel: str, rng: random.Random) -> None:
+        self.tfbus = tfbus_on(kernel)
+        # The modules of a second copy have no names.
+        self.waiter = self.tfbus.Buffer.__init__.__globals__["LiveTree"].park.__globals__["Waiter"]
+        self.rng = rng
+        self.now = 1_000
+        self.clock = self.tfbus.SimulatedClock(self.now)
+        options: dict[str, Any] = {"max_ahead": None} if rng.random() < 0.5 else {"max_ahead": 1e-6}
+        if options["max_ahead"] is not None:
+            options["reject_ahead"] = rng.random() < 0.3
+        self.bus = self.tfbus.Bus(self.clock, rng.choice(["last", "last", "reject"]), max_translation=50.0, **options)
+        self.said: list[object] = []
+        self.parked: list[Any] = []
+        self.open: list[Any] = []
+        self.depth = 0
+        self.buffers: list[Any] = []
+        self.add_buffer()
+
+    def close(self) -> None:
+        self.bus.close()
+
+    def say(self, call: Callable[[], object]) -> None:
+        """Note what a call returns or raises."""
+        try:
+            self.said.append(call())
+        except (self.tfbus.TransformError, TypeError, ValueError, RuntimeError, KeyError) as error:
+            self.said.append(error_of(error))
+
+    # Drawn things
+
+    def stamp(self) -> int:
+        rng = self.rng
+        if rng.random() < 0.01:
+            return rng.choice(LIMITS)
+        return self.now + rng.randrange(-400, 3) if rng.random() < 0.2 else self.now
+
+    def sample(self) -> Any:
+        rng, tfbus = self.rng, self.tfbus
+        parent, child = rng.choice(EDGES)
+        if rng.random() < 0.02:
+            parent, child = rng.sample(FRAMES, 2)
+        x = 1_000.0 if rng.random() < 0.005 else rng.uniform(-9.0, 9.0)
+        transform = tfbus.Transform((x, -0.0, 1.0))
+        if rng.random() < 0.5:
+            quaternion = [rng.uniform(-1.0, 1.0) for _ in range(4)]
+            norm = math.hypot(*quaternion)
+            transform = tfbus.Transform((x, 1.0, 0.0), tuple(part / norm for part in quaternion))
+        authority = "you" if rng.random() < 0.01 else "me"
+        return tfbus.TransformStamped(parent, child, self.stamp(), transform, authority, rng.random() < 0.01)
+
+    # What may happen
+
+    def publish(self) -> None:
+        rng = self.rng
+        self.now += rng.choice([1, 1, 1, 10, 100, 0])
+        samples = [self.sample() for _ in range(rng.choice([1, 1, 1, 1, 2, 3, 5, 70]))]
+        kinds: list[Callable[[Any], Any]] = [list, tuple, iter]
+        batch = samples[0] if len(samples) == 1 else rng.choice(kinds)(samples)
+        if rng.random() < 0.01:
+            batch = rng.choice([(*samples, 5), 5, (), [], None])
+        invalid = rng.choice(["raise", "drop", "drop", "drop"])
+        self.said.append([bits_of(sample) for sample in samples])
+        self.say(lambda: self.bus.publish(batch, invalid))
+
+    def step_each_edge(self) -> None:
+        self.now += self.rng.choice([1, 5, 50])
+        for parent, child in EDGES:
+            transform = self.tfbus.Transform((self.now % 7, 2.0, 3.0))
+            sample = self.tfbus.TransformStamped(parent, child, self.now, transform, "me")
+            self.say(lambda sample=sample: self.bus.publish(sample, "drop"))  # type: ignore[misc]
+
+    def remove(self) -> None:
+        frame = self.rng.choice(FRAMES)
+        self.say(lambda: self.bus.remove_frame(frame))
+
+    def move_clock(self) -> None:
+        rng = self.rng
+        self.now += rng.choice([-300, 0, 0, 500])
+        self.say(lambda: self.clock.set(self.now))
+
+    def add_buffer(self) -> None:
+        rng = self.rng
+        keep = rng.choice([None, 0.0, 1e-7, 1e-6, 10.0])
+        options: Any = rng.choice([{}, {}, {"prefix": "r1"}, {"prefix": "r1", "shared": {"map"}}])
+        if len(self.buffers) < 4:
+            self.buffers.append(self.tfbus.Buffer(self.bus, keep, **options))
+
+    def close_buffer(self) -> None:
+        if len(self.buffers) > 1:
+            self.buffers.pop(self.rng.randrange(len(self.buffers))).close()
+
+    def listen(self) -> None:
+        if self.open:
+            self.open.pop().close()
+            return
+        rng, bus = self.rng, self.bus
+        kind = rng.randrange(3)
+        if kind == 0:
+            self.open.append(bus.subscribe(lambda batch: self.said.append([bits_of(sample) for sample in batch])))
+        elif kind == 1:
+            frame = rng.choice(FRAMES)
+            self.say(lambda: self.open.append(bus.reserve(frame, rng.choice(["me", "me", "you"]))))
+        else:
+            live = self.buffers[0]._live
+            readers = live.forest.readers
+            readers[0] = set()
+            self.open.append(SimpleNamespace(close=lambda: self.said.append(sorted(readers.pop(0)))))
+
+    def question(self) -> Any:
+        rng, tfbus = self.rng, self.tfbus
+        target, source = rng.sample(FRAMES, 2)
+        if rng.random() < 0.7:
+            target, source = rng.choice([("map", "base"), ("map", "arm"), ("odom", "r1/arm"), ("base", "arm")])
+        at = rng.choice([tfbus.LATEST, self.stamp(), self.now + rng.randrange(60), self.now + rng.randrange(9)])
+        return tfbus.Question(target, source, at)
+
+    def look_up(self) -> None:
+        buffer, question = self.rng.choice(self.buffers), self.question()
+        self.say(lambda: bits_of(buffer._lookups.lookup_nowait(question)))
+        # For more, numpy rounds otherwise.
+        stamps = [self.stamp() for _ in range(self.rng.choice([1, 2]))]
+
+        def many() -> object:
+            found = buffer.tree.lookup_many(question.target, question.source, stamps)
+            return found.translations.tobytes(), found.rotations.tobytes()
+
+        self.say(many)
+
+    def park(self) -> None:
+        rng, tfbus = self.rng, self.tfbus
+        buffer, question = rng.choice(self.buffers), self.question()
+        number = len(self.parked)
+        trick = rng.choice(["none"] * 12 + ["raise", "publish", "park", "cancel"])
+
+        def wake() -> None:
+            self.said.append(("woken", number))
+            # The compiled kernel leaves stamps that are very far apart to Python: whoever gets no answer asks.
+            self.say(lambda: bits_of(waiter.answer or buffer._lookups.lookup_nowait(question)))
+            if trick == "raise":
+                raise ValueError("the loop is closed")
+            if self.depth < 3:
+                self.depth += 1
+                if trick == "publish":
+                    self.publish()
+                elif trick == "park":
+                    self.park()
+                elif trick == "cancel":
+                    self.cancel()
+                self.depth -= 1
+
+        waiter = self.waiter(question, 0, wake)
+        self.parked.append((buffer._live, waiter))
+        try:
+            buffer._lookups.lookup_nowait(question)
+        except (
+            tfbus.UnknownFrameError,
+            tfbus.DisconnectedError,
+            tfbus.FutureExtrapolationError,
+        ) as error:
+            buffer._live.park(waiter, error)
+        except tfbus.TransformLookupError:
+            pass
+
+    def cancel(self) -> None:
+        if self.parked:
+            live, waiter = self.rng.choice(self.parked)
+            live.waiting.remove(waiter)
+
+    def copy(self) -> None:
+        self.said.append(len(self.rng.choice(self.buffers).tree.copy().edges()))
+
+    def step(self) -> None:
+        rng = self.rng
+        common = (self.publish, self.publish, self.step_each_edge, self.step_each_edge, self.park, self.look_up)
+        rare = (self.remove, self.move_clock, self.add_buffer, self.close_buffer, self.listen, self.cancel, self.copy)
+        rng.choice(common if rng.random() < 0.9 else rare)()
+
+    def state(self) -> object:
+        """Everything that can be seen, and the edges of the bus."""
+        edges = [
+            (child, known.parent, known.newest, known.authority, known.trusted, known.static)
+            for child, known in self.bus._topology._newest.items()
+        ]
+        trees = []
+        for buffer in self.buffers:
+            waiting = buffer._live.waiting
+            for line in waiting.by_frame.values():
+                assert line.places or line.for_any or line.limits
+            trees.append(
+                (
+                    [str(pending) for pending in buffer.pending()],
+                    [(edge.child, edge.parent, edge.samples, edge.oldest, edge.newest) for edge in buffer.tree.edges()],
+                    [history.newest_record for history in buffer._live.forest.frames.values()],
+                    sorted(waiting.by_frame),
+                    len(waiting.limits),
+                    buffer._live.forest.paths.version,
+                )
+            )
+        return edges, trees, repr(self.bus.statistics())
+
+
+def run(seed: int, steps: int) -> None:
+    ours, theirs = (World(kernel, random.Random(seed)) for kernel in ("compiled", "python"))
+    for number in range(steps):
+        ours.step()
+        theirs.step()
+        assert ours.said == theirs.said, (seed, number)
+        assert ours.state() == theirs.state(), (seed, number)
+        ours.said.clear()
+        theirs.said.clear()
+    ours.close()
+    theirs.close()
+    assert ours.said == theirs.said, seed
+
+
+@needs_both
+@pytest.mark.thorough
+@pytest.mark.parametrize("first", range(0, 20, 5))
+def test_random_traffic_does_the_same_on_both_kernels(first: int) -> None:
+    for seed in range(first, first + 5):
+        run(seed, 250)
