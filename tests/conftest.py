@@ -47,10 +47,10 @@ DEFAULT_SUITE = "not thorough"
 """The expression of marks that pyproject.toml gives."""
 
 LIMIT, THOROUGH_LIMIT = 60.0, 280.0
-"""The longest that a test of each suite may take, in s."""
+"""The longest that a test of each suite may take, in s; benchmarks have the time of thorough tests."""
 
 EXAMPLES = settings(deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("default", EXAMPLES, max_examples=15, derandomize=True)
+settings.register_profile("default", EXAMPLES, max_examples=10, derandomize=True)
 settings.register_profile("thorough", EXAMPLES, max_examples=100, derandomize="CI" in os.environ)
 
 
@@ -168,7 +168,8 @@ def end_in_time(item: pytest.Item) -> Iterator[None]:
     if not hasattr(signal, "setitimer"):
         yield
         return
-    limit = LIMIT if item.get_closest_marker("thorough") is None else THOROUGH_LIMIT
+    slow = item.get_closest_marker("thorough") is not None or "benchmarks" in item.path.parts
+    limit = THOROUGH_LIMIT if slow else LIMIT
 
     def end(*_: object) -> None:
         pytest.fail(f"it has not ended within {limit:g} s")
@@ -198,6 +199,7 @@ def children_left() -> list[int]:
     for children in Path("/proc/self/task").glob("*/children"):
         for process in children.read_text().split():
             with suppress(OSError):
+                # A process that ends, or is just beginning, has none.
                 command = Path("/proc", process, "cmdline").read_bytes()
                 if command and not any(word in command for word in (b"execnet", b"resource_tracker", b"forkserver")):
                     found.append(int(process))

@@ -54,6 +54,25 @@ def test_a_dataclass_becomes_its_fields_and_comes_back() -> None:
     assert repr(back.error) == """Exception("KeyError: 'k'")"""
 
 
+@dataclass(frozen=True, slots=True)
+class Mixed(PlainData):
+    number: float | int
+    word: float | str | None
+    at: str | Latest
+    vector: tuple[float, float]
+
+
+def test_the_first_alternative_that_can_be_read_holds() -> None:
+    read = Mixed.from_dict({"number": 1, "word": "NaN", "at": "LATEST", "vector": [1, 2.5]})
+    assert [type(part) for part in (read.number, *read.vector)] == [float] * 3
+    assert isinstance(read.word, float)
+    assert math.isnan(read.word)
+    assert read.at == "LATEST"
+    assert Mixed.from_dict({"number": 1.5, "word": "far", "at": "x", "vector": [1.5, 2.5]}).word == "far"
+    with pytest.raises(ValueError, match=r"Mixed.vector\[1\]"):
+        Mixed.from_dict({"number": 1, "word": None, "at": "x", "vector": [1.0, True]})
+
+
 def test_the_type_may_be_left_out() -> None:
     assert Inner.from_dict({"count": 1}) == Inner(1)
 

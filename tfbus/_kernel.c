@@ -36,10 +36,71 @@ enum { WIDTH = 7 };             /* floats in a row: translation x, y, z and quat
 #define EXACT_GAP ((uint64_t)1 << 53) /* ns; beyond, a difference of stamps is no exact float, and Python divides */
 
 static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType, *PathsType, *EdgeType;
-static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType;
-static PyObject *empty_string, *raise_string, *drop_string;
+static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
+static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
+static PyObject *bound_method; /* types.MethodType */
 
 static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
+
+/* References ------------------------------------------------------------------------------------------------------- */
+
+/* What the garbage collector needs of a type whose first fields are references: `fields` of them. */
+#define REFERENCES(name, fields)                                                                        \
+    static int name##_traverse(PyObject *self, visitproc visit, void *arg)                              \
+    {                                                                                                   \
+        return visit_references(self, fields, visit, arg);                                              \
+    }                                                                                                   \
+    static int name##_clear(PyObject *self)                                                             \
+    {                                                                                                   \
+        return clear_references(self, fields);                                                          \
+    }                                                                                                   \
+    static void name##_dealloc(PyObject *self)                                                          \
+    {                                                                                                   \
+        PyObject_GC_UnTrack(self);                                                                      \
+        clear_references(self, fields);                                                                 \
+        let_go_of(self);                                                                                \
+    }
+
+static int
+visit_references(PyObject *self, int fields, visitproc visit, void *arg)
+{
+    PyObject **references = (PyObject **)(self + 1);
+    Py_VISIT(Py_TYPE(self));
+    for (int i = 0; i < fields; i++) {
+        Py_VISIT(references[i]);
+    }
+    return 0;
+}
+
+static int
+clear_references(PyObject *self, int fields)
+{
+    PyObject **references = (PyObject **)(self + 1);
+    for (int i = 0; i < fields; i++) {
+        Py_CLEAR(references[i]);
+    }
+    return 0;
+}
+
+/* The end of each deallocation. */
+static void
+let_go_of(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+/* Whether a call has no keyword arguments; else there is an error. */
+static int
+has_no_keywords(PyObject *kwargs)
+{
+    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
+        PyErr_SetString(PyExc_TypeError, "this takes no keyword arguments");
+        return 0;
+    }
+    return 1;
+}
 
 /* Rows ------------------------------------------------------------------------------------------------------------ */
 
@@ -256,13 +317,11 @@ sample_static(Sample *self, void *Py_UNUSED(closure))
 static void
 sample_dealloc(Sample *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     Py_XDECREF(self->parent);
     Py_XDECREF(self->child);
     Py_XDECREF(self->authority);
     Py_XDECREF(self->fields);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyMemberDef sample_members[] = {
@@ -343,9 +402,7 @@ block_releasebuffer(Block *self, Py_buffer *Py_UNUSED(view))
 static void
 block_dealloc(PyObject *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyType_Slot block_slots[] = {
@@ -498,8 +555,7 @@ history_init(History *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *parent, *keep;
     int64_t window = -1;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "History takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "UO:History", &parent, &keep)) {
@@ -906,12 +962,10 @@ history_set_string(PyObject *self, PyObject *value, void *closure)
 static void
 history_dealloc(History *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     Py_XDECREF(self->parent);
     Py_XDECREF(self->authority);
     Py_XDECREF(OBJECT(self->block));
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyObject *history_row(History *self, PyObject *number);
@@ -1042,12 +1096,9 @@ find_turns(const Segment *segments, Turn *turns, Py_ssize_t count)
     }
     for (Py_ssize_t i = 0; i < count; i++) {
         if (turns[i].turns) {
-            turns[i].angle = acos(turns[i].angle);
-        }
-    }
-    for (Py_ssize_t i = 0; i < count; i++) {
-        if (turns[i].turns) {
-            turns[i].scale = 1.0 / sin(turns[i].angle);
+            const double cosine = turns[i].angle;
+            turns[i].scale = 1.0 / sqrt((1.0 - cosine) * (1.0 + cosine));
+            turns[i].angle = acos(cosine);
         }
     }
 }
@@ -1150,8 +1201,7 @@ static int
 chain_init(Chain *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *sides[2];
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Chain takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
@@ -1540,14 +1590,12 @@ held_traverse(Held *self, visitproc visit, void *arg)
 static void
 held_dealloc(Held *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     PyObject_GC_UnTrack(self);
     if (self->seen != NULL) {
         let_go(self->seen, self->count);
     }
     Py_XDECREF(OBJECT(self->chain));
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyMethodDef held_methods[] = {
@@ -1604,11 +1652,9 @@ chain_traverse(Chain *self, visitproc visit, void *arg)
 static void
 chain_dealloc(Chain *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     PyObject_GC_UnTrack(self);
     chain_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyMethodDef chain_methods[] = {
@@ -1741,43 +1787,13 @@ paths_are_free(const Paths *self)
     return held == Py_False;
 }
 
-static int
-paths_traverse(Paths *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->recent);
-    Py_VISIT(self->lock_is_held);
-    Py_VISIT(self->latest);
-    Py_VISIT(self->kind);
-    return 0;
-}
-
-static int
-paths_clear(Paths *self)
-{
-    Py_CLEAR(self->recent);
-    Py_CLEAR(self->lock_is_held);
-    Py_CLEAR(self->latest);
-    Py_CLEAR(self->kind);
-    return 0;
-}
-
-static void
-paths_dealloc(Paths *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    paths_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(paths, 4)
 
 static int
 paths_init(Paths *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *lock, *latest, *kind;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Paths takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "OOO!:Paths", &lock, &latest, &PyType_Type, &kind)) {
@@ -1793,7 +1809,7 @@ paths_init(Paths *self, PyObject *args, PyObject *kwargs)
         Py_XDECREF(is_held);
         return -1;
     }
-    paths_clear(self);
+    paths_clear(OBJECT(self));
     self->recent = recent;
     self->lock_is_held = is_held;
     Py_INCREF(latest);
@@ -2045,6 +2061,169 @@ static PyType_Spec paths_spec = {
     "tfbus._kernel.Paths", sizeof(Paths), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, paths_slots
 };
 
+/* Method: a method in Python that runs only if there is no plain answer ----------------------------------------------- */
+
+typedef struct Method {
+    PyObject_HEAD
+    PyObject *function; /* the method in Python */
+    PyObject *many;     /* the class of the answers at many stamps; NULL if it asks for one */
+    PyObject *(*vectorcall)(struct Method *, PyObject *const *, size_t, PyObject *);
+} Method;
+
+/* Py_TPFLAGS_HAVE_VECTORCALL, which has this value since 3.8, and is in the limited API since 3.12. */
+#define HAVE_VECTORCALL (1UL << 11)
+
+static PyObject *method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names);
+
+REFERENCES(method, 2)
+
+static PyObject *
+method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
+{
+    PyObject *function, *many;
+    if (!has_no_keywords(kwargs)) {
+        return NULL;
+    }
+    if (!PyArg_ParseTuple(args, "OO:Method", &function, &many)) {
+        return NULL;
+    }
+    if (many != Py_None && !PyType_Check(many)) {
+        PyErr_SetString(PyExc_TypeError, "the answers at many stamps need a class, or None");
+        return NULL;
+    }
+    Method *self = (Method *)PyType_GenericAlloc(type, 0);
+    if (self != NULL) {
+        Py_INCREF(function);
+        self->function = function;
+        self->vectorcall = method_vectorcall;
+        Py_XINCREF(many == Py_None ? NULL : many);
+        self->many = many == Py_None ? NULL : many;
+    }
+    return OBJECT(self);
+}
+
+/* The plain answer to whoever asks for source in target; None if there is none. Without stamps it is the latest. */
+static PyObject *
+method_answer(const Method *self, PyObject *asker, PyObject *target, PyObject *source, PyObject *at)
+{
+    PyObject *paths = PyObject_GetAttr(asker, paths_string);
+    if (paths == NULL || !PyObject_TypeCheck(paths, PathsType)) {
+        PyErr_Clear();
+        Py_XDECREF(paths);
+        Py_RETURN_NONE;
+    }
+    PyObject *question[3] = {target, source, at == NULL ? ((Paths *)paths)->latest : at};
+    PyObject *found = self->many == NULL ? paths_answer((Paths *)paths, question, 3)
+                                         : paths_answer_many((Paths *)paths, question, 3);
+    Py_DECREF(paths);
+    if (self->many == NULL || found == NULL || found == Py_None) {
+        return found;
+    }
+    PyObject *answers = PyType_GenericAlloc((PyTypeObject *)self->many, 0);
+    if (answers != NULL && PyObject_SetAttr(answers, memory_string, found) < 0) {
+        Py_CLEAR(answers);
+    }
+    Py_DECREF(found);
+    return answers;
+}
+
+/* The call of the method in Python, with `count` arguments and as many more as there are names. */
+static PyObject *
+method_run(const Method *self, PyObject *const *args, Py_ssize_t count, PyObject *names)
+{
+    PyObject *first = PyTuple_New(count), *result = NULL;
+    PyObject *named = first == NULL || names == NULL ? NULL : PyDict_New();
+    int failed = first == NULL || (names != NULL && named == NULL) || self->function == NULL;
+    for (Py_ssize_t i = 0; !failed && i < count; i++) {
+        Py_INCREF(args[i]);
+        failed = PyTuple_SetItem(first, i, args[i]) < 0;
+    }
+    for (Py_ssize_t i = 0; !failed && names != NULL && i < PyTuple_Size(names); i++) {
+        failed = PyDict_SetItem(named, PyTuple_GetItem(names, i), args[count + i]) < 0;
+    }
+    if (!failed) {
+        result = PyObject_Call(self->function, first, named);
+    } else if (!PyErr_Occurred()) {
+        PyErr_SetString(PyExc_RuntimeError, "the garbage collector has taken the method");
+    }
+    Py_XDECREF(first);
+    Py_XDECREF(named);
+    return result;
+}
+
+/* By PEP 590. Plain are only the object, target, source, and the stamp or stamps. */
+static PyObject *
+method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names)
+{
+    const Py_ssize_t count = (Py_ssize_t)(flagged & ~((size_t)1 << (8 * sizeof(size_t) - 1)));
+    const Py_ssize_t named = names == NULL ? 0 : PyTuple_Size(names);
+    const int at_is_named = count == 3 && named == 1 && PyTuple_GetItem(names, 0) == at_string;
+    if ((count == 4 && named == 0) || (self->many == NULL && count == 3 && (named == 0 || at_is_named))) {
+        PyObject *found = method_answer(self, args[0], args[1], args[2], count + named == 4 ? args[3] : NULL);
+        if (found != Py_None) {
+            return found;
+        }
+        Py_DECREF(found);
+    }
+    return method_run(self, args, count, names);
+}
+
+static PyObject *
+method_call(Method *self, PyObject *args, PyObject *kwargs)
+{
+    if (self->function == NULL) {
+        return method_run(self, NULL, 0, NULL);
+    }
+    return PyObject_Call(self->function, args, kwargs);
+}
+
+static PyObject *
+method_bind(PyObject *self, PyObject *instance, PyObject *Py_UNUSED(owner))
+{
+    if (instance == NULL || instance == Py_None) {
+        Py_INCREF(self);
+        return self;
+    }
+    return PyObject_CallFunctionObjArgs(bound_method, self, instance, NULL);
+}
+
+/* It looks like the method in Python, so that its signature and its documentation are found. */
+static PyObject *
+method_attribute(Method *self, PyObject *name)
+{
+    PyObject *found = self->function == NULL ? NULL : PyObject_GetAttr(self->function, name);
+    if (found == NULL) {
+        PyErr_Clear();
+        found = PyObject_GenericGetAttr(OBJECT(self), name);
+    }
+    return found;
+}
+
+static PyMemberDef method_members[] = {
+    {"__wrapped__", T_OBJECT_EX, offsetof(Method, function), READONLY, PyDoc_STR("The method in Python.")},
+    {"__vectorcalloffset__", T_PYSSIZET, offsetof(Method, vectorcall), READONLY, NULL},
+    {NULL}
+};
+
+static PyType_Slot method_slots[] = {
+    {Py_tp_doc, (void *)PyDoc_STR("Method(function, many): a method that runs only if there is no plain answer.")},
+    {Py_tp_new, method_new},
+    {Py_tp_dealloc, method_dealloc},
+    {Py_tp_traverse, method_traverse},
+    {Py_tp_clear, method_clear},
+    {Py_tp_call, method_call},
+    {Py_tp_descr_get, method_bind},
+    {Py_tp_getattro, method_attribute},
+    {Py_tp_members, method_members},
+    {0, NULL}
+};
+
+static PyType_Spec method_spec = {
+    "tfbus._kernel.Method", sizeof(Method), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC | Py_TPFLAGS_METHOD_DESCRIPTOR | HAVE_VECTORCALL | Py_TPFLAGS_IMMUTABLETYPE,
+    method_slots
+};
+
 /* Edge: the newest edge of a frame on a bus, and the plain judgement of a batch --------------------------------------- */
 
 typedef struct {
@@ -2120,11 +2299,9 @@ edge_set_newest(Edge *self, PyObject *value, void *Py_UNUSED(closure))
 static void
 edge_dealloc(Edge *self)
 {
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
     Py_XDECREF(self->parent);
     Py_XDECREF(self->trusted);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
+    let_go_of(OBJECT(self));
 }
 
 static PyGetSetDef edge_getset[] = {
@@ -2157,45 +2334,21 @@ typedef struct {
     int64_t horizon; /* ns */
 } Judge;
 
-static int
-judge_traverse(Judge *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->edges);
-    return 0;
-}
-
-static int
-judge_clear(Judge *self)
-{
-    Py_CLEAR(self->edges);
-    return 0;
-}
-
-static void
-judge_dealloc(Judge *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    judge_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(judge, 1)
 
 static int
 judge_init(Judge *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *edges;
     double square;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Judge takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!d:Judge", &PyDict_Type, &edges, &square)) {
         return -1;
     }
     Py_INCREF(edges);
-    judge_clear(self);
+    judge_clear(OBJECT(self));
     self->edges = edges;
     self->square = square;
     self->horizon = INT64_MIN;
@@ -2311,36 +2464,7 @@ typedef struct {
     char elsewhere;    /* whether it is noted elsewhere than in a line and among all that are parked */
 } Parked;
 
-static int
-parked_traverse(Parked *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->plain);
-    Py_VISIT(self->wake);
-    Py_VISIT(self->place);
-    Py_VISIT(self->answer);
-    return 0;
-}
-
-static int
-parked_clear(Parked *self)
-{
-    Py_CLEAR(self->plain);
-    Py_CLEAR(self->wake);
-    Py_CLEAR(self->place);
-    Py_CLEAR(self->answer);
-    return 0;
-}
-
-static void
-parked_dealloc(Parked *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    parked_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(parked, 4)
 
 static PyMemberDef parked_members[] = {
     {"plain", T_OBJECT, offsetof(Parked, plain), 0, PyDoc_STR("Target, source and at of a plain question, or None.")},
@@ -2374,44 +2498,17 @@ typedef struct {
     PyObject *limits;  /* list of (-stamp, -order, Parked), sorted */
 } Line;
 
-static int
-line_traverse(Line *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->places);
-    Py_VISIT(self->for_any);
-    Py_VISIT(self->limits);
-    return 0;
-}
-
-static int
-line_clear(Line *self)
-{
-    Py_CLEAR(self->places);
-    Py_CLEAR(self->for_any);
-    Py_CLEAR(self->limits);
-    return 0;
-}
-
-static void
-line_dealloc(Line *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    line_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(line, 3)
 
 static int
 line_init(Line *self, PyObject *Py_UNUSED(args), PyObject *Py_UNUSED(kwargs))
 {
-    line_clear(self);
+    line_clear(OBJECT(self));
     self->places = PyList_New(0);
     self->for_any = PyDict_New();
     self->limits = PyList_New(0);
     if (self->places == NULL || self->for_any == NULL || self->limits == NULL) {
-        line_clear(self);
+        line_clear(OBJECT(self));
         return -1;
     }
     return 0;
@@ -2452,41 +2549,13 @@ typedef struct {
     PyObject *parts[PARTS];
 } Feed;
 
-static int
-feed_traverse(Feed *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    for (int i = 0; i < PARTS; i++) {
-        Py_VISIT(self->parts[i]);
-    }
-    return 0;
-}
-
-static int
-feed_clear(Feed *self)
-{
-    for (int i = 0; i < PARTS; i++) {
-        Py_CLEAR(self->parts[i]);
-    }
-    return 0;
-}
-
-static void
-feed_dealloc(Feed *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    feed_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(feed, PARTS)
 
 static int
 feed_init(Feed *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *parts[PARTS];
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Feed takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!O!O!O!O!O!O!O:Feed", PathsType, &parts[PATHS], &PyDict_Type, &parts[FRAMES],
@@ -2659,7 +2728,12 @@ feed_wake(const Feed *self, PyObject *child, int64_t stamp, Trouble *trouble)
             }
             Py_XDECREF(done);
         } else if (PyDict_DelItem(self->parts[PARKED], item) < 0) {
-            set_aside(trouble);
+            if (PyErr_ExceptionMatches(PyExc_KeyError)) {
+                /* It could not be removed whole, for want of memory. */
+                PyErr_Clear();
+            } else {
+                set_aside(trouble);
+            }
         }
         feed_answer(self, waiter);
         if (waiter->wake != NULL) {
@@ -2747,53 +2821,23 @@ static PyType_Spec feed_spec = {
 
 typedef struct {
     PyObject_HEAD
+    /* A tuple of (Feed, callable that takes a batch which is not plain). It is cleared first: nothing is taken then. */
+    PyObject *feeds;
     PyObject *judge;      /* Judge */
     PyObject *kind;       /* the class of samples */
     PyObject *listeners;  /* a tuple of containers; whatever is in one has to hear of each batch */
-    PyObject *feeds;      /* a tuple of (Feed, callable that takes a batch which is not plain) */
     long long samples;    /* how many were taken */
     unsigned long thread; /* the only one that may publish */
     char open;
 } Intake;
 
-static int
-intake_traverse(Intake *self, visitproc visit, void *arg)
-{
-    Py_VISIT(Py_TYPE(OBJECT(self)));
-    Py_VISIT(self->judge);
-    Py_VISIT(self->kind);
-    Py_VISIT(self->listeners);
-    Py_VISIT(self->feeds);
-    return 0;
-}
-
-static int
-intake_clear(Intake *self)
-{
-    /* First, because nothing is taken without it. */
-    Py_CLEAR(self->feeds);
-    Py_CLEAR(self->judge);
-    Py_CLEAR(self->kind);
-    Py_CLEAR(self->listeners);
-    return 0;
-}
-
-static void
-intake_dealloc(Intake *self)
-{
-    PyTypeObject *type = Py_TYPE(OBJECT(self));
-    PyObject_GC_UnTrack(self);
-    intake_clear(self);
-    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
-    Py_DECREF(type);
-}
+REFERENCES(intake, 4)
 
 static int
 intake_init(Intake *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *judge, *kind, *listeners;
-    if (kwargs != NULL && PyDict_Size(kwargs) > 0) {
-        PyErr_SetString(PyExc_TypeError, "Intake takes no keyword arguments");
+    if (!has_no_keywords(kwargs)) {
         return -1;
     }
     if (!PyArg_ParseTuple(args, "O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type, &listeners)) {
@@ -3026,10 +3070,23 @@ module_exec(PyObject *module)
         PyErr_SetString(PyExc_ImportError, "the compiled kernel of tfbus runs in the main interpreter only");
         return -1;
     }
-    if ((empty_string == NULL && (empty_string = PyUnicode_InternFromString("")) == NULL)
-        || (raise_string == NULL && (raise_string = PyUnicode_InternFromString("raise")) == NULL)
-        || (drop_string == NULL && (drop_string = PyUnicode_InternFromString("drop")) == NULL)) {
-        return -1;
+    const struct {
+        const char *text;
+        PyObject **place;
+    } strings[] = {{"", &empty_string}, {"raise", &raise_string}, {"drop", &drop_string},
+                   {"at", &at_string}, {"_paths", &paths_string}, {"_memory", &memory_string}};
+    for (size_t i = 0; i < sizeof strings / sizeof *strings; i++) {
+        if (*strings[i].place == NULL && (*strings[i].place = PyUnicode_InternFromString(strings[i].text)) == NULL) {
+            return -1;
+        }
+    }
+    if (bound_method == NULL) {
+        PyObject *types = PyImport_ImportModule("types");
+        bound_method = types == NULL ? NULL : PyObject_GetAttrString(types, "MethodType");
+        Py_XDECREF(types);
+        if (bound_method == NULL) {
+            return -1;
+        }
     }
     if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
         || add_type(module, "Block", &block_spec, &BlockType) < 0
@@ -3040,7 +3097,8 @@ module_exec(PyObject *module)
         || add_type(module, "Edge", &edge_spec, &EdgeType) < 0 || add_type(module, "Judge", &judge_spec, &JudgeType) < 0
         || add_type(module, "Parked", &parked_spec, &ParkedType) < 0
         || add_type(module, "Line", &line_spec, &LineType) < 0 || add_type(module, "Feed", &feed_spec, &FeedType) < 0
-        || add_type(module, "Intake", &intake_spec, &IntakeType) < 0) {
+        || add_type(module, "Intake", &intake_spec, &IntakeType) < 0
+        || add_type(module, "Method", &method_spec, &MethodType) < 0) {
         return -1;
     }
     return 0;

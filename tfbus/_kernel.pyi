@@ -2,7 +2,7 @@
 
 They are `tfbus.geometry._python_sample` for `Sample`, `tfbus.bus._python_judge` for `Edge` and `Judge`,
 `tfbus.bus._python_intake` for `Intake`, `tfbus.waiting._python_feed` for `Parked`, `Line` and `Feed`, and
-`tfbus.tree._python_kernel` for the rest.
+`tfbus.tree._python_kernel` for the rest. `Method` has none: see `tfbus.tree.plain_first`.
 """
 
 from collections.abc import Mapping
@@ -128,6 +128,11 @@ class Intake:
     thread: int
     def __init__(self, judge: Judge, kind: type[Sample], listeners: tuple[Any, ...], /) -> None: ...
     def take(self, samples: object, invalid: object, /) -> bool: ...
+
+class Method:
+    __wrapped__: Any
+    def __init__(self, function: Any, many: type | None, /) -> None: ...
+    def __call__(self, *args: Any, **kwargs: Any) -> Any: ...
 
 def commit(frames: Mapping[str, History], batch: tuple[Sample, ...], first: int, /) -> int: ...
 def compose_paths(rows: Any, origins: Any, /) -> None: ...

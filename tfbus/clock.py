@@ -74,8 +74,9 @@ class Ticks:
 class Clock(Protocol):
     """The protocol of clocks: now, sleeping, ticks, timeouts and jumps.
 
-    A buffer sets one timer of the event loop for all its waiting lookups on a `SystemClock`, and uses `call_after` of a
-    `SimulatedClock`. On any other clock, a class derived from these included, each wait has its `move_on_after`.
+    A buffer sets one timer of the event loop for all its waiting lookups on a `SystemClock`, and on a `SimulatedClock`
+    uses its method ``call_after``. On any other clock, a class derived from these included, each wait has its
+    `move_on_after`.
     """
 
     def now(self) -> int:

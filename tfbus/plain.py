@@ -17,6 +17,7 @@ import numpy as np
 from tfbus.stamps import LATEST, Latest
 
 _NOT_FINITE = ("NaN", "Infinity", "-Infinity")
+_PLAIN = frozenset((types.NoneType, bool, int, str))
 
 
 class PlainData:
@@ -26,8 +27,11 @@ class PlainData:
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain data for JSON, with the name of the class as ``"type"``; stamps are ``int`` of ns."""
-        values = {field.name: to_plain(getattr(self, field.name)) for field in fields(self)}  # type: ignore[arg-type]
-        return {"type": type(self).__name__, **values}
+        values: dict[str, Any] = {"type": type(self).__name__}
+        for name in _kinds_of_fields(type(self)):  # type: ignore[arg-type]
+            value = getattr(self, name)
+            values[name] = value if type(value) in _PLAIN else to_plain(value)
+        return values
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -97,7 +101,12 @@ def from_fields(cls: type, data: Mapping[str, Any], kinds: Mapping[str, Any]) ->
         raise ValueError(f"a {cls.__name__} cannot be made of the data of a {kind!r}")
     for name in given.keys() ^ kinds.keys():
         raise ValueError(f"{cls.__name__} {'needs the' if name in kinds else 'has no'} field {name!r}")
-    return {name: from_plain(kind, given[name], f"{cls.__name__}.{name}") for name, kind in kinds.items()}
+    found = {}
+    for name, kind in kinds.items():
+        value = given[name]
+        # Nearly all fields are plain, and a call and a name for each cost more than all the rest.
+        found[name] = value if type(value) in _exact(kind) else from_plain(kind, value, f"{cls.__name__}.{name}")
+    return found
 
 
 def from_plain(hint: Any, value: Any, name: str) -> Any:
@@ -120,6 +129,20 @@ def from_plain(hint: Any, value: Any, name: str) -> Any:
             if found is not _OTHER:
                 return found
     raise ValueError(f"{name} cannot be {value!r}{problem}")
+
+
+@cache
+def _exact(hint: Any) -> frozenset[Any]:
+    """The types of values that are their own plain data and cannot be read as another alternative of a type."""
+    readers = dict(_readers_of(hint))
+    exact = {kind for kind, read in readers.items() if read is _read_exact}
+    if len(exact) < len(readers):
+        # Some texts are numbers that are not finite, or `LATEST`.
+        exact.discard(str)
+    if float in readers:
+        exact.discard(int)
+        exact.add(float)
+    return frozenset(exact)
 
 
 @cache
@@ -165,6 +188,8 @@ def _read_tuple(kind: Any, value: Any, name: str) -> Any:
     if parts[-1] is not Ellipsis and len(parts) != len(value):
         return _OTHER
     hints = [parts[0]] * len(value) if parts[-1] is Ellipsis else parts
+    if all(type(part) is hint for part, hint in zip(value, hints, strict=True)):
+        return tuple(value)
     return tuple(
         from_plain(hint, part, f"{name}[{i}]") for i, (hint, part) in enumerate(zip(hints, value, strict=True))
     )

@@ -122,7 +122,7 @@ class LinkStatistics(PlainData):
         Connected peers now.
     sent_messages, sent_samples : int
         Messages and samples that were sent as they were published. The static frames that are kept for late joiners
-        are not counted again.
+        are not counted again, and over zenoh nothing is sent while nobody is there to hear it.
     received_messages, received_samples : int
         Messages and samples that were received and published on the bus.
     lost : int

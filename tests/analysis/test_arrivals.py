@@ -40,6 +40,14 @@ def test_late_and_missing_samples_are_counted() -> None:
     assert base.longest_gap == pytest.approx(0.93)
 
 
+def test_of_three_samples_one_may_be_missing() -> None:
+    arrivals = Arrivals(10.0)
+    for stamp in (0, 10, 40):
+        arrivals.note((moving("map", "base", stamp * MS),), stamp * MS)
+    # The usual period is that in the middle of the two, 25 ms.
+    assert [base.lost for base in arrivals.measure(SECOND)] == [1]
+
+
 def test_the_time_from_a_stamp_that_is_ahead_is_negative_and_a_single_arrival_has_no_rate() -> None:
     arrivals = Arrivals(10.0)
     arrivals.note((moving("map", "base", 2 * SECOND), moving("map", "base", 3 * SECOND)), SECOND)

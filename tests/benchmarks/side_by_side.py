@@ -1,4 +1,4 @@
-"""The fixtures of the benchmarks: a plugin, so that all files fill one table and ask one tf2."""
+"""The fixtures of the benchmarks: a plugin, so that all files fill one table."""
 
 import json
 import os
@@ -13,6 +13,11 @@ from cases import Case, Vector
 SYSTEM_PYTHON = "/usr/bin/python3"
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    # A test without its peer is skipped before it measures anything.
+    config.addinivalue_line("filterwarnings", "ignore:Benchmark fixture was not used at all")
+
+
 @pytest.fixture(scope="session")
 def table(request: pytest.FixtureRequest) -> Table:
     table = Table()
@@ -21,13 +26,16 @@ def table(request: pytest.FixtureRequest) -> Table:
     return table
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def tf2() -> Iterator[Ask | str]:
-    """Has the real tf2 of ROS 1, in a process of its own, measure one round of a case; or says why there is none."""
+    """Has the real tf2 of ROS 1, in a process of its own, measure one round of a case; or says why there is none.
+
+    For one file, because processes that a file leaves are killed.
+    """
     yield from _peer(SYSTEM_PYTHON)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def tf2_of_ros_2() -> Iterator[Ask | str]:
     """As `tf2`, of ROS 2."""
     yield from _peer(os.environ.get("ROS2_PYTHON", "the Python that ROS2_PYTHON names"), "ros2")

@@ -1,24 +1,25 @@
 """The cost of thousands of static frames, robots and remote lookups for a link over zenoh."""
 
+import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from statistics import median
-from typing import Any
+from typing import IO, Any
 
 import anyio
 import anyio.lowlevel
 import pytest
 import zenoh
 from beside import Table
-from support.processes import free_ports, new_domain
-from support.samples import static
+from support.processes import crowd, free_ports, new_domain
+from support.samples import moving, static
 
-from tfbus import Bus
-from tfbus.links.zenoh import BufferClient, ZenohLink
+from tfbus import Buffer, Bus, TransformStamped
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
 
 pytest_plugins = ["side_by_side"]
 
@@ -49,6 +50,18 @@ async def main(domain, address):
             print("ready", flush=True)
             await anyio.to_thread.run_sync(sys.stdin.read)
             del declared
+"""
+
+# A process that asks for a stamp, from its input, many times at once.
+ASKER = """
+async def main(domain, address, count):
+    async with BufferClient(domain, connect=address) as client, anyio.create_task_group() as tasks:
+        await client.lookup("map", "base", 0)
+        print("ready", flush=True)
+        stamp = int(await anyio.to_thread.run_sync(sys.stdin.readline))
+        for _ in range(count):
+            tasks.start_soon(client.lookup, "map", "base", stamp)
+        await anyio.sleep_forever()
 """
 
 # A router that tells its CPU time for each line of input.
@@ -87,7 +100,7 @@ import anyio, anyio.to_thread
 import zenoh
 from support.samples import moving, static
 from tfbus import Buffer, Bus
-from tfbus.links.zenoh import BufferServer, ZenohLink, ZenohRouter
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._settings import settings
 """
@@ -122,7 +135,7 @@ def test_statics(frames: int, wanted: str, table: Table) -> None:
                 before = time.process_time()
                 for batch in batches:
                     bus.publish(batch)
-                while link.statistics().sent_samples < frames:
+                while link._endpoint.outbox.pending:
                     await anyio.lowlevel.checkpoint()
                 declared = time.process_time() - before
                 late = [float((await anyio.run_process(command(LATE, domain, address, frames))).stdout) for _ in "123"]
@@ -147,7 +160,9 @@ def test_remote_lookup(table: Table) -> None:
                 ours.append(time.perf_counter() - began)
                 ended = threading.Event()
                 began = time.perf_counter()
-                take = zenoh.handlers.Callback(lambda _: None, ended.set, indirect=False)
+                take: zenoh.handlers.Callback[zenoh.Reply] = zenoh.handlers.Callback(
+                    lambda _: None, ended.set, indirect=False
+                )
                 client._session._opened().get(f"bare/{domain}", take, payload=bytes(300), express=True)
                 assert ended.wait(10)
                 bare.append(time.perf_counter() - began)
@@ -192,3 +207,124 @@ def test_one_robot_of_many(table: Table) -> None:
         table.add(
             label, f"{many[place]:.3f} cores", f"of 10: {few[place]:.3f}", f"{many[place] / few[place]:.2f}", "<= 1.2"
         )
+
+
+def test_what_nobody_hears(table: Table) -> None:
+    """The cost of a link whose samples nobody subscribes to, for batches of 20 frames."""
+    turns, frames = 2_000, 20
+
+    async def main() -> float:
+        with Bus() as bus:
+            async with ZenohLink(bus, new_domain(), listen=f"tcp/127.0.0.1:{free_ports(1)[0]}"):
+                before = time.process_time()
+                for turn in range(turns):
+                    bus.publish([moving("map", f"f{frame}", turn) for frame in range(frames)])
+                    await anyio.lowlevel.checkpoint()
+                return (time.process_time() - before) / turns / frames
+
+    costs = [anyio.run(main) for _ in range(5)]
+    table.add("a sample that nobody hears", f"{median(costs) * 1e6:.2f} us", f"{max(costs) * 1e6:.2f} at worst", "", "")
+
+
+def test_remote_waits(table: Table) -> None:
+    """The server's CPU time for lookups that have to wait, and for as many local ones whose answers go to a queue."""
+    domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    figures: dict[str, list[float]] = {}
+
+    async def main() -> None:
+        with Bus() as bus, Buffer(bus, keep=None) as buffer:
+            bus.publish(moving("map", "base", 0))
+
+            async def spend(name: str, stamp: int, begin: Callable[[], object], *held: Callable[[], bool]) -> None:
+                """Have lookups begin, publish what helps none of them, and then what answers all."""
+                times = [time.process_time()]
+                begin()
+                for wait_is_over in held:
+                    while not wait_is_over():  # noqa: ASYNC110 - zenoh's threads wake no event here
+                        await anyio.sleep(0.02)
+                    times.append(time.process_time())
+                    if len(times) == 2:
+                        for earlier in range(ASKED, 0, -1):
+                            bus.publish(moving("map", "base", stamp - earlier))
+                        times.append(time.process_time())
+                        bus.publish(moving("map", "base", stamp))
+                figures.setdefault(name, []).append((times[1] - times[0] + times[3] - times[2]) / ASKED * 1e6)
+                figures.setdefault(f"{name}, publish", []).append((times[2] - times[1]) / ASKED * 1e6)
+
+            send, receive = anyio.create_memory_object_stream[TransformStamped](ASKED)
+
+            async def ask(stamp: int) -> None:
+                send.send_nowait(await buffer.lookup("map", "base", stamp))
+
+            async with BufferServer(buffer, domain, listen=address) as server, anyio.create_task_group() as tasks:
+                with send, receive:
+                    for turn in range(1, 4):
+                        stamp = turn * 10**6
+
+                        def begin_local(stamp: int = stamp) -> None:
+                            for _ in range(ASKED):
+                                tasks.start_soon(ask, stamp)
+
+                        await spend(
+                            "local",
+                            stamp,
+                            begin_local,
+                            lambda: len(buffer.pending()) == ASKED,
+                            lambda: receive.statistics().current_buffer_used == ASKED,
+                        )
+                        for _ in range(ASKED):
+                            receive.receive_nowait()
+                        with running(ASKER, domain, address, ASKED) as asker:
+                            pipe = asker.stdin
+                            assert pipe is not None
+                            whole = server.statistics().answered + ASKED
+
+                            def begin_remote(pipe: IO[str] = pipe, stamp: int = stamp) -> None:
+                                pipe.write(f"{stamp + 500_000}\n")
+                                pipe.flush()
+
+                            def all_answered(whole: int = whole) -> bool:
+                                return server.statistics().answered == whole
+
+                            await spend(
+                                "remote",
+                                stamp + 500_000,
+                                begin_remote,
+                                lambda: server.statistics().waiting == ASKED,
+                                all_answered,
+                            )
+
+    anyio.run(main)
+    medians = {name: median(values) for name, values in figures.items()}
+    for what, unit in (("", "a wait"), (", publish", "a publish that wakes none")):
+        remote, local = medians[f"remote{what}"], medians[f"local{what}"]
+        label = f"{unit}, {ASKED} remote ones"
+        table.add(label, f"{remote:.0f} us CPU", f"local {local:.0f} us", f"{remote / local:.2f}", "no more")
+
+
+def test_frozen_peer(table: Table) -> None:
+    """A peer that is stopped for a minute, while another removes static frames: what it holds after it goes on."""
+    frozen, settled = 60.0, 3.0
+    names = [f"s{number}" for number in range(20)]
+    with crowd() as together:
+        options = {"domain": new_domain(), "drop_lost": False}
+        address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+        source = together.add({**options, "listen": address})
+        peer = together.add({**options, "connect": address})
+        source.ask("statics", names=names)
+        peer.ask("until", static=names)
+        peer.signal(signal.SIGSTOP)
+        time.sleep(frozen / 2)
+        for name in names[5:]:
+            source.ask("remove", frame=name)
+        time.sleep(frozen / 2)
+        peer.signal(signal.SIGCONT)
+        began = time.perf_counter()
+        whole = None
+        while time.perf_counter() - began < settled:
+            if set(peer.ask("facts")["static"]) == set(names[:5]):
+                whole = whole or time.perf_counter() - began
+        held = set(peer.ask("facts")["static"])
+    ghosts = len(held - set(names[:5]))
+    label = "no ghost" if whole is None else f"none after {whole:.2f} s"
+    table.add(f"frozen for {frozen:.0f} s, ghosts {settled:.0f} s later", f"{ghosts} of 15", label, "", "0")

@@ -21,6 +21,7 @@ from tfbus import (
     PastLoop,
     PeerJoined,
     PeerLost,
+    Question,
     SimulatedClock,
     SystemClock,
     TransformBroadcaster,
@@ -28,6 +29,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.bus._ownership import OnConflict
+from tfbus.waiting.waiting_index import Waiter
 
 pytestmark = pytest.mark.anyio
 
@@ -728,3 +730,24 @@ async def test_late_data_that_form_a_loop_in_the_past_are_stored_counted_logged_
         assert early.lookup_nowait("b", "a", 5).stamp == 5
     (message,) = [message for message in caplog.messages if "loop" in message]
     assert message == "the frames a -> b -> a form a loop at 0.000000005 s, with late data of 'late'"
+
+
+@pytest.mark.parametrize("takes", [True, False])
+def test_an_interrupt_in_one_buffer_keeps_the_batch_from_no_other_nor_from_a_subscriber(takes: bool) -> None:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    heard: list[object] = []
+    with Bus() as bus, Buffer(bus) as first, Buffer(bus) as second:
+        bus.publish(moving("map", "a", 1))
+        with pytest.raises(FutureExtrapolationError) as caught:
+            first.lookup_nowait("map", "a", 2)
+        first._live.park(Waiter(Question("map", "a", 2), 0, interrupt), caught.value)
+        if not takes:
+            bus.subscribe(heard.append)
+            heard.clear()
+        sample = moving("map", "a", 2)
+        with pytest.raises(KeyboardInterrupt):
+            bus.publish(sample)
+        assert [buffer.lookup_nowait("map", "a").stamp for buffer in (first, second)] == [2, 2]
+        assert heard == ([] if takes else [(sample,)])

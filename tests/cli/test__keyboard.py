@@ -18,7 +18,7 @@ from tfbus.cli._keyboard import Keyboard, _split, keyboard
 
 pty = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
 
-_LIMIT = 20.0
+_LIMIT = 60.0
 
 
 def test_letters_and_arrows_are_told_apart() -> None:

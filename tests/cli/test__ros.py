@@ -1,4 +1,10 @@
+import os
+import re
+from pathlib import Path
+
 import pytest
+from support.programs import start_tfbus
+from support.robot_of_ros import URDF
 
 from tfbus import Bus
 from tfbus.cli._ros import is_ros, ros_link
@@ -50,3 +56,32 @@ def test_what_is_no_place_of_ros_is_a_usage_error(place: str, why: str) -> None:
         pytest.importorskip(extra)
     with pytest.raises(UsageError, match=why):
         ros_link(Bus(), place)
+
+
+@pytest.mark.thorough
+def test_every_command_that_joins_a_domain_joins_ros(tmp_path: Path) -> None:
+    for extra in ("cyclonedds", "urdf_parser_py"):
+        pytest.importorskip(extra)
+    number = 100 + os.getpid() % 99
+    ros, other = ("--ros", f"dds:{number}"), ("--ros", f"dds:{number + 1}")
+    recording, urdf = str(tmp_path / "drive.mcap"), tmp_path / "arm.urdf"
+    urdf.write_text(URDF)
+    with (
+        start_tfbus("broadcast", *ros) as broadcast,
+        start_tfbus("static", "base_laser", "camera", "--xyz", "1", "0", "0", *ros),
+        start_tfbus("robot", str(urdf), *ros) as robot,
+        start_tfbus("listen", *ros) as listen,
+    ):
+        assert broadcast.errors.expect("broadcasting").endswith(f"on ROS at dds:{number}, until Ctrl-C")
+        assert "base_link" in listen.output.expect("base_laser")
+        assert f"on ROS at dds:{number}" in robot.errors.expect("publishing")
+        with start_tfbus("echo", "base_link", "camera", *ros) as echo, start_tfbus("record", recording, *ros) as record:
+            echo.output.expect("Translation")
+            record.errors.expect("recording ROS at")
+            with start_tfbus("tree", *ros) as tree:
+                assert tree.wait() == 0
+            assert {"base_laser", "camera", "hand"} <= set(re.findall(r"\w+", tree.output.text))
+            assert record.end() == 130
+    with start_tfbus("echo", "base_link", "camera", *other) as there, start_tfbus("play", recording, *other) as play:
+        play.errors.expect(f"on ROS at dds:{number + 1}")
+        there.output.expect("Translation")

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from support.commands import Command, check_wrong_call
 from support.processes import new_domain
-from support.programs import PATIENCE, TFBUS, Program, start_tfbus
+from support.programs import PATIENCE, TFBUS, Program
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
@@ -231,12 +231,14 @@ def test_every_command_has_a_module_of_its_name() -> None:
 def test_a_signal_ends_it_silently_whenever_it_comes(number: signal.Signals) -> None:
     statuses = set()
     for step in range(16):
-        with start_tfbus("tree", "--domain", new_domain()) as tree:
-            # Python itself shows a traceback of its own start: until then, nothing of tfbus has been loaded.
-            time.sleep(0.3 + 0.05 * step)
+        with Program(sys.executable, "-X", "importtime", TFBUS, "tree", "--domain", new_domain()) as tree:
+            # Python itself shows a traceback of its own start: until a module is loaded by the command.
+            tree.errors.expect(r"\| +tfbus\.cli$")
+            tree.errors.expect("import time")
+            time.sleep(0.05 * step)
             statuses.add(tree.end(number))
-        assert tree.errors.text.replace("waiting for transforms", "").count("\n") <= 1
-        assert "Traceback" not in tree.errors.text
+        said = [line for line in tree.errors.text.splitlines() if not line.startswith("import time:")]
+        assert not said or (len(said) == 1 and said[0].startswith("waiting for transforms"))
     assert statuses <= {-number, 128 + number}
 
 

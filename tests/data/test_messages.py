@@ -292,3 +292,47 @@ def test_data_that_have_no_message_are_refused() -> None:
         to_message(PointStamped("map", LATEST, (1.0, 2.0, 3.0)))
     with pytest.raises(TypeError, match="'point'"):
         to_message(PointStamped("map", 5, (1.0, 2.0, 3.0)), like={"header": header()})
+
+
+@pytest.mark.thorough
+def test_messages_of_rosbags_as_they_come_from_a_bag_become_data_and_messages_again() -> None:
+    rosbags = pytest.importorskip("rosbags.typesys", reason='pip install "tfbus[bag]"')
+    store = rosbags.get_typestore(rosbags.Stores.ROS2_JAZZY)
+    types = store.types
+    head = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](5, 7), "laser")
+    point = types["geometry_msgs/msg/PointStamped"](head, types["geometry_msgs/msg/Point"](1.0, 2.0, 3.0))
+    ranges, nothing = np.array([1.0, 2.0, math.nan], np.float32), np.zeros(0, np.float32)
+    scan = types["sensor_msgs/msg/LaserScan"](head, 0.0, 1.0, 0.5, 0.0, 0.1, 0.5, 10.0, ranges, nothing)
+    field = types["sensor_msgs/msg/PointField"]
+    fields = [field(name, 4 * number, 7, 1) for number, name in enumerate(("x", "y", "z", "intensity"))]
+    content = np.arange(8, dtype="<f4").view(np.uint8)
+    cloud = types["sensor_msgs/msg/PointCloud2"](head, 1, 2, fields, False, 16, 32, content, False)
+    came = [
+        store.deserialize_cdr(store.serialize_cdr(message, message.__msgtype__), message.__msgtype__)
+        for message in (point, scan, cloud)
+    ]
+    found = [from_message(message) for message in came]
+    assert found[0] == PointStamped("laser", STAMP, (1.0, 2.0, 3.0))
+    assert [len(found[1].to_points().points), found[1].stamp] == [2, STAMP]
+    assert found[2].points.tolist() == [[0, 1, 2], [4, 5, 6]]
+    assert found[2].fields["intensity"].tolist() == [3, 7]
+    assert np.shares_memory(found[2].points, came[2].data), "the cloud was copied"
+    for message, data in zip(came, found, strict=True):
+        again = to_message(data, like=message)
+        kind = message.__msgtype__
+        assert bytes(store.serialize_cdr(again, kind)) == bytes(store.serialize_cdr(message, kind))
+
+
+@pytest.mark.thorough
+def test_messages_of_cyclone_dds_become_data_and_messages_again() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    from tfbus.links.dds import _types
+
+    make: Any = _types
+    place, turn = make.Vector3(1.5, 0.0, 0.0), make.Quaternion(0.0, 0.0, 0.0, 1.0)
+    made = make.TransformStamped(make.Header(make.Time(5, 7), "map"), "base", make.Transform(place, turn))
+    # As it comes over the network.
+    came = type(made).deserialize(made.serialize())
+    found = from_message(came)
+    assert found == TransformStamped("map", "base", STAMP, Transform((1.5, 0.0, 0.0)))
+    assert to_message(found, like=came) == came

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ pytestmark = pytest.mark.thorough
 
 BACKENDS = ("asyncio", "trio", "asyncio+uvloop")
 SECONDS = 10
+BLOCKED = 3.0
+"""The seconds for which a slow process does not return to its event loop."""
 RATE = 500 / 3
 """Batches of 20 that each of three processes sends a second: 10,000 samples in all."""
 
@@ -184,20 +187,36 @@ def test_a_frozen_process_is_lost_and_comes_back_with_its_static_frames(processe
     frozen.ask("until", static=["meanwhile"], peers=2)
 
 
+def test_a_process_that_is_held_up_for_a_part_of_its_lease_is_not_lost(processes: Crowd, place: Place) -> None:
+    listener = processes.add(place.first(lease=4.0, drop_lost=True))
+    held_up = processes.add(place.other(lease=4.0))
+    held_up.ask("statics", names=["lidar"], authority="urdf")
+    listener.ask("until", static=["lidar"], peers=1)
+    for _ in range(2):
+        held_up.signal(signal.SIGSTOP)
+        time.sleep(1.5)
+        held_up.signal(signal.SIGCONT)
+        # The next one begins at another moment between two signs of life.
+        time.sleep(0.7)
+    held_up.ask("statics", names=["camera"])
+    listener.ask("until", static=["lidar", "camera"], peers=1)
+    assert not listener.said(event="PeerLost")
+
+
 def test_a_slow_and_a_frozen_process_delay_no_other(processes: Crowd, place: Place) -> None:
     # The lease outlasts the test, so no peer is spared by being lost.
     broadcaster = processes.add(place.first(lease=60.0))
     reader, slow, frozen = (processes.add(place.other(lease=60.0), backend=backend) for backend in BACKENDS)
     meet(broadcaster, reader, slow, frozen)
     frozen.signal(signal.SIGSTOP)
-    blocked = slow.start("block", seconds=3.0)
+    blocked = slow.start("block", seconds=BLOCKED)
     sent = broadcaster.ask("stream", authority="wheels", batches=3_000, rate=1_000)
     reader.ask("until", last={"wheels": 2_999})
     tally = reader.ask("facts")["tallies"]["wheels"]
     assert (tally["missing"], tally["not_in_order"], tally["not_whole"]) == (0, 0, 0)
-    # A put that waited for the others would take seconds.
-    assert sent["longest_call"] < 1.0
-    assert broadcaster.ask("facts")["longest_pause"] < 1.0
+    # A put that waited for the slow one would take as long as that is blocked, and one for the frozen one for ever.
+    assert sent["longest_call"] < BLOCKED
+    assert broadcaster.ask("facts")["longest_pause"] < BLOCKED
     # All of it was kept for the slow one.
     slow.finish(blocked)
     slow.ask("until", last={"wheels": 2_999})

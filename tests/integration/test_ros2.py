@@ -5,22 +5,19 @@ The variable ``ROS2_PYTHON`` names a Python with rclpy and tf2_ros, such as ``/u
 variable ``ROSBRIDGE`` is a command that serves a rosbridge at the port that is its last argument.
 """
 
-import json
 import os
 import shlex
 import shutil
-import statistics
 import subprocess
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import AbstractContextManager, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import anyio
-import anyio.to_thread
 import pytest
-from support.both_sides import Program
+from support.both_sides import SECONDS, Node, Program, meet, node
 from support.processes import free_ports, until
 from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
 from support.wires import latched
@@ -33,7 +30,7 @@ pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
 PEER = Path(__file__).parents[1] / "support" / "ros2_peer.py"
 MESSAGES = PEER.with_name("real_ros_messages.py")
 ROBOT = PEER.with_name("ros2_robot.py")
-SECONDS = 10.0
+CYCLONE_PEER = PEER.with_name("cyclone_peer.py")
 _next_domain = iter(range(100 + os.getpid() % 50, 200))
 
 
@@ -45,31 +42,22 @@ def ros2_python() -> str:
     return python
 
 
-class Ros2Peer:
-    """Such a process."""
-
-    def __init__(self, python: str, domain: int, seconds: float, x: float = 0.5) -> None:
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        command = [python, str(PEER), "--seconds", f"{seconds}", "--x", f"{x}"]
-        self.process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-
-    async def next_line(self) -> dict[str, Any]:
-        assert self.process.stdout is not None
-        line = await anyio.to_thread.run_sync(self.process.stdout.readline)
-        return dict(json.loads(line))
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.communicate()
+def environment(domain: int) -> dict[str, str]:
+    return {"ROS_DOMAIN_ID": f"{domain}", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
-@contextmanager
-def peer(domain: int, seconds: float, x: float = 0.5) -> Iterator[Ros2Peer]:
-    started = Ros2Peer(ros2_python(), domain, seconds, x)
-    try:
-        yield started
-    finally:
-        started.kill()
+def peer(domain: int, seconds: float = SECONDS, x: float = 0.5) -> AbstractContextManager[Node]:
+    """A node of ROS 2 with rclpy, ``/driver``."""
+    return node([ros2_python(), str(PEER)], environment(domain), seconds, x)
+
+
+def cyclone_peer(domain: int, seconds: float = SECONDS, x: float = 0.5) -> AbstractContextManager[Node]:
+    """A node of ROS 2 with Cyclone DDS, ``/cyclone``, which needs no ROS."""
+    from tfbus.links.dds._domains import configuration
+
+    # As on a robot with both kinds, which Cyclone DDS has to be told of.
+    settings = {**environment(domain), "CYCLONEDDS_URI": configuration("localhost", (), None)}
+    return node([sys.executable, str(CYCLONE_PEER)], settings, seconds, x)
 
 
 @contextmanager
@@ -79,9 +67,9 @@ def rosbridge(domain: int) -> Iterator[str]:
     if not command:
         pytest.skip("no rosbridge: set ROSBRIDGE to a command that serves one at the port that is its last argument")
     (port,) = free_ports(1)
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    variables = {**os.environ, **environment(domain)}
     process = subprocess.Popen(
-        [*shlex.split(command), str(port)], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*shlex.split(command), str(port)], env=variables, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
     try:
         yield f"ws://127.0.0.1:{port}"
@@ -103,50 +91,33 @@ async def answering(url: str) -> None:
                 await anyio.sleep(0.2)
 
 
-async def meet(link: RosLink, bus: Bus, domain: int) -> dict[str, Any]:
-    """Have both sides broadcast and ask for ten seconds, and check the answers; returns the figures."""
-    with Buffer(bus) as buffer:
-        program = Program(bus, buffer)
-        async with link, anyio.create_task_group() as tasks:
-            tasks.start_soon(program.send)
-            with peer(domain, SECONDS) as ros:
-                assert (await ros.next_line())["event"] == "up"
-                await buffer.lookup("odom", "tool", timeout=20.0)
-                laser = await buffer.lookup("base", "laser", timeout=20.0)
-                assert laser.transform.translation == (0.5, 0.0, 0.0)
-                with anyio.CancelScope() as asking:
-                    async with anyio.create_task_group() as inner:
-                        inner.start_soon(program.ask)
-                        # The peer ends first, and nobody answers then.
-                        await anyio.sleep(SECONDS - 3.0)
-                        inner.cancel_scope.cancel()
-                        asking.cancel()
-                facts = await ros.next_line()
-            tasks.cancel_scope.cancel()
-    facts |= {
-        "in_ms": statistics.median(program.latencies),
-        "asked": program.answered + program.failed,
-        "authorities": sorted(program.authorities),
-    }
-    assert program.answered > 50
-    assert facts["answered"] > 300
-    assert (program.wrong, facts["wrong"]) == (0, 0)
-    assert program.failed <= 0.01 * (program.answered + program.failed)
-    assert facts["failed"] <= 0.01 * (facts["answered"] + facts["failed"])
-    assert link.statistics().rejected == {}
-    return facts
-
-
 async def test_dds_both_ways_with_every_answer_right() -> None:
     pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
     from tfbus.links.dds import DdsLink
 
     domain = next(_next_domain)
-    ros2_python()
     with Bus() as bus:
-        facts = await meet(DdsLink(bus, domain), bus, domain)
-    assert facts["authorities"] == ["/driver"]
-    print(facts)
+        assert await meet(DdsLink(bus, domain), bus, peer(domain)) == {"/driver"}
+
+
+async def test_dds_with_a_node_of_cyclone_dds_both_ways_with_every_answer_right() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    from tfbus.links.dds import DdsLink
+
+    domain = next(_next_domain)
+    with Bus() as bus:
+        assert await meet(DdsLink(bus, domain), bus, cyclone_peer(domain)) == {"/cyclone"}
+
+
+async def test_dds_with_nodes_of_both_kinds_both_ways_with_every_answer_right() -> None:
+    pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+    from tfbus.links.dds import DdsLink
+
+    domain = next(_next_domain)
+    with Bus() as bus:
+        # Both move the same frame in the same way.
+        nodes = cyclone_peer(domain), peer(domain)
+        assert await meet(DdsLink(bus, domain), bus, *nodes) == {"/cyclone", "/driver"}
 
 
 async def test_rosbridge_both_ways_with_every_answer_right() -> None:
@@ -157,7 +128,7 @@ async def test_rosbridge_both_ways_with_every_answer_right() -> None:
     ros2_python()
     with rosbridge(domain) as url, Bus() as bus:
         await answering(url)
-        print(await meet(RosbridgeLink(bus, url), bus, domain))
+        assert await meet(RosbridgeLink(bus, url), bus, peer(domain)) == {"rosbridge"}
 
 
 @contextmanager
@@ -165,8 +136,8 @@ def robot(domain: int, folder: Path) -> Iterator[None]:
     """A robot in ROS, described and moving."""
     urdf = folder / "arm.urdf"
     urdf.write_text(URDF)
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    process = subprocess.Popen([ros2_python(), str(ROBOT), str(urdf)], env=environment, stdout=subprocess.PIPE)
+    variables = {**os.environ, **environment(domain)}
+    process = subprocess.Popen([ros2_python(), str(ROBOT), str(urdf)], env=variables, stdout=subprocess.PIPE)
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == b"up\n"
@@ -209,44 +180,51 @@ async def test_a_robot_is_described_and_moved_by_ros_and_its_clock_followed_thro
         await check_command(link, url)
 
 
-@asynccontextmanager
-async def links(carrier: str, domain: int) -> AsyncIterator[Callable[[Bus], RosLink]]:
-    """Makes links to ROS 2 by a carrier; skips the test without it."""
-    ros2_python()
-    if carrier == "dds":
-        pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
-        from tfbus.links.dds import DdsLink
+MakePeer = Callable[..., AbstractContextManager[Node]]
 
-        yield lambda bus: DdsLink(bus, domain)
-    else:
+
+@asynccontextmanager
+async def links(kind: str, domain: int) -> AsyncIterator[tuple[Callable[[Bus], RosLink], MakePeer]]:
+    """Makes links to ROS 2, and nodes of it; skips the test without them."""
+    if kind != "cyclone":
+        ros2_python()
+    if kind == "rosbridge":
         pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
         from tfbus.links.rosbridge import RosbridgeLink
 
         with rosbridge(domain) as url:
             await answering(url)
-            yield lambda bus: RosbridgeLink(bus, url)
+            yield lambda bus: RosbridgeLink(bus, url), peer
+    else:
+        pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+        from tfbus.links.dds import DdsLink
+
+        yield lambda bus: DdsLink(bus, domain), cyclone_peer if kind == "cyclone" else peer
 
 
-@pytest.mark.parametrize("carrier", ["dds", "rosbridge"])
-async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(carrier: str) -> None:
+KINDS = ["dds", "cyclone", "rosbridge"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_node_that_is_killed_is_heard_again_when_it_is_back(kind: str) -> None:
     domain = next(_next_domain)
-    async with links(carrier, domain) as link_of:
+    async with links(kind, domain) as (link_of, peer_of):
         with Bus() as bus, Buffer(bus) as buffer:
             async with link_of(bus) as link:
-                with peer(domain, 60.0):
+                with peer_of(domain, 60.0):
                     found = await buffer.lookup("base", "laser", timeout=20.0)
                     assert found.transform.translation[0] == 0.5
                 # Killed without a word: a new one says something else.
-                with peer(domain, 60.0, x=0.75):
+                with peer_of(domain, 60.0, x=0.75):
                     await until(lambda: latched(bus)["laser"].transform.translation[0] == 0.75)
                 assert link.statistics().rejected == {}
 
 
-@pytest.mark.parametrize("carrier", ["dds", "rosbridge"])
-async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(carrier: str) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(kind: str) -> None:
     domain = next(_next_domain)
-    async with links(carrier, domain) as link_of:
-        with peer(domain, 8.0) as ros, Bus() as bus, Buffer(bus) as buffer:
+    async with links(kind, domain) as (link_of, peer_of):
+        with peer_of(domain, 8.0) as ros, Bus() as bus, Buffer(bus) as buffer:
             assert (await ros.next_line())["event"] == "up"
             program = Program(bus, buffer)
             for _ in range(2):
@@ -260,11 +238,11 @@ async def test_a_node_hears_the_static_frames_of_a_link_that_came_back(carrier: 
     assert facts["wrong"] == 0
 
 
-@pytest.mark.parametrize("carrier", ["dds", "rosbridge"])
-async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(carrier: str) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(kind: str) -> None:
     domain = next(_next_domain)
-    async with links(carrier, domain) as link_of:
-        with peer(domain, 60.0), Bus() as bus, Buffer(bus) as buffer:
+    async with links(kind, domain) as (link_of, peer_of):
+        with peer_of(domain, 60.0), Bus() as bus, Buffer(bus) as buffer:
             Program(bus, buffer)
             async with link_of(bus):
                 await buffer.lookup("base", "laser", timeout=20.0)
@@ -272,6 +250,30 @@ async def test_a_late_link_has_the_static_frames_of_ros_and_of_other_links(carri
                     async with link_of(late_bus):
                         await late.lookup("base", "laser", timeout=40.0)
                         await late.lookup("arm", "tool", timeout=40.0)
+
+
+async def test_a_link_to_rosbridge_whose_connection_broke_hears_moving_frames_again_and_is_heard() -> None:
+    domain = next(_next_domain)
+    async with links("rosbridge", domain) as (link_of, peer_of):
+        with Bus() as bus, Buffer(bus) as buffer:
+            program = Program(bus, buffer)
+            async with link_of(bus) as link, anyio.create_task_group() as tasks:
+                tasks.start_soon(program.send)
+                with peer_of(domain, 25.0) as ros:
+                    assert (await ros.next_line())["event"] == "up"
+                    await buffer.lookup("odom", "tool", timeout=20.0)
+                    # The server still has our publisher, beside which it subscribes to what is latched only.
+                    await link._carrier._socket.close()  # type: ignore[attr-defined]
+                    await until(lambda: link.peers == ())
+                    await until(lambda: link.peers != ())
+                    # What it had before the break is too old by then.
+                    await anyio.sleep(2.0)
+                    await buffer.lookup("odom", "tool", max_age=1.0, timeout=40.0)
+                    facts = await ros.next_line()
+                tasks.cancel_scope.cancel()
+    # Some 11 s of 25 are lost for moving frames.
+    assert facts["received"]["arm"] > 900
+    assert facts["wrong"] == 0
 
 
 def test_messages_of_rclpy_become_data_and_messages_again() -> None:

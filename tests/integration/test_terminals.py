@@ -1,5 +1,7 @@
 """The output of commands on a real terminal fits its width, and keeps the important columns."""
 
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -35,16 +37,28 @@ def test_the_frames_of_a_robot_fit(urdf: Path, width: int) -> None:
         assert ("base_link" in text, " 0 rad" in text) == (True, True)
 
 
-@pytest.mark.parametrize("urdf", URDFS)
-def test_the_tree_of_a_domain_fits_with_frame_rate_and_age(urdf: Path, width: int) -> None:
+@pytest.fixture(scope="module", params=URDFS)
+def robot(request: pytest.FixtureRequest) -> Iterator[tuple[Path, tuple[str, ...]]]:
+    """The description of a robot that is published, and the options that join its domain."""
     domain, address = new_domain(), free_address()
-    with start_tfbus("robot", str(urdf), "--domain", domain, "--listen", address) as robot:
-        robot.errors.expect("publishing")
-        options = ("--domain", domain, "--connect", address)
-        once = lines_on_a_terminal(width, "tree", *options)
-        watched = lines_on_a_terminal(width, "tree", "--watch", *options, seconds=1.5)
-        echoed = lines_on_a_terminal(width, "echo", *pair_of(urdf), *options, seconds=0.5)
-        monitored = lines_on_a_terminal(width, "monitor", "--once", "--duration", "1.5", *options)
+    with start_tfbus("robot", str(request.param), "--domain", domain, "--listen", address) as program:
+        program.errors.expect("publishing")
+        yield request.param, ("--domain", domain, "--connect", address)
+
+
+def test_the_tree_of_a_domain_fits_with_frame_rate_and_age(robot: tuple[Path, tuple[str, ...]], width: int) -> None:
+    urdf, options = robot
+    with ThreadPoolExecutor() as side_by_side:
+        drawn = [
+            side_by_side.submit(lines_on_a_terminal, width, *command, *options, seconds=seconds)
+            for command, seconds in (
+                (("tree",), None),
+                (("tree", "--watch"), 1.5),
+                (("echo", *pair_of(urdf)), 0.5),
+                (("monitor", "--once", "--duration", "1.5"), None),
+            )
+        ]
+    once, watched, echoed, monitored = (lines.result() for lines in drawn)
     for lines in (once, watched, echoed, monitored):
         check(lines, width)
     moving = [line for line in once if " Hz" in line]

@@ -2,7 +2,15 @@ from random import Random
 
 import pytest
 
-from tfbus.links._asker import FIRST_PAUSE, LONGEST_PAUSE, MOST_OPEN, PATIENCE, SETTLING, Asker
+from tfbus.links._asker import (
+    FIRST_PAUSE,
+    LONGEST_PATIENCE,
+    LONGEST_PAUSE,
+    MOST_OPEN,
+    PATIENCE,
+    SETTLING,
+    Asker,
+)
 
 
 class Scene:
@@ -65,6 +73,27 @@ def test_a_question_without_an_answer_is_asked_again() -> None:
     assert scene.asker.take_due() == []
     assert scene.wait() <= 1.5 * FIRST_PAUSE
     assert scene.asker.take_due() == ["a"]
+
+
+def test_a_peer_that_has_no_time_is_given_ever_more() -> None:
+    scene = Scene()
+    scene.asker.want("a", at_once=True)
+    patience = PATIENCE
+    for _ in range(6):
+        assert scene.asker.take_due() == ["a"]
+        assert scene.wait() == pytest.approx(patience)
+        patience = min(2 * patience, LONGEST_PATIENCE)
+        assert scene.asker.take_due() == []
+        scene.wait()
+    assert patience == LONGEST_PATIENCE
+    # An answer that is of no use is an answer.
+    scene.asker.take_due()
+    scene.asker.progressed("a")
+    scene.asker.take_due()
+    scene.asker.failed("a")
+    scene.wait()
+    assert scene.asker.take_due() == ["a"]
+    assert scene.wait() == pytest.approx(PATIENCE)
 
 
 def test_so_many_questions_are_open_at_once_and_no_more() -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from itertools import groupby
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
 from support.samples import moving, static
@@ -17,15 +17,15 @@ from support.wires import Domain, End, size_of
 from tfbus import Buffer, Bus, BusClosedError, FrameAdded, PeerLost, PeerRejected, SimulatedClock, TransformStamped
 from tfbus.bus._ownership import OnConflict
 from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
-from tfbus.links._entries import RemovedFrame
-from tfbus.links._inbox import ReceivedBatch
+from tfbus.links._entries import MovingFrame, RemovedFrame
+from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._message import Message, read_message
 from tfbus.links._mirror import Mirror
 from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence
 from tfbus.links._relay import LARGEST_JUMP, Relay
-from tfbus.links._state import StateStep
+from tfbus.links._state import StateStep, digest_moving
 from tfbus.tf_message import encode
 
 ORIGIN, OTHER = b"0123456789abcdef", b"another origin !"
@@ -159,7 +159,6 @@ def test_a_message_is_published_batch_by_batch_with_everything_that_was_said() -
 
 
 @given(samples=st.lists(some.samples(names=st.sampled_from("abc"), at=some.stamps(0, 2**60)), min_size=1, max_size=6))
-@settings(max_examples=25)
 def test_received_samples_are_published_to_the_bit(samples: list[TransformStamped]) -> None:
     with receiver() as here, Bus(SimulatedClock()) as there:
         heard: list[Batch] = []
@@ -229,6 +228,25 @@ def test_a_claim_after_a_lost_message_is_not_believed(second: int, told: int) ->
         peer.mirror = mirror = Mirror(10)
         here.receive_bytes(encode(()), pack(second, [], StateStep(0, 1, 0)))
         assert mirror.number == told
+
+
+def test_a_live_message_that_an_answer_has_overtaken_does_not_change_what_is_known_of_the_peer() -> None:
+    with receiver() as here:
+        peer = here.peers.find("peer")
+        assert peer is not None
+        peer.mirror = mirror = Mirror(10)
+        # The answer told that frame "a" has gone by now.
+        mirror.moving("b")
+        mirror.answered(StateStep(0, 3, digest_moving("b")))
+        assert mirror.agrees
+        late: list[ReceivedBatch | RemovedFrame | MovingFrame] = [ReceivedBatch([], [], ORIGIN, 1), MovingFrame("a")]
+        late.append(RemovedFrame(ORIGIN, 1, "b", lost=True))
+        here.inbox.receive("peer", ReceivedMessage(late, 1, step=StateStep(0, 2, digest_moving("a"), message=1)))
+        assert (mirror.agrees, "a" in mirror, "b" in mirror) == (True, False, True)
+        # What an answer has not told yet is noted.
+        now = StateStep(3, 4, digest_moving("a") ^ digest_moving("b"), message=2)
+        here.inbox.receive("peer", ReceivedMessage([MovingFrame("a")], 2, step=now))
+        assert (mirror.agrees, mirror.number, "a" in mirror) == (True, 4, True)
 
 
 def test_a_claim_that_is_near_a_large_number_is_believed() -> None:
@@ -700,7 +718,6 @@ any_removal = st.builds(RemovedFrame, st.sampled_from((ORIGIN, OTHER)), st.integ
     ),
     data=st.data(),
 )
-@settings(max_examples=20)
 def test_messages_of_any_content_do_no_harm(messages: list[tuple[list[Entry], int, str]], data: st.DataObject) -> None:
     with receiver(max_frames=2) as here:
         for entries, number, sender in messages:

@@ -1,7 +1,7 @@
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support import strategies as some
 from support.samples import moving, static
@@ -85,7 +85,6 @@ def test_one_message_holds_batches_and_removals_in_order_with_their_origins_numb
 
 
 @given(wanted=st.lists(st.lists(some.samples(at=some.stamps(0, TOO_LATE - 1)), min_size=1, max_size=3), max_size=3))
-@settings(max_examples=25)
 def test_every_batch_is_read_as_it_was_written(wanted: list[Batch]) -> None:
     writer = Writer()
     for samples in wanted:
@@ -222,6 +221,16 @@ def test_a_turn_without_a_message_uses_no_number() -> None:
         assert writer.write() == []
         writer.add(moving("map", "a", 1))
         assert [unpack(message.attachment).number for message in writer.write()] == [number]
+
+
+def test_a_turn_that_is_skipped_has_a_number_and_its_time_is_told_later() -> None:
+    refused: list[Exception] = []
+    writer = MessageWriter(SendReport(refused.append))
+    writer.skip(5)
+    writer.skip()
+    (message,) = writer.write([RemovedFrame(ORIGIN, 1, "a")])
+    received = read_message(message.payload, message.attachment)
+    assert (received.number, received.time) == (3, 5)
 
 
 @pytest.mark.parametrize("frame", ["\ud800", "x" * (MAX_NAME + 1)])

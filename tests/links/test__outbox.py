@@ -1,4 +1,4 @@
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, static
 
@@ -170,7 +170,6 @@ def test_an_echo_of_frames_that_are_not_kept_notifies_nobody() -> None:
         max_size=30,
     )
 )
-@settings(max_examples=60)
 def test_what_is_kept_is_the_last_sample_that_was_sent_or_came_behind_it(steps: list[tuple[str, str, bool]]) -> None:
     sender = Sender()
     model: dict[str, TransformStamped | None] = {}

@@ -1,5 +1,6 @@
 import pytest
 
+from tfbus.links._mirror import Mirror
 from tfbus.links._peers import MAX_PEERS, Peer, Peers
 
 Report = tuple[str, str, str]
@@ -35,6 +36,20 @@ def test_only_peers_that_have_announced_themselves_are_present() -> None:
     assert list(peers.present) == ["a", "c"]
     peers.forget("c")
     assert list(peers.present) == ["a"]
+
+
+def test_a_frame_is_brought_by_peers_that_have_told_so() -> None:
+    peers, _ = peers_and_reports()
+    first, second, _ = (known(peers, name) for name in "abc")
+    first.mirror, second.mirror = Mirror(10), Mirror(10)
+    assert not peers.brings("s", None)
+    first.mirror.static("s", bytes(16), 1)
+    assert [peers.brings("s", besides) for besides in (None, first, second)] == [True, False, True]
+    second.mirror.moving("s")
+    assert peers.brings("s", first)
+    assert not peers.brings("t", None)
+    peers.forget("b")
+    assert not peers.brings("s", first)
 
 
 def test_a_peer_that_comes_back_is_a_new_and_younger_one() -> None:

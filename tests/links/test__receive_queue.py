@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.links._receive_queue import MAX_BYTES, Received, ReceiveQueue
+from tfbus.links._receive_queue import MANY, MAX_BYTES, Answer, Presence, Question, Received, ReceiveQueue
 from tfbus.statistics import QueueStatistics
 
 MIB = 2**20
@@ -35,6 +35,41 @@ def test_items_are_read_in_the_order_in_which_they_came() -> None:
     assert len(queue) == 4
     assert drained(queue) == [1, 2, 3, True]
     assert (len(queue), queue.get()) == (0, None)
+
+
+@pytest.mark.parametrize("waiting", [MANY, MANY + 1])
+def test_questions_answers_and_those_who_join_overtake_what_waits_if_that_is_much(waiting: int) -> None:
+    queue = ReceiveQueue(1_000)
+    urgent = [Presence.JOINED, Question(0, None), Answer(None)]
+    before, behind = list(range(waiting)), [-1]
+    for content in (*before, *urgent, *behind):
+        queue.put(moving(content) if isinstance(content, int) else kept(content))
+    assert len(queue) == waiting + 4
+    assert drained(queue) == ([*urgent, *before] if waiting > MANY else [*before, *urgent]) + behind
+
+
+def test_what_overtakes_has_a_bound_too() -> None:
+    queue = ReceiveQueue(10)
+    queue.put(kept(Answer("large"), MAX_BYTES + 1))
+    assert (len(queue), queue.statistics().dropped) == (0, 1)
+    queue.put(kept(Answer("small"), MIB))
+    queue.put(moving(1, MIB))
+    queue.put(kept(Answer("nearly all"), MAX_BYTES - 2 * MIB))
+    assert drained(queue) == [Answer("small"), Answer("nearly all")], "moving items make room first"
+    assert queue.statistics().dropped == 2
+
+
+def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() -> None:
+    queue = ReceiveQueue(1_000)
+    items = [*map(moving, range(MANY + 1)), kept(Presence.LEFT), moving(-1), kept(Presence.JOINED)]
+    for item in items:
+        queue.put(item)
+    assert drained(queue) == [item.content for item in items]
+    # Once the end was read, nothing holds those who join.
+    many = list(range(MANY + 1))
+    for item in (*map(moving, many), kept(Presence.JOINED)):
+        queue.put(item)
+    assert drained(queue) == [Presence.JOINED, *many]
 
 
 def test_beyond_the_capacity_the_oldest_moving_items_are_dropped_and_the_others_stay_in_order() -> None:

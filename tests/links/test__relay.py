@@ -11,10 +11,12 @@ from support.samples import moving, static
 from support.wires import (
     CHAIN,
     CIRCLE,
+    CIRCLE_OF_FIVE,
     MESH,
     PAIR,
     RING,
     RING_WITH_A_TAIL,
+    TRIANGLE,
     TWO_BRIDGES,
     Domain,
     Graph,
@@ -25,8 +27,11 @@ from support.wires import (
 
 from tfbus import Bus, BusClosedError, PeerLost, SimulatedClock, TransformStamped
 from tfbus.bus.event_stream import EventStream
-from tfbus.links._entries import OutgoingBatch
+from tfbus.links._attachment import pack
+from tfbus.links._entries import OutgoingBatch, RemovedFrame
+from tfbus.links._message import Message
 from tfbus.links._relay import relay_of
+from tfbus.tf_message import encode
 
 graphs = pytest.mark.parametrize(
     "graph", [MESH, CHAIN, RING, CIRCLE, TWO_BRIDGES], ids=["mesh", "chain", "ring", "circle", "two bridges"]
@@ -267,7 +272,7 @@ def test_frames_that_come_and_go_by_the_ten_thousand_leave_little_behind() -> No
             net.settle()
         assert [bus.statistics().frames for bus in net.buses] == [0, 0, 0]
         for relay in relays:
-            assert 1_000 < size_of(relay) <= 20_020, "what was removed last is remembered, and it is not without end"
+            assert 1_000 < size_of(relay) <= 20_030, "what was removed last is remembered, and it is not without end"
         for end in net.ends:
             assert size_of(end.endpoint.outbox) == 0
             assert 1_000 < size_of(end.endpoint.outbox.state) <= 60_000
@@ -460,6 +465,120 @@ def test_samples_on_a_slower_way_do_not_bring_back_a_lost_frame() -> None:
                 wire.deliver()
         net.settle()
         assert [frames_of(bus) for bus in (b, c)] == [set(), set()]
+
+
+# What was lost comes back as soon as its owner is reached, and not without it; see `Removals`.
+
+
+@pytest.mark.parametrize("graph", [RING, CIRCLE, CIRCLE_OF_FIVE, TRIANGLE], ids=["3", "4", "5", "triangle"])
+def test_a_ring_that_is_cut_has_all_static_frames_everywhere_and_loses_those_of_a_dead_bus(graph: Graph) -> None:
+    with Network(graph, drop_lost=True) as net:
+        for member, bus in enumerate(net.buses):
+            bus.publish(static("map", f"{member}"))
+        net.settle()
+        ends = {end.bus: end for end in net.domains[0].ends}
+        net.domains[0].part(ends[net.buses[0]], ends[net.buses[1]])
+        net.settle()
+        everything = {f"{member}" for member in range(len(net.buses))}
+        assert [set(latched(bus)) for bus in net.buses] == [everything] * len(net.buses)
+        dead = net.buses[0]
+        for domain in net.domains:
+            for end in [end for end in domain.ends if end.bus is dead]:
+                domain.kill(end)
+        net.settle()
+        assert [set(latched(bus)) for bus in net.buses[1:]] == [everything - {"0"}] * (len(net.buses) - 1)
+
+
+@pytest.mark.parametrize(
+    ("graph", "steps"),
+    [
+        (
+            TWO_BRIDGES,
+            [
+                ("part", 6, 5, [1]),
+                ("part", 1, 5, [11]),
+                ("publish", 7, 9, [7]),
+                ("send", 3, 7, [4]),
+                ("deliver", 5, 8, [4]),
+                ("part", 6, 1, [5]),
+            ],
+        ),
+        (
+            [[0, 1, 2], [1, 2, 3], [3, 4], [4, 0]],
+            [
+                ("publish", 3, 0, [11]),
+                ("send", 3, 0, [0]),
+                ("part", 11, 8, [10]),
+                ("flush", 0, 0, [0]),
+                ("part", 2, 9, [0]),
+            ],
+        ),
+        (
+            CIRCLE_OF_FIVE,
+            [
+                ("publish", 5, 7, [6, 11, 3, 8]),
+                ("send", 10, 5, [0]),
+                ("deliver", 9, 0, [6]),
+                ("part", 3, 8, [2]),
+                ("part", 2, 10, [11]),
+                ("deliver", 8, 8, [1]),
+                ("part", 6, 9, [5]),
+                ("send", 1, 6, [8]),
+                ("deliver", 4, 3, [10]),
+            ],
+        ),
+    ],
+    ids=["two bridges", "bridges in a ring", "five"],
+)
+def test_schedules_after_which_a_frame_once_stayed_away_for_good(graph: Graph, steps: list[Step]) -> None:
+    with Network(graph, drop_lost=True) as net:
+        Model(net).live(steps)
+
+
+def test_a_bus_that_has_taken_a_frame_from_a_bridge_keeps_it_when_another_peer_brings_it_instead() -> None:
+    steps = [
+        ("part", 4, 0, [5]),
+        ("part", 2, 0, [0]),
+        ("publish", 2, 0, [11]),
+        ("send", 2, 0, [0]),
+        ("deliver", 2, 0, [11]),
+        ("send", 1, 0, [0]),
+        ("part", 0, 3, [7]),
+    ]
+    with Network(TWO_BRIDGES) as net:
+        Model(net).live(steps)
+
+
+def test_an_owner_says_a_frame_again_once_for_each_loss_that_it_has_not_answered() -> None:
+    with Network(PAIR) as net:
+        owner, other = net.domains[0].ends
+        owner.bus.publish([static("map", "s"), static("map", "t")])
+        net.settle()
+        number = owner.relay.newest_number("s")
+        assert number is not None
+
+        def told(frame: str, sequence: int, origin: bytes = b"another bus here") -> tuple[int, int]:
+            """The rise of the number of `s`, and of the samples that the other bus has."""
+            before, samples = owner.relay.newest_number("s"), other.bus.statistics().samples
+            payload, attachment = encode(()), pack(0, [RemovedFrame(origin, sequence, frame, lost=True)])
+            owner.receive(other.id, Message(payload, attachment, 0))
+            net.settle()
+            after = owner.relay.newest_number("s")
+            assert before is not None
+            assert after is not None
+            return after[1] - before[1], other.bus.statistics().samples - samples
+
+        later = number[1] + 10
+        assert told("s", later) == (11, 1)
+        assert told("s", later) == (0, 0), "that loss is answered"
+        assert told("s", number[1]) == (0, 0), "it is of an older sample"
+        assert told("s", later + 100, owner.relay.origin) == (0, 0), "the owner itself has lost nothing"
+        assert told("unknown", later + 100) == (0, 0)
+        assert told("t", later + 200) == (0, 1)
+        assert [set(latched(end.bus)) for end in (owner, other)] == [{"s", "t"}] * 2
+        owner.bus.publish(moving("map", "s", 1))
+        net.settle()
+        assert told("s", later + 500) == (0, 0), "the next sample of a moving frame is news by itself"
 
 
 def test_a_subscriber_may_remove_and_publish_frames_of_a_lost_peer_when_it_hears_of_it() -> None:

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import SMALL, Line, batches_in, messages_in, write_mcap
@@ -236,6 +235,8 @@ def test_transforms_are_written_in_foxglove_s_schema_to_the_last_bit(tmp_path: P
             ("foxglove.FrameTransforms", True)
         }
     # The official decoder, with the definition in the file.
+    from mcap_protobuf.decoder import DecoderFactory
+
     with path.open("rb") as file:
         decoded = [
             message for *_, message in make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()

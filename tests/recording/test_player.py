@@ -756,7 +756,7 @@ async def test_a_pause_that_comes_when_a_message_is_due_holds_it_back(tmp_path: 
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(steered.player.play)
             await steered.until(1)
-            for _ in range(10):
+            for _ in range(4):
                 # Just when the next step of the clock is due.
                 await anyio.sleep(0.02)
                 steered.player.pause()

@@ -17,9 +17,7 @@ EDGES = (("map", "odom"), ("odom", "base"), ("base", "arm"), ("map", "r1/base"),
 LIMITS = (STAMP_MIN, STAMP_MIN + 1, -(2**62), 2**53 + 1, 2**62, STAMP_MAX - 1, STAMP_MAX)
 
 
-def bits_of(sample: Any) -> object:
-    if sample is None:
-        return None
+def bits_of(sample: Any) -> tuple[object, ...]:
     return sample.parent, sample.child, sample.stamp, sample.authority, sample.static, struct.pack("7d", *sample._row)
 
 
@@ -55,7 +53,7 @@ class World:
         """Note what a call returns or raises."""
         try:
             self.said.append(call())
-        except (self.tfbus.TransformError, TypeError, ValueError, RuntimeError, KeyError) as error:
+        except (self.tfbus.TransformError, TypeError, ValueError, RuntimeError) as error:
             self.said.append(error_of(error))
 
     # Drawn things
@@ -166,8 +164,9 @@ class World:
 
         def wake() -> None:
             self.said.append(("woken", number))
-            # The compiled kernel leaves stamps that are very far apart to Python: whoever gets no answer asks.
-            self.say(lambda: bits_of(waiter.answer or buffer._lookups.lookup_nowait(question)))
+            # The compiled kernel leaves stamps that are very far apart to Python: whoever gets no answer asks, and then
+            # the names are those of the buffer.
+            self.say(lambda: bits_of(waiter.answer or buffer._lookups.lookup_nowait(question))[2:])
             if trick == "raise":
                 raise ValueError("the loop is closed")
             if self.depth < 3:
@@ -247,7 +246,7 @@ def run(seed: int, steps: int) -> None:
 
 @needs_both
 @pytest.mark.thorough
-@pytest.mark.parametrize("first", range(0, 20, 5))
+@pytest.mark.parametrize("first", [*range(0, 20, 5), 3025])
 def test_random_traffic_does_the_same_on_both_kernels(first: int) -> None:
     for seed in range(first, first + 5):
         run(seed, 250)

@@ -5,7 +5,7 @@ import random
 import sys
 import threading
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -18,9 +18,8 @@ from support.samples import moving, over, static, tree_of
 from support.threads import threads_that
 
 import tfbus
-from tfbus import LATEST, Buffer, Bus, FutureExtrapolationError, Question, TransformLookupError, TransformTree
+from tfbus import LATEST, Buffer, Bus, TransformLookupError, TransformTree
 from tfbus.tree._kernel import History
-from tfbus.waiting.waiting_index import Waiter
 
 pytestmark = pytest.mark.thorough
 
@@ -81,6 +80,15 @@ def grown(call: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
+def check_leaves_nothing(use: Callable[[], object], shared: Sequence[object]) -> None:
+    """Check that calls leave neither memory behind nor references to the things that they share."""
+    gc.collect()
+    before = [sys.getrefcount(thing) for thing in shared]
+    # The smallest object that a call could leak would make 8,000.
+    assert grown(use) < 4_000
+    assert [sys.getrefcount(thing) for thing in shared] == before
+
+
 @needs_both
 def test_no_call_leaks_memory_or_references() -> None:
     kernel: Any = COMPILED
@@ -130,11 +138,7 @@ def test_no_call_leaks_memory_or_references() -> None:
         del held
 
     use()
-    gc.collect()
-    before = [sys.getrefcount(thing) for thing in shared]
-    # The smallest object that a call could leak would make 8,000.
-    assert grown(use) < 4_000
-    assert [sys.getrefcount(thing) for thing in shared] == before
+    check_leaves_nothing(use, shared)
 
 
 @needs_both
@@ -222,48 +226,7 @@ def test_no_publish_and_no_wake_up_leaks_memory_or_references() -> None:
         parked[intake] = intake
 
     use()
-    gc.collect()
-    before = [sys.getrefcount(thing) for thing in shared]
-    assert grown(use) < 4_000
-    assert [sys.getrefcount(thing) for thing in shared] == before
-
-
-@needs_both
-def test_out_of_memory_a_publish_stores_a_whole_batch_and_wakes_or_does_nothing() -> None:
-    memory = pytest.importorskip("_testcapi")
-    failures = successes = 0
-    for size in (1, 2, 100):
-        for allowed in range(12):
-            with Bus() as bus, Buffer(bus) as buffer:
-                bus.publish(moving("map", "a", 1, 1.0))
-                batch = tuple(moving("map", "a", stamp, 1.0) for stamp in range(2, 2 + size))
-                with pytest.raises(FutureExtrapolationError) as caught:
-                    buffer.lookup_nowait("map", "a", 2)
-                waiting = [None]
-                buffer._live.park(Waiter(Question("map", "a", 2), 0, waiting.clear), caught.value)
-                before = buffer.tree.edges()
-                take = bus._intake.take
-                memory.set_nomemory(allowed, 0)
-                try:
-                    took = take(batch, "raise")
-                except MemoryError:
-                    took = False
-                finally:
-                    memory.remove_mem_hooks()
-                if took:
-                    successes += 1
-                    assert waiting == []
-                    assert buffer.tree.edges()[0].samples == 1 + size
-                else:
-                    failures += 1
-                    assert waiting == [None]
-                    assert len(buffer.pending()) == 1
-                    assert buffer.tree.edges() == before
-                bus.publish(moving("map", "a", 1_000, 1.0))
-                assert waiting == []
-                assert not buffer.pending()
-    assert failures > 3
-    assert successes > 3
+    check_leaves_nothing(use, shared)
 
 
 def test_four_threads_read_whole_answers_while_the_loop_publishes_and_wakes() -> None:

@@ -16,9 +16,10 @@ EXTRAS = {
     "view": ("collada", "trimesh", "viser"),
     "web": ("starlette", "uvicorn", "websockets"),
     "zenoh": ("zenoh",),
-    "test": ("fastapi", "httpx", "uvloop"),
+    "test": ("httpx", "uvloop"),
     "thorough": (
         "evo",
+        "fastapi",
         "ipykernel",
         "jupyter_client",
         "pandas",

@@ -72,6 +72,10 @@ class Model:
             one, other = domain.ends[who % len(domain.ends)], domain.ends[numbers[0] % len(domain.ends)]
             if one is not other and ((one, other) in domain.wires) == (step == "part"):
                 (domain.part if step == "part" else domain.meet)(one, other)
+        elif step == "flush":
+            for wire in wires:
+                while wire.packets:
+                    wire.deliver()
         elif wires:
             wire = wires[where % len(wires)]
             place = numbers[0] % len(wire.packets)

@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import count
+from itertools import count, islice
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -22,15 +22,21 @@ PATIENCE = 60.0
 
 _PROGRAM = Path(__file__).parent / "peer_process.py"
 _numbers = count()
+# Systems give ports above these to whoever asks for any; processes of tests begin far apart.
+_ports = (12_000 + (os.getpid() * 997 + number) % 20_000 for number in count())
 
 
 def free_ports(how_many: int) -> list[int]:
-    """Free ports of the loopback."""
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(how_many)]
-    ports = [taken.getsockname()[1] for taken in sockets]
-    for taken in sockets:
-        taken.close()
-    return ports
+    """Ports of the loopback that nobody listens at, and that nobody is given before the test uses them."""
+    return list(islice(filter(_is_free, _ports), how_many))
+
+
+def _is_free(port: int) -> bool:
+    try:
+        socket.create_server(("127.0.0.1", port)).close()
+    except OSError:
+        return False
+    return True
 
 
 def new_domain() -> str:

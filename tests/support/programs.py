@@ -14,7 +14,7 @@ from typing import IO
 from support.processes import free_ports
 
 TFBUS = str(Path(sys.executable).with_name("tfbus"))
-PATIENCE = 30.0
+PATIENCE = 60.0
 """The longest that a test waits for a line or for the end of a program, in s."""
 
 

@@ -1,57 +1,69 @@
 """A ROS 2 node with zenoh-ros2-sdk, for the tests of `tfbus.links.rmw_zenoh`, in a process of its own.
 
-It publishes ``odom:base`` on /tf a hundred times, 50 a second, and then says how many transforms of ``arm`` have come.
-The SDK sends no message that late joiners get, so it has no static frames. Its argument is the port of the router.
+It does what `ros_driver.py` says, and sends the static ``base:laser``, x = 0.5, which late joiners do not get: the SDK
+cannot do that. Its own subscription to /tf_static has what was said before. ``ROUTER_PORT`` and ``ROS_DOMAIN_ID`` are
+its settings.
 """
 
-import json
-import sys
+import os
 import time
 from typing import Any
 
+from ros_chain import Chain  # type: ignore[import-not-found]
+from ros_driver import Driver  # type: ignore[import-not-found]
 from rosbags.typesys import Stores, get_typestore
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
+from zenoh_ros2_sdk.qos import QosDurability, QosProfile
 from zenoh_ros2_sdk.session import ZenohSession
 
 TYPE = "tf2_msgs/msg/TFMessage"
 
 
 def main() -> None:
-    port, domain = int(sys.argv[1]), int(sys.argv[2])
+    driver, chain = Driver(), Chain()
+    port = int(os.environ["ROUTER_PORT"])
     # By itself, it fetches the definitions of messages from the net.
     session = ZenohSession.get_instance("127.0.0.1", port)
     session.store = get_typestore(Stores.ROS2_JAZZY)
     session._registered_types[TYPE] = TYPE
-    where = {"router_port": port, "domain_id": domain, "type_hash": session.store.hash_rihs01(TYPE)}
-    heard: list[tuple[str, str, float]] = []
+    where = {
+        "router_port": port,
+        "domain_id": int(os.environ["ROS_DOMAIN_ID"]),
+        "type_hash": session.store.hash_rihs01(TYPE),
+    }
+    latched = QosProfile(durability=QosDurability.TRANSIENT_LOCAL)
 
-    def hear(message: Any) -> None:
-        heard.extend(
-            (each.header.frame_id, each.child_frame_id, each.transform.translation.x) for each in message.transforms
-        )
+    def hear(static: bool, message: Any) -> None:
+        for each in message.transforms:
+            stamp = each.header.stamp.sec * 10**9 + each.header.stamp.nanosec
+            chain.take(each.header.frame_id, each.child_frame_id, stamp, each.transform.translation.x, static)
+            driver.hear(each.child_frame_id, stamp)
 
-    subscription = ROS2Subscriber("/tf", TYPE, hear, **where)
-    publisher = ROS2Publisher("/tf", TYPE, **where)
+    subscriptions = [
+        ROS2Subscriber("/tf", TYPE, lambda message: hear(False, message), **where),
+        ROS2Subscriber("/tf_static", TYPE, lambda message: hear(True, message), qos=latched, **where),
+    ]
+    moving = ROS2Publisher("/tf", TYPE, **where)
+    statics = ROS2Publisher("/tf_static", TYPE, qos=latched, **where)
     types = session.store.types
     stamped, transform, vector, quaternion = (
         types[f"geometry_msgs/msg/{name}"] for name in ("TransformStamped", "Transform", "Vector3", "Quaternion")
     )
-    header, stamp = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
-    print(json.dumps({"event": "up"}), flush=True)
-    for number in range(100):
-        sec, nanosec = divmod(time.time_ns(), 10**9)
+    header, stamp_type = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
+
+    def publish(publisher: Any, parent: str, child: str, stamp: int, x: float) -> None:
+        sec, nanosec = divmod(stamp, 10**9)
         row = stamped(
-            header=header(stamp=stamp(sec=sec, nanosec=nanosec), frame_id="odom"),
-            child_frame_id="base",
-            transform=transform(
-                translation=vector(x=float(number), y=0.0, z=0.0), rotation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-            ),
+            header=header(stamp=stamp_type(sec=sec, nanosec=nanosec), frame_id=parent),
+            child_frame_id=child,
+            transform=transform(translation=vector(x=x, y=0.0, z=0.0), rotation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0)),
         )
         publisher.publish(transforms=[row])
-        time.sleep(0.02)
-    arms = [x for parent, child, x in heard if (parent, child) == ("base", "arm")]
-    print(json.dumps({"event": "end", "arms": arms}), flush=True)
-    del subscription
+
+    publish(statics, "base", "laser", time.time_ns(), driver.x)
+    driver.run(lambda stamp, x: publish(moving, "odom", "base", stamp, x), chain.ask)
+    for subscription in subscriptions:
+        subscription.close()
 
 
 if __name__ == "__main__":

@@ -29,6 +29,8 @@ RING: Graph = [[0, 1], [1, 2], [2, 0]]
 CIRCLE: Graph = [[0, 1], [1, 2], [2, 3], [3, 0]]
 RING_WITH_A_TAIL: Graph = [[0, 1], [1, 2], [2, 0], [0, 3]]
 TWO_BRIDGES: Graph = [[0, 1, 2], [1, 2, 3]]
+CIRCLE_OF_FIVE: Graph = [[0, 1], [1, 2], [2, 3], [3, 4], [4, 0]]
+TRIANGLE: Graph = [[0, 1, 2], [1, 2, 3], [2, 3, 0]]
 
 
 class WireCarrier:

@@ -1,5 +1,6 @@
 """The whole tree on both kernels: the same answers, bit for bit, and the same errors."""
 
+import os
 import random
 import struct
 
@@ -14,6 +15,8 @@ from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree import _kernel
 
 FRAMES = "abcdef"
+TREES = int(os.environ.get("KERNEL_TREES", "10000"))
+"""The number of random trees in the thorough suite."""
 
 Sample = tuple[str, str, int, tuple[float, ...], tuple[float, ...], str, bool]
 Question = tuple[str, str, int | None]
@@ -135,7 +138,8 @@ def random_rotation(rng: random.Random, before: tuple[float, ...] | None) -> tup
 
 @needs_both
 @pytest.mark.parametrize(
-    ("seed", "count"), [(1, 200), *(pytest.param(seed, 2_000, marks=pytest.mark.thorough) for seed in range(2, 7))]
+    ("seed", "count"),
+    [(1, 60), *(pytest.param(seed, TREES // 20, marks=pytest.mark.thorough) for seed in range(2, 22))],
 )
 def test_both_kernels_say_the_same_of_random_trees(seed: int, count: int) -> None:
     rng = random.Random(seed)

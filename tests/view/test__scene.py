@@ -8,7 +8,7 @@ from tfbus import LATEST, SECOND, Latest, Transform, TransformStamped, Transform
 from tfbus.errors import UnknownFrameError
 from tfbus.tree.edge_state import EdgeState
 from tfbus.tree.tree import forest_of
-from tfbus.view._scene import Scene, SceneReader, largest_root
+from tfbus.view._scene import NO_SCENE, Scene, SceneReader, largest_root
 
 
 def read(
@@ -19,6 +19,10 @@ def read(
 
 def states(scene: Scene) -> dict[str, EdgeState]:
     return dict(zip(scene.frames, scene.states, strict=True))
+
+
+def test_no_scene_has_nothing_to_draw() -> None:
+    assert {len(part) for part in NO_SCENE} == {0}
 
 
 def test_poses_are_positions_and_quaternions_with_w_first() -> None:

@@ -249,7 +249,7 @@ class Lookups:
             wait.cancel_reminder = alarms.call_after(pause, partial(self._remind, wait, alarms))
 
     async def _wait_in_scopes(self, wait: "_Wait", limit: float) -> TransformStamped | None:
-        """As `_wait`, by a clock that knows no alarms."""
+        """Wait for the answer for some time (s) by a clock that knows no alarms; None if there was none."""
         pause = REPORT_AFTER
         found = None
         with self._clock.move_on_after(limit):

@@ -21,6 +21,7 @@ from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
 from tfbus.tree.html import legend, to_html
 from tfbus.tree.lookup import answer
+from tfbus.tree.plain_first import plain_first
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.question import Question, question_of
 from tfbus.tree.rendering import counted, describe
@@ -109,6 +110,8 @@ class Buffer:
                 raise TypeError(f"prefill must be a Buffer or a TransformTree, not {prefill!r}")
             bus._check_thread()
             self._forest = forest_of(tree).copy_within(window)
+        # None with a prefix: then the paths have other names.
+        self._paths = self._forest.paths if named is None else None
         self._tree = tree_of(self._forest, keep, bus.max_translation)
         self._live = LiveTree(self._forest, bus._announce_past_loop)
         self._lookups = Lookups(self._live, bus.clock, bus._check_thread, bus._newest_plausible, self._local_names)
@@ -119,6 +122,7 @@ class Buffer:
         """The tree behind this buffer. It can only be read: its samples come from the bus."""
         return self._tree
 
+    @plain_first
     def lookup_nowait(
         self,
         target: str,
@@ -163,9 +167,9 @@ class Buffer:
         names = self._local_names
         policy = None
         if tolerance == 0.0 and max_gap is None and extrapolate is None:
-            if names is None and source_at is None and fixed is None and bounds is None:
+            if self._paths is not None and source_at is None and fixed is None and bounds is None:
                 # Nearly all questions are plain, and a call on the way costs a fifth of the answer.
-                plain = self._forest.paths.answer(target, source, at)
+                plain = self._paths.answer(target, source, at)
                 if plain is not None:
                     return plain
         else:

@@ -168,11 +168,7 @@ class Bus:
         if not batch:
             return
         self._intake.samples += len(batch)
-        if self._late:
-            self._insert_into_late_buffers(batch)
-        else:
-            for buffer in self._buffers:
-                buffer.insert(batch)
+        error = self._insert(batch)
         for stream in self._streams:
             stream.put(batch)
         if self._events:
@@ -180,6 +176,8 @@ class Bus:
                 events.arrived(batch)
         if callbacks:
             self._subscribers.deliver(batch)
+        if error is not None:
+            raise error
 
     def _check_thread(self) -> None:
         """Raise `RuntimeError` unless this thread may use the bus. Called by buffers, message filters and links.
@@ -434,15 +432,22 @@ class Bus:
         if events in self._events:
             self._events.remove(events)
 
-    def _insert_into_late_buffers(self, batch: Batch) -> None:
+    def _insert(self, batch: Batch) -> BaseException | None:
+        """Insert a batch into all buffers; an error of one keeps no other from it. The first error, or None."""
+        first = None
         for buffer in self._buffers:
-            late = self._late.get(buffer)
-            if late is None:
-                buffer.insert(batch)
-                continue
-            late.insert(batch)
-            if late.has_caught_up:
-                del self._late[buffer]
+            late = self._late.get(buffer) if self._late else None
+            try:
+                if late is None:
+                    buffer.insert(batch)
+                    continue
+                late.insert(batch)
+                if late.has_caught_up:
+                    # A wake-up that publishes may have been first.
+                    self._late.pop(buffer, None)
+            except BaseException as error:  # noqa: BLE001 - it is raised after all have the batch
+                first = first or error
+        return first
 
     def _remove_if_known(self, frame: str) -> None:
         with suppress(UnknownFrameError):

@@ -8,7 +8,7 @@ from tfbus.bus._event_queue import EventQueue
 from tfbus.bus._staleness import Staleness
 from tfbus.bus._topology import Topology
 from tfbus.clock import Clock
-from tfbus.events import ClockReset, Event, FrameRemoved
+from tfbus.events import ClockReset, Event, FrameAdded, FrameRemoved, KindChanged
 from tfbus.geometry.stamped import Batch
 from tfbus.stamps import as_duration, from_seconds, to_seconds
 
@@ -48,7 +48,9 @@ class EventStream(OneReaderStream[Event]):
         """Add an event and wake the reader."""
         self.queue.put(event)
         if self._staleness is not None:
-            if isinstance(event, FrameRemoved):
+            if isinstance(event, FrameAdded | KindChanged):
+                self._staleness.note(event.frame)
+            elif isinstance(event, FrameRemoved):
                 self._staleness.forget(event.frame)
             elif isinstance(event, ClockReset):
                 self._staleness.clear()

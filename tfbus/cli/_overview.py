@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 
 from tfbus.cli._width import wrapped
 
+SUMMARY = "Stamped coordinate transforms for asyncio and trio."
+INSTALL_COMPLETION = "Install completion for the shell that is in use, and exit."
 COMMANDS = {
     "bridge": "Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.",
     "broadcast": "Broadcast the transform of the tutorial's laser, until Ctrl-C; tfbus listen in another terminal "
@@ -48,7 +50,7 @@ EXIT_STATUSES = (
 
 _OPTIONS = {
     "--help (-h)": "Display this message and exit.",
-    "--install-completion": "Install completion for the shell that is in use, and exit.",
+    "--install-completion": INSTALL_COMPLETION,
     "--version": "Display application version.",
 }
 _OPTIONS_OF_ALL = {
@@ -67,7 +69,7 @@ def overview() -> str:
     width = shutil.get_terminal_size((80, 24)).columns
     texts = [
         "Usage: tfbus COMMAND [OPTIONS]",
-        "Stamped coordinate transforms for asyncio and trio.",
+        SUMMARY,
         _panel("Commands", COMMANDS | _OPTIONS, width),
         _panel("Options of all commands", _OPTIONS_OF_ALL, width),
         "\n".join(wrapped(EXIT_STATUSES, width, 0)),

@@ -11,7 +11,7 @@ except ImportError:
 
     raise SystemExit(f"tfbus: the command needs some packages more: {pip_install('cli')}") from None
 
-from tfbus.cli._overview import COMMANDS, EXIT_STATUSES
+from tfbus.cli._overview import COMMANDS, EXIT_STATUSES, INSTALL_COMPLETION, SUMMARY
 
 LogLevel = Literal["debug", "info", "warning", "error", "critical"]
 """A level of the module `logging`."""
@@ -38,7 +38,7 @@ def application(command: str | None) -> App:
     """
     app = App(
         name="tfbus",
-        help="Stamped coordinate transforms for asyncio and trio.",
+        help=SUMMARY,
         version=_version,
         help_epilogue=EXIT_STATUSES,
         # To load a parser of Markdown takes as long as all the rest of the list of commands.
@@ -47,7 +47,7 @@ def application(command: str | None) -> App:
     )
     for name, summary in COMMANDS.items():
         app.command(f"tfbus.cli.commands.{name}:{name}", name=name, help=None if name == command else summary)
-    app.register_install_completion_command(help="Install completion for the shell that is in use, and exit.")
+    app.register_install_completion_command(help=INSTALL_COMPLETION)
 
     @app.meta.default
     def prepare(

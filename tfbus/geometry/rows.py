@@ -72,8 +72,8 @@ def interpolate(a: Row, b: Row, fraction: float) -> Row:
     """The row a `fraction` of the way from `a` to `b`: translation linear, rotation slerp along the shorter arc.
 
     Slerp is Shoemake's, "Animating rotation with quaternion curves", SIGGRAPH 1985, section 3.3. There is no switch
-    to a straight line near the identity: the rounding of ``acos`` cancels in the ratio of sines, so only parallel
-    quaternions, where it would divide by zero, are blended as they are.
+    to a straight line near the identity: ``acos``, and the sine of the whole angle as the root of 1 - cos^2, keep all
+    digits of a given cosine, so only parallel quaternions, where it would divide by zero, are blended as they are.
     """
     ax, ay, az, ai, aj, ak, aw = a
     bx, by, bz, bi, bj, bk, bw = b
@@ -81,7 +81,7 @@ def interpolate(a: Row, b: Row, fraction: float) -> Row:
     dot = ai * bi + aj * bj + ak * bk + aw * bw
     if -1.0 < dot < 1.0:
         angle = math.acos(abs(dot))
-        scale = 1.0 / math.sin(angle)
+        scale = 1.0 / math.sqrt((1.0 - dot) * (1.0 + dot))
         keep = math.sin(angle - fraction * angle) * scale
         turn = math.sin(fraction * angle) * scale
     if dot < 0.0:

@@ -20,6 +20,9 @@ from tfbus.stamps import StampsLike, as_stamps, format_stamp
 
 _RECORD = 8 * 8
 """The bytes of a transform and its stamp."""
+_FLOAT = np.dtype(np.float64)
+_INTEGER = np.dtype(np.int64)
+_ndarray = np.ndarray
 _new = object.__new__
 
 Floats = npt.NDArray[np.float64]
@@ -57,11 +60,11 @@ class TransformArray:
     """
 
     __array_ufunc__ = None
-    __slots__ = ("_known_columns", "_known_stamps", "_memory", "_policy_use")
+    __slots__ = ("_known_columns", "_known_policy_use", "_known_stamps", "_memory")
     _known_columns: Floats
+    _known_policy_use: Integers | None
     _known_stamps: Integers | None
     _memory: bytes
-    _policy_use: Integers | None
 
     def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike, stamps: StampsLike | None = None) -> None:
         moves = np.asarray(translations, np.float64)
@@ -84,7 +87,6 @@ class TransformArray:
             )
         norms[np.abs(squares - 1.0) <= ROUNDING] = 1.0
         self._known_columns = locked(np.vstack((moves.T, turns.T / norms)))
-        self._policy_use = None
         self._known_stamps = None
         if stamps is not None:
             instants = as_stamps(stamps)
@@ -103,22 +105,23 @@ class TransformArray:
     def _columns(self) -> Floats:
         """All transforms, shape (7, n). Made of `_memory` when first read, as making an array takes as long as a few
         answers."""
-        try:
-            return self._known_columns
-        except AttributeError:
+        columns: Floats | None = getattr(self, "_known_columns", None)
+        if columns is None:
             memory = self._memory
-            self._known_columns = columns = np.ndarray((7, len(memory) // _RECORD), np.float64, memory)
-            return columns
+            self._known_columns = columns = _ndarray((7, len(memory) // _RECORD), _FLOAT, memory)
+        return columns
 
     @property
     def _stamps(self) -> Integers | None:
-        try:
-            return self._known_stamps
-        except AttributeError:
-            memory = self._memory
+        memory = getattr(self, "_memory", None)
+        if memory is not None and not hasattr(self, "_known_stamps"):
             count = len(memory) // _RECORD
-            self._known_stamps = stamps = np.ndarray((count,), np.int64, memory, 7 * 8 * count)
-            return stamps
+            self._known_stamps = _ndarray((count,), _INTEGER, memory, 7 * 8 * count)
+        return self._known_stamps
+
+    @property
+    def _policy_use(self) -> Integers | None:
+        return getattr(self, "_known_policy_use", None)
 
     @property
     def stamps(self) -> Integers | None:
@@ -339,7 +342,7 @@ def from_columns(columns: Floats, policy_use: Integers | None = None, stamps: In
     """
     transforms = TransformArray.__new__(TransformArray)
     transforms._known_columns = locked(columns)
-    transforms._policy_use = None if policy_use is None else locked(policy_use)
+    transforms._known_policy_use = None if policy_use is None else locked(policy_use)
     transforms._known_stamps = None if stamps is None else locked(stamps)
     return transforms
 
@@ -348,7 +351,6 @@ def from_memory(memory: bytes) -> TransformArray:
     """The transforms of seven valid columns of floats, all in one piece, and behind them their stamps in ns."""
     transforms = _new(TransformArray)
     transforms._memory = memory
-    transforms._policy_use = None
     return transforms
 
 

@@ -8,10 +8,14 @@ SETTLING = 0.05
 """s; what live messages bring by themselves has come by then, nearly always."""
 FIRST_PAUSE = 0.2
 LONGEST_PAUSE = 5.0
-PATIENCE = 3.0
-"""s without an answer, after which a question counts as lost."""
-MOST_OPEN = 16
-"""So many questions are open at once."""
+PATIENCE = 2.0
+LONGEST_PATIENCE = 16.0
+"""s without an answer, after which a question counts as lost: at first, and then twice that time, up to the longest.
+
+A peer that has no time would else be asked again for what it is about to answer, and have less time for that.
+"""
+MOST_OPEN = 64
+"""So many questions are open at once: where nobody has time each takes seconds, and few at a time take minutes."""
 
 
 @dataclass(slots=True)
@@ -19,6 +23,7 @@ class _Question:
     due: float
     open: bool = False
     pause: float = FIRST_PAUSE
+    patience: float = PATIENCE
 
 
 class Asker:
@@ -66,13 +71,14 @@ class Asker:
         now = self._now()
         for question in self._questions.values():
             if question.open and question.due <= now:
+                question.patience = min(2 * question.patience, LONGEST_PATIENCE)
                 self._pause(question)
         room = MOST_OPEN - sum(question.open for question in self._questions.values())
         due = [peer for peer, question in self._questions.items() if not question.open and question.due <= now]
         for peer in due[: max(room, 0)]:
             question = self._questions[peer]
             question.open = True
-            question.due = now + PATIENCE
+            question.due = now + question.patience
         return due[: max(room, 0)]
 
     def next_due(self) -> float | None:

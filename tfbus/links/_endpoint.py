@@ -109,7 +109,7 @@ class Endpoint:
         BusClosedError
         """
         # Peers that cannot be asked are of a world that knows no buses.
-        self._relay.attach(self.outbox, foreign=self._askable is None)
+        self._relay.attach(self.outbox, foreign=self._askable is None, brings=self.peers.brings)
 
     def detach(self) -> None:
         """Leave the bus; its peers are forgotten, and their frames stay."""

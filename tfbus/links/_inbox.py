@@ -166,11 +166,15 @@ class Inbox:
     def _take(self, peer: Peer, message: ReceivedMessage, live: bool) -> None:
         for error in message.errors:
             self._peers.reject(peer.id, error.reason, error)
+        mirror, step = peer.mirror, message.step
+        if live and mirror is not None and step is not None and step.number <= mirror.number:
+            # An answer has overtaken it, or it changes nothing.
+            mirror = None
         together: list[ReceivedBatch] = []
         for entry in message.entries:
             if isinstance(entry, ReceivedBatch):
-                if peer.mirror is not None:
-                    _note(peer.mirror, entry)
+                if mirror is not None:
+                    _note(mirror, entry)
                 together.append(entry)
                 # The batches of an answer were never one batch, but nothing is between them.
                 if not live and entry.origin is not None:
@@ -182,8 +186,8 @@ class Inbox:
                 return
             if isinstance(entry, ReceivedBatch):
                 continue
-            if peer.mirror is not None:
-                peer.mirror.entry(entry)
+            if mirror is not None:
+                mirror.entry(entry)
             if not isinstance(entry, RemovedFrame) or not self._admit_number(peer, entry.sequence, 1):
                 continue
             if self._frames is None or entry.frame in self._frames:

@@ -70,6 +70,12 @@ class MessageWriter:
                 return [message]
         return [*self._write(entries), self.claim(step)]
 
+    def skip(self, time: int | None = None) -> None:
+        """Write nothing of a turn, because nobody hears it; whoever has heard the last message will see the gap."""
+        self._number += 1
+        if time is not None:
+            self._time = time
+
     def claim(self, step: StateStep) -> Message:
         """A message without a number and without entries, which claims a state."""
         return _message([], 0, step._replace(message=self._number), self._time)

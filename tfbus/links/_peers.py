@@ -93,6 +93,12 @@ class Peers:
         """The peer of an id, if it is known."""
         return self._peers.get(id)
 
+    def brings(self, frame: str, besides: Peer | None) -> bool:
+        """Whether any peer but one has told that it brings a frame."""
+        return any(
+            peer.mirror is not None and peer is not besides and frame in peer.mirror for peer in self._peers.values()
+        )
+
     def make_room(self, id: str) -> Peer | None:  # noqa: A002
         """Evict a peer that has not announced itself, if all places are taken, for a new one that has.
 

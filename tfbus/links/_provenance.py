@@ -3,7 +3,12 @@
 from typing import Any
 
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._outbox import Outbox
 from tfbus.links._peers import Peer
+
+Rank = tuple[int, bytes]
+"""Of two things that were said of a frame, the one of the higher rank holds: number, and then origin."""
+LOWEST: Rank = (-1, b"")
 
 
 class Provenance:
@@ -15,8 +20,8 @@ class Provenance:
         The bus on which it was published first, 16 bytes.
     sequence : int
         Its number on that bus; later ones have higher numbers.
-    outbox : object
-        The outbox of the link that brought it: what came in there does not go out there.
+    outbox : Outbox or None
+        That of the link that brought it: what came in there does not go out there. None for this bus's own.
     peer : Peer or None
         The other end of that link; None for this bus's own.
     live : bool
@@ -28,7 +33,13 @@ class Provenance:
     __slots__ = ("live", "lost", "origin", "outbox", "peer", "sequence")
 
     def __init__(
-        self, origin: bytes, sequence: int, outbox: object, peer: Peer | None, live: bool = True, lost: bool = False
+        self,
+        origin: bytes,
+        sequence: int,
+        outbox: Outbox | None,
+        peer: Peer | None,
+        live: bool = True,
+        lost: bool = False,
     ) -> None:
         self.origin = origin
         self.sequence = sequence
@@ -38,7 +49,7 @@ class Provenance:
         self.lost = lost
 
     @property
-    def rank(self) -> tuple[int, bytes]:
+    def rank(self) -> Rank:
         """Of two things that were said of a frame, the one of the higher rank holds."""
         return self.sequence, self.origin
 

@@ -9,6 +9,8 @@ from typing import Any
 from tfbus.statistics import QueueStatistics
 
 MAX_BYTES = 64 * 2**20
+MANY = 100
+"""Moving items that wait, beyond which questions and answers overtake them."""
 _OVERHEAD = 256
 """Bytes that an item takes besides its content."""
 
@@ -78,7 +80,11 @@ class Received:
 
 
 class ReceiveQueue:
-    """Holds what threads have received until the event loop reads it, in order.
+    """Holds what threads have received until the event loop reads it.
+
+    Items are read in order, so that batches stay whole. But while more than `MANY` moving items wait, what brings two
+    ends to agree is read first: questions, answers, and that a peer has joined. The end of a peer is always read in
+    order, for its last messages come before it.
 
     Parameters
     ----------
@@ -90,20 +96,23 @@ class ReceiveQueue:
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._lock = threading.Lock()
+        self._urgent: deque[Received] = deque()
         # Items that do not move and were passed over in a search for the oldest moving one.
         self._kept: deque[Received] = deque()
         self._pending: deque[Received] = deque()
         self._bytes = 0
         self._moving = 0
+        self._ends = 0
         self._dropped = 0
 
     def __len__(self) -> int:
-        return len(self._kept) + len(self._pending)
+        return len(self._urgent) + len(self._kept) + len(self._pending)
 
     def put(self, item: Received) -> None:
         """Append an item, from any thread."""
         with self._lock:
-            self._pending.append(item)
+            (self._urgent if self._is_urgent(item) else self._pending).append(item)
+            self._ends += item.content is Presence.LEFT
             self._bytes += _footprint(item)
             self._moving += item.moving
             while self._moving > self._capacity or self._bytes > MAX_BYTES:
@@ -112,7 +121,7 @@ class ReceiveQueue:
     def get(self) -> Received | None:
         """Remove and return the oldest item; None if the queue is empty."""
         with self._lock:
-            for queue in (self._kept, self._pending):
+            for queue in (self._urgent, self._kept, self._pending):
                 if queue:
                     return self._pop(queue)
         return None
@@ -123,7 +132,7 @@ class ReceiveQueue:
             kept = [item for item in (*self._kept, *self._pending) if not item.moving]
             self._dropped += self._moving
             self._kept, self._pending = deque(kept), deque()
-            self._bytes = sum(map(_footprint, kept))
+            self._bytes = sum(map(_footprint, (*self._urgent, *kept)))
             self._moving = 0
 
     def statistics(self) -> QueueStatistics:
@@ -134,14 +143,23 @@ class ReceiveQueue:
     def _drop_oldest(self) -> None:
         while self._pending and not self._pending[0].moving:
             self._kept.append(self._pending.popleft())
-        self._pop(self._pending or self._kept)
+        self._pop(self._pending or self._kept or self._urgent)
         self._dropped += 1
 
     def _pop(self, queue: deque[Received]) -> Received:
         item = queue.popleft()
         self._bytes -= _footprint(item)
         self._moving -= item.moving
+        self._ends -= item.content is Presence.LEFT
         return item
+
+    def _is_urgent(self, item: Received) -> bool:
+        if self._moving <= MANY:
+            return False
+        if item.content is Presence.JOINED:
+            # A peer that comes back comes after its end.
+            return not self._ends
+        return isinstance(item.content, Question | Answer)
 
 
 def _footprint(item: Received) -> int:

@@ -14,15 +14,12 @@ removal, the one of the higher number was said with the other in mind, or withou
 bus, in whatever order they come. The first number is the machine's time in microseconds, so that what a program says
 when it is started again holds against what it has said before, although it knows nothing of that.
 
-Removals are remembered with their numbers, so that a copy on a slower way does not bring the frame back. Their memory
-is bounded: of the removals that leave it, only the highest number of each origin is remembered, and live samples of
-unknown frames below that number count as outdated.
+What has gone is remembered with its number; see `tfbus.links._removals`.
 """
 
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
 from itertools import groupby
 from time import time_ns
-from typing import NamedTuple
 from uuid import uuid4
 
 from tfbus.bus.bus import Bus
@@ -31,27 +28,18 @@ from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.links._entries import OutgoingBatch, RemovedFrame
 from tfbus.links._outbox import Outbox
 from tfbus.links._passed import PassedSamples
-from tfbus.links._peers import Peer, next_age
-from tfbus.links._provenance import Provenance, ReceivedTransform
+from tfbus.links._peers import Peer
+from tfbus.links._provenance import LOWEST, Provenance, Rank, ReceivedTransform
+from tfbus.links._removals import Removals
 from tfbus.registration import Registration
 
+Brings = Callable[[str, Peer | None], bool]
 LARGEST_JUMP = 2**52
 """A number may be so far ahead of all that came before: 142 years in us, for some machines begin in 1970."""
-_REMEMBERED_REMOVALS = 10_000
-_REMEMBERED_ORIGINS = 1_000
 
 
-class _Removal(NamedTuple):
-    """The memory of a frame of one origin that has gone.
-
-    Samples with a number up to `sequence` are outdated. If the frame was not removed but lost with a peer, `lost_at` is
-    the age from `next_age` at that moment: the sample with just that number is news again from peers met later, and
-    from the peer that told of the loss, `told_by`; from all others it may only be late.
-    """
-
-    sequence: int
-    lost_at: int | None = None
-    told_by: str = ""
+def _nobody(_frame: str, _peer: Peer | None) -> bool:
+    return False
 
 
 class Relay:
@@ -79,17 +67,17 @@ class Relay:
         self._number = number
         self._bus = bus
         self._outboxes: list[Outbox] = []
+        self._brings: dict[Outbox, Brings] = {}
         self._newest: dict[bytes, dict[str, int]] = {}
         self._brought_by: dict[tuple[bytes, str], Peer] = {}
-        self._removals: dict[tuple[bytes, str], _Removal] = {}
-        self._outdated_up_to: dict[bytes, int] = {}
+        self._removals = Removals()
         self._latest: dict[str, Provenance] = {}
-        self._settled: dict[str, tuple[int, bytes]] = {}
-        self._removed: dict[str, tuple[int, bytes]] = {}
+        self._settled: dict[str, Rank] = {}
+        self._losses_passed_on: dict[str, int] = {}
         self._removing: tuple[str, Provenance] | None = None
         self._passed: PassedSamples | None = None
 
-    def attach(self, outbox: Outbox, foreign: bool = False) -> None:
+    def attach(self, outbox: Outbox, foreign: bool = False, brings: Brings = _nobody) -> None:
         """Give a link all that is latched, and all that is published from now on.
 
         Parameters
@@ -97,6 +85,8 @@ class Relay:
         outbox : Outbox
         foreign : bool
             Whether it is a link to a world whose samples have no origin.
+        brings : callable, optional
+            Whether any peer of the link but a given one brings a frame.
 
         Raises
         ------
@@ -108,15 +98,17 @@ class Relay:
             self._registration = self._bus.subscribe(self._on_batch, self._on_removal)
         self._bus.subscribe(lambda batch: self._send_latched(batch, outbox)).close()
         self._outboxes.append(outbox)
+        self._brings[outbox] = brings
 
     def detach(self, outbox: Outbox) -> None:
         """Give a link nothing any more; its peers must be lost before, with `lose`."""
         self._outboxes.remove(outbox)
+        del self._brings[outbox]
         if not self._outboxes:
             self._registration.close()
-            for memory in (self._newest, self._brought_by, self._removals, self._outdated_up_to):
+            for memory in (self._newest, self._brought_by, self._removals):
                 memory.clear()
-            for by_frame in (self._latest, self._settled, self._removed):
+            for by_frame in (self._latest, self._settled, self._losses_passed_on):
                 by_frame.clear()
             self._passed = None
 
@@ -189,12 +181,16 @@ class Relay:
         self._number = max(self._number, provenance.sequence)
         latest = self._latest.get(frame)
         if provenance.lost:
-            # Others may still bring it, on another way.
             news = latest is not None and latest.peer is provenance.peer
+            if latest is not None and not news:
+                self._answer_loss(provenance, frame, latest)
+            elif latest is not None and provenance.sequence <= latest.sequence:
+                # The peer has left the frame to another one; for this bus it is lost.
+                provenance = Provenance(self.origin, self._next_number(), provenance.outbox, provenance.peer, lost=True)
         else:
             newest = self._newest.get(provenance.origin, {}).get(frame, -1)
-            news = newest < provenance.sequence and not self._is_outdated(provenance, frame)
-            if provenance.rank <= self._removed.get(frame, _LOWEST) or (latest and provenance.rank < latest.rank):
+            news = newest < provenance.sequence and not self._removals.is_late(provenance, frame)
+            if provenance.rank <= self._removals.rank(frame) or (latest and provenance.rank < latest.rank):
                 news = False
         if news:
             self._remove_from_bus(frame, provenance)
@@ -225,10 +221,8 @@ class Relay:
             Those frames, sorted.
         """
         frames = tuple(sorted(frame for frame, latest in self._latest.items() if latest.peer is peer))
-        lost_at = next_age()
         for origin, child in tuple(peer.frames):
-            self._remember_removal(origin, child, _Removal(self._newest[origin][child], lost_at))
-            self._release(origin, child)
+            self._release(origin, child, None)
         if drop:
             self._remove_lost(frames, peer, outbox)
         return frames
@@ -256,13 +250,14 @@ class Relay:
         rank = provenance.rank
         newest = self._newest.setdefault(provenance.origin, {})
         passed, foreign = self._passed, provenance.origin == self.origin
+        removed = self._removals.ranks
         for sample in samples:
             fields = sample._fields
             child = fields[1]
             # A static one with an origin has to be ranked, so that all buses agree in the end.
             if passed is not None and (foreign or not fields[5]) and sample in passed:
                 continue
-            if (child in self._settled or child in self._removed or fields[5]) and self._is_outranked(sample, rank):
+            if (child in self._settled or child in removed or fields[5]) and self._is_outranked(sample, rank):
                 continue
             known = newest.get(child)
             if known is not None:
@@ -270,7 +265,9 @@ class Relay:
                     continue
             # Otherwise the child is new in this batch, and this is not its first sample there.
             elif (provenance.origin, child) not in peer.frames:
-                if self._is_outdated(provenance, child):
+                if self._removals.is_late(provenance, child):
+                    if fields[5] and self._removals.was_lost(provenance, child):
+                        self._tell_loss_again(provenance, child)
                     continue
                 if len(peer.frames) >= max_frames:
                     refused += 1
@@ -336,34 +333,51 @@ class Relay:
             provenance = self._removing[1]
         else:
             provenance = Provenance(self.origin, self._next_number(), None, None)
-        self._latest.pop(frame, None)
+        latest = self._latest.pop(frame, None)
+        lost_static = provenance.lost and latest is not None and self._settled.get(frame) == latest.rank
         self._forget_frame(frame, provenance)
         removal = RemovedFrame(provenance.origin, provenance.sequence, frame, provenance.lost)
         for outbox in self._outboxes:
-            outbox.add_removal(removal, echo=outbox is provenance.outbox)
+            # Those who brought it as well have to hear that it was taken from somebody else.
+            asks = lost_static and self._brings[outbox](frame, provenance.peer)
+            outbox.add_removal(removal, echo=outbox is provenance.outbox and not asks)
 
     def _forget_frame(self, frame: str, provenance: Provenance) -> None:
-        lost_at, told_by = None, ""
         self._settled.pop(frame, None)
+        self._losses_passed_on.pop(frame, None)
         if self._passed is not None:
             # What is lost may come again just as it was.
             (self._passed.forget if provenance.lost else self._passed.retire)(frame)
-        if provenance.lost and provenance.peer is not None:
-            lost_at, told_by = next_age(), provenance.peer.id
-        else:
-            self._removed.pop(frame, None)
-            self._removed[frame] = provenance.rank
-            if len(self._removed) > _REMEMBERED_REMOVALS:
-                del self._removed[next(iter(self._removed))]
+        if not provenance.lost:
+            self._removals.remove(frame, provenance)
         for origin in [origin for origin, newest in self._newest.items() if frame in newest]:
-            self._remember_removal(origin, frame, _Removal(self._newest[origin][frame], lost_at, told_by))
-            self._release(origin, frame)
-        self._remember_removal(provenance.origin, frame, _Removal(provenance.sequence, lost_at, told_by))
+            self._release(origin, frame, provenance)
+        if provenance.origin != self.origin:
+            self._removals.gone(provenance.origin, frame, provenance.sequence, provenance)
 
-    def _is_outranked(self, sample: ReceivedTransform, rank: tuple[int, bytes]) -> bool:
+    def _answer_loss(self, loss: Provenance, frame: str, latest: Provenance) -> None:
+        """Say a static frame again if this bus owns it, else tell towards its owner that a peer has lost it."""
+        if loss.sequence <= latest.sequence or self._settled.get(frame) != latest.rank:
+            return
+        if latest.origin == self.origin:
+            self._say_again([frame])
+            return
+        # Several peers may pass on the same.
+        is_new = loss.sequence > self._losses_passed_on.get(frame, -1)
+        if is_new and latest.outbox is not loss.outbox and latest.outbox in self._outboxes:
+            self._losses_passed_on[frame] = loss.sequence
+            latest.outbox.add_removal(RemovedFrame(loss.origin, loss.sequence, frame, lost=True))
+
+    def _tell_loss_again(self, copy: Provenance, frame: str) -> None:
+        """Tell those who have brought a copy of a static frame that it is not taken, unless the bus has the frame."""
+        latest = self._latest.get(frame)
+        if copy.outbox is not None and (latest is None or latest.rank < copy.rank):
+            copy.outbox.add_removal(RemovedFrame(self.origin, self._next_number(), frame, lost=True))
+
+    def _is_outranked(self, sample: ReceivedTransform, rank: Rank) -> bool:
         """Whether something else that was said of the frame holds: a removal, or a static sample of another bus."""
         _, child, _, _, _, static = sample._fields
-        if rank < self._settled.get(child, _LOWEST) or rank < self._removed.get(child, _LOWEST):
+        if rank < self._settled.get(child, LOWEST) or rank < self._removals.rank(child):
             return True
         latest = self._latest.get(child)
         return static and latest is not None and rank < latest.rank
@@ -375,6 +389,10 @@ class Relay:
     def _outnumber(self, number: int, frames: Iterable[str]) -> None:
         """Number on from a number of this bus that somebody has made up, and say again what it may have hidden."""
         self._number = number
+        self._say_again(frames)
+
+    def _say_again(self, frames: Iterable[str]) -> None:
+        """Give static samples of this bus new numbers, by which they are news to all others."""
         for frame in sorted(frames):
             latest = self._latest.get(frame)
             if latest is None or latest.origin != self.origin:
@@ -392,42 +410,15 @@ class Relay:
         peer.frames.add((origin, child))
         self._brought_by[origin, child] = peer
 
-    def _release(self, origin: bytes, child: str) -> None:
-        """Count a frame of an origin for nobody any more."""
+    def _release(self, origin: bytes, child: str, removal: Provenance | None) -> None:
+        """Count a frame of an origin for nobody any more, because of a removal, a loss, or a peer that has gone."""
         self._brought_by.pop((origin, child)).frames.discard((origin, child))
         newest = self._newest[origin]
+        if origin != self.origin:
+            self._removals.gone(origin, child, newest[child], removal)
         del newest[child]
         if not newest:
             del self._newest[origin]
-
-    def _is_outdated(self, provenance: Provenance, child: str) -> bool:
-        """Whether samples of a child that is not there are older than its removal."""
-        removal = self._removals.get((provenance.origin, child))
-        if removal is None:
-            # What is kept for late joiners holds now, however old it is.
-            return provenance.live and provenance.sequence <= self._outdated_up_to.get(provenance.origin, -1)
-        if removal.sequence == provenance.sequence and removal.lost_at is not None and provenance.peer is not None:
-            return provenance.peer.age < removal.lost_at and provenance.peer.id != removal.told_by
-        return removal.sequence >= provenance.sequence
-
-    def _remember_removal(self, origin: bytes, frame: str, removal: _Removal) -> None:
-        if origin == self.origin:
-            return
-        known = self._removals.pop((origin, frame), None)
-        if known is not None and known.sequence > removal.sequence:
-            removal = known
-        self._removals[origin, frame] = removal
-        if len(self._removals) > _REMEMBERED_REMOVALS:
-            oldest = next(iter(self._removals))
-            self._forget_removal(oldest[0], self._removals.pop(oldest).sequence)
-
-    def _forget_removal(self, origin: bytes, sequence: int) -> None:
-        self._outdated_up_to[origin] = max(sequence, self._outdated_up_to.pop(origin, -1))
-        if len(self._outdated_up_to) > _REMEMBERED_ORIGINS:
-            del self._outdated_up_to[next(iter(self._outdated_up_to))]
-
-
-_LOWEST = (-1, b"")
 
 
 def relay_of(bus: Bus) -> Relay:

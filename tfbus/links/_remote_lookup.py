@@ -55,9 +55,14 @@ class Cancellation(PlainData):
     number: int
 
 
-def write_question(question: RemoteQuestion | Cancellation) -> bytes:
-    """The bytes of a question or of its cancellation."""
-    return json.dumps(question.to_dict()).encode()
+def write_question(
+    question: RemoteQuestion | Cancellation, number: int | None = None, timeout: float | None = None
+) -> bytes:
+    """The bytes of a question or of its cancellation; with another number and timeout, if a number is given."""
+    fields = question.to_dict()
+    if number is not None:
+        fields |= {"number": number, "timeout": timeout}
+    return json.dumps(fields).encode()
 
 
 def read_question(data: bytes) -> RemoteQuestion | Cancellation:

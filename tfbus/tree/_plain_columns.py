@@ -31,6 +31,7 @@ def plain_columns(forest: Forest, queries: Sequence[Query], with_nan: bool) -> l
         None if an answer is not plain, there is none without `with_nan`, or the kernel gives none at many stamps.
     """
     if kernel == "python":
+        # Its chains hold nothing, which would be found out after the paths.
         return None
     held: list[Held] = []
     try:

@@ -14,7 +14,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from itertools import chain as chained
-from math import acos, sin
+from math import acos, sin, sqrt
 from typing import Any, Protocol
 
 import numpy as np
@@ -289,7 +289,7 @@ def climb(steps: tuple[Step, ...], at: int) -> Row | None:
                     dot = ai * bi + aj * bj + ak * bk + aw * bw
                     if -1.0 < dot < 1.0:
                         angle = acos(dot if dot > 0.0 else -dot)
-                        scale = 1.0 / sin(angle)
+                        scale = 1.0 / sqrt((1.0 - dot) * (1.0 + dot))
                         keep = sin(angle - f * angle) * scale
                         turn = sin(f * angle) * scale
                     else:

@@ -36,6 +36,7 @@ from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge, FrameHistory, Outcome
 from tfbus.tree.html import legend, to_html
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, answer, bounds_of
+from tfbus.tree.plain_first import plain_first, plain_many_first
 from tfbus.tree.policy import Hold, policy_of
 from tfbus.tree.rendering import counted, describe, to_dot, to_yaml
 
@@ -44,7 +45,8 @@ class TransformTree:
     """The transforms between any two frames, over the last few seconds.
 
     Any thread may read it while another one inserts. A copy, and what `edges` and the texts show, is the tree at one
-    moment; an explanation reads its edges one after the other.
+    moment; an explanation reads its edges one after the other. A finaliser (``__del__``) or a signal handler must not
+    use it: if it interrupts a call of its own thread that holds the lock of the tree, it would wait for ever.
 
     Parameters
     ----------
@@ -78,8 +80,12 @@ class TransformTree:
     def __init__(self, keep: float | None = 10.0, *, max_translation: float = MAX_TRANSLATION) -> None:
         self.keep = keep
         self.max_translation = as_max_translation(max_translation)
-        self._forest = Forest(window_of(keep))
+        self._stand_on(Forest(window_of(keep)))
         self._filled_by_bus = False
+
+    def _stand_on(self, forest: Forest) -> None:
+        self._forest = forest
+        self._paths = forest.paths
 
     # Insertion
 
@@ -136,6 +142,7 @@ class TransformTree:
 
     # Questions about transforms
 
+    @plain_first
     def lookup(
         self,
         target: str,
@@ -208,7 +215,7 @@ class TransformTree:
         if tolerance == 0.0 and max_gap is None and extrapolate is None:
             if source_at is None and fixed is None and not_before is None and not_after is None:
                 # Nearly all questions are plain, and a call on the way costs a fifth of the answer.
-                found = self._forest.paths.answer(target, source, at)
+                found = self._paths.answer(target, source, at)
                 if found is not None:
                     return found
         else:
@@ -259,6 +266,7 @@ class TransformTree:
             at = as_stamp(at)
         return explain(self._forest, target, source, at, bounds, policy, now)
 
+    @plain_many_first
     def lookup_many(
         self,
         target: str,
@@ -325,7 +333,7 @@ class TransformTree:
             and (out_of_range == "raise" or out_of_range == "nan")
         ):
             # Nearly all questions are plain, and for a few stamps the way to numpy takes longer than the answers.
-            memory = self._forest.paths.answer_many(target, source, stamps)
+            memory = self._paths.answer_many(target, source, stamps)
             if memory is not None:
                 return from_memory(memory)
         asked = as_stamps(stamps)
@@ -538,7 +546,7 @@ class TransformTree:
     def copy(self) -> "TransformTree":
         """An independent copy with the same samples, such as a snapshot to analyse elsewhere."""
         twin = TransformTree(self.keep, max_translation=self.max_translation)
-        twin._forest = self._forest.copy()
+        twin._stand_on(self._forest.copy())
         return twin
 
     def __deepcopy__(self, memo: object) -> "TransformTree":
@@ -602,7 +610,7 @@ class TransformTree:
 def tree_of(forest: Forest, keep: float | None, max_translation: float = MAX_TRANSLATION) -> TransformTree:
     """The tree over a forest that a bus fills. It cannot be changed, because a change would wake no waiting lookup."""
     tree = TransformTree(keep, max_translation=max_translation)
-    tree._forest = forest
+    tree._stand_on(forest)
     tree._filled_by_bus = True
     return tree
 

@@ -13,7 +13,7 @@ import viser
 from tfbus.data import PointCloud
 from tfbus.geometry.rows import Row
 from tfbus.view._page import Picture
-from tfbus.view._scene import Scene
+from tfbus.view._scene import NO_SCENE, Scene
 from tfbus.view._solids import Solids
 
 HIGHLIGHT = (230, 159, 0)
@@ -38,7 +38,7 @@ class Canvas:
     def __init__(self, server: viser.ViserServer, clicked: Callable[[str], object]) -> None:
         self._server = server
         self._clicked = clicked
-        self._frames: tuple[str, ...] = ()
+        self._drawn = Picture(NO_SCENE, (), NO_SCENE.lines)
         self._axes: viser.BatchedAxesHandle | None = None
         self._dots: viser.BatchedMeshHandle | None = None
         self._solids: Solids | None = None
@@ -60,12 +60,17 @@ class Canvas:
 
     def draw(self, picture: Picture, axes_length: float) -> None:
         """Bring the browsers to a picture, with axes of a length in m."""
-        scene = picture.scene
+        scene, drawn = picture.scene, self._drawn
         self._draw_frames(scene, axes_length)
+        # What stays is not given to viser, which would compare it number by number.
         self._lines.points = scene.lines
-        self._lines.colors = scene.line_colours
-        self._chain.points = scene.chain_lines
-        self._trails.points = picture.trails
+        if scene.line_colours is not drawn.scene.line_colours:
+            self._lines.colors = scene.line_colours
+        if scene.chain_lines is not drawn.scene.chain_lines:
+            self._chain.points = scene.chain_lines
+        if picture.trails is not drawn.trails:
+            self._trails.points = picture.trails
+        self._drawn = picture
         self._draw_labels(scene, picture.labels)
         if self._solids is not None:
             self._solids.draw(scene)
@@ -104,14 +109,14 @@ class Canvas:
         self._clouds.pop(name).remove()
 
     def _draw_frames(self, scene: Scene, axes_length: float) -> None:
-        axes, dots = self._axes, self._dots
-        same = len(scene.frames) == len(self._frames) and axes_length == self._axes_length
-        self._frames = scene.frames
+        axes, dots, drawn = self._axes, self._dots, self._drawn.scene
+        same = len(scene.frames) == len(drawn.frames) and axes_length == self._axes_length
         if axes is not None and dots is not None and same:
             axes.batched_positions = scene.positions
             axes.batched_wxyzs = scene.wxyzs
             dots.batched_positions = scene.positions
-            dots.batched_colors = scene.colours
+            if scene.colours is not drawn.colours:
+                dots.batched_colors = scene.colours
             return
         self._axes_length = axes_length
         # Arrays of another length would reach the browser one after the other.
@@ -134,7 +139,7 @@ class Canvas:
         self._dots.on_click(self._on_click)
 
     def _on_click(self, event: Any) -> None:
-        frames, place = self._frames, event.instance_index
+        frames, place = self._drawn.scene.frames, event.instance_index
         if place is not None and place < len(frames):
             self._clicked(frames[place])
 

@@ -192,7 +192,7 @@ class Page:
             labels = scene.frames
         elif self.labels == "selection":
             labels = scene.chain
-        return Picture(scene, labels, np.concatenate([NO_SCENE.lines, *trails]))
+        return Picture(scene, labels, np.concatenate(trails) if trails else NO_SCENE.lines)
 
     def texts(self, now: int, scene: Scene) -> Texts:
         """The texts of the side panel beside a scene, with ages from the stamp `now`, in ns."""
@@ -209,14 +209,14 @@ class Page:
             asked = LATEST if at is None else at
             facts = selection_facts(self._tree, self.fixed, self.selected, asked, then, delay)
         wanted = self.search.casefold()
-        matches = [frame for frame in frames if wanted in frame.casefold()][:_MATCHES]
+        matches = tuple(frame for frame in frames if wanted in frame.casefold()) if wanted else frames
         return Texts(
             self._status(frames, len(scene.frames)),
             _block(_table(facts) if facts else "Click on a frame, or search for one."),
             self._tree_text(frames, scene, then),
             _block("<br>".join(escape(str(event)) for event in reversed(self._events)) or "none so far"),
             frames,
-            tuple(matches),
+            matches[:_MATCHES],
             self.chosen_fixed,
             self.selected,
         )

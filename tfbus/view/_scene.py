@@ -17,6 +17,7 @@ Colours = npt.NDArray[np.uint8]
 _STATES = tuple(EdgeState)
 _PALETTE = np.array([[int(state.value[i : i + 2], 16) for i in (1, 3, 5)] for state in _STATES], np.uint8)
 _STATIC, _MOVING, _STALE, _SILENT = range(4)
+_NO_POSE = -1
 
 
 class Scene(NamedTuple):
@@ -77,6 +78,7 @@ class SceneReader:
     def __init__(self, forest: Forest, stale_after: float = STALE_AFTER) -> None:
         self._poses = PoseReader(forest)
         self._stale_after = round(stale_after * SECOND)
+        self._kept: _Kept | None = None
 
     @property
     def topology(self) -> object:
@@ -103,27 +105,24 @@ class SceneReader:
         """
         poses = self._poses.read(fixed, at)
         codes = self._codes(poses, now if isinstance(at, Latest) else at)
-        drawn = np.flatnonzero(np.isfinite(poses.columns).all(axis=0))
-        rank = np.full(len(poses.frames) + 1, -1)
-        rank[drawn] = np.arange(len(drawn))
-        parents = rank[poses.parents[drawn]]
-        positions = poses.columns[:3, drawn].T.astype(np.float32)
-        wxyzs = poses.columns[[6, 3, 4, 5]][:, drawn].T.astype(np.float32)
-        colours = _PALETTE[codes[drawn]]
-        children = np.flatnonzero(parents >= 0)
-        frames = poses.frames if len(drawn) == len(poses.frames) else tuple(poses.frames[place] for place in drawn)
-        chain = _chain(frames, parents, selected)
+        kept = self._kept
+        if kept is None or not kept.holds(poses, codes):
+            kept = self._kept = _Kept(poses, codes)
+        rows = poses.columns.T if kept.all_drawn else poses.columns.T[codes != _NO_POSE]
+        positions = rows[:, :3].astype(np.float32)
+        chain = _chain(kept.frames, kept.parents, selected)
+        chain_edges = np.array([chain[:-1], chain[1:]], np.intp).T
         return Scene(
-            frames,
+            kept.frames,
             positions,
-            wxyzs,
-            colours,
-            tuple(map(_STATES.__getitem__, codes[drawn].tolist())),
-            parents,
-            _lines(positions, children, parents[children]),
-            np.repeat(colours[children][:, None], 2, axis=1),
-            tuple(frames[place] for place in chain),
-            _lines(positions, np.array(chain[:-1], np.intp), np.array(chain[1:], np.intp)),
+            rows[:, [6, 3, 4, 5]].astype(np.float32),
+            kept.colours,
+            kept.states,
+            kept.parents,
+            positions[kept.edges],
+            kept.line_colours,
+            tuple(kept.frames[place] for place in chain),
+            positions[chain_edges] if chain else NO_SCENE.lines,
         )
 
     def _codes(self, poses: Poses, now: int) -> npt.NDArray[np.intp]:
@@ -131,16 +130,43 @@ class SceneReader:
         # The age of a silent frame would overflow.
         stale = now - np.where(silent, now, poses.heard) > self._stale_after
         codes = np.where(silent, _SILENT, np.where(stale, _STALE, _MOVING))
-        return np.where(poses.static | (poses.parents < 0), _STATIC, codes)
+        codes = np.where(poses.static | (poses.parents < 0), _STATIC, codes)
+        has_pose = np.isfinite(poses.columns)
+        # Nearly always all have one; to ask for each frame takes longer.
+        if not has_pose.all():
+            codes[~has_pose.all(axis=0)] = _NO_POSE
+        return codes
 
 
-def _lines(positions: Floats, begins: npt.NDArray[np.intp], ends: npt.NDArray[np.intp]) -> Floats:
-    return np.stack((positions[begins], positions[ends]), axis=1)
+class _Kept:
+    """The parts of a scene that stay while the frames only move: the same arrays, so that they are not sent again."""
+
+    def __init__(self, poses: Poses, codes: npt.NDArray[np.intp]) -> None:
+        self._poses, self._codes = poses, codes
+        places = np.flatnonzero(codes != _NO_POSE)
+        self.all_drawn = len(places) == len(codes)
+        rank = np.full(len(codes) + 1, -1)
+        rank[places] = np.arange(len(places))
+        self.frames = poses.frames if self.all_drawn else tuple(poses.frames[place] for place in places)
+        self.parents: npt.NDArray[np.intp] = rank[poses.parents[places]]
+        children = np.flatnonzero(self.parents >= 0)
+        self.edges = np.stack((children, self.parents[children]), axis=1)
+        self.states = tuple(_STATES[code] for code in codes[places])
+        self.colours = _PALETTE[codes[places]]
+        self.line_colours = np.repeat(self.colours[children][:, None], 2, axis=1)
+
+    def holds(self, poses: Poses, codes: npt.NDArray[np.intp]) -> bool:
+        """Whether these poses differ from the first ones in nothing but where the frames are."""
+        return (
+            poses.frames == self._poses.frames
+            and np.array_equal(poses.parents, self._poses.parents)
+            and np.array_equal(codes, self._codes)
+        )
 
 
 def _chain(frames: Sequence[str], parents: npt.NDArray[np.intp], selected: str | None) -> list[int]:
     """The places on the path from the selected frame to the fixed one, the first; empty if it has no pose."""
-    if selected not in frames:
+    if selected is None or selected not in frames:
         return []
     chains: list[list[int]] = []
     for frame in (selected, frames[0]):

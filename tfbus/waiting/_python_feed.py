@@ -166,7 +166,8 @@ class Feed:
                 if waiter.elsewhere:
                     self._forget(waiter)
                 else:
-                    del self._parked[waiter]
+                    # Not there if it could not be removed whole, for want of memory.
+                    self._parked.pop(waiter, None)
             except BaseException as error:  # noqa: BLE001 - the first one is raised after all have been woken
                 # It must be woken all the same.
                 errors.append(error)

@@ -5,7 +5,6 @@ It knows no event loop: to wake a waiter is to call the function that the waiter
 
 import logging
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 
 from tfbus.errors import ClockResetError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.geometry.stamped import Batch
@@ -79,7 +78,7 @@ class LiveTree:
         """As `insert`, for a batch that the feed has left alone because it is not plain."""
         waiters = self._waiters
         plain = self.forest.commit(batch)
-        if waiters:
+        if waiters or self.waiting.limits:
             limit = self.waiting.limit
             passed = None
             for sample in batch:
@@ -223,11 +222,12 @@ class LiveTree:
 def _wake(waiters: Iterable[Waiter | WatchState]) -> None:
     interrupt: BaseException | None = None
     for waiter in waiters:
-        # Its wait was cancelled, or its event loop is gone. The others must be woken all the same.
-        with suppress(Exception):
-            try:
-                waiter.wake()
-            except (KeyboardInterrupt, SystemExit) as error:
-                interrupt = interrupt or error
+        # The others must be woken all the same.
+        try:
+            waiter.wake()
+        except (KeyboardInterrupt, SystemExit) as error:
+            interrupt = interrupt or error
+        except Exception:  # noqa: BLE001 - its wait was cancelled, or its event loop is gone
+            pass
     if interrupt is not None:
         raise interrupt

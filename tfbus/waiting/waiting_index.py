@@ -194,17 +194,22 @@ class WaitingIndex:
             # At the newest common stamp something else is missing as well; late data may bring it.
             also = (cause.child,) if isinstance(cause, GapError) else blocking_frames(cause)
             waiter.names = tuple(dict.fromkeys((*waiter.names, *also)))
-        if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
-            needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp - error.slack
-            waiter.place = (-needed, -next(self._order), waiter)
-            insort(self._under(error.child).places, waiter.place)
-        else:
-            waiter.place = None
-            for name in waiter.names:
-                self._under(name).for_any[waiter] = None
         waiter.blocked_by = error
         self.parked[waiter] = None
-        self.set_limits(waiter, limits)
+        try:
+            if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
+                needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp - error.slack
+                waiter.place = (-needed, -next(self._order), waiter)
+                insort(self._under(error.child).places, waiter.place)
+            else:
+                waiter.place = None
+                for name in waiter.names:
+                    self._under(name).for_any[waiter] = None
+            self.set_limits(waiter, limits)
+        except BaseException:
+            # Out of memory.
+            self.remove(waiter)
+            raise
 
     def set_limits(self, waiter: Waiter, limits: Iterable[tuple[str, int]]) -> None:
         """Note the limits of a parked waiter that has none."""
@@ -212,9 +217,9 @@ class WaitingIndex:
         for frame, limit in limits:
             if limit < self._passed:
                 place = (-limit, -next(self._order), waiter)
-                insort(self._under(frame).limits, place)
-                waiter.limits.append((frame, place))
                 waiter.elsewhere = True
+                waiter.limits.append((frame, place))
+                insort(self._under(frame).limits, place)
             elif limit < first:
                 first = limit
         if first < _NEVER:
@@ -228,12 +233,12 @@ class WaitingIndex:
             return
         self.forget(waiter)
         for name in waiter.names:
-            blocked = self.by_frame[name]
-            if waiter.place is not None:
-                del blocked.places[bisect_left(blocked.places, waiter.place)]
-            else:
-                del blocked.for_any[waiter]
-            self._drop_if_empty(name, blocked)
+            blocked = self.by_frame.get(name)
+            if blocked is not None:
+                if waiter.place is not None:
+                    _discard(blocked.places, waiter.place)
+                blocked.for_any.pop(waiter, None)
+                self._drop_if_empty(name, blocked)
         waiter.place = None
 
     def pop_unblocked(self, frame: str, stamp: int | None) -> list[Waiter]:
@@ -273,7 +278,8 @@ class WaitingIndex:
             waiter = limits.pop()[2]
             waiter.limit = None
             self._forget_limits(waiter)
-            found.append(waiter)
+            if waiter in self.parked:
+                found.append(waiter)
         return found
 
     def pop_asking_for(self, frames: Iterable[str]) -> list[Waiter]:
@@ -300,19 +306,23 @@ class WaitingIndex:
 
     def forget(self, waiter: Waiter) -> None:
         """Forget a waiter, but for the frames that block it."""
-        del self.parked[waiter]
-        if waiter.indexed:
-            waiter.indexed = False
-            for name in waiter.asked():
-                waiters = self._by_name[name]
-                del waiters[waiter]
-                if not waiters:
-                    del self._by_name[name]
-        if waiter.limit is not None:
-            del self.limits[bisect_left(self.limits, waiter.limit)]
-            waiter.limit = None
-        if waiter.limits:
-            self._forget_limits(waiter)
+        try:
+            if waiter.limit is not None:
+                _discard(self.limits, waiter.limit)
+                waiter.limit = None
+            if waiter.limits:
+                self._forget_limits(waiter)
+            if waiter.indexed:
+                for name in waiter.asked():
+                    waiters = self._by_name.get(name)
+                    if waiters is not None:
+                        waiters.pop(waiter, None)
+                        if not waiters:
+                            del self._by_name[name]
+                waiter.indexed = False
+        finally:
+            # Even if there is no memory for the rest, which is then forgotten when its turn comes.
+            self.parked.pop(waiter, None)
 
     def _index(self) -> dict[str, dict[Waiter, None]]:
         """The waiters by the frames that their questions name."""
@@ -326,9 +336,10 @@ class WaitingIndex:
     def _forget_limits(self, waiter: Waiter) -> None:
         """Take a waiter from under the edges that it is kept under by limit."""
         for frame, place in waiter.limits:
-            blocked = self.by_frame[frame]
-            del blocked.limits[bisect_left(blocked.limits, place)]
-            self._drop_if_empty(frame, blocked)
+            blocked = self.by_frame.get(frame)
+            if blocked is not None:
+                _discard(blocked.limits, place)
+                self._drop_if_empty(frame, blocked)
         waiter.limits.clear()
 
     def _under(self, frame: str) -> Line:
@@ -351,3 +362,10 @@ class WaitingIndex:
         for waiter in list(self.parked):
             if waiter.since <= stamp and waiter.blocked_by is not None:
                 yield PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
+
+
+def _discard(places: list[Place], place: Place) -> None:
+    """Remove a place from a sorted list, if it is in it."""
+    i = bisect_left(places, place)
+    if i < len(places) and places[i] is place:
+        del places[i]

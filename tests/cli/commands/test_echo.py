@@ -109,7 +109,7 @@ def test_it_prints_what_programs_on_the_domain_send_and_notices_their_death(back
     domain, address = new_domain(), free_address()
     options = ("--domain", domain, "--backend", backend)
     to_echo = ("--connect", address, *options)
-    limits = ("--rate", "5", "--max-age", "0.5")
+    limits = ("--rate", "5", "--max-age", "2")
     with start_tfbus("echo", "camera", "base_laser", *limits, "--listen", address, *options) as echo:
         waiting = echo.errors.expect("waiting")
         with start_tfbus("static", "base_link", "camera", "--xyz", "0", "0", "1", *to_echo):

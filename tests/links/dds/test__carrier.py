@@ -109,8 +109,8 @@ async def test_without_a_name_a_message_waits_only_a_while(domain_number: int) -
     assert items[1].content.authority == items[0].sender
 
 
-@pytest.mark.parametrize(("user_data", "of_ros"), [(b"enclave=/robot;\0", True), (b"other", False), (b"", False)])
-async def test_a_participant_of_ros_is_known_by_its_user_data(
+@pytest.mark.parametrize(("user_data", "of_ros"), [(b"enclave=/robot;\0", True), (b"", False)])
+async def test_who_has_sent_a_message_is_known_to_be_of_ros_or_not(
     domain_number: int, user_data: bytes, of_ros: bool
 ) -> None:
     items: list[Received] = []

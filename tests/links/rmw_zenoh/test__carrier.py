@@ -7,9 +7,9 @@ from support.samples import moving, static
 
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Received
-from tfbus.links.rmw_zenoh._carrier import MAX_SIZE, RmwZenohCarrier
+from tfbus.links.rmw_zenoh._carrier import RmwZenohCarrier
 from tfbus.links.rmw_zenoh._wire import Attachment, pack
-from tfbus.links.ros._carrier import RosMessage
+from tfbus.links.ros._carrier import MAX_SIZE, RosMessage
 from tfbus.links.ros.settings import settings_of
 from tfbus.tf_message import MalformedMessageError, encode
 
@@ -43,8 +43,8 @@ def test_messages_come_in_but_those_that_this_carrier_has_sent_itself() -> None:
 
 def test_positions_of_joints_and_the_time_come_in() -> None:
     made, items = carrier()
-    made._take_joints(sample(b"state", None))
-    made._take_clock(sample(b"time", None))
+    made._take_other("joints", sample(b"state", None))
+    made._take_other("clock", sample(b"time", None))
     assert [(item.content.payload, item.content.joints, item.content.clock, item.moving) for item in items] == [
         (b"state", True, False, True),
         (b"time", False, True, True),

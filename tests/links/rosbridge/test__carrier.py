@@ -1,3 +1,5 @@
+from typing import Any
+
 import anyio
 import pytest
 
@@ -41,3 +43,26 @@ async def test_a_server_that_falls_silent_is_left_and_asked_again(monkeypatch: p
 
 async def test_a_carrier_that_never_opened_closes() -> None:
     await RosbridgeCarrier("ws://127.0.0.1:1", settings_of({})).close()
+
+
+async def test_attempts_to_come_back_are_ever_further_apart_up_to_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    pauses: list[float] = []
+
+    class Refused(RosbridgeCarrier):
+        async def _connect(self) -> None:
+            if len(pauses) < 8:
+                raise OSError("refused")
+            self._socket = found
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    found: Any = object()
+    carrier = Refused("ws://127.0.0.1:1", settings_of({}))
+    carrier._report = SendReport(lambda _: None)
+    monkeypatch.setattr(anyio, "sleep", sleep)
+    await carrier._come_back()
+    # Each is between a half of it and the whole, so that not all clients of a server come in one instant.
+    for pause, longest in zip(pauses, [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0, 5.0], strict=True):
+        assert longest / 2 <= pause <= longest
+    assert len(set(pauses[5:])) == 3

@@ -19,6 +19,7 @@ from tfbus.links.rosbridge._protocol import (
     advertise,
     decode_content,
     decode_joints,
+    is_of_ros2,
     publish,
     read,
     subscribe,
@@ -39,7 +40,8 @@ def test_requests_are_those_of_the_protocol() -> None:
     assert json.loads(unsubscribe("/tf")) == {"op": "unsubscribe", "id": "tfbus:/tf", "topic": "/tf"}
     latched = json.loads(advertise("/tf_static", static=True))
     assert (latched["op"], latched["latch"], latched["queue_size"]) == ("advertise", True, 1)
-    assert json.loads(advertise("/tf", static=False))["latch"] is False
+    each = json.loads(advertise("/tf", static=False))
+    assert (each["latch"], each["queue_size"]) == (False, 100)
 
 
 def test_a_published_message_has_the_fields_of_ros() -> None:
@@ -77,6 +79,23 @@ def test_bytes_of_ros_1_are_told_from_those_of_ros_2() -> None:
         rows = [moving(sample.parent, sample.child, 0) for sample in samples]
         assert decode_content(ros1(*map(ros1_of, rows))).samples == rows
         assert decode_content(encode(rows)).samples == rows
+
+
+@pytest.mark.parametrize(
+    ("content", "ros2"),
+    [
+        (encode([moving("map", "base", 5)]), True),
+        ({"transforms": [{"header": {"stamp": {"sec": 5, "nanosec": 0}}}]}, True),
+        (json.loads(publish("/tf", [moving("map", "base", 5)]))["msg"], False),
+        (ros1(ros1_of(moving("map", "base", 5))), False),
+        (ros1(), False),
+        ({"transforms": []}, False),
+        ({"transforms": [5]}, False),
+        (5, False),
+    ],
+)
+def test_the_content_of_a_message_tells_whether_it_is_of_ros_2(content: Any, ros2: bool) -> None:
+    assert is_of_ros2(content) is ros2
 
 
 def test_the_status_of_a_server_has_no_topic() -> None:

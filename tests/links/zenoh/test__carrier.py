@@ -121,6 +121,19 @@ async def test_an_answer_that_one_message_cannot_hold_is_refused() -> None:
         assert isinstance(await there.next(), Answer)
 
 
+async def test_nothing_is_written_while_nobody_hears_it_and_whoever_comes_back_sees_a_gap() -> None:
+    async with ends() as (here, there):
+        unsendable = OutgoingBatch(ORIGIN, 1, (moving("map", "a", 2**62),))
+        here.carrier.send(Turn([OutgoingBatch(ORIGIN, 1, (moving("map", "a", 1),))], {}))
+        message = await there.next()
+        assert isinstance(message, ReceivedMessage)
+        await there.carrier.close()
+        await until(lambda: not here.carrier._sessions.is_heard())
+        here.carrier.send(Turn([unsendable], {}))
+        assert (here.report.messages, here.report.not_sent, here.errors) == (1, {}, [])
+        assert here.carrier._writer.write([RemovedFrame(ORIGIN, 8, "c")])[0].number == message.number + 2
+
+
 async def test_failures_to_send_are_reported_and_never_raised() -> None:
     async with ends() as (here, _):
         long = OutgoingBatch(ORIGIN, 1, (moving("map", "a", 2**62),))

@@ -1,6 +1,14 @@
 from random import Random
 
-from tfbus.links.zenoh._hearing import DEAF, FIRST_PAUSE, LONGEST_PAUSE, MOST_SILENT, SECOND_PAUSE, Hearing
+from tfbus.links.zenoh._hearing import (
+    DEAF,
+    FIRST_PAUSE,
+    LONGEST_PAUSE,
+    MOST_SILENT,
+    SECOND_PAUSE,
+    SETTLED_PAUSE,
+    Hearing,
+)
 
 
 class Scene:
@@ -72,3 +80,35 @@ def test_a_peer_that_never_answers_is_taken_for_deaf_a_few_times_only() -> None:
         verdicts = [scene.hearing.is_silent("a") for _ in range(DEAF * (MOST_SILENT + 2))]
         assert verdicts == ([False] * (DEAF - 1) + [True]) * MOST_SILENT + [False] * 2 * DEAF
         scene.hearing.joined("a")
+
+
+def test_silence_is_no_reason_to_ask_more_often() -> None:
+    scene = Scene()
+    scene.hearing.joined("a")
+    pause = FIRST_PAUSE
+    for _ in range(2 * DEAF * MOST_SILENT):
+        assert is_about(scene.until_due(), pause)
+        scene.hearing.is_silent("a")
+        pause = min(2 * pause, LONGEST_PAUSE)
+
+
+def test_a_peer_that_tells_by_itself_that_it_hears_need_not_be_asked_soon() -> None:
+    scene = Scene()
+    scene.hearing.is_heard("a")
+    assert scene.wait(1_000) == []
+    scene.hearing.joined("a")
+    scene.until_due()
+    scene.hearing.is_deaf("a", hears=False)
+    scene.hearing.is_heard("a")
+    assert is_about(scene.until_due(), SETTLED_PAUSE)
+    assert not scene.hearing.is_deaf("a", hears=False), "it was heard in between"
+    for _ in range(3):
+        scene.hearing.is_heard("a")
+        assert not scene.hearing.is_deaf("a", hears=True)
+    assert is_about(scene.until_due(), SETTLED_PAUSE)
+    # Seldom stays seldom.
+    scene.until_due()
+    scene.until_due()
+    before = scene.time
+    scene.hearing.is_heard("a")
+    assert scene.time - before + scene.until_due() > 2 * SETTLED_PAUSE

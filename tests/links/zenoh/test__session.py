@@ -26,7 +26,8 @@ class End:
     def __init__(self, id: str, domain: str, config: zenoh.Config) -> None:  # noqa: A002
         self.id = id
         self.items: Queue[Received] = Queue()
-        self.session = ZenohSession(config, Keys(domain, id), self.items.put, self._note)
+        self.heard_by: Queue[bytes] = Queue()
+        self.session = ZenohSession(config, Keys(domain, id), self.items.put, self._note, note_heard=self.heard_by.put)
 
     def _note(self, link: str, name: str, presence: Presence) -> None:
         assert name == FIRST_SESSION
@@ -108,6 +109,16 @@ def test_a_question_and_its_answer_are_received(join: Join) -> None:
     assert (question.sender, question.content.since, question.moving) == ("", 2**40, False)
     first.session.answer([(question.content.handle, Message(b"payload", b"beside", 1))])
     assert second.next() == Received(A, Answer((b"payload", b"beside")), 13)
+
+
+def test_a_question_tells_that_the_peer_is_heard_if_it_is(join: Join, domain: str) -> None:
+    first, second = join(A), join(B)
+    meet(first, second)
+    for heard in (False, True):
+        second.session.ask(A, 0, heard)
+        first.next().content.handle.drop()
+    assert first.heard_by.get(timeout=PATIENCE) == Keys(domain, B).token(FIRST_SESSION).encode()
+    assert first.heard_by.empty()
 
 
 def test_a_question_that_is_not_answered_ends(join: Join) -> None:

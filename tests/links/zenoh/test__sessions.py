@@ -44,18 +44,34 @@ class End:
 
 
 @asynccontextmanager
-async def ends(count: int = 2) -> AsyncIterator[list[End]]:
-    domain = new_domain()
-    made = [End(domain) for _ in range(count)]
+async def running(*made: End) -> AsyncIterator[None]:
     async with anyio.create_task_group() as tasks:
         for end in made:
             await anyio.to_thread.run_sync(end.sessions.open)
             tasks.start_soon(end.sessions.keep_connected)
-        yield made
+        yield
         tasks.cancel_scope.cancel()
     for end in made:
         for closing in end.sessions.close():
             await anyio.to_thread.run_sync(closing.join)
+
+
+@asynccontextmanager
+async def ends(count: int = 2) -> AsyncIterator[list[End]]:
+    domain = new_domain()
+    made = [End(domain) for _ in range(count)]
+    async with running(*made):
+        yield made
+
+
+@asynccontextmanager
+async def joined_to(here: End) -> AsyncIterator[End]:
+    """An end that has connected to another one, once both have met."""
+    joining = End(here.domain, connect=here.address)
+    async with running(joining):
+        assert await joining.next() == Received(here.id, Presence.JOINED)
+        assert await here.next() == Received(joining.id, Presence.JOINED)
+        yield joining
 
 
 async def test_a_lost_peer_is_reached_again_by_a_patch_that_carries_everything() -> None:
@@ -98,6 +114,18 @@ async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
         assert here.dialing.next_due() is None
 
 
+async def test_an_address_at_which_nobody_listens_is_forgotten_if_there_is_another() -> None:
+    here, peer = End(new_domain()), f"{1 << 127:032x}"
+    first, second = (f"tcp/127.0.0.1:{port}" for port in free_ports(2))
+    for address in (first, second):
+        here.dialing.reached(peer, address)
+    for _ in range(2):
+        await here.sessions._patch(peer, first)
+    assert here.dialing._addresses == {peer: [second]}
+    await here.sessions._patch(peer, second)
+    assert here.dialing._addresses == {peer: [second]}
+
+
 @pytest.mark.thorough
 async def test_nobody_at_the_address_is_tried_again() -> None:
     async with ends() as (here, there):
@@ -111,47 +139,44 @@ async def test_nobody_at_the_address_is_tried_again() -> None:
 
 @pytest.mark.thorough
 async def test_an_end_that_does_not_hear_those_who_ask_it_dials_them() -> None:
-    async with ends(1) as (here,):
-        joining = End(here.domain, connect=here.address)
-        await anyio.to_thread.run_sync(joining.sessions.open)
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(joining.sessions.keep_connected)
-            assert await joining.next() == Received(here.id, Presence.JOINED)
-            assert await here.next() == Received(joining.id, Presence.JOINED)
-            # As if zenoh had never told of it. The other end has accepted the connection, and cannot dial this one.
-            joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
-            joining.sessions._changes.clear()
-            assert await joining.next() == Received(here.id, Presence.LEFT)
-            assert await joining.next() == Received(here.id, Presence.JOINED)
-            assert here.items.empty()
-            tasks.cancel_scope.cancel()
-        for closing in joining.sessions.close():
-            await anyio.to_thread.run_sync(closing.join)
+    async with ends(1) as (here,), joined_to(here) as joining:
+        # As if zenoh had never told of it. The other end has accepted the connection, and cannot dial this one.
+        joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
+        joining.sessions._changes.clear()
+        assert await joining.next() == Received(here.id, Presence.LEFT)
+        assert await joining.next() == Received(here.id, Presence.JOINED)
+        assert here.items.empty()
 
 
 @pytest.mark.thorough
 async def test_a_peer_that_does_not_hear_this_end_is_dialled_until_it_does() -> None:
-    async with ends(1) as (here,):
-        # Both are connected by their first sessions, as when a connection has come back.
-        joining = End(here.domain, connect=here.address)
-        await anyio.to_thread.run_sync(joining.sessions.open)
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(joining.sessions.keep_connected)
-            assert await joining.next() == Received(here.id, Presence.JOINED)
-            assert await here.next() == Received(joining.id, Presence.JOINED)
-            # As after faults in which zenoh has lost it at that end only.
-            here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.LEFT)
-            assert await here.next() == Received(joining.id, Presence.LEFT)
-            assert await here.next() == Received(joining.id, Presence.JOINED)
-            assert {name for _, name in here.sessions._present[joining.id]} != {FIRST_SESSION}
-            assert joining.items.empty()
-            # Now it hears the first session again, so the other one ends.
-            here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.JOINED)
-            await until(lambda: {name for _, name in here.sessions._present[joining.id]} == {FIRST_SESSION})
-            assert here.items.empty()
-            tasks.cancel_scope.cancel()
-        for closing in joining.sessions.close():
-            await anyio.to_thread.run_sync(closing.join)
+    # Both are connected by their first sessions, as when a connection has come back.
+    async with ends(1) as (here,), joined_to(here) as joining:
+        # As after faults in which zenoh has lost it at that end only.
+        here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.LEFT)
+        assert await here.next() == Received(joining.id, Presence.LEFT)
+        assert await here.next() == Received(joining.id, Presence.JOINED)
+        assert {name for _, name in here.sessions._present[joining.id]} != {FIRST_SESSION}
+        assert joining.items.empty()
+        # Now it hears the first session again, so the other one ends.
+        here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.JOINED)
+        await until(lambda: {name for _, name in here.sessions._present[joining.id]} == {FIRST_SESSION})
+        assert here.items.empty()
+
+
+async def test_whoever_asks_and_hears_directly_tells_so() -> None:
+    async with ends(1) as (here,), joined_to(here) as joining:
+        told: Queue[bytes] = Queue()
+        here.sessions._main._note_heard = told.put
+        joining.sessions.ask(here.id, 0)
+        await here.next()
+        token = told.get_nowait()
+        assert here.sessions._peer_of(token) == joining.id
+        assert here.sessions._peer_of(b"\xff") is None
+        joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
+        joining.sessions.ask(here.id, 0)
+        await here.next()
+        assert told.empty()
 
 
 async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:

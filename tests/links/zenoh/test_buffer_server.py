@@ -1,15 +1,16 @@
 import math
+from dataclasses import replace
 from typing import Any
 
 import anyio
 import anyio.to_thread
 import pytest
 import zenoh
-from support.processes import until
+from support.processes import PATIENCE, until
 from support.samples import static
 
-from tfbus import Buffer, Bus, RemoteLookupError
-from tfbus.links._remote_lookup import read_answer
+from tfbus import LATEST, Buffer, Bus, RemoteLookupError, TransformStamped
+from tfbus.links._remote_lookup import RemoteQuestion, read_answer, write_question
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
 from tfbus.links.zenoh._settings import settings
 
@@ -54,7 +55,7 @@ async def test_what_is_no_question_is_refused_and_harms_nobody(address: str, dom
             def ask() -> list[Any]:
                 replies = []
                 for payload in bad:
-                    replies += list(session.get(f"tfbus/{domain}/~/lookup", payload=payload, timeout=5.0))
+                    replies += list(session.get(f"tfbus/{domain}/~/lookup", payload=payload, timeout=PATIENCE))
                 return replies
 
             try:
@@ -69,6 +70,25 @@ async def test_what_is_no_question_is_refused_and_harms_nobody(address: str, dom
             assert server.statistics().refused == {"malformed": len(bad)}
             async with BufferClient(domain, connect=address) as client:
                 assert (await client.lookup("map", "base")).static
+
+
+async def test_what_is_known_is_answered_while_the_event_loop_is_busy(address: str, domain: str) -> None:
+    config = settings([], address, {"mode": "client"}, 2.0)
+    question = RemoteQuestion("asker", 1, "map", "base", LATEST)
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with BufferServer(buffer, domain, listen=address) as server:
+            bus.publish(static("map", "base", 2.0))
+            session = await anyio.to_thread.run_sync(zenoh.open, config)
+            try:
+                # Nothing is awaited here, so the event loop stands still until the answer has come.
+                for asked, kind in ((question, TransformStamped), (replace(question, source_at=5), Exception)):
+                    (reply,) = session.get(f"tfbus/{domain}/~/lookup", payload=write_question(asked), timeout=30.0)
+                    assert reply.ok is not None
+                    assert isinstance(read_answer(reply.ok.payload.to_bytes(), domain, None), kind)
+            finally:
+                await anyio.to_thread.run_sync(session.close)
+            counts = server.statistics()
+            assert (counts.answered, counts.failed, counts.waiting, counts.queue.dropped) == (1, 1, 0, 0)
 
 
 async def test_what_makes_no_sense_is_refused_at_once(domain: str) -> None:

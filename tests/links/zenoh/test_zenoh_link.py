@@ -642,8 +642,9 @@ async def test_fifty_links_one_after_another_leave_no_thread_and_no_file_behind(
             for _ in range(50):
                 await open_one()
             threads, files, bytes_held = (now - then for now, then in zip(held(), before, strict=True))
-    assert threads <= 1
-    assert files <= 2
+    # zenoh and anyio keep a few idle threads for some seconds; what each link leaves would be fifty.
+    assert threads < 10
+    assert files < 10
     assert bytes_held < 10e6
 
 

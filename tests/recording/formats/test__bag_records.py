@@ -71,6 +71,9 @@ def test_a_chunk_is_found_by_its_bytes() -> None:
     # Also across the blocks that are read at once.
     for size in (2**20 - 30, 2**20 - 5, 2**20 + 3):
         assert find_chunk(io.BytesIO(bytes(size) + CHUNK_RECORD), 0) == size
+    # Its mark begins in one block and ends in the next, and its header began 89 bytes before them.
+    fields = field(b"compression", b"none") + field(b"size", bytes(4)) + field(b"note", bytes(38)) + field(b"op", b"\5")
+    assert find_chunk(io.BytesIO(bytes(2**20 - 89) + record(fields)), 0) == 2**20 - 89
 
 
 def test_damage_is_an_error() -> None:

@@ -126,6 +126,20 @@ def test_all_messages_are_read_with_an_index_and_without(
         assert facts(recording) == (10, 159, 61, False)
 
 
+def test_an_index_behind_the_end_that_counts_nothing_hides_no_message(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(write_bag(path))
+    for name, value in (
+        (b"index_pos=", bytes([0, 0, 0, 1, 0, 0, 0, 0])),
+        (b"conn_count=", bytes(4)),
+        (b"chunk_count=", bytes(4)),
+    ):
+        place = data.index(name) + len(name)
+        data[place : place + len(value)] = value
+    path.write_bytes(data)
+    assert read(path) == (EXPECTED, [])
+
+
 @pytest.mark.parametrize(
     "compression", [None, *(pytest.param(kind, marks=pytest.mark.thorough) for kind in Writer.CompressionFormat)]
 )

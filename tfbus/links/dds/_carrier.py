@@ -1,15 +1,15 @@
 """The carrier of links over DDS."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
-from threading import Lock, Thread
+from threading import Thread
 from typing import Any, Literal
 
 import anyio
 import anyio.to_thread
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
-from cyclonedds.core import DDSException, Entity, Listener
+from cyclonedds.core import DDSException
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -18,24 +18,23 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+from tfbus._aio.threads import wait_for_all
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds._domains import domain
+from tfbus.links.dds._joining import delete, is_of_ros, join, read
 from tfbus.links.dds._publishers import PATIENCE, Publishers
+from tfbus.links.dds._reader_thread import ReaderThread
 from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawString, RawTFMessage
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.tf_message import MalformedMessageError, encode
 
-MAX_SIZE = 2**22
-"""The largest message that is received, in bytes."""
 _CLOSING_TIME = 1.0
 _DEPTH = 100
 _OTHERS = "other topics"
 """The authority of joint positions and of the time."""
 _AT_ONCE = 100
-_MOST_PARTICIPANTS = 1_000
-_OF_ROS = b"enclave="
 # A writer never waits for a reader that is frozen: the event loop would.
 _RELIABLE = (
     Policy.Reliability.Reliable(duration(seconds=0)),
@@ -66,7 +65,6 @@ class DdsCarrier(RosCarrier):
         super().__init__(f"dds:{number}", settings)
         self._number = number
         self._config = config
-        self._lock = Lock()
         self._open = ExitStack()
         self._publishers = Publishers(self._deliver, self._is_of_ros)
         self._participants: BuiltinDataReader | None = None
@@ -82,8 +80,7 @@ class DdsCarrier(RosCarrier):
     def _join(self) -> None:
         try:
             self._open.enter_context(domain(self._number, self._config))
-            participant = DomainParticipant(self._number)
-            self._open.callback(_delete, participant)
+            participant = join(self._number, self._open)
             topics = {
                 name: Topic(participant, f"rt{name}", RawTFMessage)
                 for name in (*self.settings.tf, *self.settings.tf_static)
@@ -92,53 +89,36 @@ class DdsCarrier(RosCarrier):
                 self._moving_writer = DataWriter(participant, topics[self.settings.tf[0]], _MOVING)
                 self._static_writer = DataWriter(participant, topics[self.settings.tf_static[0]], _STATIC)
                 for writer in (self._moving_writer, self._static_writer):
-                    self._open.callback(_delete, writer)
+                    self._open.callback(delete, writer)
+            thread = ReaderThread(participant, self._misread)
             if self.settings.authority is None:
                 self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
-                self._open.callback(_delete, self._participants)
+                self._open.callback(delete, self._participants)
                 info = Topic(participant, "ros_discovery_info", ParticipantEntitiesInfo)
-                self._read(participant, info, _STATICS, self._take_nodes, None)
+                thread.watch(self._reader(participant, info, _STATICS), self._take_nodes)
             for name in self.settings.joint_topic:
                 joints = Topic(participant, f"rt{name}", RawJointState)
-                self._read(participant, joints, _ANY, partial(self._take_other, "joints"), None)
+                thread.watch(self._reader(participant, joints, _ANY), partial(self._take_other, "joints"))
             for name in self.settings.clock_topic:
                 clock = Topic(participant, f"rt{name}", RawClock)
-                self._read(participant, clock, _ANY, partial(self._take_other, "clock"), None)
+                thread.watch(self._reader(participant, clock, _ANY), partial(self._take_other, "clock"))
             for name in self.settings.description_topic:
                 # Latched, as static frames are.
-                description = Topic(participant, f"rt{name}", RawString)
-                self._read(participant, description, _STATICS, partial(self._take_other, "description"), None)
+                text = Topic(participant, f"rt{name}", RawString)
+                thread.watch(self._reader(participant, text, _STATICS), partial(self._take_other, "description"))
             for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
                 static = number < len(self.settings.tf_static)
-                self._read(
-                    participant,
-                    topics[name],
-                    _STATICS if static else _MOVING,
-                    partial(self._take, static),
-                    partial(self._match, number),
-                )
+                reader = self._reader(participant, topics[name], _STATICS if static else _MOVING)
+                thread.watch(reader, partial(self._take, static), partial(self._match, number))
+            thread.start()
+            self._open.callback(thread.stop)
         except DDSException as error:
             raise OSError(f"cannot join the DDS domain {self._number}: {error}") from None
 
-    def _read(
-        self,
-        participant: DomainParticipant,
-        topic: Topic[Any],
-        qos: Qos,
-        take: Callable[[DataReader[Any]], object],
-        match: Callable[[DataReader[Any]], None] | None,
-    ) -> None:
-        reader = DataReader(participant, topic, qos)
-        listener = Listener(on_data_available=lambda _: take(reader))
-        if match is not None:
-            listener.set_on_subscription_matched(lambda _, __: match(reader))
-        self._open.callback(_delete, reader)
-        # Only now, because a listener is called with no reader before the library knows the one that it makes.
-        reader.set_listener(listener)
-        self._open.callback(reader.set_listener, None)
-        if match is not None:
-            match(reader)
-        take(reader)
+    def _reader(self, participant: DomainParticipant, topic: Topic[Any], qos: Qos) -> DataReader[Any]:
+        reader: DataReader[Any] = DataReader(participant, topic, qos)
+        self._open.callback(delete, reader)
+        return reader
 
     async def run(self) -> None:
         """Let no message wait for the name of its node for ever."""
@@ -150,9 +130,7 @@ class DdsCarrier(RosCarrier):
         """Leave the domain, or give up waiting for that."""
         closing = Thread(target=self._open.close, name="tfbus dds close", daemon=True)
         closing.start()
-        with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            # With a limit, for a worker of asyncio keeps the interpreter.
-            await anyio.to_thread.run_sync(closing.join, _CLOSING_TIME, abandon_on_cancel=True)
+        await wait_for_all([closing], _CLOSING_TIME)
 
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
         try:
@@ -162,7 +140,7 @@ class DdsCarrier(RosCarrier):
             return False
         return True
 
-    # What follows is called by the library, in its own threads, which print whatever is raised.
+    # What follows is called in the thread of the readers.
 
     def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> None:
         while True:
@@ -190,12 +168,9 @@ class DdsCarrier(RosCarrier):
 
     def _is_of_ros(self, participant: str) -> bool:
         """Whether a participant has the user data that ROS 2 gives it."""
-        found: list[Any] = [] if self._participants is None else self._participants.read(N=_MOST_PARTICIPANTS)
-        for each in found:
-            if not isinstance(each, InvalidSample) and each.key.hex == participant:
-                data = each.qos[Policy.Userdata].data if Policy.Userdata in each.qos else b""
-                return data.startswith(_OF_ROS)
-        return False
+        if self._participants is None:
+            return False
+        return any(is_of_ros(each) for each in read(self._participants) if each.key.hex == participant)
 
     def _take_nodes(self, reader: DataReader[ParticipantEntitiesInfo]) -> None:
         messages: list[Any] = reader.take(N=_AT_ONCE)
@@ -208,32 +183,26 @@ class DdsCarrier(RosCarrier):
         for message in messages:
             if not isinstance(message, InvalidSample):
                 other = {kind: True}
-                content = RosMessage(message.payload, static=False, authority="", **other)
-                # What is latched comes once.
-                self._pass_on(_OTHERS, content, moving=kind != "description")
+                self._pass_on(_OTHERS, RosMessage(message.payload, static=False, authority="", **other))
 
     def _match(self, number: int, reader: DataReader[RawTFMessage]) -> None:
-        with self._lock:
-            self._writers.clear()
-            publications = map(reader.get_matched_publication_data, reader.get_matched_publications())
-            self._matched[number] = frozenset(each.participant_key.hex for each in publications if each is not None)
-            present = frozenset().union(*self._matched.values())
-            self._publishers.keep_only(set(present))
-            for participant in sorted(present - self._present):
-                self._receive(Received(participant, Presence.JOINED))
-            for participant in sorted(self._present - present):
-                self._receive(Received(participant, Presence.LEFT))
-            self._present = present
+        self._writers.clear()
+        publications = map(reader.get_matched_publication_data, reader.get_matched_publications())
+        self._matched[number] = frozenset(each.participant_key.hex for each in publications if each is not None)
+        present = frozenset().union(*self._matched.values())
+        self._publishers.keep_only(set(present))
+        for participant in sorted(present - self._present):
+            self._receive(Received(participant, Presence.JOINED))
+        for participant in sorted(self._present - present):
+            self._receive(Received(participant, Presence.LEFT))
+        self._present = present
+
+    def _misread(self, error: Exception) -> None:
+        """Count a message that the library itself could not read."""
+        self._receive(Received("", MalformedMessageError("encoding", f"the library cannot read it: {error!r}"[:200])))
 
     def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
-        self._pass_on(participant, RosMessage(payload, static, authority), moving=not static)
-
-    def _pass_on(self, sender: str, message: RosMessage, moving: bool) -> None:
-        size = len(message.payload)
-        if size > MAX_SIZE:
-            self._receive(Received(sender, MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")))
-        else:
-            self._receive(Received(sender, message, size, moving=moving))
+        self._pass_on(participant, RosMessage(payload, static, authority))
 
 
 def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:
@@ -245,8 +214,3 @@ def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:
         )
         for node in info.node_entities_info_seq
     ]
-
-
-def _delete(entity: Entity) -> None:
-    # The library deletes an entity when nothing refers to it any more, and its listener does.
-    entity.__del__()

@@ -4,7 +4,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from functools import partial
 from time import time_ns
-from typing import Any
+from typing import Any, Literal
 from uuid import uuid4
 
 import anyio
@@ -13,7 +13,6 @@ import zenoh
 import zenoh.ext
 
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.links._receive_queue import Received
 from tfbus.links.rmw_zenoh._wire import (
     CLOCK_HASH,
     CLOCK_TYPE,
@@ -34,12 +33,12 @@ from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
 from tfbus.links.zenoh._session import directly
-from tfbus.tf_message import MalformedMessageError, encode
+from tfbus.links.zenoh._settings import without_source_location
+from tfbus.tf_message import encode
 
-MAX_SIZE = 2**22
-"""The largest message that is received, in bytes."""
 _HEARTBEAT = 0.5
 _AUTHORITY = "rmw_zenoh"
+_Other = Literal["joints", "clock", "description"]
 
 
 class RmwZenohCarrier(RosCarrier):
@@ -70,7 +69,7 @@ class RmwZenohCarrier(RosCarrier):
         try:
             await anyio.to_thread.run_sync(self._join)
         except zenoh.ZError as error:
-            raise ConnectionError(f"no router of rmw_zenoh: {error}") from error
+            raise ConnectionError(f"no router of rmw_zenoh: {without_source_location(error)}") from error
 
     def _join(self) -> None:
         session = self._session = zenoh.open(self._config)
@@ -93,14 +92,15 @@ class RmwZenohCarrier(RosCarrier):
                 self._declared.append(self._subscriber(session, key, static, partial(self._take, static)))
             self._token(endpoint_token(self._domain, name, number, self._node, topic, static, publishes))
 
-        others = (
-            *((topic, JOINT_TYPE, JOINT_HASH, False, self._take_joints) for topic in self.settings.joint_topic),
-            *((topic, CLOCK_TYPE, CLOCK_HASH, False, self._take_clock) for topic in self.settings.clock_topic),
-            *((topic, TEXT_TYPE, TEXT_HASH, True, self._take_text) for topic in self.settings.description_topic),
+        others: tuple[tuple[_Other, str, str, str], ...] = (
+            *(("joints", topic, JOINT_TYPE, JOINT_HASH) for topic in self.settings.joint_topic),
+            *(("clock", topic, CLOCK_TYPE, CLOCK_HASH) for topic in self.settings.clock_topic),
+            *(("description", topic, TEXT_TYPE, TEXT_HASH) for topic in self.settings.description_topic),
         )
-        for number, (topic, kind, digest, latched, take) in enumerate(others, len(topics) + 1):
+        for number, (content, topic, kind, digest) in enumerate(others, len(topics) + 1):
+            latched = content == "description"
             key = topic_expression(self._domain, topic, kind)
-            self._declared.append(self._subscriber(session, key, latched, take))
+            self._declared.append(self._subscriber(session, key, latched, partial(self._take_other, content)))
             self._token(other_token(self._domain, name, number, self._node, topic, kind, digest, latched))
 
     def _token(self, key: str) -> None:
@@ -165,24 +165,9 @@ class RmwZenohCarrier(RosCarrier):
         attachment = sample.attachment
         if attachment is not None and publisher_of(bytes(attachment)) in self._ids.values():
             return
-        self._pass_on(RosMessage(bytes(sample.payload), static, _AUTHORITY))
+        self._pass_on(_AUTHORITY, RosMessage(bytes(sample.payload), static, _AUTHORITY))
 
-    def _take_joints(self, sample: zenoh.Sample) -> None:
-        """Take positions of joints, in zenoh's threads."""
-        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, joints=True))
-
-    def _take_clock(self, sample: zenoh.Sample) -> None:
-        """Take the time, in zenoh's threads."""
-        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, clock=True))
-
-    def _take_text(self, sample: zenoh.Sample) -> None:
-        """Take the description of a robot, in zenoh's threads."""
-        self._pass_on(RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, description=True))
-
-    def _pass_on(self, message: RosMessage) -> None:
-        size = len(message.payload)
-        if size > MAX_SIZE:
-            error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
-            self._receive(Received(_AUTHORITY, error))
-        else:
-            self._receive(Received(_AUTHORITY, message, size, moving=not (message.static or message.description)))
+    def _take_other(self, content: _Other, sample: zenoh.Sample) -> None:
+        """Take positions of joints, the time, or the description of a robot, in zenoh's threads."""
+        other = {content: True}
+        self._pass_on(_AUTHORITY, RosMessage(bytes(sample.payload), static=False, authority=_AUTHORITY, **other))

@@ -21,8 +21,10 @@ from tfbus.links.ros._clock_message import decode_clock
 from tfbus.links.ros._text_message import decode_text
 from tfbus.links.ros.settings import RosSettings
 from tfbus.robot.joint_state_message import decode_joint_state
-from tfbus.tf_message import Decoded, decode, refusal
+from tfbus.tf_message import Decoded, MalformedMessageError, decode, refusal
 
+MAX_SIZE = 2**22
+"""The largest message that is received, in bytes."""
 MOST_TRANSFORMS = 1_000
 """So many moving transforms go into one message."""
 
@@ -152,6 +154,17 @@ class RosCarrier:
     def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
         """The stamp and the positions of joints of a message; raises `MalformedMessageError`."""
         return decode_joint_state(payload, ros1=False)
+
+    def _pass_on(self, sender: str, message: RosMessage) -> None:
+        """Hand a message of bytes to the link, or the refusal of one that is too large; any thread may call this."""
+        size = len(message.payload)
+        if size > MAX_SIZE:
+            error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
+            self._receive(Received(sender, error))
+        else:
+            # What is latched comes once.
+            moving = not (message.static or message.description)
+            self._receive(Received(sender, message, size, moving=moving))
 
     def _publish_statics(self) -> None:
         """Publish the static frames once more, for whoever has come or come back."""

@@ -2,7 +2,8 @@
 
 import random
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from math import inf
 from time import monotonic
 from typing import Any, Literal
 from uuid import uuid4
@@ -13,7 +14,7 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.ros._carrier import RosCarrier, RosMessage
+from tfbus.links.ros._carrier import MAX_SIZE, RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.links.rosbridge._protocol import (
     CLOCK_TYPE,
@@ -23,6 +24,7 @@ from tfbus.links.rosbridge._protocol import (
     advertise,
     decode_content,
     decode_joints,
+    is_of_ros2,
     publish,
     read,
     subscribe,
@@ -31,8 +33,6 @@ from tfbus.links.rosbridge._protocol import (
 from tfbus.links.rosbridge._websocket import WebSocket
 from tfbus.tf_message import Decoded, MalformedMessageError
 
-MAX_SIZE = 2**22
-"""The largest message that is received, in bytes."""
 MOST_QUEUED = 1_000
 """So many messages wait for a slow server; then the oldest are dropped."""
 Encoding = Literal["cbor", "cbor-raw"]
@@ -41,6 +41,10 @@ SILENCE = 10.0
 """s; a server that does not even answer a ping for so long is gone."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.25, 5.0
 """s between two attempts to connect."""
+LINGER_TIME = 11.0
+"""s; a server of ROS 2 keeps the publisher of a client that has gone for 10, and then ROS takes a while."""
+ECHO_TIME = 2.0
+"""s; a server of ROS 2 gives the last second of its own clients to those who come, so it may come from this link."""
 _CLOSING_TIME = 1.0
 _MISS_PERIODS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """s; while a lookup waits, the static frames are asked for again so often, and then after the last of these."""
@@ -76,6 +80,9 @@ class RosbridgeCarrier(RosCarrier):
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
         self._woken = anyio.Event()
+        self._of_ros2 = False
+        self._advertised = self._heard_moving = False
+        self._connected_at = self._broken_at = self._held_until = -inf
         # Made when the server is there: anyio makes none without an event loop.
         self._writing: anyio.CancelScope
         self._ending = False
@@ -83,6 +90,10 @@ class RosbridgeCarrier(RosCarrier):
     async def _connect(self) -> None:
         self._socket = await WebSocket.connect(self._url, MAX_SIZE, CONNECT_TIME)
         self._encoding = self._wanted
+        if self._of_ros2 and self._advertised:
+            self._held_until = self._broken_at + LINGER_TIME
+        self._advertised = self._heard_moving = False
+        self._connected_at = monotonic()
         self._moving.clear()
         self._requests.clear()
         # First of all: what is latched may come only once, and moving frames come again.
@@ -97,7 +108,6 @@ class RosbridgeCarrier(RosCarrier):
             self._request(subscribe(topic, self._encoding, TEXT_TYPE))
         if self.settings.send:
             self._request(advertise(self.settings.tf_static[0], static=True))
-            self._request(advertise(self.settings.tf[0], static=False))
             self._publish_statics()
         self._receive(Received(self._url, Presence.JOINED))
 
@@ -128,7 +138,15 @@ class RosbridgeCarrier(RosCarrier):
             error = ConnectionError(f"{self._url} is not connected")
             self._report.refused("not connected", error, len(samples))
             return False
+        elif monotonic() < self._held_until:
+            error = ConnectionError(f"{self._url} was away, and still has a publisher of that time, which hides others")
+            self._report.refused("rejoining", error, len(samples))
+            return False
         else:
+            if not self._advertised:
+                # Not before there is something: a server of ROS 2 then gives later clients only what is latched.
+                self._advertised = True
+                self._request(advertise(self.settings.tf[0], static=False))
             if len(self._moving) >= MOST_QUEUED:
                 _, dropped = self._moving.popleft()
                 self._report.refused("congested", OSError(f"{self._url} is too slow for what is published"), dropped)
@@ -151,10 +169,12 @@ class RosbridgeCarrier(RosCarrier):
         for work in (self._read_all, self._write_all, self._keep_alive):
             tasks.start_soon(self._until_gone, work, socket, tasks.cancel_scope)
         tasks.start_soon(self._ask_again)
+        tasks.start_soon(self._end_holding)
         tasks.start_soon(self._end_writing)
         await close_task_group(tasks)
         # Not when the link ends: then there is still something to send.
         self._socket = None
+        self._broken_at = monotonic()
         self._receive(Received(self._url, Presence.LEFT))
         await socket.close()
 
@@ -204,15 +224,18 @@ class RosbridgeCarrier(RosCarrier):
             raise MalformedMessageError("topic", f"a message on {incoming.topic[:100]!r}, which nobody asked for")
         if self._encoding == "cbor-raw" and incoming.encoding == "none":
             self._ask_for_cbor()
+        self._of_ros2 = self._of_ros2 or is_of_ros2(incoming.content)
+        if not static:
+            self._heard_moving = True
+            if monotonic() > self._connected_at + ECHO_TIME:
+                self._held_until = -inf
         content = RosMessage(incoming.content, static, "rosbridge")
         self._receive(Received(self._url, content, size, moving=not static))
 
     def _ask_for_cbor(self) -> None:
         """Subscribe anew: a server that answers ``cbor-raw`` in JSON may know ``cbor``, which is older."""
         self._encoding = "cbor"
-        for topic in (*self.settings.tf_static, *self.settings.tf):
-            self._request(unsubscribe(topic))
-            self._request(subscribe(topic, self._encoding))
+        self._subscribe_again((*self.settings.tf_static, *self.settings.tf))
 
     async def _write_all(self, socket: WebSocket) -> None:
         with self._writing:
@@ -252,10 +275,10 @@ class RosbridgeCarrier(RosCarrier):
             await socket.ping()
 
     async def _ask_again(self) -> None:
-        """Subscribe to the static frames once more while a lookup waits.
+        """Subscribe once more while a lookup waits, to the static frames, and to the moving ones if none has come.
 
         A rosbridge of ROS 2 gives latched messages to no later subscriber if it has asked ROS for that topic before
-        there was a publisher.
+        there was a publisher; and only latched messages if it has asked while another client published there.
         """
         misses = 0
         while True:
@@ -264,9 +287,26 @@ class RosbridgeCarrier(RosCarrier):
                 misses = 0
                 continue
             misses += 1
-            for topic in self.settings.tf_static:
-                self._request(unsubscribe(topic))
-                self._request(subscribe(topic, self._encoding))
+            self._subscribe_again(self.settings.tf_static)
+            # Beside a publisher of this link, the new subscription would hear nobody else.
+            if not (self._heard_moving or self._advertised):
+                self._subscribe_again(self.settings.tf)
+
+    async def _end_holding(self) -> None:
+        """Send moving frames again when those of others are heard, or the former publisher of this link has gone.
+
+        A server of ROS 2 subscribes to a topic as it finds publishers there, and its own are latched: a subscription
+        that meets one of them never hears the nodes of ROS. It keeps the publisher of a client for 10 s after that.
+        """
+        await anyio.sleep(max(0.0, self._held_until - monotonic()))
+        if self._held_until > -inf:
+            self._subscribe_again(self.settings.tf)
+            self._held_until = -inf
+
+    def _subscribe_again(self, topics: Iterable[str]) -> None:
+        for topic in topics:
+            self._request(unsubscribe(topic))
+            self._request(subscribe(topic, self._encoding))
 
     def _request(self, text: str) -> None:
         self._requests.append(text)

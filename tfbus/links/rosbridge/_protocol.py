@@ -22,6 +22,7 @@ JOINT_TYPE: Final = "sensor_msgs/JointState"
 CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 TEXT_TYPE: Final = "std_msgs/String"
 QUEUE: Final = 100
+_CDR: Final = b"\0\1\0\0"
 _DOUBLES: Final = 86
 """The tag of little endian float64 (RFC 8746)."""
 
@@ -101,6 +102,16 @@ def decode_content(content: Any) -> Decoded[ReceivedTransform]:
     return decode_ros1(content)
 
 
+def is_of_ros2(content: Any) -> bool:
+    """Whether the content of a message of transforms tells that it comes from ROS 2."""
+    if isinstance(content, bytes):
+        return len(content) > len(_CDR) and content.startswith(_CDR)
+    try:
+        return "sec" in content["transforms"][0]["header"]["stamp"]
+    except (LookupError, TypeError):
+        return False
+
+
 def decode_joints(content: Any) -> tuple[int, dict[str, float]]:
     """The stamp and the positions of joints of a message, in bytes of either ROS or as a mapping.
 
@@ -110,7 +121,7 @@ def decode_joints(content: Any) -> tuple[int, dict[str, float]]:
         If it holds none.
     """
     if isinstance(content, bytes):
-        if content[:4] == b"\0\1\0\0":
+        if content.startswith(_CDR):
             try:
                 return decode_joint_state(content, ros1=False)
             except MalformedMessageError:

@@ -166,8 +166,9 @@ class WebSocket:
     async def _send(self, event: Event) -> None:
         try:
             data = self._connection.send(event)
-        except ProtocolError as error:
-            raise ConnectionResetError(f"the websocket is closed: {error}") from None
+        except ProtocolError:
+            # Its text has the whole message.
+            raise ConnectionResetError("the websocket is closed") from None
         async with self._sending:
             try:
                 await self._stream.send(data)

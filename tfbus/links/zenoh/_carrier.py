@@ -64,8 +64,11 @@ class ZenohCarrier:
         await anyio.to_thread.run_sync(self._sessions.open, abandon_on_cancel=True)
 
     def send(self, turn: Turn) -> None:
-        """Send live messages at once; while the network is congested, zenoh drops them."""
+        """Send live messages at once, if anybody hears them; while the network is congested, zenoh drops them."""
         self._newest.note(turn)
+        if not self._is_heard():
+            self._writer.skip(turn.time)
+            return
         for message in self._writer.write(turn.entries, turn.step, turn.time):
             if self._put(message) and message.number:
                 self._report.sent(message.samples)
@@ -128,6 +131,13 @@ class ZenohCarrier:
         late = await wait_until_closed(self._sessions.close())
         if late is not None:
             self._report.failed(late)
+
+    def _is_heard(self) -> bool:
+        try:
+            return self._sessions.is_heard()
+        except zenoh.ZError:
+            # What is sent fails as well, and that is reported.
+            return True
 
     def _put(self, message: Message) -> bool:
         try:

@@ -8,11 +8,10 @@ import atexit
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from time import monotonic
 
-import anyio
-import anyio.to_thread
 import zenoh
+
+from tfbus._aio.threads import join_all, wait_for_all
 
 CLOSING_TIME = 1.0
 LONGEST_CLOSE = 15.0
@@ -38,20 +37,11 @@ def begin_to_close(session: zenoh.Session | None) -> threading.Thread:
 
 async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError | None:
     """Wait a second for such threads, also when cancelled; returns an error if that was too short."""
-    with anyio.move_on_after(CLOSING_TIME, shield=True):
-        # With a limit, for a worker of asyncio keeps the interpreter.
-        await anyio.to_thread.run_sync(_join, closing, CLOSING_TIME, abandon_on_cancel=True)
-    if not any(thread.is_alive() for thread in closing):
+    if await wait_for_all(closing, CLOSING_TIME):
         return None
     return TimeoutError(f"zenoh has not closed its session within {CLOSING_TIME:g} s, and goes on in the background")
 
 
-def _join(threads: Sequence[threading.Thread], seconds: float) -> None:
-    deadline = monotonic() + seconds
-    for thread in threads:
-        thread.join(max(0.0, deadline - monotonic()))
-
-
 @atexit.register
 def _wait_at_exit() -> None:
-    _join([thread for thread in threading.enumerate() if thread.name == _NAME], LONGEST_CLOSE)
+    join_all([thread for thread in threading.enumerate() if thread.name == _NAME], LONGEST_CLOSE)

@@ -13,6 +13,8 @@ from random import Random
 FIRST_PAUSE = 1.0
 LONGEST_PAUSE = 300.0
 """s between two questions to one peer: at first, and then twice that time, up to the longest."""
+SETTLED_PAUSE = 60.0
+"""s; after a peer has told that it hears this link."""
 SECOND_PAUSE = 0.5
 """s; after an answer that the link is not heard, for its presence may be on its way."""
 DEAF = 2
@@ -62,31 +64,47 @@ class Hearing:
             check.due = now + self._jitter(check.pause)
         return due
 
+    def is_heard(self, peer: str) -> None:
+        """Note that a peer has told by itself that it hears this link: it need not be asked soon."""
+        check = self._checks.get(peer)
+        if check is not None:
+            check.unheard = 0
+            check.pause = max(check.pause, SETTLED_PAUSE)
+            check.due = max(check.due, self._now() + self._jitter(SETTLED_PAUSE))
+
     def is_deaf(self, peer: str, hears: bool) -> bool:
         """Note a peer's answer; returns whether it does not hear this link, and will not by itself."""
         check = self._checks.get(peer)
         if check is None:
             return False
-        check.unheard = 0 if hears else check.unheard + 1
         if hears:
+            check.unheard = 0
             return False
+        deaf = _count_unheard(check)
         check.pause = FIRST_PAUSE
-        check.due = self._now() + self._jitter(SECOND_PAUSE)
-        if check.unheard < DEAF:
-            return False
-        # Time for what is done about it.
-        check.unheard = 0
-        check.due = self._now() + self._jitter(2 * FIRST_PAUSE)
-        return True
+        check.due = self._ask_again(deaf)
+        return deaf
 
     def is_silent(self, peer: str) -> bool:
         """Note that a peer has not answered; returns whether it is taken for deaf."""
         check = self._checks.get(peer)
         if check is None or check.silent >= MOST_SILENT:
             return False
-        deaf = self.is_deaf(peer, hears=False)
+        deaf = _count_unheard(check)
+        # An end that has no time to answer must not be asked more often for it.
+        check.due = max(check.due, self._ask_again(deaf))
         check.silent += deaf
         return deaf
 
+    def _ask_again(self, deaf: bool) -> float:
+        """The time of the next question; there is time for what is done about a deaf peer."""
+        return self._now() + self._jitter(2 * FIRST_PAUSE if deaf else SECOND_PAUSE)
+
     def _jitter(self, seconds: float) -> float:
         return seconds * self._random.uniform(0.8, 1.2)
+
+
+def _count_unheard(check: _Check) -> bool:
+    """Count an answer that the link is not heard, or none; returns whether that makes the peer deaf."""
+    check.unheard = (check.unheard + 1) % DEAF
+    return check.unheard == 0

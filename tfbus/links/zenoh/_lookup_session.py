@@ -11,6 +11,7 @@ import threading
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from queue import SimpleQueue
 from typing import Any
 
@@ -33,7 +34,7 @@ class LookupSession:
     """A session, and the keys of one robot's lookups.
 
     Questions and answers are sent by a thread of its own: zenoh drops none, and waits for a peer that is frozen or
-    overloaded.
+    overloaded. So that thread also makes the answers that are at hand.
 
     Parameters
     ----------
@@ -129,8 +130,12 @@ class LookupSession:
 
     @property
     def unsent(self) -> int:
-        """The number of questions and answers that wait to be sent."""
+        """The number of things that wait for the session's thread, such as questions to be sent."""
         return self._sending.qsize()
+
+    def soon(self, do: Callable[[], object]) -> None:
+        """Have something done by the session's thread, in order; it must not raise."""
+        self._sending.put(do)
 
     def ask(self, payload: bytes, take: Callable[[bytes | None], object], timeout: float, to_all: bool = False) -> None:
         """Send a question; `take` is called once in another thread, with the answer or with None."""
@@ -167,14 +172,7 @@ class LookupSession:
 
     def reply(self, query: zenoh.Query, answer: bytes) -> None:
         """Send the answer of a question that was received."""
-
-        def send() -> None:
-            # An asker that has gone needs no answer.
-            with suppress(zenoh.ZError):
-                query.reply(query.key_expr, answer, express=True)
-            query.drop()
-
-        self._sending.put(send)
+        self._sending.put(partial(reply_now, query, answer))
 
     async def close(self) -> None:
         """End what was declared, and the session if it is not the link's."""
@@ -191,6 +189,14 @@ class LookupSession:
     def _opened(self) -> zenoh.Session:
         assert self._session is not None
         return self._session
+
+
+def reply_now(query: zenoh.Query, answer: bytes) -> None:
+    """Send the answer of a question; for the session's thread."""
+    # An asker that has gone needs no answer.
+    with suppress(zenoh.ZError):
+        query.reply(query.key_expr, answer, express=True)
+    query.drop()
 
 
 def _send_all(sending: _Sending) -> None:

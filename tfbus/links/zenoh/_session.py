@@ -26,8 +26,11 @@ _LONGEST_SHOWN_KEY = 200
 MOST_QUESTIONS = 1_000
 MOST_NAMES = 1_000
 """Bytes; so much is read of an answer with names of sessions."""
-_ANSWER_TIME = 2.0
+_ANSWER_TIME = 10.0
+"""s; an answer that comes late is as good, so it is longer than the asker's patience."""
 _HEARING_TIME = 1.0
+_URGENT = zenoh.Priority.INTERACTIVE_HIGH
+"""Of questions whether a link is heard, and so of their answers: they overtake live messages, and are dropped last."""
 _TOGETHER = 0.02
 _EARLY = 0.9
 """s, and part of a period: what comes later than the one, and earlier than the other, is left out."""
@@ -52,6 +55,8 @@ class ZenohSession:
         Called in zenoh's threads with each query of a link that asks whether it is heard; without it, none is answered.
     note_connection : callable, optional
         Called in zenoh's threads with the id of a session to which a connection was made or has broken.
+    note_heard : callable, optional
+        Called in zenoh's threads with the token of each link that tells that it hears this one.
     name : str
         The name of this session among those of the link.
 
@@ -69,11 +74,13 @@ class ZenohSession:
         name: str = FIRST_SESSION,
         note_asked: Callable[[zenoh.Query], object] | None = None,
         note_connection: Callable[[str], object] | None = None,
+        note_heard: Callable[[bytes], object] | None = None,
     ) -> None:
         self._config = config
         self._note_presence = note_presence
         self._note_asked = note_asked
         self._note_connection = note_connection
+        self._note_heard = note_heard
         self._name = name
         self._keys = keys
         self._receive = receive
@@ -121,8 +128,11 @@ class ZenohSession:
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, close_session, session)
         drop, remote, keys = zenoh.CongestionControl.DROP, zenoh.Locality.REMOTE, self._keys
-        self._live = session.declare_publisher(keys.own("live"), congestion_control=drop)
-        self._slow = session.declare_publisher(keys.own("slow"), congestion_control=drop)
+        # The link's own subscriptions must not count for somebody who hears it.
+        self._live, self._slow = (
+            session.declare_publisher(keys.own(kind), congestion_control=drop, allowed_destination=remote)
+            for kind in ("live", "slow")
+        )
         # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
         self._declared = [
             *(
@@ -160,6 +170,10 @@ class ZenohSession:
         """Send a message by the slow key, or drop it while the network is congested."""
         self._slow.put(message.payload, attachment=message.attachment)
 
+    def is_heard(self) -> bool:
+        """Whether anybody subscribes to the live key; also if the session has ended, for that has to be reported."""
+        return bool(self._live.matching_status.matching or self.session.is_closed())  # type: ignore[attr-defined]
+
     def is_heard_slowly(self) -> bool:
         """Whether anybody subscribes to the slow key."""
         return bool(self._slow.matching_status.matching)  # type: ignore[attr-defined]
@@ -171,15 +185,20 @@ class ZenohSession:
         except zenoh.ZError:
             return {}
 
-    def ask(self, peer: str, since: int) -> None:
-        """Ask a peer for the changes of its state behind a number; the answer is received as an item."""
-        self._ask("state", peer, _SINCE.pack(since), Answer)
+    def ask(self, peer: str, since: int, heard: bool = False) -> None:
+        """Ask a peer for the changes of its state behind a number; the answer is received as an item.
+
+        With `heard`, the peer is also told that this link hears it.
+        """
+        self._ask("state", peer, _SINCE.pack(since), Answer, heard)
 
     def ask_history(self, peer: str, seconds: float, after: str) -> None:
         """Ask a peer for the last seconds of its moving frames behind a name; the answer is received as an item."""
         self._ask("history", peer, _SECONDS.pack(seconds) + after.encode(), HistoryAnswer)
 
-    def _ask(self, kind: str, peer: str, payload: bytes, answer: type[Answer | HistoryAnswer]) -> None:
+    def _ask(
+        self, kind: str, peer: str, payload: bytes, answer: type[Answer | HistoryAnswer], heard: bool = False
+    ) -> None:
         answered = False
 
         def take(reply: zenoh.Reply) -> None:
@@ -200,6 +219,8 @@ class ZenohSession:
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
+                # At the priority of live messages, for an answer that overtook one would split its batch.
+                attachment=self._keys.token(FIRST_SESSION) if heard else None,
             )
         except zenoh.ZError:
             self._receive(Received(peer, answer(None)))
@@ -227,6 +248,7 @@ class ZenohSession:
                 payload=self._keys.token(FIRST_SESSION),
                 timeout=_HEARING_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
+                priority=_URGENT,
             )
 
     def answer_hearing(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
@@ -316,6 +338,8 @@ class ZenohSession:
             self._note_connection(str(event.link.zid))
 
     def _receive_question(self, query: zenoh.Query) -> None:
+        if query.attachment is not None and self._note_heard is not None:
+            self._note_heard(query.attachment.to_bytes()[:MOST_NAMES])
         payload = b"" if query.payload is None else query.payload.to_bytes()
         self._admit(query, Question(_SINCE.unpack(payload)[0], query) if len(payload) == _SINCE.size else None)
 

@@ -68,6 +68,7 @@ class ZenohSessions:
             self._note_directly,
             note_asked=self._note_asked,
             note_connection=self._note_connection,
+            note_heard=self._note_heard,
         )
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
@@ -78,6 +79,7 @@ class ZenohSessions:
         self._connected: set[str] = set()
         self._asking: list[zenoh.Query] = []
         self._heard_by: list[tuple[str, list[str] | None]] = []
+        self._hearers: set[str] = set()
         self._unheard: Counter[str] = Counter()
         self._closing: list[threading.Thread] = []
 
@@ -108,13 +110,17 @@ class ZenohSessions:
             for session in hearing:
                 session.put_slowly(message)
 
+    def is_heard(self) -> bool:
+        """Whether a peer is there, or anybody else subscribes to the live key; raises `zenoh.ZError`."""
+        return bool(self._present) or any(session.is_heard() for session in self._open())
+
     def is_heard_slowly(self) -> bool:
         """Whether anybody subscribes to the slow key."""
         return any(session.is_heard_slowly() for session in self._open())
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
-        self._to(peer).ask(peer, since)
+        self._to(peer).ask(peer, since, heard=self._is_direct(peer))
 
     def ask_history(self, peer: str, seconds: float, after: str) -> None:
         """Ask a peer for the last seconds of its moving frames."""
@@ -141,19 +147,26 @@ class ZenohSessions:
         """Dial peers that were lost, or do not hear this link, until cancelled."""
         async with anyio.create_task_group() as tasks:
             while True:
+                began = monotonic()
                 await anyio.sleep(interval)
+                late = monotonic() - began > 2 * interval
                 with self._lock:
                     changes, self._changes = self._changes, []
                     asking, self._asking = self._asking, []
                     connected, self._connected = self._connected, set()
                     heard_by, self._heard_by = self._heard_by, []
+                    hearers, self._hearers = self._hearers, set()
                     answers = [(query, self._names_heard(query)) for query in asking]
                 await self._note(changes)
                 for peer in connected:
                     if self._is_direct(peer):
                         self._hearing.joined(peer)
+                for peer in hearers:
+                    self._hearing.is_heard(peer)
                 for peer, names in heard_by:
-                    self._judge(peer, names)
+                    # Where this loop has no time, nobody's silence proves anything.
+                    if names is not None or not late:
+                        self._judge(peer, names)
                 if answers:
                     await self._note_unheard(answers)
                     # zenoh may wait for a peer that is frozen.
@@ -232,7 +245,11 @@ class ZenohSessions:
 
     def _asker(self, query: zenoh.Query) -> str | None:
         """The link that asks whether it is heard; None for one that this link does not mean to hear."""
-        token = (b"" if query.payload is None else query.payload.to_bytes()).decode("ascii", "replace")
+        return self._peer_of(b"" if query.payload is None else query.payload.to_bytes())
+
+    def _peer_of(self, data: bytes) -> str | None:
+        """The link that a token belongs to; None for one that this link does not mean to hear."""
+        token = data.decode("ascii", "replace")
         found = self._keys.session(token)
         if found is None or not any(zenoh.KeyExpr(key).includes(token) for key in self._keys.heard("@alive")):
             return None
@@ -248,6 +265,12 @@ class ZenohSessions:
                 self._asking.append(query)
                 return
         query.drop()
+
+    def _note_heard(self, token: bytes) -> None:
+        with self._lock:
+            peer = self._peer_of(token)
+            if peer is not None and len(self._hearers) < _MOST_ASKING:
+                self._hearers.add(peer)
 
     def _note_heard_by(self, peer: str, names: list[str] | None) -> None:
         with self._lock:

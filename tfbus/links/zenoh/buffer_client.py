@@ -4,7 +4,6 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from time import monotonic
 from types import TracebackType
 from typing import Any, Self
@@ -207,10 +206,9 @@ class BufferClient:
             raise RuntimeError(f"{self._capacity} lookups wait for this client already")
         self._number = number = self._number + 1
         pending = self._pending[number] = _Pending()
-        asked = replace(question, number=number, timeout=timeout)
         answered = False
         try:
-            payload = write_question(asked)
+            payload = write_question(question, number, timeout)
             if self._session.is_closed:
                 raise self._error("lost", "the session is closed")
             self._session.ask(payload, lambda answer: self._take(number, answer), timeout + 2 * PATIENCE)

@@ -1,8 +1,10 @@
 """The server of a buffer: other processes ask it, and wait for the answers, instead of hearing all that it holds."""
 
+import threading
 from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from time import monotonic
 from types import TracebackType
 from typing import Any, Self
@@ -26,12 +28,14 @@ from tfbus.links._remote_lookup import (
     read_question,
     write_answer,
 )
-from tfbus.links.zenoh._lookup_session import LookupSession
+from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 from tfbus.links.zenoh._settings import Addresses
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 from tfbus.statistics import BufferServerStatistics, QueueStatistics
 from tfbus.tree.policy import Hold
 
+_Item = tuple[zenoh.Query, RemoteQuestion] | Cancellation | str
+"""A question that has to wait, the end of one, or an asker that has gone."""
 LONGEST_WAIT = 10.0
 """s; then the asker is told what is missing, and asks again if it still wants to know."""
 
@@ -68,8 +72,9 @@ class BufferServer:
 
     Notes
     -----
-    A lookup ends when its asker is cancelled or goes. Where one robot has several servers, one of them answers. Anyone
-    who can reach the server can ask it.
+    Lookups that can be answered at once are answered by a thread of their own, also while the event loop is busy. The
+    others wait on the event loop, until the asker is cancelled or goes. Where one robot has several servers, one of
+    them answers. Anyone who can reach the server can ask it.
     """
 
     def __init__(
@@ -97,11 +102,11 @@ class BufferServer:
         self._allowance = rate
         self._refilled = monotonic()
         self._entered = False
-        self._received: deque[zenoh.Query | str] = deque()
-        self._dropped = 0
+        self._received: deque[_Item] = deque()
         self._came = anyio.Event()
         self._waker = LoopWaker(lambda: self._came.set())
         self._waiting: dict[tuple[str, int], anyio.CancelScope] = {}
+        self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._tasks: anyio.abc.TaskGroup | None = None
 
@@ -114,7 +119,7 @@ class BufferServer:
             failed=counts["failed"],
             cancelled=counts["cancelled"],
             refused={reason: counts[reason] for reason in ("busy", "malformed") if counts[reason]},
-            queue=QueueStatistics("lookups", "drop_newest", self._capacity, len(self._received), self._dropped),
+            queue=QueueStatistics("lookups", "drop_newest", self._capacity, len(self._received), counts["dropped"]),
         )
 
     async def __aenter__(self) -> Self:
@@ -142,22 +147,49 @@ class BufferServer:
             await self._session.close()
 
     def _receive(self, query: zenoh.Query) -> None:
-        if len(self._received) >= self._capacity:
-            self._dropped += 1
+        if max(len(self._received), self._session.unsent) >= self._capacity:
+            self._count("dropped")
             query.drop()
             return
-        self._received.append(query)
-        self._wake()
+        self._session.soon(partial(self._take, query))
 
     def _note_asker(self, asker: str, present: bool) -> None:
         if not present:
-            self._received.append(asker)
-            self._wake()
+            # Behind its questions.
+            self._session.soon(partial(self._hand_over, asker))
 
-    def _wake(self) -> None:
+    def _hand_over(self, item: _Item) -> None:
+        self._received.append(item)
         # The event loop may have ended without the end of the server, as in a crash.
         with suppress(RuntimeError):
             self._waker.wake()
+
+    def _take(self, query: zenoh.Query) -> None:
+        """Answer a question that can be answered now, else have the event loop wait; for the session's thread."""
+        try:
+            question = read_question(b"" if query.payload is None else query.payload.to_bytes())
+        except ValueError as error:
+            self._refuse(query, "malformed", f"the question cannot be read: {str(error)[: MAX_BYTES // 100]}")
+            return
+        if isinstance(question, Cancellation):
+            self._hand_over(question)
+            query.drop()
+            return
+        if not self._admit():
+            self._refuse(query, "busy", f"more than {self._rate:g} lookups come in a second")
+            return
+        try:
+            answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
+        except MAY_COME:
+            self._hand_over((query, question))
+            return
+        except (TransformError, TypeError, ValueError) as error:
+            answer = error
+        except Exception:  # noqa: BLE001 - the wait on the event loop raises it again, where it is seen
+            self._hand_over((query, question))
+            return
+        self._count_answer(answer)
+        reply_now(query, write_answer(answer))
 
     async def _take_all(self, tasks: anyio.abc.TaskGroup) -> None:
         while True:
@@ -167,37 +199,21 @@ class BufferServer:
                 if isinstance(received, str):
                     for key in [key for key in self._waiting if key[0] == received]:
                         self._cancel(key)
+                elif isinstance(received, Cancellation):
+                    self._cancel((received.asker, received.number))
                 else:
-                    self._take(received, tasks)
+                    self._begin_to_wait(*received, tasks)
             await self._came.wait()
 
-    def _take(self, query: zenoh.Query, tasks: anyio.abc.TaskGroup) -> None:
-        try:
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            question = read_question(payload)
-        except ValueError as error:
-            self._refuse(query, "malformed", f"the question cannot be read: {str(error)[: MAX_BYTES // 100]}")
-            return
+    def _begin_to_wait(self, query: zenoh.Query, question: RemoteQuestion, tasks: anyio.abc.TaskGroup) -> None:
         key = question.asker, question.number
-        if isinstance(question, Cancellation):
-            self._cancel(key)
-            query.drop()
-        elif key in self._waiting:
+        if key in self._waiting:
             self._refuse(query, "malformed", "the number of the question was used before")
         elif len(self._waiting) >= self._capacity:
             self._refuse(query, "busy", f"{self._capacity} lookups wait there, and no more may")
-        elif not self._admit():
-            self._refuse(query, "busy", f"more than {self._rate:g} lookups come in a second")
         else:
-            try:
-                answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
-            except MAY_COME:
-                self._waiting[key] = scope = anyio.CancelScope()
-                tasks.start_soon(self._wait, query, question, key, scope)
-                return
-            except (TransformError, TypeError, ValueError) as error:
-                answer = error
-            self._answer(query, answer)
+            self._waiting[key] = scope = anyio.CancelScope()
+            tasks.start_soon(self._wait, query, question, key, scope)
 
     def _admit(self) -> bool:
         now = monotonic()
@@ -211,7 +227,7 @@ class BufferServer:
     def _cancel(self, key: tuple[str, int]) -> None:
         scope = self._waiting.pop(key, None)
         if scope is not None:
-            self._counts["cancelled"] += 1
+            self._count("cancelled")
             scope.cancel()
 
     async def _wait(
@@ -232,20 +248,28 @@ class BufferServer:
             self._answer(query, answer)
 
     def _answer(self, query: zenoh.Query, answer: TransformStamped | Exception) -> None:
-        self._counts["failed" if isinstance(answer, Exception) else "answered"] += 1
+        self._count_answer(answer)
         self._reply(query, write_answer(answer))
 
     def _refuse(self, query: zenoh.Query, reason: str, detail: str) -> None:
-        self._counts[reason] += 1
+        self._count(reason)
         error = RemoteLookupError(domain=self._session.domain, robot=self._session.robot, reason=reason, detail=detail)
         self._reply(query, write_answer(error))
 
     def _reply(self, query: zenoh.Query, answer: bytes) -> None:
         if self._session.unsent >= self._capacity:
-            self._dropped += 1
+            self._count("dropped")
             query.drop()
             return
         self._session.reply(query, answer)
+
+    def _count_answer(self, answer: TransformStamped | Exception) -> None:
+        self._count("failed" if isinstance(answer, Exception) else "answered")
+
+    def _count(self, what: str) -> None:
+        # Threads of zenoh, that of the session and the event loop count.
+        with self._lock:
+            self._counts[what] += 1
 
 
 def _arguments(question: RemoteQuestion) -> dict[str, Any]:

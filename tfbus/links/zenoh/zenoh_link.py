@@ -56,7 +56,8 @@ class ZenohLink(Link):
         Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
     lease : float
         Seconds of silence after which others take this link for lost, when it is frozen or cut off, and it takes them
-        for lost by theirs; a process that dies is lost at once.
+        for lost by theirs; a process that dies is lost at once. Four signs of life go out in each lease, so to be held
+        up for less than three quarters of it loses nobody.
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int

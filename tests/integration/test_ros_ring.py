@@ -1,0 +1,88 @@
+"""Three buses in a ring: a rosbridge joins the first two, DDS the second two, and a domain the last to the first.
+
+`tests/stress/test_foreign_storms.py` has the same ring, and others, without a network.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from typing import Any
+
+import anyio
+import pytest
+
+pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+pytest.importorskip("wsproto", reason='pip install "tfbus[rosbridge]"')
+pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
+
+from support.processes import new_domain, until
+from support.programs import free_address
+from support.rosbridge import rosbridge_server
+from support.samples import moving, static
+from support.wires import latched
+
+from tfbus import Bus
+from tfbus.links.dds import DdsLink
+from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.links.zenoh import ZenohLink
+
+pytestmark = [pytest.mark.thorough, pytest.mark.anyio]
+
+STAMPS = 100
+CHILDREN = ("ros1", "ros2", "first", "second", "third")
+
+
+@pytest.fixture
+def domain_number(request: pytest.FixtureRequest) -> int:
+    """A domain for each loop."""
+    return 210 + ["asyncio", "uvloop", "trio"].index(request.node.callspec.id)
+
+
+async def test_a_ring_of_rosbridge_dds_and_zenoh_hears_each_sample_once(domain_number: int) -> None:
+    address, domain = free_address(), new_domain()
+    async with rosbridge_server() as ros1, AsyncExitStack() as stack:
+        # A program in ROS 2 is a bus of its own.
+        ros2, *buses = (stack.enter_context(Bus()) for _ in range(4))
+        first, second, third = buses
+        heard: list[Counter[tuple[str, int]]] = [Counter() for _ in buses]
+        for bus, counter in zip(buses, heard, strict=True):
+            bus.subscribe(_counting(counter))
+        links: list[Any] = [
+            await stack.enter_async_context(link)
+            for link in (
+                RosbridgeLink(first, ros1.url),
+                RosbridgeLink(second, ros1.url),
+                DdsLink(second, domain_number),
+                DdsLink(third, domain_number),
+                DdsLink(ros2, domain_number),
+                ZenohLink(third, domain, listen=address),
+                ZenohLink(first, domain, connect=address),
+            )
+        ]
+        await until(lambda: all(link.peers for link in links))
+        await until(lambda: all(len(link.peers) == 2 for link in links[2:5]))
+        await until(lambda: all(len(client.subscriptions) == 2 for client in ros1.clients))
+        for stamp in range(STAMPS):
+            await ros1.say(moving("map", "ros1", stamp))
+            ros2.publish(moving("map", "ros2", stamp))
+            for bus, child in zip(buses, ("first", "second", "third"), strict=True):
+                bus.publish(moving("map", child, stamp))
+            await anyio.sleep(0.005)
+        await ros1.say(static("map", "lidar", 1.0), topic="/tf_static")
+        await until(lambda: all("lidar" in latched(bus) for bus in (*buses, ros2)))
+        everything = Counter({(child, stamp): 1 for child in CHILDREN for stamp in range(STAMPS)})
+        await until(lambda: all(counter.total() >= everything.total() for counter in heard))
+        # What goes round comes before one that is sent now has gone round.
+        for stamp in range(STAMPS, STAMPS + 5):
+            first.publish(moving("map", "first", stamp))
+            everything["first", stamp] = 1
+            await until(lambda stamp=stamp: all(counter["first", stamp] for counter in heard))  # type: ignore[misc]
+        assert heard == [everything] * 3
+        assert [link.statistics().rejected for link in links] == [{}] * len(links)
+
+
+def _counting(counter: Counter[tuple[str, int]]) -> Callable[[Any], None]:
+    def count(batch: Any) -> None:
+        counter.update((sample.child, sample.stamp) for sample in batch if not sample.static)
+
+    return count

@@ -1,0 +1,106 @@
+import os
+import subprocess
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import pytest
+
+pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
+
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.internal import InvalidSample
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from support.both_sides import node
+
+from tfbus.links.dds._domains import configuration, domain
+from tfbus.links.dds._reader_thread import ReaderThread
+from tfbus.links.dds._types import RawString
+from tfbus.links.ros._text_message import decode_text
+
+CONFIG = configuration("localhost", (), None)
+CYCLONE_PEER = Path(__file__).parents[2] / "support" / "cyclone_peer.py"
+PATIENCE = 30.0
+
+
+def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(domain_number: int) -> None:
+    told: list[Any] = []
+    errors: list[Exception] = []
+    woken = Event()
+
+    def take(reader: DataReader[Any]) -> None:
+        # A sample without data tells of a writer that has gone.
+        new = [decode_text(each.payload) for each in reader.take(N=10) if not isinstance(each, InvalidSample)]
+        told.extend(new)
+        woken.set()
+        if "bad" in new:
+            raise ValueError(*new)
+
+    def wait_for(count: int) -> None:
+        while len(told) + len(errors) < count:
+            assert woken.wait(PATIENCE)
+            woken.clear()
+
+    def match(reader: DataReader[Any]) -> None:
+        told.append(len(reader.get_matched_publications()))
+        woken.set()
+
+    def fail(error: Exception) -> None:
+        errors.append(error)
+        woken.set()
+
+    with domain(domain_number, CONFIG), ExitStack() as stack:
+        participant = DomainParticipant(domain_number)
+        stack.callback(participant.__del__)
+        topic = Topic(participant, "rt/text", RawString)
+        thread = ReaderThread(participant, fail)
+        reader: DataReader[Any] = DataReader(participant, topic)
+        writer = DataWriter(participant, topic)
+        # Before it is watched: told all the same.
+        writer.write(RawString("first"))
+        thread.watch(reader, take, match)
+        thread.start()
+        wait_for(2)
+        for number, text in enumerate(("bad", "last")):
+            writer.write(RawString(text))
+            wait_for(4 + number)
+        writer.__del__()
+        wait_for(6)
+        thread.stop()
+        reader.__del__()
+    assert told == [1, "first", "bad", "last", 0]
+    assert [str(error) for error in errors] == ["bad"]
+
+
+TWO_LINKS = """
+import anyio, sys
+from tfbus import Bus, Transform, TransformStamped
+from tfbus.links.dds import DdsLink
+
+async def main():
+    number = int(sys.argv[1])
+    with Bus() as near, Bus() as far:
+        async with DdsLink(near, number) as here, DdsLink(far, number) as there:
+            for stamp in range(4_000):
+                near.publish(TransformStamped("map", "near", stamp, Transform()))
+                far.publish(TransformStamped("map", "far", stamp, Transform()))
+                await anyio.sleep(0.001)
+            # Each has heard the other, and the third program.
+            assert min(here.statistics().received_samples, there.statistics().received_samples) > 4_100
+
+anyio.run(main)
+"""
+
+
+@pytest.mark.thorough
+def test_two_links_of_a_process_and_another_program_do_not_wait_for_each_other_for_ever(domain_number: int) -> None:
+    variables = {"ROS_DOMAIN_ID": f"{domain_number}", "CYCLONEDDS_URI": CONFIG}
+    with node([sys.executable, str(CYCLONE_PEER)], variables, 60.0):
+        command = [sys.executable, "-c", TWO_LINKS, f"{domain_number}"]
+        # Which would keep the interpreter lock: only another process can tell.
+        done = subprocess.run(command, timeout=60.0, capture_output=True, text=True, env=os.environ, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
