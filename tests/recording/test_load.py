@@ -233,3 +233,22 @@ def test_a_translation_that_is_not_physical_is_left_out_unless_the_bound_is_rais
     assert (wide.edges()[0].samples, wide.max_translation) == (3, 1e13)
     with pytest.raises(ValueError, match="max_translation"):
         load(path, max_translation=0.0)
+
+
+def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Path) -> None:
+    lines = [(10 * k, moving("a", "b", 10 * k, float(k))) for k in range(2_000)]
+    # The same instant again: the sample that comes later counts.
+    lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
+    # Beyond the bound, also among near ones.
+    lines.insert(1_800, (17_990, moving("a", "b", 17_995, 1e13)))
+    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+        output.write([(received, (sample,)) for received, sample in lines])
+        output.finish()
+    problems: Counter[str] = Counter()
+    tree = load(tmp_path / "run.mcap", problems=problems)
+    assert problems == {"not physical": 1}
+    (edge,) = tree.edges()
+    assert (edge.samples, edge.oldest, edge.newest) == (2_000, 0, 19_990)
+    asked = [0, 5, 9_990, 14_980, 14_990, 15_000, 17_995, 19_990]
+    expected = [0.0, 0.5, 999.0, 1_498.0, -1.0, 1_500.0, 1_799.5, 1_999.0]
+    assert [x_of(tree, "a", "b", stamp) for stamp in asked] == expected

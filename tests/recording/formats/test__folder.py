@@ -201,3 +201,23 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
         # What reads it has it open, and it has no name.
         assert list(temporary.iterdir()) == []
         assert sum(bool(message.batch) for message in recording.messages()) > 700
+
+
+def test_what_the_metadata_promise_of_a_long_file_is_held_to_what_is_read_in_blocks(tmp_path: Path) -> None:
+    lines = [(5 + k, "/tf", [moving("odom", "base", k)]) for k in range(2_000)]
+    write_mcap(tmp_path / "run_0.mcap", lines)
+    for promised, lost in ((2_000, []), (2_003, ["/tf"])):
+        metadata(tmp_path, "run_0.mcap", count=promised)
+        with open_recording(tmp_path) as recording:
+            blocks = list(recording.blocks())
+        messages = [message for block in blocks for message in block.messages()]
+        told = [message for message in messages if message.errors]
+        assert [(message.received, "'/tf'" in str(message.errors[0])) for message in told] == [(2_004, True)] * len(lost)
+        assert [message.received for message in messages if message.batch] == [received for received, _, _ in lines]
+    metadata(tmp_path, "run_0.mcap", topic="/gone", count=7)
+    with open_recording(tmp_path) as recording:
+        # Of a range nothing can be said.
+        within = [message for block in recording.blocks(100, 200) for message in block.messages()]
+        (lost_one,) = (message for block in recording.blocks() for message in block.messages() if message.errors)
+    assert [message.received for message in within] == list(range(100, 201))
+    assert "promises 7 messages on '/gone'" in str(lost_one.errors[0])
