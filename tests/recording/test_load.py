@@ -20,6 +20,7 @@ from tfbus import (
     DisconnectedError,
     ExtrapolationError,
     RecordingError,
+    Transform,
     TransformLookupError,
     TransformStamped,
     TransformTree,
@@ -239,14 +240,15 @@ def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Pa
     lines = [(10 * k, moving("a", "b", 10 * k, float(k))) for k in range(2_000)]
     # The same instant again: the sample that comes later counts.
     lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
-    # Beyond the bound, also among near ones.
-    lines.insert(1_800, (17_990, moving("a", "b", 17_995, 1e13)))
+    # Beyond the bound, each along another axis, and each in another block.
+    for place, far in ((1_950, (1e13, 0.0, 0.0)), (1_400, (0.0, 1e13, 0.0)), (900, (0.0, 0.0, 1e13))):
+        lines.insert(place, (10 * place - 10, TransformStamped("a", "b", 10 * place - 5, Transform(far))))
     with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
     problems: Counter[str] = Counter()
     tree = load(tmp_path / "run.mcap", problems=problems)
-    assert problems == {"not physical": 1}
+    assert problems == {"not physical": 3}
     (edge,) = tree.edges()
     assert (edge.samples, edge.oldest, edge.newest) == (2_000, 0, 19_990)
     asked = [0, 5, 9_990, 14_980, 14_990, 15_000, 17_995, 19_990]
