@@ -1,13 +1,13 @@
 /* The compiled kernel: samples, the history of an edge, a path, the plain answer and the plain commit.
  *
- * Its definition is the Python twin: tfbus/tree/_python_kernel.py and tfbus/geometry/_python_sample.py. Both give the
- * same bits, so every sum below is added in the order of tfbus/geometry/rows.py, and the compiler must not fuse a
- * multiplication with an addition (-ffp-contract=off). Whatever is not plain is handed back: None, False or a count
- * says so, and Python decides. There is no policy and no text of a transform error here.
+ * The Python twins, which tfbus/_kernel.pyi names, are its definition. Both give the same bits, so every sum below is
+ * added in the order of tfbus/geometry/rows.py, and the compiler must not fuse a multiplication with an addition
+ * (-ffp-contract=off). Whatever is not plain is handed back: None, False or a count says so, and Python decides. There
+ * is no policy and no text of a transform error here.
  *
  * No function that touches a history runs Python code, allocates an object that the garbage collector tracks or lets
- * go of the interpreter's lock in between, so that other threads see each call as one step. `Held.rows` alone works
- * without that lock, on blocks that nobody changes while it is a reader of them.
+ * go of the interpreter's lock in between, so that other threads see each call as one step. Only the answers at many
+ * stamps are made without that lock, from blocks that nobody changes while they have a reader.
  */
 #ifndef Py_LIMITED_API
 #define Py_LIMITED_API 0x030b0000
@@ -102,6 +102,31 @@ has_no_keywords(PyObject *kwargs)
     return 1;
 }
 
+/* Open the buffers of two arguments, each as its flags say; 0 for an error, and then neither is open. */
+static int
+open_buffers(PyObject *const *args, Py_ssize_t nargs, Py_buffer *buffers, int first, int second)
+{
+    if (nargs != 2) {
+        PyErr_SetString(PyExc_TypeError, "this takes two buffers");
+        return 0;
+    }
+    if (PyObject_GetBuffer(args[0], &buffers[0], first) < 0) {
+        return 0;
+    }
+    if (PyObject_GetBuffer(args[1], &buffers[1], second) < 0) {
+        PyBuffer_Release(&buffers[0]);
+        return 0;
+    }
+    return 1;
+}
+
+static void
+close_buffers(Py_buffer *buffers)
+{
+    PyBuffer_Release(&buffers[1]);
+    PyBuffer_Release(&buffers[0]);
+}
+
 /* Rows ------------------------------------------------------------------------------------------------------------ */
 
 static PyObject *
@@ -161,6 +186,36 @@ plain_string(PyObject *value)
         return NULL;
     }
     return PyUnicode_FromObject(value);
+}
+
+/* A plain str of an object, whose offset is `closure`. */
+static PyObject *
+string_of(PyObject *self, void *closure)
+{
+    PyObject *value = *(PyObject **)((char *)self + (size_t)closure);
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "it was not initialised");
+        return NULL;
+    }
+    Py_INCREF(value);
+    return value;
+}
+
+static int
+set_string_of(PyObject *self, PyObject *value, void *closure)
+{
+    PyObject **place = (PyObject **)((char *)self + (size_t)closure);
+    if (value == NULL) {
+        PyErr_SetString(PyExc_AttributeError, "it cannot be deleted");
+        return -1;
+    }
+    if ((value = plain_string(value)) == NULL) {
+        return -1;
+    }
+    PyObject *old = *place;
+    *place = value;
+    Py_XDECREF(old);
+    return 0;
 }
 
 /* The row of a @ b: tfbus.geometry.rows.compose. `out` may be `b`. */
@@ -555,10 +610,7 @@ history_init(History *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *parent, *keep;
     int64_t window = -1;
-    if (!has_no_keywords(kwargs)) {
-        return -1;
-    }
-    if (!PyArg_ParseTuple(args, "UO:History", &parent, &keep)) {
+    if (!has_no_keywords(kwargs) || !PyArg_ParseTuple(args, "UO:History", &parent, &keep)) {
         return -1;
     }
     if (keep != Py_None && read_stamp(keep, &window) < 0) {
@@ -633,43 +685,34 @@ history_push_method(History *self, PyObject *const *args, Py_ssize_t count)
 static PyObject *
 history_push_many(History *self, PyObject *const *args, Py_ssize_t nargs)
 {
-    Py_buffer stamps, rows;
-    if (nargs != 2) {
-        PyErr_SetString(PyExc_TypeError, "push_many takes stamps and rows");
+    Py_buffer buffers[2], *const stamps = &buffers[0], *const rows = &buffers[1];
+    if (!open_buffers(args, nargs, buffers, PyBUF_SIMPLE, PyBUF_SIMPLE)) {
         return NULL;
     }
-    if (PyObject_GetBuffer(args[0], &stamps, PyBUF_SIMPLE) < 0) {
-        return NULL;
-    }
-    if (PyObject_GetBuffer(args[1], &rows, PyBUF_SIMPLE) < 0) {
-        PyBuffer_Release(&stamps);
-        return NULL;
-    }
-    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps.len / size;
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps->len / size;
     int done = 0;
-    if (stamps.len % size != 0 || rows.len % (Py_ssize_t)ROW_SIZE != 0
-        || rows.len / (Py_ssize_t)ROW_SIZE != count) {
+    if (stamps->len % size != 0 || rows->len % (Py_ssize_t)ROW_SIZE != 0
+        || rows->len / (Py_ssize_t)ROW_SIZE != count) {
         PyErr_SetString(PyExc_ValueError, "each stamp needs a row of seven floats");
     } else if (count == 0) {
         done = 1;
     } else if (history_reserve(self, count) == 0) {
         int64_t *own = block_stamps(self->block) + self->end;
         Py_ssize_t i = self->end == self->start ? 1 : 0;
-        memcpy(own, stamps.buf, stamps.len);
+        memcpy(own, stamps->buf, stamps->len);
         while (i < count && own[i - 1] < own[i]) {
             i++;
         }
         if (i < count) {
             PyErr_SetString(PyExc_ValueError, "pushed samples must be newer than all others, and in order");
         } else {
-            memcpy(block_rows(self->block) + WIDTH * self->end, rows.buf, rows.len);
+            memcpy(block_rows(self->block) + WIDTH * self->end, rows->buf, rows->len);
             self->end += count;
             history_slide(self);
             done = 1;
         }
     }
-    PyBuffer_Release(&rows);
-    PyBuffer_Release(&stamps);
+    close_buffers(buffers);
     if (!done) {
         return NULL;
     }
@@ -710,39 +753,41 @@ history_between(History *self, PyObject *const *args, Py_ssize_t nargs)
     return Py_BuildValue("nn", from_low > 0 && !hits ? from_low - 1 : from_low, from_high < count ? from_high + 1 : count);
 }
 
-static int
-check_index(const History *self, Py_ssize_t index)
+/* The place of a sample in the block, by its index in the window; -1 for an error. */
+static Py_ssize_t
+place_of(const History *self, PyObject *number)
 {
+    const Py_ssize_t index = PyLong_AsSsize_t(number);
+    if (index == -1 && PyErr_Occurred()) {
+        return -1;
+    }
     if (index < 0 || index >= self->end - self->start) {
         PyErr_SetString(PyExc_IndexError, "no sample has this index");
         return -1;
     }
-    return 0;
+    return self->start + index;
 }
 
 static PyObject *
 history_stamp(History *self, PyObject *number)
 {
-    const Py_ssize_t index = PyLong_AsSsize_t(number);
-    if ((index == -1 && PyErr_Occurred()) || check_index(self, index) < 0) {
-        return NULL;
-    }
-    return PyLong_FromLongLong(block_stamps(self->block)[self->start + index]);
+    const Py_ssize_t place = place_of(self, number);
+    return place < 0 ? NULL : PyLong_FromLongLong(block_stamps(self->block)[place]);
 }
 
 static PyObject *
 history_sample(History *self, PyObject *number)
 {
-    const Py_ssize_t index = PyLong_AsSsize_t(number);
-    if ((index == -1 && PyErr_Occurred()) || check_index(self, index) < 0) {
+    double row[WIDTH];
+    const Py_ssize_t place = place_of(self, number);
+    if (place < 0) {
         return NULL;
     }
-    PyObject *stamp = PyLong_FromLongLong(block_stamps(self->block)[self->start + index]);
-    PyObject *row = stamp == NULL ? NULL : boxed_row(block_rows(self->block) + WIDTH * (self->start + index));
-    PyObject *both = row == NULL ? NULL : PyTuple_Pack(2, stamp, row);
-    Py_XDECREF(stamp);
-    Py_XDECREF(row);
-    return both;
+    /* Copied, because making a tuple may run Python code, by the garbage collector. */
+    const long long stamp = block_stamps(self->block)[place];
+    memcpy(row, block_rows(self->block) + WIDTH * place, ROW_SIZE);
+    PyObject *boxed = boxed_row(row);
+    return boxed == NULL ? NULL : Py_BuildValue("LN", stamp, boxed);
 }
 
 static PyObject *
@@ -754,22 +799,25 @@ history_put(History *self, PyObject *const *args, Py_ssize_t count)
         PyErr_SetString(PyExc_TypeError, "put takes an index, a stamp and a row");
         return NULL;
     }
-    const Py_ssize_t index = PyLong_AsSsize_t(args[0]);
-    if (index == -1 && PyErr_Occurred()) {
+    /* The place last, because reading a row may run Python code. */
+    if (read_stamp(args[1], &stamp) < 0 || read_row(args[2], row) < 0) {
         return NULL;
     }
-    if (read_stamp(args[1], &stamp) < 0 || read_row(args[2], row) < 0
-        || check_index(self, index) < 0) {
+    Py_ssize_t place = place_of(self, args[0]);
+    if (place < 0) {
         return NULL;
     }
-    const int replaces = block_stamps(self->block)[self->start + index] == stamp;
+    const Py_ssize_t index = place - self->start;
+    const int replaces = block_stamps(self->block)[place] == stamp;
     if (!replaces && history_reserve(self, 1) < 0) {
         return NULL;
     }
     if (self->block->readers > 0 && history_rehouse(self, 1) < 0) {
         return NULL;
     }
-    const Py_ssize_t place = self->start + index, behind = self->end - place;
+    /* It may have been moved. */
+    place = self->start + index;
+    const Py_ssize_t behind = self->end - place;
     int64_t *stamps = block_stamps(self->block) + place;
     double *rows = block_rows(self->block) + WIDTH * place;
     if (!replaces) {
@@ -929,36 +977,6 @@ history_set_keep(History *self, PyObject *value, void *Py_UNUSED(closure))
     return 0;
 }
 
-/* `closure` is the offset of the string. */
-static PyObject *
-history_string(PyObject *self, void *closure)
-{
-    PyObject *value = *(PyObject **)((char *)self + (size_t)closure);
-    if (value == NULL) {
-        PyErr_SetString(PyExc_AttributeError, "the history was not initialised");
-        return NULL;
-    }
-    Py_INCREF(value);
-    return value;
-}
-
-static int
-history_set_string(PyObject *self, PyObject *value, void *closure)
-{
-    PyObject **place = (PyObject **)((char *)self + (size_t)closure);
-    if (value == NULL) {
-        PyErr_SetString(PyExc_AttributeError, "the history always has a parent and an authority");
-        return -1;
-    }
-    if ((value = plain_string(value)) == NULL) {
-        return -1;
-    }
-    PyObject *old = *place;
-    *place = value;
-    Py_XDECREF(OBJECT(old));
-    return 0;
-}
-
 static void
 history_dealloc(History *self)
 {
@@ -992,10 +1010,8 @@ static PyMethodDef history_methods[] = {
 };
 
 static PyGetSetDef history_getset[] = {
-    {"parent", history_string, history_set_string, PyDoc_STR("Of the newest sample."),
-     (void *)offsetof(History, parent)},
-    {"authority", history_string, history_set_string, PyDoc_STR("Of the newest sample."),
-     (void *)offsetof(History, authority)},
+    {"parent", string_of, set_string_of, PyDoc_STR("Of the newest sample."), (void *)offsetof(History, parent)},
+    {"authority", string_of, set_string_of, PyDoc_STR("Of the newest sample."), (void *)offsetof(History, authority)},
     {"keep", (getter)history_keep, (setter)history_set_keep, PyDoc_STR("Length of the window in ns, or None."), NULL},
     {"count", (getter)history_count, NULL, PyDoc_STR("The number of samples in the window."), NULL},
     {"oldest", (getter)history_oldest, NULL, PyDoc_STR("The oldest stamp in the window, or None."), NULL},
@@ -1201,10 +1217,8 @@ static int
 chain_init(Chain *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *sides[2];
-    if (!has_no_keywords(kwargs)) {
-        return -1;
-    }
-    if (!PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
+    if (!has_no_keywords(kwargs)
+        || !PyArg_ParseTuple(args, "O!O!:Chain", &PyTuple_Type, &sides[0], &PyTuple_Type, &sides[1])) {
         return -1;
     }
     const Py_ssize_t up = PyTuple_Size(sides[0]), down = PyTuple_Size(sides[1]);
@@ -1541,30 +1555,22 @@ fill_columns_unlocked(Chain *chain, Seen *seen, const char *stamps, Py_ssize_t c
 static PyObject *
 held_rows(Held *self, PyObject *const *args, Py_ssize_t nargs)
 {
-    Py_buffer stamps, columns;
-    if (nargs != 2) {
-        PyErr_SetString(PyExc_TypeError, "rows takes stamps and columns");
-        return NULL;
-    }
+    Py_buffer buffers[2], *const stamps = &buffers[0], *const columns = &buffers[1];
     if (self->busy) {
         PyErr_SetString(PyExc_RuntimeError, "another thread reads these samples");
         return NULL;
     }
-    if (PyObject_GetBuffer(args[0], &stamps, PyBUF_SIMPLE) < 0) {
-        return NULL;
-    }
-    if (PyObject_GetBuffer(args[1], &columns, PyBUF_WRITABLE) < 0) {
-        PyBuffer_Release(&stamps);
+    if (!open_buffers(args, nargs, buffers, PyBUF_SIMPLE, PyBUF_WRITABLE)) {
         return NULL;
     }
     PyObject *result = NULL;
-    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps.len / size;
-    if (columns.len != count * (Py_ssize_t)ROW_SIZE || stamps.len % size != 0) {
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = stamps->len / size;
+    if (columns->len != count * (Py_ssize_t)ROW_SIZE || stamps->len % size != 0) {
         PyErr_SetString(PyExc_ValueError, "columns must have room for seven floats a stamp");
     } else {
         self->busy = 1;
         Py_INCREF(OBJECT(self));
-        const Py_ssize_t missing = fill_columns_unlocked(self->chain, self->seen, stamps.buf, count, columns.buf);
+        const Py_ssize_t missing = fill_columns_unlocked(self->chain, self->seen, stamps->buf, count, columns->buf);
         self->busy = 0;
         Py_DECREF(OBJECT(self));
         if (missing == -2) {
@@ -1574,8 +1580,7 @@ held_rows(Held *self, PyObject *const *args, Py_ssize_t nargs)
             result = PyLong_FromSsize_t(missing);
         }
     }
-    PyBuffer_Release(&columns);
-    PyBuffer_Release(&stamps);
+    close_buffers(buffers);
     return result;
 }
 
@@ -1793,10 +1798,7 @@ static int
 paths_init(Paths *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *lock, *latest, *kind;
-    if (!has_no_keywords(kwargs)) {
-        return -1;
-    }
-    if (!PyArg_ParseTuple(args, "OOO!:Paths", &lock, &latest, &PyType_Type, &kind)) {
+    if (!has_no_keywords(kwargs) || !PyArg_ParseTuple(args, "OOO!:Paths", &lock, &latest, &PyType_Type, &kind)) {
         return -1;
     }
     if (!PyType_IsSubtype((PyTypeObject *)kind, SampleType)) {
@@ -2081,10 +2083,7 @@ static PyObject *
 method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
 {
     PyObject *function, *many;
-    if (!has_no_keywords(kwargs)) {
-        return NULL;
-    }
-    if (!PyArg_ParseTuple(args, "OO:Method", &function, &many)) {
+    if (!has_no_keywords(kwargs) || !PyArg_ParseTuple(args, "OO:Method", &function, &many)) {
         return NULL;
     }
     if (many != Py_None && !PyType_Check(many)) {
@@ -2235,17 +2234,6 @@ typedef struct {
 } Edge;
 
 static PyObject *
-edge_parent(Edge *self, void *Py_UNUSED(closure))
-{
-    if (self->parent == NULL) {
-        PyErr_SetString(PyExc_AttributeError, "parent");
-        return NULL;
-    }
-    Py_INCREF(self->parent);
-    return self->parent;
-}
-
-static PyObject *
 edge_trusted(Edge *self, void *Py_UNUSED(closure))
 {
     PyObject *trusted = self->trusted == NULL ? Py_None : self->trusted;
@@ -2262,23 +2250,13 @@ edge_newest(Edge *self, void *Py_UNUSED(closure))
     return PyLong_FromLongLong(self->newest);
 }
 
-/* `closure` is the offset of the string; None is NULL. */
 static int
-edge_set_string(PyObject *self, PyObject *value, void *closure)
+edge_set_trusted(PyObject *self, PyObject *value, void *closure)
 {
-    PyObject **place = (PyObject **)((char *)self + (size_t)closure);
-    if (value == NULL) {
-        PyErr_SetString(PyExc_AttributeError, "an edge keeps all its fields");
-        return -1;
+    if (value != Py_None) {
+        return set_string_of(self, value, closure);
     }
-    if (value == Py_None && place == &((Edge *)self)->trusted) {
-        value = NULL;
-    } else if ((value = plain_string(value)) == NULL) {
-        return -1;
-    }
-    PyObject *old = *place;
-    *place = value;
-    Py_XDECREF(old);
+    Py_CLEAR(((Edge *)self)->trusted);
     return 0;
 }
 
@@ -2305,8 +2283,8 @@ edge_dealloc(Edge *self)
 }
 
 static PyGetSetDef edge_getset[] = {
-    {"parent", (getter)edge_parent, edge_set_string, PyDoc_STR("The newest parent."), (void *)offsetof(Edge, parent)},
-    {"trusted", (getter)edge_trusted, edge_set_string,
+    {"parent", string_of, set_string_of, PyDoc_STR("The newest parent."), (void *)offsetof(Edge, parent)},
+    {"trusted", (getter)edge_trusted, edge_set_trusted,
      PyDoc_STR("The authority whose moving samples under this parent need no judgement, or None."),
      (void *)offsetof(Edge, trusted)},
     {"newest", (getter)edge_newest, (setter)edge_set_newest, PyDoc_STR("The newest stamp, or None."), NULL},
@@ -2329,9 +2307,9 @@ static PyType_Spec edge_spec = {
 
 typedef struct {
     PyObject_HEAD
-    PyObject *edges; /* {child: Edge} */
-    double square;   /* m^2 */
-    int64_t horizon; /* ns */
+    PyObject *edges;   /* {child: Edge} */
+    double square;     /* m^2 */
+    long long horizon; /* ns */
 } Judge;
 
 REFERENCES(judge, 1)
@@ -2341,10 +2319,7 @@ judge_init(Judge *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *edges;
     double square;
-    if (!has_no_keywords(kwargs)) {
-        return -1;
-    }
-    if (!PyArg_ParseTuple(args, "O!d:Judge", &PyDict_Type, &edges, &square)) {
+    if (!has_no_keywords(kwargs) || !PyArg_ParseTuple(args, "O!d:Judge", &PyDict_Type, &edges, &square)) {
         return -1;
     }
     Py_INCREF(edges);
@@ -2353,22 +2328,6 @@ judge_init(Judge *self, PyObject *args, PyObject *kwargs)
     self->square = square;
     self->horizon = INT64_MIN;
     return 0;
-}
-
-static PyObject *
-judge_horizon(Judge *self, void *Py_UNUSED(closure))
-{
-    return PyLong_FromLongLong(self->horizon);
-}
-
-static int
-judge_set_horizon(Judge *self, PyObject *value, void *Py_UNUSED(closure))
-{
-    if (value == NULL) {
-        PyErr_SetString(PyExc_AttributeError, "a judge keeps its horizon");
-        return -1;
-    }
-    return read_stamp(value, &self->horizon);
 }
 
 /* accepts(batch): whether all samples continue known edges, none is newer than the horizon and no translation longer
@@ -2431,8 +2390,8 @@ static PyMethodDef judge_methods[] = {
     {NULL}
 };
 
-static PyGetSetDef judge_getset[] = {
-    {"horizon", (getter)judge_horizon, (setter)judge_set_horizon, PyDoc_STR("No stamp may be newer, in ns."), NULL},
+static PyMemberDef judge_members[] = {
+    {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("No stamp may be newer, in ns.")},
     {NULL}
 };
 
@@ -2444,7 +2403,7 @@ static PyType_Slot judge_slots[] = {
     {Py_tp_traverse, judge_traverse},
     {Py_tp_clear, judge_clear},
     {Py_tp_methods, judge_methods},
-    {Py_tp_getset, judge_getset},
+    {Py_tp_members, judge_members},
     {0, NULL}
 };
 
@@ -2555,12 +2514,10 @@ static int
 feed_init(Feed *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *parts[PARTS];
-    if (!has_no_keywords(kwargs)) {
-        return -1;
-    }
-    if (!PyArg_ParseTuple(args, "O!O!O!O!O!O!O!O:Feed", PathsType, &parts[PATHS], &PyDict_Type, &parts[FRAMES],
-                          &PyDict_Type, &parts[READERS], &PyDict_Type, &parts[LINES], &PyDict_Type, &parts[PARKED],
-                          &PyList_Type, &parts[LIMITS], &PyDict_Type, &parts[WATCHES], &parts[FORGET])) {
+    if (!has_no_keywords(kwargs)
+        || !PyArg_ParseTuple(args, "O!O!O!O!O!O!O!O:Feed", PathsType, &parts[PATHS], &PyDict_Type, &parts[FRAMES],
+                             &PyDict_Type, &parts[READERS], &PyDict_Type, &parts[LINES], &PyDict_Type, &parts[PARKED],
+                             &PyList_Type, &parts[LIMITS], &PyDict_Type, &parts[WATCHES], &parts[FORGET])) {
         return -1;
     }
     if (self->parts[PATHS] != NULL) {
@@ -2837,10 +2794,9 @@ static int
 intake_init(Intake *self, PyObject *args, PyObject *kwargs)
 {
     PyObject *judge, *kind, *listeners;
-    if (!has_no_keywords(kwargs)) {
-        return -1;
-    }
-    if (!PyArg_ParseTuple(args, "O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type, &listeners)) {
+    if (!has_no_keywords(kwargs)
+        || !PyArg_ParseTuple(args, "O!O!O!:Intake", JudgeType, &judge, &PyType_Type, &kind, &PyTuple_Type,
+                             &listeners)) {
         return -1;
     }
     if (self->feeds != NULL) {
@@ -3009,34 +2965,25 @@ static PyType_Spec intake_spec = {
 static PyObject *
 compose_paths(PyObject *Py_UNUSED(module), PyObject *const *args, Py_ssize_t nargs)
 {
-    Py_buffer rows, origins;
-    if (nargs != 2) {
-        PyErr_SetString(PyExc_TypeError, "compose_paths takes rows and origins");
+    Py_buffer buffers[2], *const rows = &buffers[0], *const origins = &buffers[1];
+    if (!open_buffers(args, nargs, buffers, PyBUF_WRITABLE, PyBUF_SIMPLE)) {
         return NULL;
     }
-    if (PyObject_GetBuffer(args[0], &rows, PyBUF_WRITABLE) < 0) {
-        return NULL;
-    }
-    if (PyObject_GetBuffer(args[1], &origins, PyBUF_SIMPLE) < 0) {
-        PyBuffer_Release(&rows);
-        return NULL;
-    }
-    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = origins.len / size;
-    const int fits = origins.len % size == 0 && rows.len % (Py_ssize_t)ROW_SIZE == 0
-                     && rows.len / (Py_ssize_t)ROW_SIZE == count;
+    const Py_ssize_t size = (Py_ssize_t)sizeof(int64_t), count = origins->len / size;
+    const int fits = origins->len % size == 0 && rows->len % (Py_ssize_t)ROW_SIZE == 0
+                     && rows->len / (Py_ssize_t)ROW_SIZE == count;
     Py_ssize_t i = 0;
     for (; fits && i < count; i++) {
-        const int64_t origin = ((const int64_t *)origins.buf)[i];
+        const int64_t origin = ((const int64_t *)origins->buf)[i];
         if (origin < 0 || (origin > 0 && origin >= i)) {
             break;
         }
         if (origin > 0) {
-            double *row = (double *)rows.buf + WIDTH * i;
-            compose((const double *)rows.buf + WIDTH * origin, row, row);
+            double *row = (double *)rows->buf + WIDTH * i;
+            compose((const double *)rows->buf + WIDTH * origin, row, row);
         }
     }
-    PyBuffer_Release(&origins);
-    PyBuffer_Release(&rows);
+    close_buffers(buffers);
     if (!fits || i < count) {
         PyErr_SetString(PyExc_ValueError, "each row of seven floats needs an origin before it");
         return NULL;

@@ -28,6 +28,9 @@ pytest_plugins = ["side_by_side"]
 
 ROUNDS = 25
 FEW_ROUNDS = 5
+HUNDRED = 100
+A_SECOND = 100_000
+"""The number of samples that a hundred frames have in a second at 1 kHz."""
 WAKE_UPS = 200
 CROWD = 10_000
 
@@ -175,6 +178,50 @@ def beside(benchmark: Any, table: Table, tf2: Ask | str, label: str, case: Case,
     if isinstance(tf2, str):
         pytest.skip(tf2)
     assert answer == pytest.approx(expected[-1], abs=1e-6)
+
+
+def hundred_frames(package: Any, *, built: bool) -> Callable[[], float]:
+    """Publishes batches of one sample for each of a hundred frames, `built` before or not: seconds a sample."""
+    frames = [f"f{i}" for i in range(HUNDRED)]
+    stamps = range(START, START + 20 * cases.PERIOD // 10, cases.PERIOD // 10)
+    rotation = Transform.from_axis_angle((1.0, 2.0, 3.0), 0.7).rotation
+
+    def batch(stamp: int) -> list[TransformStamped]:
+        stamped, transform = package.TransformStamped, package.Transform
+        return [stamped(BASE, frame, stamp, transform((1.0, 2.0, 3.0), rotation), AUTHORITY) for frame in frames]
+
+    ready = [batch(stamp) for stamp in stamps]
+
+    def one_pass() -> float:
+        bus = package.Bus()
+        buffer = package.Buffer(bus)
+        bus.publish(batch(START - 1))
+        start = perf_counter()
+        for stamp, samples in zip(stamps, ready, strict=True):
+            bus.publish(samples if built else batch(stamp))
+        seconds = perf_counter() - start
+        assert buffer.tree.latest_common_stamp(BASE, frames[-1]) == stamps[-1]
+        return seconds / len(stamps) / HUNDRED
+
+    return one_pass
+
+
+@pytest.mark.parametrize("built", [True, False])
+def test_a_hundred_frames_in_each_batch(table: Table, built: bool) -> None:
+    """With the making of the samples it is shown as the share of a core that a hundred frames at 1 kHz take."""
+    other = "python" if tfbus.kernel == "compiled" else "compiled"
+    sides = [hundred_frames(tfbus, built=built)]
+    if other == "python" or COMPILED is not None:
+        sides.append(hundred_frames(tfbus_on(other), built=built))
+    ours, *others = ([*rounds] for rounds in zip(*([side() for side in sides] for _ in range(ROUNDS)), strict=True))
+    if built:
+        table.add("publish 100, each", show(ours, "ns"))
+    else:
+        table.add(
+            "100 frames at 1 kHz, built and published", f"{median(ours) * A_SECOND:.1%} of a core", wanted="<= 9 %"
+        )
+    for rounds in others:
+        table.compare(f"  on the {other} kernel", rounds, f"the {tfbus.kernel} one", ours, unit="ns")
 
 
 def loop_name(backend: Backend) -> str:

@@ -194,9 +194,36 @@ def test_the_copy_of_a_history_is_independent(kernel: ModuleType) -> None:
     edge.put(0, 20, x(-1.0))
     edge.push(100, x(10.0))
     assert contents(twin) == [(20, x(2.0)), (90, x(9.0))]
+    longer = history(kernel, keep=1_000)
+    longer.take(edge)
+    assert [longer.append("parent", stamp, x(1.0), "") for stamp in (100, 101)] == [False, True]
     twin.take(twin)
     twin.clear()
     assert (twin.count, contents(edge)) == (0, [(90, x(9.0)), (100, x(10.0))])
+
+
+@needs_both
+def test_a_sample_is_whole_though_the_garbage_collector_clears_the_history_meanwhile() -> None:
+    assert COMPILED is not None
+    edge = history(COMPILED, [(0, x(1.0)), (10, x(2.0))])
+
+    def clear(_phase: str, _info: dict[str, int]) -> None:
+        edge.clear()
+
+    threshold = gc.get_threshold()
+    gc.set_threshold(1_000_000)
+    # Until they are used up, tuples come from a store of old ones, and begin no collection.
+    tuples = [(number,) * 7 for number in range(3_000)]
+    gc.callbacks.append(clear)
+    try:
+        # These were so many that the next one begins a collection.
+        gc.set_threshold(1)
+        found = edge.sample(1)
+    finally:
+        gc.set_threshold(*threshold)
+        gc.callbacks.remove(clear)
+    assert found == (10, x(2.0))
+    assert (edge.count, len(tuples)) == (0, 3_000)
 
 
 @on_both

@@ -64,26 +64,30 @@ class Intake:
         """
         if not self.open or get_ident() != self.thread or (invalid != "raise" and invalid != "drop"):
             return False
-        for listening in self._listeners:
-            if listening:
-                return False
+        if any(self._listeners):
+            return False
+        kind = self._kind
         batch: tuple[Any, ...]
-        if type(samples) is self._kind:
+        if type(samples) is kind:
             batch = (samples,)
-        elif type(samples) is tuple and samples and all(type(sample) is self._kind for sample in samples):
+        elif type(samples) is tuple and samples:
+            for sample in samples:
+                if type(sample) is not kind:
+                    return False
             batch = samples
         else:
             return False
         if not self._judge.accepts(batch):
             return False
         self.samples += len(batch)
-        errors = []
+        first = None
         for feed, insert in self.feeds:
             try:
                 if not feed.insert(batch):
                     insert(batch)
             except BaseException as error:  # noqa: BLE001 - the first one is raised after all have the batch
-                errors.append(error)
-        if errors:
-            raise errors[0]
+                if first is None:
+                    first = error
+        if first is not None:
+            raise first
         return True

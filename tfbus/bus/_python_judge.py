@@ -50,16 +50,18 @@ class Judge:
     def accepts(self, batch: Batch) -> bool:
         """Whether a whole batch continues known edges; then the newest stamps are noted, else nothing."""
         edges, square, horizon = self._edges, self._square, self.horizon
-        known = None
         for sample in batch:
-            parent, child, stamp, (x, y, z, _, _, _, _), authority, static = sample._fields
-            known = edges.get(child)
-            if known is None or known.parent != parent or known.trusted != authority or static or stamp > horizon:
+            parent, child, stamp, row, authority, static = sample._fields
+            if child not in edges:
                 return False
-            # Not `>`, which is false for NaN.
+            known = edges[child]
+            if known.parent != parent or known.trusted != authority or static or stamp > horizon:
+                return False
+            # Three picks take less than an unpacking of all seven. Not `>`, which is false for NaN.
+            x, y, z = row[0], row[1], row[2]
             if not x * x + y * y + z * z <= square:
                 return False
-        if known is not None and len(batch) == 1:
+        if len(batch) == 1:
             # Nearly always so, and a second look costs a quarter of the first.
             if known.newest is None or stamp > known.newest:
                 known.newest = stamp

@@ -31,7 +31,7 @@ class Sample:
 
     @property
     def _square(self) -> float:
-        x, y, z, *_ = self._fields[3]
+        x, y, z, _, _, _, _ = self._fields[3]
         return x * x + y * y + z * z
 
     @property

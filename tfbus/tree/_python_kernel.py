@@ -112,15 +112,17 @@ class History:
     def append(self, parent: str, stamp: int, row: Row, authority: str) -> bool:
         """Store a sample that is newer and has the same parent and authority, as nearly all; else do nothing."""
         stamps = self.stamps
-        if not stamps or stamp <= stamps[-1] or parent != self.parent or authority != self.authority or self.mixed:
+        # The horizon goes with the newest stamp, which takes longer to read.
+        horizon = stamp - self._keep
+        if not stamps or horizon <= self.horizon or parent != self.parent or authority != self.authority or self.mixed:
             return False
         # Spelt out, because `*row` would build a list of the arguments first.
         x, y, z, qx, qy, qz, qw = row
         record = _pack(stamp, x, y, z, qx, qy, qz, qw)
-        # No call between the two, so that Ctrl-C cannot come there.
+        # No call before the last of the three, so that Ctrl-C cannot come between them.
         self.records += record
+        self.horizon = horizon
         stamps.append(stamp)
-        self.horizon = stamp - self._keep
         if stamp > self._cut_after:
             self._cut()
         return True
@@ -219,7 +221,7 @@ class History:
         start = other._start
         self.stamps = other.stamps[start:]
         self.records = other.records[start * _SIZE :]
-        self.horizon = other.horizon
+        self.horizon = self.stamps[-1] - self._keep if self.stamps else STAMP_MIN
         self._cut_after = other._cut_after
 
     def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
@@ -400,7 +402,7 @@ class Paths:
         Another number after each change.
     """
 
-    __slots__ = ("_kind", "_latest", "_lock", "inserted", "recent", "version")
+    __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "recent")
 
     def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: type[TransformStamped]) -> None:
         self._lock = lock
@@ -408,7 +410,16 @@ class Paths:
         self._kind = kind
         self.recent: dict[str, dict[str, Chain]] = {}
         self.inserted = 0
-        self.version = 0
+        self._changes = 0
+
+    @property
+    def version(self) -> int:
+        """Not counted by itself, because every sample takes the time of that, and only a woken waiter reads it."""
+        return self.inserted + self._changes
+
+    @version.setter
+    def version(self, version: int) -> None:
+        self._changes = version - self.inserted
 
     def answer(self, target: str, source: str, at: object) -> TransformStamped | None:
         """The answer of a lookup, if it needs nothing but a path of `recent` that covers the stamp; else None."""
@@ -455,11 +466,9 @@ class Paths:
             return False
         parent, child, stamp, row, authority, static = batch[0]._fields
         with self._lock:
-            history = frames.get(child)
-            if readers or history is None or static or not history.append(parent, stamp, row, authority):
+            if readers or static or child not in frames or not frames[child].append(parent, stamp, row, authority):
                 return False
             self.inserted += 1
-            self.version += 1
         return True
 
 
@@ -473,7 +482,6 @@ def commit(frames: Mapping[str, History], batch: Batch, first: int) -> int:
     """
     for i in range(first, len(batch)):
         parent, child, stamp, row, authority, static = batch[i]._fields
-        history = frames.get(child)
-        if history is None or static or not history.append(parent, stamp, row, authority):
+        if static or child not in frames or not frames[child].append(parent, stamp, row, authority):
             return i
     return len(batch)

@@ -152,16 +152,16 @@ class Forest:
         """
         if self.paths.commit(self.frames, self.readers, batch):
             return True
-        count = len(batch)
+        count, paths = len(batch), self.paths
         with self.lock:
-            self.version += 1
+            paths.version += 1
             stored = commit(self.frames, batch, 0)
-            self.inserted += stored
+            paths.inserted += stored
             plain = stored == count
             while stored < count:
                 self.insert_judged(batch[stored])
                 end = commit(self.frames, batch, stored + 1)
-                self.inserted += end - stored - 1
+                paths.inserted += end - stored - 1
                 stored = end
             if self._suspects:
                 self.find_past_loops()
@@ -213,7 +213,7 @@ class Forest:
             self._restructure(history)
             self._suspects.append(sample)
         if outcome is Outcome.INSERTED:
-            self.inserted += 1
+            self.paths.inserted += 1
         elif outcome is Outcome.REPLACED:
             self.replaced += 1
         else:

@@ -174,12 +174,12 @@ class FrameHistory(History):
         if newest is not None:
             self._parents.push(stamp, parent, self.parent)
             self._authorities.push(stamp, authority, self.authority)
+            if self._parents or self._authorities:
+                self._forget_old_names()
         if parent != self.parent:
             self.parent = parent
             self.changed = True
         self.authority = authority
-        if self._parents or self._authorities:
-            self._forget_old_names()
         return Outcome.INSERTED
 
     def insert_static(self, parent: str, stamp: int, row: Row, authority: str) -> Outcome:

@@ -164,6 +164,22 @@ async def test_a_peer_that_does_not_hear_this_end_is_dialled_until_it_does() -> 
         assert here.items.empty()
 
 
+@pytest.mark.thorough
+async def test_two_ends_that_are_connected_and_have_never_met_dial_each_other() -> None:
+    async with ends(1) as (here,), joined_to(here) as joining:
+        for end, other in ((here, joining), (joining, here)):
+            # As if zenoh had told of their connection, and of nothing else.
+            end.sessions._note_presence(other.id, (None, FIRST_SESSION), Presence.LEFT)
+            end.sessions._changes.clear()
+            end.sessions._hearing.left(other.id)
+            end.dialing._addresses.clear()
+            assert await end.next() == Received(other.id, Presence.LEFT)
+        for end, other in ((here, joining), (joining, here)):
+            end.sessions._note_connection(other.id)
+        for end, other in ((here, joining), (joining, here)):
+            assert await end.next() == Received(other.id, Presence.JOINED)
+
+
 async def test_whoever_asks_and_hears_directly_tells_so() -> None:
     async with ends(1) as (here,), joined_to(here) as joining:
         told: Queue[bytes] = Queue()

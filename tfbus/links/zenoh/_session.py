@@ -185,6 +185,21 @@ class ZenohSession:
         except zenoh.ZError:
             return {}
 
+    def find_deaf(self, sessions: Iterable[str]) -> list[tuple[str, str]]:
+        """Those of some connected sessions that may be links which this one ought to hear, with addresses; blocks."""
+        addresses = self.addresses()
+        connected = [session for session in sessions if session in addresses]
+        return [(session, addresses[session]) for session in connected if not self._is_of_others(session)]
+
+    def _is_of_others(self, session: str) -> bool:
+        """Whether a session is that of a link of another domain, or of a robot that this link does not hear."""
+        heard = [zenoh.KeyExpr(key) for key in self._keys.heard("@alive")]
+        with suppress(zenoh.ZError):
+            for reply in self.session.liveliness().get(f"tfbus/**/@alive/{session}/*", timeout=_HEARING_TIME):
+                if reply.ok is not None and not any(key.includes(reply.ok.key_expr) for key in heard):
+                    return True
+        return False
+
     def ask(self, peer: str, since: int, heard: bool = False) -> None:
         """Ask a peer for the changes of its state behind a number; the answer is received as an item.
 

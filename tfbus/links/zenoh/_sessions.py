@@ -24,6 +24,7 @@ from tfbus.links.zenoh._dialing import Dialing
 from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
+from tfbus.links.zenoh._unmet import Unmet
 
 _PROBE_TIME = 1.0
 _MEETING_TIME = 3.0
@@ -75,6 +76,7 @@ class ZenohSessions:
         self._changes: list[tuple[str, Presence]] = []
         self._dialing = Dialing(monotonic) if dialing is None else dialing
         self._hearing = Hearing(monotonic)
+        self._unmet = Unmet(monotonic)
         self._deaf: set[str] = set()
         self._connected: set[str] = set()
         self._asking: list[zenoh.Query] = []
@@ -161,6 +163,8 @@ class ZenohSessions:
                 for peer in connected:
                     if self._is_direct(peer):
                         self._hearing.joined(peer)
+                    else:
+                        self._unmet.connected(peer)
                 for peer in hearers:
                     self._hearing.is_heard(peer)
                 for peer, names in heard_by:
@@ -174,7 +178,11 @@ class ZenohSessions:
                 for peer in self._hearing.take_due():
                     self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
-                for peer, address in self._dialing.take_due():
+                dialled = self._dialing.take_due()
+                unmet = self._unmet.take_due(self._present)
+                if unmet:
+                    dialled += await anyio.to_thread.run_sync(self._main.find_deaf, unmet)
+                for peer, address in dialled:
                     if peer not in self._patches:
                         tasks.start_soon(self._patch, peer, address)
 
