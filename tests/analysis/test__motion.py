@@ -1,4 +1,7 @@
+import math
+
 import numpy as np
+import pytest
 
 from tfbus.analysis._motion import MovingSamples
 from tfbus.analysis.limits import Limits
@@ -31,3 +34,15 @@ def test_a_rate_breaks_down_where_fewer_than_half_of_the_samples_come() -> None:
         none = np.zeros(len(stamps), np.int64)
         samples = MovingSamples("base", stamps, np.array([ROW] * len(stamps)), none, none, None)
         assert [finding.kind for finding in samples.findings(Limits())] == kinds
+
+
+@pytest.mark.parametrize("angle", [0.2, 0.9, 1.0, math.pi / 2, 3.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_speed_of_a_turn_is_its_angle_over_the_time(angle: float, sign: float) -> None:
+    # About z in half a second; a quaternion and its opposite are one rotation.
+    turned = [3.0, 4.0, 0.0, 0.0, 0.0, sign * math.sin(angle / 2), sign * math.cos(angle / 2)]
+    stamps, none = np.array([0, 5 * 10**8]), np.zeros(2, np.int64)
+    samples = MovingSamples("base", stamps, np.array([ROW, turned]), none, none, None)
+    jump, turn = samples.findings(Limits(speed=9.9, turn_rate=0.3))
+    assert (jump.kind, jump.worst, jump.at) == ("jump", pytest.approx(10.0), 5 * 10**8)
+    assert (turn.kind, turn.worst, turn.at) == ("turn", pytest.approx(2 * angle), 5 * 10**8)

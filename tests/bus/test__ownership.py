@@ -120,13 +120,14 @@ def test_reserving_a_frame_of_another_authority_is_an_error_that_names_both() ->
     ownership.reserve("b", "odometry").close()
 
 
-def test_one_authority_may_reserve_a_frame_twice_and_has_it_until_both_end() -> None:
+def test_one_authority_may_reserve_a_frame_several_times_and_has_it_until_all_end() -> None:
     ownership = Ownership("last")
-    first, second = ownership.reserve("b", "slam"), ownership.reserve("b", "slam")
+    first, second, third = (ownership.reserve("b", "slam") for _ in range(3))
     first.close()
     first.close()
-    assert ownership.reserved_for("b") == "slam"
     second.close()
+    assert ownership.reserved_for("b") == "slam"
+    third.close()
     assert ownership.reserved_for("b") is None
     assert not ownership.restricts
 

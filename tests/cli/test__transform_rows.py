@@ -33,4 +33,6 @@ def test_where_a_line_does_not_fit_the_quaternion_is_on_a_second_one(
             "1396293888.050000001  1.0000e+12   -2.000000    0.500000    0.000000    0.000000    0.000000    1.000000"
         )
         assert " ".join(lines).split()[-8:] == numbers.split()
+        # All of one width, however large.
+        assert width < 104 or lines[-1].endswith(numbers)
     assert heights == {60: 4, 103: 4, 104: 2}

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
-from support.recorded import SMALL, Line, batches_in, messages_in, write_mcap
+from support.recorded import SMALL, Line, batches_in, messages_in, sender_of, write_mcap
 from support.samples import moving, static
 
 from tfbus import RecordingError
@@ -155,6 +155,13 @@ def test_only_some_frames_stay_with_their_authorities_and_empty_messages_go(tmp_
         (100 + k, [("wheel", "b")]) for k in range(20)
     ]
     assert (done.messages, done.transforms) == (20, 20)
+
+
+def test_a_single_authority_is_the_node_that_a_bag_names(tmp_path: Path, source: Path) -> None:
+    convert([source], tmp_path / "run.bag", edits=Edits(frames=["wheel"]))
+    with rosbag1.Reader(tmp_path / "run.bag") as bag:
+        assert {sender_of(connection) for connection in bag.connections} == {"/b"}
+    assert {each.authority for _, batch in batches_in(tmp_path / "run.bag") for each in batch} == {"b"}
 
 
 def test_static_transforms_are_left_out_and_told(tmp_path: Path, source: Path) -> None:

@@ -20,6 +20,7 @@ from tfbus import (
     DisconnectedError,
     ExtrapolationError,
     RecordingError,
+    Transform,
     TransformLookupError,
     TransformStamped,
     TransformTree,
@@ -233,3 +234,23 @@ def test_a_translation_that_is_not_physical_is_left_out_unless_the_bound_is_rais
     assert (wide.edges()[0].samples, wide.max_translation) == (3, 1e13)
     with pytest.raises(ValueError, match="max_translation"):
         load(path, max_translation=0.0)
+
+
+def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Path) -> None:
+    lines = [(10 * k, moving("a", "b", 10 * k, float(k))) for k in range(2_000)]
+    # The same instant again: the sample that comes later counts.
+    lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
+    # Beyond the bound, each along another axis, and each in another block.
+    for place, far in ((1_950, (1e13, 0.0, 0.0)), (1_400, (0.0, 1e13, 0.0)), (900, (0.0, 0.0, 1e13))):
+        lines.insert(place, (10 * place - 10, TransformStamped("a", "b", 10 * place - 5, Transform(far))))
+    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+        output.write([(received, (sample,)) for received, sample in lines])
+        output.finish()
+    problems: Counter[str] = Counter()
+    tree = load(tmp_path / "run.mcap", problems=problems)
+    assert problems == {"not physical": 3}
+    (edge,) = tree.edges()
+    assert (edge.samples, edge.oldest, edge.newest) == (2_000, 0, 19_990)
+    asked = [0, 5, 9_990, 14_980, 14_990, 15_000, 17_995, 19_990]
+    expected = [0.0, 0.5, 999.0, 1_498.0, -1.0, 1_500.0, 1_799.5, 1_999.0]
+    assert [x_of(tree, "a", "b", stamp) for stamp in asked] == expected

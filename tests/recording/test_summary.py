@@ -2,6 +2,7 @@ import dataclasses
 import pickle
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from support.samples import any_samples, moving, static
 
 from tfbus import TransformStamped
 from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
+from tfbus.recording.formats._mcap_output import McapOutput
 
 SECOND = 1_000_000_000
 MS = 1_000_000
@@ -140,3 +142,32 @@ def test_the_summary_of_a_real_robot() -> None:
     # 153 messages on /tf, and one on /tf_static.
     assert summary.messages == 154
     assert {frame.moving for frame in summary.frames if frame.moving} == {153}
+
+
+def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path: Path) -> None:
+    # 2,000 samples at 100 Hz, each received 3 ms after its stamp, but for the last: 5 ms, from another sender.
+    lines = [(10 * MS * k + 3 * MS, moving("a", "b", 10 * MS * k, float(k), "one")) for k in range(1_999)]
+    lines.append((19_990 * MS + 5 * MS, moving("a", "b", 19_990 * MS, 0.0, "two")))
+    # A late sample of another parent leaves the newest edge as it is, so the next one closes no loop.
+    lines.append((20_000 * MS, moving("c", "b", 19_985 * MS, 0.0, "one")))
+    lines.append((20_001 * MS, moving("b", "c", 20_001 * MS, 0.0, "three")))
+    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+        output.write([(received, (sample,)) for received, sample in lines])
+        output.finish()
+    counted: list[int] = []
+    with open_recording(tmp_path / "run.mcap") as recording:
+        summary = summarise(recording, progress=counted.append)
+        one_by_one = summarise(recording, recording.messages())
+    assert len(counted) > 1
+    assert sum(counted) == summary.messages == summary.transforms == 2_002
+    assert summary.problems == {}
+    assert summary.frames == one_by_one.frames
+    frames = {frame.frame: frame for frame in summary.frames}
+    b = frames["b"]
+    assert (b.moving, b.oldest, b.newest, b.authorities) == (2_001, 0, 19_990 * MS, ("one", "two"))
+    assert b.delay is not None
+    # 1,999 of 3 ms, one of 5 ms and one of 15 ms.
+    assert b.delay.mean == pytest.approx((1_999 * 0.003 + 0.005 + 0.015) / 2_001)
+    assert b.delay.max == 0.015
+    senders = {sender.authority: (sender.frames, sender.moving) for sender in summary.senders}
+    assert senders == {"one": (("b",), 2_000), "two": (("b",), 1), "three": (("c",), 1)}

@@ -1,5 +1,6 @@
 import math
 import socket
+from queue import Queue
 
 import anyio
 import httpx
@@ -18,6 +19,7 @@ from tfbus import (
     Buffer,
     Bus,
     BusClosedError,
+    FrameAdded,
     InvalidRobotError,
     InvalidTransformError,
     PointCloud,
@@ -27,6 +29,7 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.view import View
+from tfbus.view._screen import Screen, Sight
 
 pytestmark = pytest.mark.anyio
 
@@ -117,6 +120,48 @@ async def test_a_page_that_nobody_looks_at_listens_to_nothing() -> None:
         await anyio.wait_all_tasks_blocked()
         assert (before, len(shown.bus._subscribers.callbacks)) == (0, 0)
         assert [queue for queue in shown.bus.statistics().queues if queue.kind == "events"] == []
+
+
+async def test_what_happens_is_drawn_while_somebody_looks(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    shown, viewers, sights = Shown(), 1, Queue[Sight]()
+    draw = Screen.show
+
+    def show(screen: Screen, sight: Sight) -> None:
+        draw(screen, sight)
+        sights.put(sight)
+
+    async def next_sight_with(frames: set[str]) -> Sight:
+        while True:
+            sight = await anyio.to_thread.run_sync(sights.get)
+            if set(sight.picture.scene.frames) == frames:
+                return sight
+
+    monkeypatch.setattr(Screen, "show", show)
+    monkeypatch.setattr(View, "viewers", property(lambda _: viewers))
+    shown.bus.publish(static("map", "dock"))
+    async with View(shown.bus, shown.buffer, 0, rate=1_000.0) as view:
+        await next_sight_with({"map", "dock"})
+        # Sent a second after its stamp.
+        shown.bus.publish(moving("map", "tool", 99 * SECOND, 2.0))
+        await next_sight_with({"map", "dock", "tool"})
+        assert view._page.delays == {"tool": 1.0}
+        assert [type(event) for event in view._page._events] == [FrameAdded]
+        # A picture that fails is told, and the next one is drawn.
+        monkeypatch.setattr(view._page, "picture", lambda _: 1 / 0)
+        view.add_points(PointCloud("map", LATEST, np.zeros((1, 3))))
+        while "could not be drawn" not in caplog.text:  # noqa: ASYNC110 - a log line sets no event
+            await anyio.sleep(0.001)
+        monkeypatch.delattr(view._page, "picture")
+        shown.bus.remove_frame("tool")
+        await next_sight_with({"map", "dock"})
+        assert view._page.delays == {}
+        viewers = 0
+        view.remove_points()
+        # Until nothing listens any more.
+        while shown.bus._subscribers.callbacks or shown.bus.statistics().queues:  # noqa: ASYNC110
+            await anyio.sleep(0.001)
 
 
 # Arguments

@@ -204,8 +204,10 @@ def test_pop_all_gives_every_waiter_in_order_of_arrival_and_empties_the_index() 
     index = WaitingIndex()
     errors = (unknown("camera"), short_of("tool", 9), disconnected("map", "odom"), short_of("tool", 1))
     waiters = [parked(index, error) for error in errors]
+    assert len(index.names) > 0
     assert index.pop_all() == waiters
     assert (len(index), index.by_frame, index.pending(), index.pop_all()) == (0, {}, (), [])
+    assert list(index.names) == []
 
 
 def test_a_given_waiter_can_be_parked_again_with_another_error() -> None:

@@ -19,8 +19,7 @@ class ReplayClock(SystemClock):
     def __init__(self) -> None:
         self._told: int | None = None
         self._heard = anyio.Event()
-        self._callbacks: dict[int, JumpCallback] = {}
-        self._registered = 0
+        self._callbacks: dict[object, JumpCallback] = {}
 
     def now(self) -> int:
         """The newest stamp that was heard, or the machine's time; in ns."""
@@ -49,7 +48,6 @@ class ReplayClock(SystemClock):
 
     def on_jump(self, callback: JumpCallback) -> Registration:
         """Call `callback` with the stamps before and after each jump."""
-        self._registered += 1
-        key = self._registered
+        key = object()
         self._callbacks[key] = callback
         return Registration(lambda: self._callbacks.pop(key, None))

@@ -153,8 +153,6 @@ def _read_scan(message: object, frame: str, stamp: int) -> LaserScan:
 
 def _write_scan(scan: LaserScan) -> dict[str, Any]:
     values = {name: getattr(scan, name) for name in _SCAN}
-    if scan.angle_max is None:
-        values["angle_max"] = scan.angle_min + max(0, len(scan.ranges) - 1) * scan.angle_increment
     none = np.empty(0, scan.ranges.dtype)
     return {**values, "ranges": scan.ranges, "intensities": none if scan.intensities is None else scan.intensities}
 

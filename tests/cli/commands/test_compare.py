@@ -74,3 +74,33 @@ def test_a_wrong_call_is_one_line_and_status_2(
     both: tuple[Path, Path], options: tuple[str, ...], why: str, tfbus: Command
 ) -> None:
     check_wrong_call(tfbus("compare", *both, *options), why)
+
+
+def test_a_scale_is_told_and_what_is_left_out_of_a_recording_too(tmp_path: Path, tfbus: Command) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    # One is twice as large as the other, which ends with a sample that cannot be.
+    lines, doubled = (
+        [
+            (k, "/tf", [TransformStamped("map", "base", k * SECOND, Transform((size * k, size * k * k, 0.0)))])
+            for k in range(10)
+        ]
+        for size in (1.0, 2.0)
+    )
+    write_mcap(folder / "run_0.mcap", [*lines, (10, "/tf", [moving("map", "base", 10 * SECOND, 1e13)])])
+    write_mcap(folder / "stray.mcap", lines)
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n    - run_0.mcap\n"
+        "  topics_with_message_count: []\n"
+    )
+    truth = write_mcap(tmp_path / "truth.mcap", doubled)
+    done = tfbus("compare", truth, folder, "--pair", "map:base", "--scale")
+    assert done.stderr.splitlines() == [
+        f"tfbus: left out of {folder}: 1 x not physical",
+        f"tfbus: {folder}: stray.mcap is ignored: metadata.yaml does not name it",
+    ]
+    headings = [line for line in done.stdout.splitlines() if line.startswith("map:base")]
+    assert headings == [
+        "map:base, not aligned: 10 poses of 10 and 10",
+        "map:base, aligned and scaled by 2: 10 poses of 10 and 10",
+    ]

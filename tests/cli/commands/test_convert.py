@@ -59,3 +59,11 @@ def test_without_statics_the_file_is_an_empty_list(tmp_path: Path, tfbus: Comman
 )
 def test_a_wrong_call_is_one_line_and_status_2(arguments: tuple[object, ...], why: str, tfbus: Command) -> None:
     check_wrong_call(tfbus("convert", *arguments), why)
+
+
+def test_what_is_left_out_is_told_with_its_details(tmp_path: Path, tfbus: Command) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/a", b"{}"), (2, "/a", b"{}")], schema="my.Thing", encoding="json")
+    done = tfbus("convert", path, tmp_path / "run.bag")
+    lines = done.stderr.splitlines()
+    assert lines[:2] == [f"0 messages with 0 transforms in {tmp_path / 'run.bag'}", "tfbus: left out: 2 x format"]
+    assert "cannot hold the encoding 'json'" in lines[2]

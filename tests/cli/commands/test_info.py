@@ -154,7 +154,9 @@ def test_all_lines_fit_80_columns_and_what_matters_least_is_left_out(
     assert len(titles) == 4
 
 
-def test_topics_that_are_not_read_are_listed_and_noted(tmp_path: Path, tfbus: Command) -> None:
+def test_topics_that_are_not_read_are_listed_and_noted(
+    tmp_path: Path, tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lines: list[Line] = [
         (1, "/tf", [moving("a", "b", 1)]),
         (2, "/robot1/tf", [moving("a", "b", 1)]),
@@ -164,6 +166,12 @@ def test_topics_that_are_not_read_are_listed_and_noted(tmp_path: Path, tfbus: Co
     assert "note      not read: 2 messages on topic /robot1/tf of type tf2_msgs/msg/TFMessage" in done.stdout
     assert re.search(r"/robot1/tf +tf2_msgs/msg/TFMessage +2  no, it may hold transforms", done.stdout)
     assert re.search(r"/tf +tf2_msgs/msg/TFMessage +1  yes", done.stdout)
+    # On a narrow terminal the facts of the heading stay in their column.
+    monkeypatch.setenv("COLUMNS", "50")
+    narrow = tfbus("info", tmp_path / "run.mcap").stdout.splitlines()
+    at = next(place for place, line in enumerate(narrow) if line.startswith("note"))
+    assert narrow[at].index("not read") == 10
+    assert re.match(r" {10}\S", narrow[at + 1])
 
 
 def test_what_is_lost_is_told_line_by_line(tmp_path: Path, tfbus: Command) -> None:

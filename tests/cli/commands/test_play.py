@@ -12,6 +12,7 @@ from support.samples import moving, static
 from support.terminal import on_a_terminal
 
 from tfbus import SECOND, Bus, PeerJoined, SystemClock, TransformStamped
+from tfbus.cli.commands.play import press
 
 START = 1_700_000_000 * SECOND
 BACKENDS = ["asyncio", "trio"]
@@ -201,3 +202,47 @@ def test_a_bar_is_on_standard_error_if_that_is_a_terminal(tmp_path: Path, ten_se
     assert "playing \x1b" in shown
     assert re.search(r"[1-9]\d?%", shown)
     assert "102 samples in 102 messages played" in shown
+
+
+class Recorded:
+    """A player that notes what is done with it."""
+
+    def __init__(self, paused: bool, rate: float) -> None:
+        self.paused = paused
+        self.rate = rate
+        self.done = ""
+
+    def pause(self) -> None:
+        self.done = "pause"
+
+    def resume(self) -> None:
+        self.done = "resume"
+
+    def step(self) -> None:
+        self.done = "step"
+
+
+@pytest.mark.parametrize(
+    ("key", "paused", "rate", "done", "after"),
+    [
+        (" ", False, 1.0, "pause", 1.0),
+        (" ", True, 1.0, "resume", 1.0),
+        ("s", False, 1.0, "step", 1.0),
+        ("right", True, 1.0, "step", 1.0),
+        ("x", False, 1.0, "", 1.0),
+        ("+", False, 1.0, "", 2.0),
+        ("=", False, 2.0, "", 5.0),
+        ("up", False, 3.0, "", 5.0),
+        ("-", False, 1.0, "", 0.5),
+        ("down", False, 3.0, "", 2.0),
+        # From a hundredth to five hundred times as fast.
+        ("-", False, 0.01, "", 0.01),
+        ("+", False, 500.0, "", 500.0),
+        ("+", False, 0.001, "", 0.01),
+        ("-", False, 1_000.0, "", 500.0),
+    ],
+)
+def test_each_key_does_one_thing(key: str, paused: bool, rate: float, done: str, after: float) -> None:
+    player = Recorded(paused, rate)
+    press(player, key)  # type: ignore[arg-type]
+    assert (player.done, player.rate) == (done, pytest.approx(after))

@@ -68,6 +68,19 @@ def test_two_recordings_are_drawn_over_each_other(recording: Path, tmp_path: Pat
     assert "<!-- base, other -->" in texts_of(output)
 
 
+@pytest.mark.parametrize("name", ["run.mcap", "other.mcap"])
+def test_recordings_are_told_apart_by_their_names_or_else_by_their_paths(
+    recording: Path, tmp_path: Path, tfbus: Command, name: str
+) -> None:
+    (tmp_path / "second").mkdir()
+    other = write_mcap(tmp_path / "second" / name, [(0, "/tf", [moving("map", "base", 5), moving("map", "base", 9)])])
+    done = tfbus("plot", recording, "map", "base", "--compare", other, "--text")
+    lines = done.stdout.splitlines()
+    names = [str(recording), str(other)] if name == recording.name else ["run", "other"]
+    assert [line for line in lines if line in names] == names
+    assert lines[lines.index(names[1]) + 1].startswith("base in map, 0.000 s to 0.000 s")
+
+
 def test_text_prints_the_curves(recording: Path, tfbus: Command) -> None:
     done = tfbus("plot", recording, "map", "base", "--text")
     assert done.returncode == 0

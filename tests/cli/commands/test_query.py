@@ -281,6 +281,17 @@ def test_the_stamps_of_another_topic_are_asked_for(tmp_path: Path, tfbus: Comman
     assert "1 of 3 instants are left out" in done.stderr
 
 
+def test_messages_without_a_readable_header_are_counted(tmp_path: Path, tfbus: Command) -> None:
+    write_mcap(tmp_path / "tf.mcap", [(k, "/tf", [moving("map", "base", k, float(k))]) for k in range(10)])
+    # Little endian: seconds and nanoseconds; the second one is too short.
+    images: list[Line] = [(20, "/image", b"\0\1\0\0" + bytes(4) + b"\5\0\0\0"), (21, "/image", b"\0\1\0\0")]
+    write_mcap(tmp_path / "image.mcap", images, schema="sensor_msgs/msg/Image", definition=b"std_msgs/Header header")
+    done = tfbus("query", tmp_path, "map", "base", "--stamps-of", "/image", "--csv")
+    assert done.stderr.splitlines() == ["tfbus: 1 messages on /image cannot be read"]
+    (row,) = csv.DictReader(StringIO(done.stdout))
+    assert (row["stamp"], float(row["x"])) == ("0.000000005", 5.0)
+
+
 def test_namespaces_are_read_and_ignored_ones_are_mentioned(tmp_path: Path, tfbus: Command) -> None:
     lines = [(1, f"{space}/tf", [moving("odom", "base", 1, x)]) for space, x in (("/r1", 1.0), ("/r2", 2.0))]
     path = write_mcap(tmp_path / "run.mcap", lines)

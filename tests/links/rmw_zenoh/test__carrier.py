@@ -1,16 +1,34 @@
+from queue import Queue
 from types import SimpleNamespace
 from typing import Any
 
 import anyio
 import zenoh
+from support.processes import until
+from support.programs import free_address
 from support.samples import moving, static
 
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Received
 from tfbus.links.rmw_zenoh._carrier import RmwZenohCarrier
-from tfbus.links.rmw_zenoh._wire import Attachment, pack
+from tfbus.links.rmw_zenoh._wire import (
+    CLOCK_HASH,
+    CLOCK_TYPE,
+    JOINT_HASH,
+    JOINT_TYPE,
+    TEXT_HASH,
+    TEXT_TYPE,
+    Attachment,
+    endpoint_token,
+    node_token,
+    other_token,
+    pack,
+    topic_expression,
+    topic_key,
+)
 from tfbus.links.ros._carrier import MAX_SIZE, RosMessage
 from tfbus.links.ros.settings import settings_of
+from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError, encode
 
 AS_A_CARRIER: type[Carrier] = RmwZenohCarrier
@@ -56,6 +74,63 @@ def test_a_message_that_is_too_large_is_refused() -> None:
     made._take(False, sample(bytes(MAX_SIZE), None))
     made._take(False, sample(bytes(MAX_SIZE + 1), None))
     assert [type(item.content) for item in items] == [RosMessage, MalformedMessageError]
+
+
+def test_a_node_announces_its_topics_and_passes_messages_on_both_ways() -> None:
+    address = free_address()
+    nothing: Any = print
+    options = settings_of({"joint_states": nothing, "clock": nothing, "robot_description": nothing})
+    made, items = RmwZenohCarrier(7, "tfbus", settings(address, None, None, 2.0), options), Queue[Received]()
+    made._receive, made._report = items.put, SendReport(print)
+    heard = Queue[zenoh.Sample]()
+    made._join()
+    assert made._session is not None
+    zid = str(made._session.zid())
+    with zenoh.open(settings(None, address, None, 2.0)) as other:
+        tokens = {str(reply.ok.key_expr) for reply in other.liveliness().get("@ros2_lv/**") if reply.ok is not None}
+        assert tokens == {
+            node_token(7, zid, "tfbus"),
+            *(endpoint_token(7, zid, 1 + n, "tfbus", "/tf_static", static=True, publishes=n == 1) for n in (0, 1)),
+            *(endpoint_token(7, zid, 3 + n, "tfbus", "/tf", static=False, publishes=n == 1) for n in (0, 1)),
+            other_token(7, zid, 5, "tfbus", "/joint_states", JOINT_TYPE, JOINT_HASH),
+            other_token(7, zid, 6, "tfbus", "/clock", CLOCK_TYPE, CLOCK_HASH),
+            other_token(7, zid, 7, "tfbus", "/robot_description", TEXT_TYPE, TEXT_HASH, latched=True),
+        }
+        subscriber = other.declare_subscriber(topic_expression(7, "/tf"), heard.put)
+        sent = 0
+
+        def send() -> bool:
+            nonlocal sent
+            sent += 1
+            assert made._publish([moving("map", "base", sent)], static=False)
+            return not heard.empty()
+
+        # Until the other session is known to hear it; from then on nothing is lost.
+        anyio.run(until, send)
+        send()
+        first = number = sent + 1
+        while number != sent:
+            received = heard.get(timeout=20.0)
+            assert received.attachment is not None
+            attachment = bytes(received.attachment)
+            # The number in its sequence comes first.
+            number = int.from_bytes(attachment[:8], "little")
+            first = min(first, number)
+            assert bytes(received.payload) == encode([moving("map", "base", number)])
+            assert attachment[-16:] == made._ids[False]
+        assert first < number
+        subscriber.undeclare()
+        for key in ("/tf", "/tf_static"):
+            other.put(topic_key(7, key), encode([moving("a", "b", 1)]))
+            item = items.get(timeout=20.0)
+            assert (item.content.static, item.moving) == (key == "/tf_static", key == "/tf")
+        for key, kind in (("/joint_states", JOINT_TYPE), ("/clock", CLOCK_TYPE), ("/robot_description", TEXT_TYPE)):
+            other.put(topic_expression(7, key, kind).replace("*", "any"), b"content")
+            content = items.get(timeout=20.0).content
+            found = (content.joints, content.clock, content.description)
+            assert found == (key == "/joint_states", key == "/clock", key == "/robot_description")
+    anyio.run(made.close)
+    assert made._publish([moving("map", "base", 3)], static=False) is False
 
 
 def test_what_cannot_be_sent_is_not_counted_as_sent() -> None:

@@ -12,7 +12,7 @@ from support.samples import moving, static
 
 from tfbus import Buffer, Bus
 from tfbus.links.zenoh import ZenohLink
-from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, settings
+from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, patch_settings, settings
 
 LISTEN, CONNECT = "listen/endpoints", "connect/endpoints"
 LOOPBACK = "tcp/127.0.0.1:0"
@@ -79,6 +79,30 @@ def test_settings_of_zenoh_win_over_those_of_the_link() -> None:
     assert read("transport/link/tx/lease", config=config) == 7_000
     assert read("mode", config=config) == "client"
     assert read(LISTEN, listen="tcp/127.0.0.1:7000", config=config) == []
+
+
+def test_a_patch_connects_to_one_address_and_takes_nothing_else_of_where_the_link_is() -> None:
+    address = "tcp/10.0.0.1:7"
+    given = {
+        "id": "ab",
+        "mode": "router",
+        "listen/endpoints": ["tcp/127.0.0.1:8"],
+        "connect/endpoints": ["tcp/127.0.0.1:9"],
+        "scouting/multicast/enabled": True,
+        "transport/link/tx/batch_size": 4_096,
+    }
+    patch = patch_settings(address, given, 3.0)
+    plain = patch_settings(address, None, 3.0)
+
+    def value(config: Any, path: str) -> Any:
+        return json.loads(config.get_json(path))
+
+    assert value(patch, "connect/endpoints") == [address]
+    assert value(patch, "transport/link/tx/batch_size") == 4_096
+    assert value(patch, "transport/link/tx/lease") == 3_000
+    assert value(patch, "scouting/gossip/enabled") is False
+    for path in ("id", "mode", "listen/endpoints", "scouting/multicast/enabled"):
+        assert value(patch, path) == value(plain, path), path
 
 
 def test_the_lease_is_in_milliseconds() -> None:

@@ -121,6 +121,9 @@ async def test_a_server_that_goes_ends_the_lookups_and_one_that_never_was_is_tol
             with pytest.raises(RemoteLookupError) as absent:
                 await nobody.lookup("map", "base", timeout=0.2)
             assert (absent.value.reason, absent.value.domain, absent.value.robot) == ("absent", domain, None)
+            # What makes no sense is refused before anybody is asked.
+            with pytest.raises(ValueError, match="max_gap"):
+                await nobody.lookup("map", "base", timeout=0.2, max_gap=-1.0)
 
             async def ask() -> None:
                 with pytest.raises(RemoteLookupError) as lost:

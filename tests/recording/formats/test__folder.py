@@ -176,6 +176,12 @@ def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, 
         assert recording.remarks[0].startswith("metadata.yaml is ignored, as it cannot be read: ")
 
 
+def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    metadata(tmp_path, "run_0.mcap", topic="/gone", count=0)
+    assert batches_in(tmp_path) == EXPECTED
+
+
 def test_without_metadata_an_uncompressed_file_hides_the_compressed_one(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run_0.mcap", LINES)
     (tmp_path / "run_0.mcap.zstd").write_bytes(zstandard.compress(path.read_bytes()))
@@ -201,3 +207,24 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
         # What reads it has it open, and it has no name.
         assert list(temporary.iterdir()) == []
         assert sum(bool(message.batch) for message in recording.messages()) > 700
+
+
+def test_what_the_metadata_promise_of_a_long_file_is_held_to_what_is_read_in_blocks(tmp_path: Path) -> None:
+    lines = [(5 + k, "/tf", [moving("odom", "base", k)]) for k in range(2_000)]
+    write_mcap(tmp_path / "run_0.mcap", lines)
+    for promised, lost in ((2_000, 0), (2_003, 1)):
+        metadata(tmp_path, "run_0.mcap", count=promised)
+        with open_recording(tmp_path) as recording:
+            blocks = list(recording.blocks())
+        messages = [message for block in blocks for message in block.messages()]
+        told = [message for message in messages if message.errors]
+        assert [message.received for message in told] == [2_004] * lost
+        assert all("promises 2,003 messages on '/tf', and 2,000 were found" in str(each.errors[0]) for each in told)
+        assert [message.received for message in messages if message.batch] == [received for received, _, _ in lines]
+    metadata(tmp_path, "run_0.mcap", topic="/gone", count=7)
+    with open_recording(tmp_path) as recording:
+        # Of a range nothing can be said.
+        within = [message for block in recording.blocks(100, 200) for message in block.messages()]
+        (lost_one,) = (message for block in recording.blocks() for message in block.messages() if message.errors)
+    assert [message.received for message in within] == list(range(100, 201))
+    assert "promises 7 messages on '/gone'" in str(lost_one.errors[0])
