@@ -52,7 +52,7 @@ def test_it_publishes_one_static_transform_for_everybody_until_ctrl_c(
 
     done = tfbus.on_domain(join_late, "static", "base_link", "laser", *options, "--domain", "yard")
     assert (done.returncode, done.stdout) == (130, "")
-    assert done.stderr == f"publishing 'laser' in 'base_link' on domain 'yard', until Ctrl-C: {numbers}\n"
+    assert done.stderr == f"publishing 'laser' in 'base_link' on domain 'yard', until Ctrl-C:\n  {numbers}\n"
     (sample,) = received
     assert (sample.parent, sample.child, sample.stamp) == ("base_link", "laser", START)
     assert (sample.authority, sample.static) == (authority, True)

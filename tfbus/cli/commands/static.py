@@ -75,7 +75,8 @@ def static(
     async def publish(bus: Bus) -> None:
         for sample in samples:
             what = f"{sample.child!r} in {sample.parent!r} on {link.place}"
-            say(f"publishing {what}, until Ctrl-C: {format_transform(sample.transform)}")
+            # In two lines, for one is wider than many terminals.
+            say(f"publishing {what}, until Ctrl-C:\n  {format_transform(sample.transform)}")
         stamp = bus.clock.now()
         await publish_static(bus, [sample.replace(stamp=stamp) for sample in samples])
         await anyio.sleep_forever()
