@@ -146,7 +146,7 @@ def test_all_transforms_of_a_file_are_published(tfbus: Command, tmp_path: Path) 
         ("b", "c", START, "me"),
     ]
     assert samples[0].transform.translation == (1.0, 2.0, 3.0)
-    assert len(said.splitlines()) == 2
+    assert said.count("publishing") == 2
 
 
 @pytest.mark.parametrize(
