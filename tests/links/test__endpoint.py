@@ -159,6 +159,11 @@ def test_a_link_claims_its_state_ever_less_often_while_nothing_happens() -> None
         return found
 
     assert claims(until=120.0) == [0.0, 2.0, 6.0, 14.0, 30.0, 60.0, 90.0, 120.0]
+    # Peers that come back may never have lost this link, and ask for nothing.
+    domain.time = 125.0
+    for name in ("a", "b"):
+        end.endpoint.handle(Received(name, Presence.JOINED))
+    assert claims(until=131.0) == [125.0, 127.0, 131.0]
     sent = domain.time
     bus.publish(moving("map", "a", 1))
     end.endpoint.send()

@@ -24,7 +24,8 @@ from tfbus.tf_message import MalformedMessageError
 
 CLAIM_PERIOD = 1.0
 LONGEST_CLAIM_PERIOD = 30.0
-"""s; a link claims its state so long after it has sent something, and then after twice that time, up to the longest."""
+"""s; a link claims its state so long after it has sent something or met a peer, and then after twice that time, up to
+the longest."""
 
 
 class Endpoint:
@@ -262,6 +263,8 @@ class Endpoint:
         peer = self.peers.find(sender)
         if peer is not None and not peer.present:
             peer.present = True
+            # A peer that has never lost this link asks for nothing now, and may have missed something all the same.
+            self._claim_period = CLAIM_PERIOD
             if self._reconciler is not None:
                 self._reconciler.joined(peer)
             if self.outbox.time is not None:
