@@ -287,7 +287,7 @@ def test_messages_without_a_readable_header_are_counted(tmp_path: Path, tfbus: C
     images: list[Line] = [(20, "/image", b"\0\1\0\0" + bytes(4) + b"\5\0\0\0"), (21, "/image", b"\0\1\0\0")]
     write_mcap(tmp_path / "image.mcap", images, schema="sensor_msgs/msg/Image", definition=b"std_msgs/Header header")
     done = tfbus("query", tmp_path, "map", "base", "--stamps-of", "/image", "--csv")
-    assert done.stderr.splitlines() == ["tfbus: 1 messages on /image cannot be read"]
+    assert done.stderr.splitlines() == ["tfbus: 1 message on /image cannot be read"]
     (row,) = csv.DictReader(StringIO(done.stdout))
     assert (row["stamp"], float(row["x"])) == ("0.000000005", 5.0)
 

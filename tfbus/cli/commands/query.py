@@ -112,7 +112,8 @@ def _stamps_of(file: Path, topic: str) -> npt.NDArray[np.int64]:
     if not found.from_headers:
         warn(f"the messages on {topic} have no headers: their log times are used")
     if found.unreadable:
-        warn(f"{found.unreadable:,} messages on {topic} cannot be read")
+        messages = "1 message" if found.unreadable == 1 else f"{found.unreadable:,} messages"
+        warn(f"{messages} on {topic} cannot be read")
     return found.stamps
 
 
