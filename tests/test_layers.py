@@ -221,6 +221,7 @@ MUTABLE = {
     "links.dds._publishers._Publisher",
     "links.zenoh._dialing._Lost",
     "links.zenoh._hearing._Check",
+    "links.zenoh._unmet._Look",
     "recording.convert.Conversion",
 }
 

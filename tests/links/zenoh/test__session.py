@@ -129,24 +129,6 @@ def test_a_question_that_is_not_answered_ends(join: Join) -> None:
     assert second.next() == Received(A, Answer(None))
 
 
-def test_a_connected_session_of_another_domain_or_of_a_robot_that_is_not_heard_is_not_deaf(
-    address: str, domain: str
-) -> None:
-    first, *ids, bare = (f"{uuid4().int | 1 << 127:032x}" for _ in range(5))
-    here = Keys(domain, first, robots=("r$*",))
-    others = [Keys(domain, ids[0], "r1"), Keys(domain, ids[1], "s1"), Keys(f"{domain}/b", ids[2], "r1")]
-    with ExitStack() as stack:
-        opened: list[ZenohSession] = []
-        for keys in (here, *others):
-            config = settings([] if opened else address, address if opened else None, {"id": keys.link}, 2.0)
-            opened.append(ZenohSession(config, keys, Queue[Received]().put, lambda *_: None))
-            stack.callback(opened[-1].close)
-            opened[-1].open()
-        stack.enter_context(zenoh.open(settings([], address, {"id": bare}, 2.0)))
-        asked = [*ids, bare, uuid4().hex]
-        assert [session for session, _ in opened[0].find_deaf(asked)] == [ids[0], bare]
-
-
 def test_questions_are_limited_in_number_and_malformed_ones_are_dropped(join: Join, address: str, domain: str) -> None:
     first = join(A)
     with stranger(address, domain) as session:

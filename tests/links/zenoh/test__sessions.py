@@ -195,7 +195,7 @@ async def test_two_ends_that_are_connected_and_have_never_met_dial_each_other() 
             end.dialing._addresses.clear()
             assert await end.next() == Received(other.id, Presence.LEFT)
         for end, other in ((here, joining), (joining, here)):
-            end.sessions._note_connection(other.id)
+            end.sessions._note_connection(other.id, "tcp/127.0.0.1:1")
         for end, other in ((here, joining), (joining, here)):
             assert await end.next() == Received(other.id, Presence.JOINED)
 

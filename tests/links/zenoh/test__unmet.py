@@ -1,4 +1,14 @@
-from tfbus.links.zenoh._unmet import MOST_UNMET, PAUSES, Unmet
+from contextlib import ExitStack
+from queue import Queue
+from uuid import uuid4
+
+import zenoh
+
+from tfbus.links._receive_queue import Received
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._session import ZenohSession
+from tfbus.links.zenoh._settings import settings
+from tfbus.links.zenoh._unmet import MOST_ADDRESSES, MOST_UNMET, PAUSES, Unmet, find_deaf
 
 
 class Scene:
@@ -8,12 +18,15 @@ class Scene:
 
     def wait(self, seconds: float, *present: str) -> list[str]:
         self.time += seconds
-        return self.unmet.take_due(present)
+        return [session for session, _ in self.unmet.take_due(present)]
+
+    def connected(self, session: str, address: str = "tcp/x:1") -> None:
+        self.unmet.connected(session, address)
 
 
 def test_a_connection_is_looked_after_several_times_and_then_no_more() -> None:
     scene = Scene()
-    scene.unmet.connected("a")
+    scene.connected("a")
     for pause in PAUSES:
         assert scene.wait(pause - 0.1) == []
         assert scene.wait(0.2) == ["a"]
@@ -23,16 +36,16 @@ def test_a_connection_is_looked_after_several_times_and_then_no_more() -> None:
 def test_whoever_is_present_is_not_looked_after_later_either() -> None:
     scene = Scene()
     for name in ("a", "b"):
-        scene.unmet.connected(name)
+        scene.connected(name)
     assert scene.wait(0.1, "a") == []
     assert scene.wait(1_000) == ["b"]
 
 
 def test_a_connection_that_is_made_again_is_looked_after_anew() -> None:
     scene = Scene()
-    scene.unmet.connected("a")
+    scene.connected("a")
     assert scene.wait(PAUSES[0]) == ["a"]
-    scene.unmet.connected("a")
+    scene.connected("a")
     assert scene.wait(PAUSES[0] - 0.1) == []
     assert scene.wait(0.1) == ["a"]
 
@@ -40,8 +53,43 @@ def test_a_connection_that_is_made_again_is_looked_after_anew() -> None:
 def test_so_many_connections_are_remembered() -> None:
     scene = Scene()
     for number in range(MOST_UNMET + 1):
-        scene.unmet.connected(f"s{number}")
+        scene.connected(f"s{number}")
     scene.time += 1.0
-    scene.unmet.connected("s0")
+    scene.connected("s0")
     assert scene.wait(PAUSES[0] - 1) == [f"s{number}" for number in range(1, MOST_UNMET)]
     assert scene.wait(1.0) == ["s0"]
+
+
+def test_the_newest_addresses_of_a_session_are_told_once_each() -> None:
+    scene = Scene()
+    for port in (1, 2, 3, 2, 4, 5, 6):
+        scene.connected("a", f"tcp/x:{port}")
+    scene.time += PAUSES[0]
+    newest = [f"tcp/x:{port}" for port in (6, 5, 4, 2)]
+    assert len(newest) == MOST_ADDRESSES
+    for pause in (0.0, *PAUSES[1:]):
+        scene.time += pause
+        assert scene.unmet.take_due(()) == [("a", newest)]
+
+
+def test_a_connected_session_of_another_domain_or_of_a_robot_that_is_not_heard_is_not_deaf(
+    address: str, domain: str
+) -> None:
+    first, *ids, bare = (f"{uuid4().int | 1 << 127:032x}" for _ in range(5))
+    here = Keys(domain, first, robots=("r$*",))
+    others = [Keys(domain, ids[0], "r1"), Keys(domain, ids[1], "s1"), Keys(f"{domain}/b", ids[2], "r1")]
+    with ExitStack() as stack:
+        opened: list[ZenohSession] = []
+        for keys in (here, *others):
+            config = settings([] if opened else address, address if opened else None, {"id": keys.link}, 2.0)
+            opened.append(ZenohSession(config, keys, Queue[Received]().put, lambda *_: None))
+            stack.callback(opened[-1].close)
+            opened[-1].open()
+        stack.enter_context(zenoh.open(settings([], address, {"id": bare}, 2.0)))
+        gone = uuid4().hex
+        looks = [(session, ["tcp/x:1", "tcp/x:2"]) for session in (*ids, bare, gone)]
+        found = find_deaf(opened[0], here, looks)
+        connected = opened[0].addresses()
+        # One that is not connected any more is looked for wherever it was.
+        assert found[:2] == [(session, connected[session]) for session in (ids[0], bare)]
+        assert found[2:] == [(gone, "tcp/x:1"), (gone, "tcp/x:2")]

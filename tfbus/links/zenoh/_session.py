@@ -54,7 +54,7 @@ class ZenohSession:
     note_asked : callable, optional
         Called in zenoh's threads with each query of a link that asks whether it is heard; without it, none is answered.
     note_connection : callable, optional
-        Called in zenoh's threads with the id of a session to which a connection was made or has broken.
+        Called in zenoh's threads with the id and address of a session to which a connection was made or has broken.
     note_heard : callable, optional
         Called in zenoh's threads with the token of each link that tells that it hears this one.
     filters : Filters, optional
@@ -79,7 +79,7 @@ class ZenohSession:
         note_presence: Callable[[str, str, Presence], object],
         name: str = FIRST_SESSION,
         note_asked: Callable[[zenoh.Query], object] | None = None,
-        note_connection: Callable[[str], object] | None = None,
+        note_connection: Callable[[str, str], object] | None = None,
         note_heard: Callable[[bytes], object] | None = None,
         filters: Filters | None = None,
         note_served: Callable[[str, bool], object] = lambda *_: None,
@@ -163,7 +163,8 @@ class ZenohSession:
             session.liveliness().declare_token(keys.token(self._name)),
         ]
         if self._note_connection is not None:
-            self._declared.append(session.info.declare_link_events_listener(directly(self._receive_connection)))
+            listener = session.info.declare_link_events_listener(directly(self._receive_connection), history=True)
+            self._declared.append(listener)
         self.is_open = True
 
     @property
@@ -187,21 +188,6 @@ class ZenohSession:
             return {str(link.zid): link.dst for link in self.session.info.links()}
         except zenoh.ZError:
             return {}
-
-    def find_deaf(self, sessions: Iterable[str]) -> list[tuple[str, str]]:
-        """Those of some connected sessions that may be links which this one ought to hear, with addresses; blocks."""
-        addresses = self.addresses()
-        connected = [session for session in sessions if session in addresses]
-        return [(session, addresses[session]) for session in connected if not self._is_of_others(session)]
-
-    def _is_of_others(self, session: str) -> bool:
-        """Whether a session is that of a link of another domain, or of a robot that this link does not hear."""
-        heard = [zenoh.KeyExpr(key) for key in self._keys.heard("@alive")]
-        with suppress(zenoh.ZError):
-            for reply in self.session.liveliness().get(f"tfbus/**/@alive/{session}/*", timeout=_HEARING_TIME):
-                if reply.ok is not None and not any(key.includes(reply.ok.key_expr) for key in heard):
-                    return True
-        return False
 
     def ask(self, peer: str, since: int, heard: bool = False) -> None:
         """Ask a peer for the changes of its state behind a number; the answer is received as an item.
@@ -363,7 +349,7 @@ class ZenohSession:
 
     def _receive_connection(self, event: zenoh.LinkEvent) -> None:
         if self._note_connection is not None:
-            self._note_connection(str(event.link.zid))
+            self._note_connection(str(event.link.zid), event.link.dst)
 
     def _receive_question(self, query: zenoh.Query) -> None:
         if query.attachment is not None and self._note_heard is not None:

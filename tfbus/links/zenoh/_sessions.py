@@ -25,7 +25,7 @@ from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
-from tfbus.links.zenoh._unmet import Unmet
+from tfbus.links.zenoh._unmet import Unmet, find_deaf
 
 _MEETING_TIME = 3.0
 _MOST_ASKING = 1_000
@@ -81,7 +81,7 @@ class ZenohSessions:
         self._hearing = Hearing(monotonic)
         self._unmet = Unmet(monotonic)
         self._deaf: set[str] = set()
-        self._connected: set[str] = set()
+        self._connected: list[tuple[str, str]] = []
         self._asking: list[zenoh.Query] = []
         self._heard_by: list[tuple[str, list[str] | None]] = []
         self._hearers: set[str] = set()
@@ -175,16 +175,16 @@ class ZenohSessions:
                 with self._lock:
                     changes, self._changes = self._changes, []
                     asking, self._asking = self._asking, []
-                    connected, self._connected = self._connected, set()
+                    connected, self._connected = self._connected, []
                     heard_by, self._heard_by = self._heard_by, []
                     hearers, self._hearers = self._hearers, set()
                     answers = [(query, self._names_heard(query)) for query in asking]
                 await self._note(changes)
-                for peer in connected:
+                for peer, address in connected:
                     if self._is_direct(peer):
                         self._hearing.joined(peer)
                     else:
-                        self._unmet.connected(peer)
+                        self._unmet.connected(peer, address)
                 for peer in hearers:
                     self._hearing.is_heard(peer)
                 for peer, names in heard_by:
@@ -201,9 +201,9 @@ class ZenohSessions:
                     self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
                 dialled = self._dialing.take_due()
-                unmet = self._unmet.take_due(self._present)
+                unmet = [look for look in self._unmet.take_due(self._present) if not self._dialing.is_dialled(look[0])]
                 if unmet:
-                    dialled += await anyio.to_thread.run_sync(self._main.find_deaf, unmet)
+                    dialled += await anyio.to_thread.run_sync(find_deaf, self._main, self._keys, unmet)
                 for peer, address in dialled:
                     if peer not in self._patches:
                         tasks.start_soon(self._patch, peer, address)
@@ -295,9 +295,9 @@ class ZenohSessions:
             return None
         return found[0]
 
-    def _note_connection(self, peer: str) -> None:
+    def _note_connection(self, peer: str, address: str) -> None:
         with self._lock:
-            self._connected.add(peer)
+            self._connected.append((peer, address))
 
     def _note_asked(self, query: zenoh.Query) -> None:
         with self._lock:

@@ -1,16 +1,33 @@
 """The times at which a link looks after connections behind which it has met nobody.
 
-Where many start at once and have little time, connections break and are made again from both ends, and zenoh sometimes
-keeps one of which both ends have lost all that the other end has declared. Then neither hears the other, so neither
-asks whether it is heard, as in `tfbus.links.zenoh._hearing`. All that they know is that they are connected.
+Where two dial each other at once, or have little time, connections break and are made again from both ends. In the end
+zenoh sometimes has none, or one of which both ends have lost all that the other end has declared. Then neither hears
+the other, so neither asks whether it is heard, as in `tfbus.links.zenoh._hearing`. All that they know is that they are
+connected, or were, and at which address.
 """
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import zenoh
+
+from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._session import ZenohSession
 
 PAUSES = 3.0, 10.0, 30.0
 """s before each look; whoever is not met after the last one is no link, or has no right to be heard."""
 MOST_UNMET = 1_000
 """So many connections are remembered, the first."""
+MOST_ADDRESSES = 4
+_ANSWER_TIME = 1.0
+
+
+@dataclass(slots=True)
+class _Look:
+    due: float = 0.0
+    number: int = 0
+    addresses: list[str] = field(default_factory=list)
 
 
 class Unmet:
@@ -24,23 +41,55 @@ class Unmet:
 
     def __init__(self, now: Callable[[], float]) -> None:
         self._now = now
-        self._due: dict[str, tuple[float, int]] = {}
+        self._looks: dict[str, _Look] = {}
 
-    def connected(self, session: str) -> None:
-        """A connection to a session has come or gone, and no peer is known behind it."""
-        if session in self._due or len(self._due) < MOST_UNMET:
-            self._due[session] = self._now() + PAUSES[0], 1
+    def connected(self, session: str, address: str) -> None:
+        """A connection to a session at an address has come or gone, and no peer is known behind it."""
+        if session not in self._looks and len(self._looks) >= MOST_UNMET:
+            return
+        look = self._looks.setdefault(session, _Look())
+        look.due, look.number = self._now() + PAUSES[0], 1
+        look.addresses = [address, *(other for other in look.addresses if other != address)][:MOST_ADDRESSES]
 
-    def take_due(self, present: Container[str]) -> list[str]:
-        """The sessions to look after now; those that are present by now are left out for good."""
+    def take_due(self, present: Container[str]) -> list[tuple[str, list[str]]]:
+        """The sessions to look after now, with their addresses; those that are present are left out for good."""
         now, due = self._now(), []
-        for session, (when, looks) in tuple(self._due.items()):
+        for session, look in tuple(self._looks.items()):
             if session in present:
-                del self._due[session]
-            elif when <= now:
-                due.append(session)
-                if looks < len(PAUSES):
-                    self._due[session] = now + PAUSES[looks], looks + 1
+                del self._looks[session]
+            elif look.due <= now:
+                due.append((session, look.addresses))
+                if look.number < len(PAUSES):
+                    look.due, look.number = now + PAUSES[look.number], look.number + 1
                 else:
-                    del self._due[session]
+                    del self._looks[session]
         return due
+
+
+def find_deaf(own: ZenohSession, keys: Keys, sessions: Iterable[tuple[str, list[str]]]) -> list[tuple[str, str]]:
+    """Those of some sessions that may be links which this one ought to hear, with each address to dial; blocks.
+
+    Parameters
+    ----------
+    own : ZenohSession
+    keys : Keys
+    sessions : iterable of (str, list of str)
+        Each with its known addresses; one that is connected is dialled at the end of its connection.
+    """
+    connected = own.addresses()
+    return [
+        (session, address)
+        for session, known in sessions
+        if session not in connected or not _is_of_others(own, keys, session)
+        for address in ([connected[session]] if session in connected else known)
+    ]
+
+
+def _is_of_others(own: ZenohSession, keys: Keys, session: str) -> bool:
+    """Whether a session is that of a link of another domain, or of a robot that this link does not hear."""
+    heard = [zenoh.KeyExpr(key) for key in keys.heard("@alive")]
+    with suppress(zenoh.ZError):
+        for reply in own.session.liveliness().get(f"tfbus/**/@alive/{session}/*", timeout=_ANSWER_TIME):
+            if reply.ok is not None and not any(key.includes(reply.ok.key_expr) for key in heard):
+                return True
+    return False
