@@ -28,6 +28,7 @@ from tfbus.tf_message import encode
 
 DOMAIN = "fleet"
 IN_FULL = 10
+CONNECTING = 5
 CLIENT: dict[str, Any] = {"mode": "client"}
 
 
@@ -39,24 +40,29 @@ class Fleet:
     rate: float
 
 
-async def drive(fleet: Fleet, number: int) -> None:
+async def drive(fleet: Fleet, number: int, connecting: anyio.Semaphore) -> None:
     """Publish the frames of one robot."""
     name = f"r{number}"
-    with tfbus.Bus() as bus:
-        async with ZenohLink(bus, DOMAIN, robot=name, robots=[], connect=fleet.address, config=CLIENT):
-            broadcaster = tfbus.TransformBroadcaster(bus, authority=name)
-            # Not all in one moment.
-            await anyio.sleep(random.random() / fleet.rate)
-            async for _ in bus.clock.ticks(fleet.rate):
-                pose = tfbus.Transform((math.sin(time.monotonic()), 0.0, 0.0))
-                broadcaster.send_all([("map", f"{name}/frame{frame}", pose) for frame in range(fleet.frames)])
+    async with AsyncExitStack() as stack:
+        bus = stack.enter_context(tfbus.Bus())
+        link = ZenohLink(bus, DOMAIN, robot=name, robots=[], connect=fleet.address, config=CLIENT)
+        async with connecting:
+            await stack.enter_async_context(link)
+        broadcaster = tfbus.TransformBroadcaster(bus, authority=name)
+        # Not all in one moment.
+        await anyio.sleep(random.random() / fleet.rate)
+        async for _ in bus.clock.ticks(fleet.rate):
+            pose = tfbus.Transform((math.sin(time.monotonic()), 0.0, 0.0))
+            broadcaster.send_all([("map", f"{name}/frame{frame}", pose) for frame in range(fleet.frames)])
 
 
 def run_robots(fleet: Fleet, numbers: Iterable[int]) -> None:
     async def drive_all() -> None:
+        # A router has no time for hundreds that connect at once, and a client gives up at once.
+        connecting = anyio.Semaphore(CONNECTING)
         async with anyio.create_task_group() as tasks:
             for number in numbers:
-                tasks.start_soon(drive, fleet, number)
+                tasks.start_soon(drive, fleet, number, connecting)
 
     anyio.run(drive_all)
 
@@ -108,10 +114,10 @@ async def look(fleet: Fleet, robots: Any, seconds: float, router_cpu: Any) -> di
 def show(views: dict[str, dict[str, float]]) -> None:
     print("view         peers  dashboard    router    samples/s   MB/s  age (median, oldest)")
     for name, view in views.items():
+        ages = f"{view['age'] * 1e3:.0f} ms, {view['oldest'] * 1e3:.0f} ms" if view["samples"] else "-"
         print(
             f"{name:<12} {view['peers']:5.0f} {view['dashboard']:6.3f} cores {view['router']:5.3f} cores "
-            f"{view['samples']:9.0f} {view['megabytes']:6.2f}  "
-            f"{view['age'] * 1e3:.0f} ms, {view['oldest'] * 1e3:.0f} ms"
+            f"{view['samples']:9.0f} {view['megabytes']:6.2f}  {ages}"
         )
 
 
