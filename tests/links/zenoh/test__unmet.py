@@ -8,13 +8,15 @@ from tfbus.links._receive_queue import Received
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._settings import settings
-from tfbus.links.zenoh._unmet import MOST_ADDRESSES, MOST_UNMET, PAUSES, Unmet, find_deaf
+from tfbus.links.zenoh._unmet import MOST_ADDRESSES, MOST_ROUTERS, MOST_UNMET, PAUSES, Unmet, find_deaf
 
 
 class Scene:
     def __init__(self) -> None:
         self.time = 50.0
-        self.unmet = Unmet(lambda: self.time)
+        keys = Keys("tf", uuid4().hex)
+        own = ZenohSession(zenoh.Config(), keys, Queue[Received]().put, lambda *_: None)
+        self.unmet = Unmet(own, keys, lambda: self.time)
 
     def wait(self, seconds: float, *present: str) -> list[str]:
         self.time += seconds
@@ -58,6 +60,20 @@ def test_so_many_connections_are_remembered() -> None:
     scene.connected("s0")
     assert scene.wait(PAUSES[0] - 1) == [f"s{number}" for number in range(1, MOST_UNMET)]
     assert scene.wait(1.0) == ["s0"]
+
+
+def test_a_router_is_not_looked_after_also_when_it_has_gone() -> None:
+    scene = Scene()
+    scene.connected("a")
+    scene.unmet.is_router("a")
+    scene.connected("a")
+    assert scene.wait(1_000) == []
+    # The oldest are forgotten.
+    for number in range(MOST_ROUTERS):
+        scene.unmet.is_router(f"r{number}")
+    for name in ("a", "r0"):
+        scene.connected(name)
+    assert scene.wait(1_000) == ["a"]
 
 
 def test_the_newest_addresses_of_a_session_are_told_once_each() -> None:

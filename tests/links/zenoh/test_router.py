@@ -37,6 +37,15 @@ async def test_clients_behind_a_router_hear_each_other_and_late_ones_have_everyt
                 await until(lambda: late.statistics().frames == 2)
 
 
+@pytest.mark.thorough
+async def test_a_router_is_not_taken_for_a_link_that_has_not_been_met(address: str, domain: str) -> None:
+    with Bus() as bus:
+        async with ZenohRouter(address), client(bus, domain, address) as link:
+            unmet = link._zenoh._sessions._unmet
+            await until(lambda: len(unmet._routers) == 1)
+            assert unmet._looks == {}
+
+
 async def test_the_frames_of_a_client_that_ends_leave_behind_a_router(address: str, domain: str) -> None:
     with Bus() as here, Bus() as there:
         async with ZenohRouter(address), client(here, domain, address, drop_lost=True) as link:

@@ -189,6 +189,13 @@ class ZenohSession:
         except zenoh.ZError:
             return {}
 
+    def routers(self) -> list[str]:
+        """The sessions of directly connected routers; may block."""
+        try:
+            return [str(router) for router in self.session.info.routers_zid()]
+        except zenoh.ZError:
+            return []
+
     def ask(self, peer: str, since: int, heard: bool = False) -> None:
         """Ask a peer for the changes of its state behind a number; the answer is received as an item.
 

@@ -25,7 +25,7 @@ from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
-from tfbus.links.zenoh._unmet import Unmet, find_deaf
+from tfbus.links.zenoh._unmet import Unmet
 
 _MEETING_TIME = 3.0
 _MOST_ASKING = 1_000
@@ -79,7 +79,7 @@ class ZenohSessions:
         self._changes: list[tuple[str, Presence]] = []
         self._dialing = Dialing(monotonic) if dialing is None else dialing
         self._hearing = Hearing(monotonic)
-        self._unmet = Unmet(monotonic)
+        self._unmet = Unmet(self._main, keys, monotonic)
         self._deaf: set[str] = set()
         self._connected: list[tuple[str, str]] = []
         self._asking: list[zenoh.Query] = []
@@ -180,11 +180,9 @@ class ZenohSessions:
                     hearers, self._hearers = self._hearers, set()
                     answers = [(query, self._names_heard(query)) for query in asking]
                 await self._note(changes)
-                for peer, address in connected:
+                for peer, _ in connected:
                     if self._is_direct(peer):
                         self._hearing.joined(peer)
-                    else:
-                        self._unmet.connected(peer, address)
                 for peer in hearers:
                     self._hearing.is_heard(peer)
                 for peer, names in heard_by:
@@ -200,11 +198,8 @@ class ZenohSessions:
                 for peer in self._hearing.take_due():
                     self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
-                dialled = self._dialing.take_due()
-                unmet = [look for look in self._unmet.take_due(self._present) if not self._dialing.is_dialled(look[0])]
-                if unmet:
-                    dialled += await anyio.to_thread.run_sync(find_deaf, self._main, self._keys, unmet)
-                for peer, address in dialled:
+                unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
+                for peer, address in (*self._dialing.take_due(), *unmet):
                     if peer not in self._patches:
                         tasks.start_soon(self._patch, peer, address)
 

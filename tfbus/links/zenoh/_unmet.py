@@ -10,6 +10,7 @@ from collections.abc import Callable, Container, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+import anyio.to_thread
 import zenoh
 
 from tfbus.links.zenoh._keys import Keys
@@ -20,6 +21,7 @@ PAUSES = 3.0, 10.0, 30.0
 MOST_UNMET = 1_000
 """So many connections are remembered, the first."""
 MOST_ADDRESSES = 4
+MOST_ROUTERS = 100
 _ANSWER_TIME = 1.0
 
 
@@ -35,17 +37,53 @@ class Unmet:
 
     Parameters
     ----------
+    own : ZenohSession
+        That of the link, which has the connections.
+    keys : Keys
     now : callable
         Returns a monotonic time in s.
     """
 
-    def __init__(self, now: Callable[[], float]) -> None:
+    def __init__(self, own: ZenohSession, keys: Keys, now: Callable[[], float]) -> None:
+        self._own = own
+        self._keys = keys
         self._now = now
         self._looks: dict[str, _Look] = {}
+        self._routers: dict[str, None] = {}
+
+    async def find(
+        self, connected: Iterable[tuple[str, str]], present: Container[str], is_dialled: Callable[[str], bool]
+    ) -> list[tuple[str, str]]:
+        """The sessions to dial now, each with an address.
+
+        Parameters
+        ----------
+        connected : iterable of (str, str)
+            Sessions and addresses to which connections have come or gone since the last call.
+        present : container of str
+            The peers that are there.
+        is_dialled : callable
+            Whether a peer is dialled anyway.
+        """
+        connected = list(connected)
+        if connected:
+            for router in await anyio.to_thread.run_sync(self._own.routers):
+                self.is_router(router)
+        for session, address in connected:
+            self.connected(session, address)
+        due = [look for look in self.take_due(present) if not is_dialled(look[0])]
+        return await anyio.to_thread.run_sync(find_deaf, self._own, self._keys, due) if due else []
+
+    def is_router(self, session: str) -> None:
+        """A session is that of a router, which is no link."""
+        self._routers[session] = None
+        if len(self._routers) > MOST_ROUTERS:
+            del self._routers[next(iter(self._routers))]
+        self._looks.pop(session, None)
 
     def connected(self, session: str, address: str) -> None:
-        """A connection to a session at an address has come or gone, and no peer is known behind it."""
-        if session not in self._looks and len(self._looks) >= MOST_UNMET:
+        """A connection to a session at an address has come or gone; it is looked after unless a peer is behind it."""
+        if session in self._routers or (session not in self._looks and len(self._looks) >= MOST_UNMET):
             return
         look = self._looks.setdefault(session, _Look())
         look.due, look.number = self._now() + PAUSES[0], 1
