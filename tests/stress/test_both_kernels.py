@@ -44,6 +44,7 @@ class World:
         self.open: list[Any] = []
         self.depth = 0
         self.buffers: list[Any] = []
+        self.versions: dict[Any, int] = {}
         self.add_buffer()
 
     def close(self) -> None:
@@ -214,7 +215,10 @@ class World:
         ]
         trees = []
         for buffer in self.buffers:
-            waiting = buffer._live.waiting
+            waiting, paths = buffer._live.waiting, buffer._live.forest.paths
+            # The numbers differ between the kernels; when they change does not.
+            changed = self.versions.get(buffer) != paths.version
+            self.versions[buffer] = paths.version
             for line in waiting.by_frame.values():
                 assert line.places or line.for_any or line.limits
             trees.append(
@@ -224,7 +228,8 @@ class World:
                     [history.newest_record for history in buffer._live.forest.frames.values()],
                     sorted(waiting.by_frame),
                     len(waiting.limits),
-                    buffer._live.forest.paths.version,
+                    paths.inserted,
+                    changed,
                 )
             )
         return edges, trees, repr(self.bus.statistics())
