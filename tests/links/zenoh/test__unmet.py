@@ -5,10 +5,11 @@ from uuid import uuid4
 import zenoh
 
 from tfbus.links._receive_queue import Received
+from tfbus.links.zenoh._dialing import MOST_ADDRESSES
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._settings import settings
-from tfbus.links.zenoh._unmet import MOST_ADDRESSES, MOST_ROUTERS, MOST_UNMET, PAUSES, Unmet, find_deaf
+from tfbus.links.zenoh._unmet import MOST_ROUTERS, MOST_UNMET, PAUSES, Unmet, find_deaf
 
 
 class Scene:

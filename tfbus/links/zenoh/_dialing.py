@@ -1,7 +1,7 @@
 """The times at which a link dials peers that it has lost, at the addresses where it had reached them."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import anyio
@@ -14,7 +14,7 @@ SHORT_TIME = 120.0
 """s; so long after the loss the pause is short."""
 MOST_PEERS = 1_000
 """So many lost peers are remembered, the newest."""
-_MOST_ADDRESSES = 4
+MOST_ADDRESSES = 4
 _PROBE_TIME = 1.0
 _TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
 
@@ -45,9 +45,7 @@ class Dialing:
 
     def reached(self, peer: str, address: str) -> None:
         """A peer has been reached at an address, or has reached us from there, which leads nowhere later."""
-        known = self._addresses.pop(peer, [])
-        self._addresses[peer] = known = [address, *(other for other in known if other != address)]
-        del known[_MOST_ADDRESSES:]
+        self._addresses[peer] = newest_first(address, self._addresses.pop(peer, []))
         if len(self._addresses) > MOST_PEERS:
             oldest = next(iter(self._addresses))
             del self._addresses[oldest]
@@ -96,6 +94,11 @@ class Dialing:
             lost.due = now + lost.pause
             self._addresses[peer].append(self._addresses[peer].pop(0))
         return [(peer, self._addresses[peer][-1]) for peer in due]
+
+
+def newest_first(address: str, known: Iterable[str]) -> list[str]:
+    """An address and those known before it, each once, and at most `MOST_ADDRESSES` of them."""
+    return [address, *(other for other in known if other != address)][:MOST_ADDRESSES]
 
 
 async def is_reachable(address: str) -> bool:

@@ -6,13 +6,14 @@ the other, so neither asks whether it is heard, as in `tfbus.links.zenoh._hearin
 connected, or were, and at which address.
 """
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 import anyio.to_thread
 import zenoh
 
+from tfbus.links.zenoh._dialing import newest_first
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._session import ZenohSession
 
@@ -20,7 +21,6 @@ PAUSES = 3.0, 10.0, 30.0
 """s before each look; whoever is not met after the last one is no link, or has no right to be heard."""
 MOST_UNMET = 1_000
 """So many connections are remembered, the first."""
-MOST_ADDRESSES = 4
 MOST_ROUTERS = 100
 _ANSWER_TIME = 1.0
 
@@ -52,20 +52,19 @@ class Unmet:
         self._routers: dict[str, None] = {}
 
     async def find(
-        self, connected: Iterable[tuple[str, str]], present: Container[str], is_dialled: Callable[[str], bool]
+        self, connected: Sequence[tuple[str, str]], present: Container[str], is_dialled: Callable[[str], bool]
     ) -> list[tuple[str, str]]:
         """The sessions to dial now, each with an address.
 
         Parameters
         ----------
-        connected : iterable of (str, str)
+        connected : sequence of (str, str)
             Sessions and addresses to which connections have come or gone since the last call.
         present : container of str
             The peers that are there.
         is_dialled : callable
             Whether a peer is dialled anyway.
         """
-        connected = list(connected)
         if connected:
             for router in await anyio.to_thread.run_sync(self._own.routers):
                 self.is_router(router)
@@ -87,7 +86,7 @@ class Unmet:
             return
         look = self._looks.setdefault(session, _Look())
         look.due, look.number = self._now() + PAUSES[0], 1
-        look.addresses = [address, *(other for other in look.addresses if other != address)][:MOST_ADDRESSES]
+        look.addresses = newest_first(address, look.addresses)
 
     def take_due(self, present: Container[str]) -> list[tuple[str, list[str]]]:
         """The sessions to look after now, with their addresses; those that are present are left out for good."""
