@@ -111,7 +111,7 @@ def test_the_past_comes_in_chunks_of_whole_frames_and_is_bounded() -> None:
             "much": MOST_OF_FRAME,
         }
         assert stamps_of(s.heard, "much")[0] == 10 / SECOND
-        teller = s.teller.endpoint._teller
+        teller = s.teller.endpoint._history_teller
         told, step = teller.chunk(LONGEST_HISTORY, "")
         assert ([batch.samples[0].child for batch in told], step.final) == (["f0", "f1"], False)
         told, step = teller.chunk(LONGEST_HISTORY, "f4")
@@ -177,7 +177,8 @@ def test_a_peer_whose_answers_lead_nowhere_is_asked_no_more() -> None:
         s.deliver(only=HistoryQuestion)
         asker = HistoryAsker(5.0, lambda _peer, _seconds, after: asked.append(after), lambda: 0.0)
         told, step = HistoryTeller(s.source, s.teller.relay, s.teller.endpoint.outbox).chunk(5.0, "")
-        s.teller.carrier.answer(HistoryQuestion(5.0, "", s.asker.id), told, step._replace(final=False))
+        written = s.teller.carrier.write_answer(told, step._replace(final=False))
+        s.teller.carrier.answer(HistoryQuestion(5.0, "", s.asker.id), written)
         packet = s.domain.wires[s.teller, s.asker].packets[-1]
         assert isinstance(packet, HistoryAnswer)
         message = s.asker.carrier.read(packet.message)

@@ -77,9 +77,12 @@ class WireCarrier:
     def ask(self, peer: str, since: int) -> None:
         self._put_to(peer, Question(since, self.id))
 
-    def answer(self, question: Question | HistoryQuestion, entries: Sequence[StateEntry], step: StateStep) -> None:
+    def write_answer(self, entries: Sequence[StateEntry], step: StateStep) -> Message:
+        return write_answer(entries, step)
+
+    def answer(self, question: Question | HistoryQuestion, message: Message) -> None:
         answer = Answer if isinstance(question, Question) else HistoryAnswer
-        self._put_to(question.handle, answer(write_answer(entries, step)))
+        self._put_to(question.handle, answer(message))
 
     def ask_history(self, peer: str, seconds: float, after: str) -> None:
         self._put_to(peer, HistoryQuestion(seconds, after, self.id))

@@ -138,13 +138,19 @@ class AskableCarrier(Carrier, Protocol):
         Then `receive` is called with an `Answer` from that peer, one without a message if there is none in a while.
         """
 
-    def answer(self, question: Question | HistoryQuestion, entries: Sequence[StateEntry], step: StateStep) -> None:
-        """Answer a question that came as an item.
+    def write_answer(self, entries: Sequence[StateEntry], step: StateStep) -> Any:
+        """A message that tells changes of a state, or samples of the past, for `answer`.
 
         Raises
         ------
         ValueError
             If one message cannot hold so many entries; fewer may do.
+        """
+
+    def answer(self, question: Question | HistoryQuestion, message: Any) -> None:
+        """Answer a question that came as an item, with what `write_answer` has written; must not block or raise.
+
+        The same message may answer several questions.
         """
 
 

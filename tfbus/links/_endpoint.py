@@ -19,7 +19,7 @@ from tfbus.links._peers import Peers
 from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links._reconciler import Reconciler
 from tfbus.links._relay import relay_of
-from tfbus.links._state import CHUNK
+from tfbus.links._state_teller import StateTeller
 from tfbus.tf_message import MalformedMessageError
 
 CLAIM_PERIOD = 1.0
@@ -96,8 +96,10 @@ class Endpoint:
             if self._askable is None
             else Reconciler(self.inbox, self.peers, self._askable.ask, Asker(now), wake, max_frames)
         )
-
-        self._teller = HistoryTeller(bus, self._relay, self.outbox)
+        self._state_teller = (
+            None if self._askable is None else StateTeller(self.outbox.state, self._askable.write_answer)
+        )
+        self._history_teller = HistoryTeller(bus, self._relay, self.outbox)
         self._history: HistoryAsker | None = None
         if history is not None and isinstance(carrier, HistoryCarrier):
             self._history = HistoryAsker(history, carrier.ask_history, now)
@@ -199,7 +201,8 @@ class Endpoint:
 
     def _tell_history(self, question: HistoryQuestion) -> None:
         if self._askable is not None:
-            self._askable.answer(question, *self._teller.chunk(question.seconds, question.after))
+            told = self._history_teller.chunk(question.seconds, question.after)
+            self._askable.answer(question, self._askable.write_answer(*told))
 
     def _take_history(self, sender: str, answer: HistoryAnswer) -> None:
         if self._history is None or not self._history.is_open(sender):
@@ -232,16 +235,9 @@ class Endpoint:
             self.peers.reject(sender, "second clock", error)
 
     def _answer(self, question: Question) -> None:
-        if self._askable is None:
-            return
-        limit = CHUNK
-        while limit:
-            try:
-                self._askable.answer(question, *self.outbox.state.changes(question.since, limit))
-            except ValueError:
-                limit //= 2
-            else:
-                return
+        message = None if self._state_teller is None else self._state_teller.answer(question.since)
+        if self._askable is not None and message is not None:
+            self._askable.answer(question, message)
 
     def _take_answer(self, sender: str, answer: Answer) -> None:
         if self._reconciler is None:

@@ -86,7 +86,8 @@ async def test_a_question_is_answered_with_entries_and_a_step_and_claims_go_to_a
         question = await here.next()
         assert isinstance(question, Question)
         assert question.since == 5
-        here.carrier.answer(question, [kept("lidar"), MovingFrame("base")], StateStep(5, 7, 99))
+        told = here.carrier.write_answer([kept("lidar"), MovingFrame("base")], StateStep(5, 7, 99))
+        here.carrier.answer(question, told)
         answer = await there.next()
         assert isinstance(answer, Answer)
         message = there.carrier.read(answer.message)
@@ -116,8 +117,8 @@ async def test_an_answer_that_one_message_cannot_hold_is_refused() -> None:
         assert isinstance(question, Question)
         long = OutgoingBatch(ORIGIN, 1, [static("map", "a")] * 100_000)
         with pytest.raises(ValueError, match="more than"):
-            here.carrier.answer(question, [long], StateStep(0, 1, 0))
-        here.carrier.answer(question, [], StateStep(0, 0, 0))
+            here.carrier.write_answer([long], StateStep(0, 1, 0))
+        here.carrier.answer(question, here.carrier.write_answer([], StateStep(0, 0, 0)))
         assert isinstance(await there.next(), Answer)
 
 

@@ -105,9 +105,13 @@ class ZenohCarrier:
         """Ask a peer for the last seconds of the moving frames whose names come after `after`."""
         self._sessions.ask_history(peer, seconds, after)
 
-    def answer(self, question: Question | HistoryQuestion, entries: Sequence[StateEntry], step: StateStep) -> None:
+    def write_answer(self, entries: Sequence[StateEntry], step: StateStep) -> Message:
+        """A message for `answer`; raises `ValueError` if one message cannot hold so many entries."""
+        return write_answer(entries, step)
+
+    def answer(self, question: Question | HistoryQuestion, message: Message) -> None:
         """Answer a question; a worker thread sends the answers, because zenoh may wait for a peer that is frozen."""
-        self._answers.append((question.handle, write_answer(entries, step)))
+        self._answers.append((question.handle, message))
         self._woken.set()
 
     async def run(self) -> None:
