@@ -8,6 +8,7 @@ from tfbus.links._asker import (
     LONGEST_PAUSE,
     MOST_OPEN,
     PATIENCE,
+    PATIENCE_EACH,
     SETTLING,
     Asker,
 )
@@ -94,6 +95,19 @@ def test_a_peer_that_has_no_time_is_given_ever_more() -> None:
     scene.wait()
     assert scene.asker.take_due() == ["a"]
     assert scene.wait() == pytest.approx(PATIENCE)
+
+
+def test_peers_that_are_asked_with_many_others_have_more_time() -> None:
+    scene = Scene()
+    scene.asker.want("first", at_once=True)
+    scene.asker.take_due()
+    others = [f"{number}" for number in range(20)]
+    for name in others:
+        scene.asker.want(name, at_once=True)
+    assert scene.asker.take_due() == others
+    assert scene.wait() == pytest.approx(PATIENCE), "the first one was asked alone"
+    scene.asker.satisfied("first")
+    assert scene.wait() == pytest.approx(20 * PATIENCE_EACH)
 
 
 def test_so_many_questions_are_open_at_once_and_no_more() -> None:

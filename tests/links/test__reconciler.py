@@ -66,6 +66,20 @@ def test_a_peer_that_joins_is_asked_at_once_and_not_again_when_all_was_told() ->
     assert scene.reconciler.next_due() is None
 
 
+def test_a_second_answer_to_what_all_was_told_already_changes_nothing() -> None:
+    scene = Scene()
+    peer = scene.join()
+    scene.run()
+    scene.answer(StateStep(0, 2, A ^ B), "a", "b")
+    # An older one, written before "b" came, and the same once more.
+    for number, digest, names in ((1, A, "a"), (2, A ^ B, "ab")):
+        scene.answer(StateStep(0, number, digest), *names)
+        assert peer.mirror is not None
+        assert (peer.mirror.agrees, peer.mirror.number, "b" in peer.mirror) == (True, 2, True)
+        assert not peer.mirror.take_whole()
+        assert scene.reconciler.next_due() is None
+
+
 def test_what_a_peer_claims_and_has_not_told_is_asked_for_in_parts() -> None:
     scene = Scene()
     scene.join()

@@ -14,6 +14,8 @@ LONGEST_PATIENCE = 16.0
 
 A peer that has no time would else be asked again for what it is about to answer, and have less time for that.
 """
+PATIENCE_EACH = 0.1
+"""s more for each other question that is open: many are open where many links start at once, and nobody has time."""
 MOST_OPEN = 64
 """So many questions are open at once: where nobody has time each takes seconds, and few at a time take minutes."""
 
@@ -75,11 +77,13 @@ class Asker:
                 self._pause(question)
         room = MOST_OPEN - sum(question.open for question in self._questions.values())
         due = [peer for peer, question in self._questions.items() if not question.open and question.due <= now]
-        for peer in due[: max(room, 0)]:
+        asked = due[: max(room, 0)]
+        others = MOST_OPEN - room + len(asked) - 1
+        for peer in asked:
             question = self._questions[peer]
             question.open = True
-            question.due = now + question.patience
-        return due[: max(room, 0)]
+            question.due = now + question.patience + PATIENCE_EACH * others
+        return asked
 
     def next_due(self) -> float | None:
         """The time of the next call of `take_due`; None while nobody is to be asked."""

@@ -142,6 +142,9 @@ class Inbox:
         self.messages += 1
         mirror = peer.mirror
         before = mirror.number
+        if mirror.agrees and 0 < step.number <= before:
+            # The peer was asked twice, because its first answer took long.
+            return False
         if step.since == 0:
             mirror.begins_anew()
         elif step.since != before:

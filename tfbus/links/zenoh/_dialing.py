@@ -15,7 +15,8 @@ SHORT_TIME = 120.0
 MOST_PEERS = 1_000
 """So many lost peers are remembered, the newest."""
 MOST_ADDRESSES = 4
-_PROBE_TIME = 1.0
+_PROBE_TIME = 3.0
+"""s; on a busy machine a connection on the loopback may take more than one."""
 _TCP = re.compile(r"(?:tcp|tls)/(?:\[(?P<six>[^\]]+)\]|(?P<four>[^:/?#\s]+)):(?P<port>\d+)")
 
 
