@@ -16,6 +16,7 @@ from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
+from tfbus.links.zenoh._unmet import Unmet
 
 pytestmark = pytest.mark.anyio
 
@@ -198,6 +199,20 @@ async def test_two_ends_that_are_connected_and_have_never_met_dial_each_other() 
             end.sessions._note_connection(other.id, "tcp/127.0.0.1:1")
         for end, other in ((here, joining), (joining, here)):
             assert await end.next() == Received(other.id, Presence.JOINED)
+
+
+async def test_a_peer_whose_connection_was_gone_before_anybody_looked_is_dialled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The connections behind which nobody was met are looked after much later.
+    monkeypatch.setattr(Unmet, "connected", lambda *_: None)
+    async with ends() as (here, there):
+        here.sessions._note_connection(there.id, there.address)
+        for presence in (Presence.JOINED, Presence.LEFT):
+            here.sessions._note_presence(there.id, (None, FIRST_SESSION), presence)
+            assert await here.next() == Received(there.id, presence)
+        assert await here.next() == Received(there.id, Presence.JOINED)
+        assert await there.next() == Received(here.id, Presence.JOINED)
 
 
 async def test_whoever_asks_and_hears_directly_tells_so() -> None:

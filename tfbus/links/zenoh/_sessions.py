@@ -27,7 +27,8 @@ from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._unmet import Unmet
 
-_MEETING_TIME = 3.0
+_MEETING_TIME = 10.0
+"""s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
 _MOST_ASKING = 1_000
 
 _Way = tuple[ZenohSession | None, str]
@@ -179,6 +180,9 @@ class ZenohSessions:
                     heard_by, self._heard_by = self._heard_by, []
                     hearers, self._hearers = self._hearers, set()
                     answers = [(query, self._names_heard(query)) for query in asking]
+                for peer, address in connected:
+                    # Where this loop has no time, the connection may be gone when its address is asked for.
+                    self._dialing.reached(peer, address)
                 await self._note(changes)
                 for peer, _ in connected:
                     if self._is_direct(peer):
