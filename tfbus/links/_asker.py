@@ -14,7 +14,7 @@ LONGEST_PATIENCE = 16.0
 
 A peer that has no time would else be asked again for what it is about to answer, and have less time for that.
 """
-PATIENCE_EACH = 0.1
+PATIENCE_EACH = 0.15
 """s more for each other question that is open: many are open where many links start at once, and nobody has time."""
 MOST_OPEN = 64
 """So many questions are open at once: where nobody has time each takes seconds, and few at a time take minutes."""
