@@ -419,6 +419,32 @@ def test_each_message_is_published_at_its_time(
 
 
 @pytest.mark.parametrize("simulated", [True, False])
+def test_a_pause_and_a_new_rate_count_from_their_moment(tmp_path: Path, simulated: bool) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+    heard: list[float] = []
+
+    async def play() -> None:
+        # The clock of the loop is not at zero at the beginning.
+        await anyio.sleep(1_000.0)
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            first = anyio.Event()
+            bus.subscribe(lambda _: (heard.append(anyio.current_time()), first.set()))
+            player = Player(bus, path)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                await first.wait()
+                await anyio.sleep(3.0)
+                player.pause()
+                await anyio.sleep(100.0)
+                player.resume()
+                await anyio.sleep(2.0)
+                player.rate = 5.0
+
+    in_virtual_time(play)
+    assert heard[1] - heard[0] == pytest.approx(3.0 + 100.0 + 2.0 + (10.0 - 5.0) / 5.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
 async def test_the_highest_rates_wait_for_nothing(tmp_path: Path, simulated: bool) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
     for rate in (1e12, 1e300):
