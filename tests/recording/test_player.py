@@ -428,7 +428,12 @@ def test_a_pause_and_a_new_rate_count_from_their_moment(tmp_path: Path, simulate
         await anyio.sleep(1_000.0)
         with Bus(SimulatedClock() if simulated else None) as bus:
             first = anyio.Event()
-            bus.subscribe(lambda _: (heard.append(anyio.current_time()), first.set()))
+
+            def hear(_: Batch) -> None:
+                heard.append(anyio.current_time())
+                first.set()
+
+            bus.subscribe(hear)
             player = Player(bus, path)
             async with anyio.create_task_group() as tasks:
                 tasks.start_soon(player.play)

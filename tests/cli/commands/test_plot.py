@@ -74,7 +74,7 @@ def test_the_options_choose_the_picture(
 ) -> None:
     found: list[str] = []
 
-    def save(figure: Figure, file: BytesIO, **how: object) -> None:
+    def save(figure: Figure, _: BytesIO, **how: object) -> None:
         found.extend(axes.name for axes in figure.axes)
         assert how == {"format": "png", "dpi": 150}
 

@@ -1,8 +1,10 @@
 import errno
 import socket
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from queue import Queue
+from types import SimpleNamespace
 from typing import Any
 from uuid import uuid4
 
@@ -10,10 +12,12 @@ import pytest
 import zenoh
 from support.processes import PATIENCE
 
+from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._receive_queue import Answer, Presence, Received
+from tfbus.links._receive_queue import Answer, HistoryQuestion, Presence, Received
+from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
-from tfbus.links.zenoh._session import MOST_QUESTIONS, ZenohSession
+from tfbus.links.zenoh._session import MOST_NAMES, MOST_QUESTIONS, ZenohSession
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError
 
@@ -282,3 +286,118 @@ def test_a_session_closed_before_it_was_open_does_not_stay_open(join: Join, doma
     assert first.next() == Received(third.id, Presence.JOINED)
     second.session.close()
     assert second.items.empty()
+
+
+def closed_end() -> End:
+    """An end that was not opened; a test calls it as zenoh's threads do."""
+    return End(A, "yard", zenoh.Config())
+
+
+class Payload(bytes):
+    """The bytes of a sample, as zenoh has them."""
+
+    def to_bytes(self) -> bytes:
+        return bytes(self)
+
+
+class Asked:
+    """A query, and whether it was dropped."""
+
+    key_expr = "tfbus/yard/~/history/" + A
+    attachment: Payload | None = None
+
+    def __init__(self, payload: bytes | None) -> None:
+        self.payload = None if payload is None else Payload(payload)
+        self.dropped = 0
+
+    def drop(self) -> None:
+        self.dropped += 1
+
+
+@pytest.mark.parametrize(
+    ("payload", "asked"),
+    [
+        (None, None),
+        (bytes(7), None),
+        (struct.pack("<d", 1.5), (1.5, "")),
+        (struct.pack("<d", 1.5) + b"lidar", (1.5, "lidar")),
+        (struct.pack("<d", 1.5) + b"x" * 2**16, (1.5, "x" * 2**16)),
+        (struct.pack("<d", 1.5) + b"x" * (2**16 + 1), None),
+        (struct.pack("<d", LONGEST_HISTORY), (LONGEST_HISTORY, "")),
+        (struct.pack("<d", LONGEST_HISTORY * 1.001), None),
+        (struct.pack("<d", 0.0), None),
+        (struct.pack("<d", float("nan")), None),
+        (struct.pack("<d", 1.5) + b"\xff", None),
+    ],
+)
+def test_a_question_for_the_last_seconds_is_received_or_dropped(
+    payload: bytes | None, asked: tuple[float, str] | None
+) -> None:
+    end, query = closed_end(), Asked(payload)
+    end.session._receive_history_question(query)  # type: ignore[arg-type]
+    assert query.dropped == (asked is None)
+    assert (end.items.qsize(), end.session._questions) == ((0, 0) if asked is None else (1, 1))
+    if asked is not None:
+        assert end.next() == Received("", HistoryQuestion(*asked, query))
+
+
+def test_of_what_a_question_brings_only_so_much_is_read() -> None:
+    end, query = closed_end(), Asked(bytes(8))
+    query.attachment = Payload(b"x" * (MOST_NAMES + 1))
+    end.session._receive_question(query)  # type: ignore[arg-type]
+    assert end.heard_by.get_nowait() == b"x" * MOST_NAMES
+    end.session._note_heard = None
+    end.session._receive_question(query)  # type: ignore[arg-type]
+    assert (end.items.qsize(), query.dropped) == (2, 0)
+
+
+def test_the_filters_of_others_come_and_go_and_wrong_ones_are_refused() -> None:
+    end = closed_end()
+    for link in (A, B):
+        token = Keys("yard", link, filter=write_filter(["*"], ["base"])).filter_token(FIRST_SESSION)
+        came = SimpleNamespace(key_expr=token, kind=zenoh.SampleKind.PUT)
+        went = SimpleNamespace(key_expr=token, kind=zenoh.SampleKind.DELETE)
+        end.session._receive_filter(came)  # type: ignore[arg-type]
+        # Its own is no peer's.
+        assert len(end.session._filters.wanted) == (link == B)
+    end.session._receive_filter(went)  # type: ignore[arg-type]
+    assert end.session._filters.wanted == {}
+    end.session._closed = True
+    end.session._receive_filter(came)  # type: ignore[arg-type]
+    assert end.session._filters.wanted == {}
+    assert end.items.empty()
+    end.session._closed = False
+    wrong = SimpleNamespace(key_expr="tfbus/yard/x", kind=zenoh.SampleKind.PUT)
+    end.session._receive_filter(wrong)  # type: ignore[arg-type]
+    assert end.next().content.reason == "key"
+
+
+def test_a_link_hears_presence_of_others_only() -> None:
+    end = closed_end()
+    for link in (A, B):
+        for kind in (zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE):
+            sample: Any = SimpleNamespace(key_expr=Keys("yard", link).token(FIRST_SESSION), kind=kind)
+            end.session._receive_presence(sample)
+    assert [end.next() for _ in range(2)] == [Received(B, Presence.JOINED), Received(B, Presence.LEFT)]
+    assert end.items.empty()
+
+
+def test_a_peer_without_the_filter_is_heard_by_its_live_key_alone() -> None:
+    end = closed_end()
+    end.session._keys = keys = Keys("yard", A, filter=write_filter(["*"], ["base"]))
+    live, part = (
+        SimpleNamespace(key_expr=key, kind=zenoh.SampleKind.PUT, payload=Payload(data), attachment=beside)
+        for key, data, beside in (
+            (Keys("yard", B).own("live"), b"all", None),
+            (Keys("yard", B).part(name_of(keys.filter)), b"part", Payload(b"!")),
+        )
+    )
+    end.session._receive_all(live)  # type: ignore[arg-type]
+    assert end.next() == Received(B, (b"all", b""), 3, moving=True)
+    end.session._receive_live(part)  # type: ignore[arg-type]
+    assert end.next() == Received(B, (b"part", b"!"), 5, moving=True)
+    end.session._unfiltered = {B: None}  # type: ignore[dict-item]
+    end.session._receive_live(part)  # type: ignore[arg-type]
+    live.kind = zenoh.SampleKind.DELETE
+    end.session._receive_all(live)  # type: ignore[arg-type]
+    assert end.items.empty()
