@@ -118,8 +118,8 @@ def test_a_question_and_its_answer_are_received(join: Join) -> None:
 def test_a_question_tells_that_the_peer_is_heard_if_it_is(join: Join, domain: str) -> None:
     first, second = join(A), join(B)
     meet(first, second)
-    for heard in (False, True):
-        second.session.ask(A, 0, heard)
+    for heard in ({}, {"heard": True}):
+        second.session.ask(A, 0, **heard)
         first.next().content.handle.drop()
     assert first.heard_by.get(timeout=PATIENCE) == Keys(domain, B).token(FIRST_SESSION).encode()
     assert first.heard_by.empty()
