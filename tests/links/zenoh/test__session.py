@@ -1,7 +1,7 @@
 import errno
 import socket
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from queue import Queue
 from types import SimpleNamespace
@@ -14,7 +14,7 @@ from support.processes import PATIENCE
 
 from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._receive_queue import Answer, HistoryQuestion, Presence, Received
+from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Received
 from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._session import MOST_NAMES, MOST_QUESTIONS, ZenohSession
@@ -401,3 +401,108 @@ def test_a_peer_without_the_filter_is_heard_by_its_live_key_alone() -> None:
     live.kind = zenoh.SampleKind.DELETE
     end.session._receive_all(live)  # type: ignore[arg-type]
     assert end.items.empty()
+
+
+class Network:
+    """Notes the questions that a session asks; a test answers them as zenoh's threads do."""
+
+    def __init__(self, end: End, failing: bool = False) -> None:
+        self.asked: list[tuple[str, zenoh.handlers.Callback[Any], dict[str, Any]]] = []
+        self._failing = failing
+        end.session._session = self  # type: ignore[assignment]
+
+    def get(self, key: str, handler: Any, **options: Any) -> None:
+        if self._failing:
+            raise zenoh.ZError("the session is closed")
+        self.asked.append((key, handler, options))
+
+    def reply(self, payload: bytes | None, encoding: str = "", end: bool = True) -> None:
+        """Answer the newest question, and end it; an error for None."""
+        _, handler, _ = self.asked[-1]
+        sample = SimpleNamespace(payload=Payload(payload or b""), attachment=Payload(b"!"), encoding=encoding)
+        handler.callback(SimpleNamespace(ok=None if payload is None else sample))
+        if end:
+            handler.drop()
+
+
+def test_an_answer_is_received_once_and_tells_whether_the_filter_is_served() -> None:
+    end, served = closed_end(), list[tuple[str, bool]]()
+    end.session._note_served = lambda *noted: served.append(noted)
+    network = Network(end)
+    end.session.ask(B, 5, heard=True)
+    network.reply(None, end=False)
+    network.reply(b"first", "tfbus/state;filters", end=False)
+    network.reply(b"second")
+    assert end.next() == Received(B, Answer((b"first", b"!")), 6)
+    end.session.ask(B, 6)
+    network.reply(b"older", "tfbus/state")
+    assert end.next() == Received(B, Answer((b"older", b"!")), 6)
+    end.session.ask_history(B, 1.5, "lidar")
+    network.reply(b"history", "tfbus/state")
+    assert end.next() == Received(B, HistoryAnswer((b"history", b"!")), 8)
+    assert served == [(B, True), (B, False)]
+    end.session.ask(B, 7)
+    network.reply(None)
+    assert end.next() == Received(B, Answer(None))
+    kinds = ("state", "state", "history", "state")
+    assert [key for key, _, _ in network.asked] == [f"tfbus/yard/*/{kind}/{B}" for kind in kinds]
+    options = [options for _, _, options in network.asked]
+    assert [each["payload"] for each in options[1:3]] == [struct.pack("<Q", 6), struct.pack("<d", 1.5) + b"lidar"]
+    assert [each["attachment"] for each in options[:3]] == [Keys("yard", A).token(FIRST_SESSION), None, None]
+    Network(end, failing=True)
+    end.session.ask(B, 8)
+    assert end.next() == Received(B, Answer(None))
+    assert end.items.empty()
+
+
+@pytest.mark.parametrize(
+    ("replies", "names"),
+    [
+        ((), None),
+        ((None,), None),
+        ((b"",), []),
+        ((None, b"0,x"), ["0", "x"]),
+        ((b"0", b"1"), ["0"]),
+        ((b"x" * MOST_NAMES + b"y",), ["x" * MOST_NAMES]),
+        ((b"\xff",), ["\ufffd"]),
+    ],
+)
+def test_the_sessions_that_a_peer_hears_are_told_once(replies: Sequence[bytes | None], names: list[str] | None) -> None:
+    end, told = closed_end(), list[list[str] | None]()
+    network = Network(end)
+    end.session.ask_hearing(B, told.append)
+    for reply in replies:
+        network.reply(reply, end=False)
+    ((key, handler, options),) = network.asked
+    handler.drop()
+    assert told == [names]
+    assert (key, options["payload"]) == (f"tfbus/yard/*/hears/{B}", Keys("yard", A).token(FIRST_SESSION))
+    Network(end, failing=True)
+    end.session.ask_hearing(B, told.append)
+    assert told == [names]
+
+
+def test_whoever_asks_is_told_the_sessions_that_are_heard_of_it() -> None:
+    replies: list[tuple[str, str]] = []
+
+    class Heard(Asked):
+        def reply(self, key: str, names: str) -> None:
+            if self.payload is None:
+                raise zenoh.ZError("the asker has gone")
+            replies.append((key, names))
+
+    queries = [Heard(None), Heard(b"a"), Heard(b"b")]
+    names = [["gone"], ["0", "x"], ["x" * (MOST_NAMES + 1)]]
+    closed_end().session.answer_hearing(zip(queries, names, strict=True))  # type: ignore[arg-type]
+    own = f"tfbus/yard/~/hears/{A}"
+    assert replies == [(own, "0,x"), (own, "x" * MOST_NAMES)]
+    assert [query.dropped for query in queries] == [1, 1, 1]
+
+
+def test_connections_are_noted_by_session_and_address() -> None:
+    end, noted = closed_end(), list[tuple[str, str]]()
+    event: Any = SimpleNamespace(link=SimpleNamespace(zid=7, dst="tcp/127.0.0.1:1"))
+    end.session._receive_connection(event)
+    end.session._note_connection = lambda *connection: noted.append(connection)
+    end.session._receive_connection(event)
+    assert noted == [("7", "tcp/127.0.0.1:1")]
