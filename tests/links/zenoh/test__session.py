@@ -422,7 +422,7 @@ class Network:
         sample = SimpleNamespace(payload=Payload(payload or b""), attachment=Payload(b"!"), encoding=encoding)
         handler.callback(SimpleNamespace(ok=None if payload is None else sample))
         if end:
-            handler.drop()
+            handler.drop()  # type: ignore[misc]
 
 
 def test_an_answer_is_received_once_and_tells_whether_the_filter_is_served() -> None:
@@ -474,7 +474,7 @@ def test_the_sessions_that_a_peer_hears_are_told_once(replies: Sequence[bytes | 
     for reply in replies:
         network.reply(reply, end=False)
     ((key, handler, options),) = network.asked
-    handler.drop()
+    handler.drop()  # type: ignore[misc]
     assert told == [names]
     assert (key, options["payload"]) == (f"tfbus/yard/*/hears/{B}", Keys("yard", A).token(FIRST_SESSION))
     Network(end, failing=True)
