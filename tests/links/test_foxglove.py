@@ -130,6 +130,8 @@ async def test_an_application_gets_the_static_frames_and_then_what_is_published(
         assert base == (START + 5, "map", "base", turned.translation, turned.rotation)
         assert arm == (START + 7, "map", "arm", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         assert (server.sent, server.not_sent) == (3, 0)
+        assert bus._subscribers.callbacks
+    assert not bus._subscribers.callbacks
 
 
 async def test_a_second_application_gets_the_static_frames_of_now(bus: Bus) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import anyio
 import anyio.lowlevel
@@ -416,6 +417,14 @@ def test_each_message_is_published_at_its_time(
     heard: list[float] = []
     in_virtual_time(play)
     assert [time - heard[0] for time in heard] == pytest.approx([time / rate for time in times], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "options", [{"topics": ["/tf"], "namespaces": True}, {"prefix": "/r1"}, {"rate": 0.0}, {"since": 2, "until": 1}]
+)
+async def test_wrong_options_are_refused_at_once(options: dict[str, Any]) -> None:
+    with Bus() as bus, pytest.raises(ValueError, match=r"."):
+        Player(bus, "nowhere.mcap", **options)
 
 
 @pytest.mark.parametrize("simulated", [True, False])

@@ -126,6 +126,7 @@ def test_positions_of_joints_are_read_in_every_encoding() -> None:
     numbered = struct.pack("<I", 256) + ros1[4:]
     for content in (cdr, ros1, numbered, fields, cbor2.loads(cbor2.dumps(tagged))):
         assert decode_joints(content) == (5, {"a": 0.5, "b": 1.5})
+    assert decode_joints({**fields, "name": ["a"]}) == (5, {"a": 0.5})
     assert json.loads(subscribe("/j", "cbor", JOINT_TYPE))["type"] == "sensor_msgs/JointState"
 
 
