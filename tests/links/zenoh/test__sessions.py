@@ -269,7 +269,10 @@ async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
     alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT)
     assert alone.items.empty()
     # The end of a patch ends what came by it.
+    alone.sessions._filters.joined((alone.peer, alone.patch, "other"), write_filter(["*"], ["base"]))
+    assert list(alone.sessions.filters.values()) == [{"base"}]
     alone.sessions._drop_patch(alone.peer)
+    assert alone.sessions.filters == {}
     assert alone.items.get_nowait() == Received(alone.peer, Presence.LEFT)
     assert (alone.sessions._present, alone.patch.closed, len(alone.sessions._closing)) == ({}, 1, 1)
     assert alone.sessions._changes == [
