@@ -3,8 +3,8 @@ import signal
 import sys
 import termios
 import time
-from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncGenerator, Iterator
+from contextlib import aclosing, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -93,12 +93,13 @@ async def test_the_terminal_is_given_back_before_the_program_stops(monkeypatch: 
         def give_back(self) -> None:
             steps.append("give back")
 
-    async def signals() -> AsyncIterator[signal.Signals]:
+    async def signals() -> AsyncGenerator[signal.Signals, None]:
         for number in (signal.SIGCONT, signal.SIGTSTP, signal.SIGTERM, signal.SIGTSTP):
             yield number
 
     monkeypatch.setattr(os, "kill", lambda process, number: steps.append((process, number)))
-    await follow_job(Noted(0), signals(), partial(steps.append, "stopped"), partial(steps.append, "continued"))
+    async with aclosing(signals()) as received:
+        await follow_job(Noted(0), received, partial(steps.append, "stopped"), partial(steps.append, "continued"))
     stop = (os.getpid(), signal.SIGSTOP)
     assert steps == ["take", "stopped", "give back", stop, "take", "continued"]
 

@@ -3,8 +3,9 @@ import re
 import signal
 import sys
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Sequence
+from contextlib import aclosing, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 
 import anyio
@@ -280,7 +281,7 @@ async def test_keys_steer_the_player_and_a_stopped_program_plays_on_unless_it_wa
     paused: list[bool] = []
     ended_by: list[int] = []
 
-    async def signals() -> AsyncIterator[signal.Signals]:
+    async def signals() -> AsyncGenerator[signal.Signals, None]:
         await keys.read.wait()
         for before in (False, True):
             if before:
@@ -289,14 +290,11 @@ async def test_keys_steer_the_player_and_a_stopped_program_plays_on_unless_it_wa
             paused.append(player.paused)
         yield signal.SIGTERM
 
-    @contextmanager
-    def job_signals() -> Iterator[AsyncIterator[signal.Signals]]:
-        yield signals()
-
-    monkeypatch.setattr(play_module, "job_signals", job_signals)
     monkeypatch.setattr(os, "kill", lambda *_: paused.append(player.paused))
-    with anyio.fail_after(10), anyio.CancelScope() as everything:
-        await _steer(keys, player, everything, ended_by)
+    async with aclosing(signals()) as received:
+        monkeypatch.setattr(play_module, "job_signals", partial(nullcontext, received))
+        with anyio.fail_after(10), anyio.CancelScope() as everything:
+            await _steer(keys, player, everything, ended_by)
     assert capsys.readouterr().err.splitlines() == ["paused", "playing", "playing at 2 x"]
     assert paused == [True, False, True, True]
     assert everything.cancelled_caught
