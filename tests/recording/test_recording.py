@@ -191,7 +191,7 @@ def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -
         schema = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
         moving_topic, _ = (writer.register_channel(topic, "cdr", schema) for topic in ("/tf", "/tf_static"))
         writer.add_message(moving_topic, 1, encode([moving("map", "base", 1)]), 1)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
     with open_recording(path) as recording:
         assert recording.count == 1
         assert [topic.name for topic in recording.topics] == ["/tf", "/tf_static"]
