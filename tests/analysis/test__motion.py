@@ -33,7 +33,10 @@ def test_a_rate_breaks_down_where_fewer_than_half_of_the_samples_come() -> None:
         stamps = (np.array([*seconds, 100.0]) * 10**9).astype(np.int64)
         none = np.zeros(len(stamps), np.int64)
         samples = MovingSamples("base", stamps, np.array([ROW] * len(stamps)), none, none, None)
-        assert [finding.kind for finding in samples.findings(Limits())] == kinds
+        found = list(samples.findings(Limits()))
+        assert [finding.kind for finding in found] == kinds
+        # The fifth tenth begins after 40 s.
+        assert {stamp for finding in found for stamp in (finding.first, finding.at)} <= {40 * 10**9}
 
 
 @pytest.mark.parametrize("angle", [0.2, 0.9, 1.0, math.pi / 2, 3.0])

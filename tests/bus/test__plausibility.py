@@ -14,6 +14,7 @@ from tfbus import (
     AheadError,
     Buffer,
     Bus,
+    Hold,
     InvalidTransformError,
     PastExtrapolationError,
     PointStamped,
@@ -200,6 +201,16 @@ def test_max_age_bounds_the_future_as_well() -> None:
     assert (caught.value.child, caught.value.stamp, caught.value.ahead) == ("base", NOW + 3 * SECOND // 2, 2 * SECOND)
     assert isinstance(buffer.explain("map", "base", max_age=1.5).errors[0], AheadError)
     assert buffer.can_transform("map", "base", max_age=9.2e9)
+
+
+def test_the_edge_that_is_ahead_is_named_the_lagging_one_or_under_a_policy_the_newest() -> None:
+    bus = bus_at()
+    buffer = Buffer(bus)
+    bus.publish([moving("map", "base", NOW + 2 * SECOND), moving("base", "arm", NOW + 5 * SECOND)])
+    for policy, child in ((None, "base"), (Hold(10.0), "arm")):
+        with pytest.raises(AheadError) as caught:
+            buffer.lookup_nowait("map", "arm", max_age=1.0, extrapolate=policy)
+        assert caught.value.child == child
 
 
 @pytest.mark.every_loop

@@ -3,8 +3,9 @@ import signal
 import sys
 import termios
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncGenerator, Iterator
+from contextlib import aclosing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,7 @@ from support.recorded import write_mcap
 from support.samples import moving
 
 from tfbus import SECOND
-from tfbus.cli._keyboard import Keyboard, _split, keyboard
+from tfbus.cli._keyboard import Keyboard, _split, follow_job, keyboard
 
 pty = pytest.importorskip("pty", reason="this system has no pseudo-terminals")
 
@@ -57,6 +58,50 @@ def test_a_terminal_of_another_session_is_left_alone() -> None:
     finally:
         os.close(ours)
         os.close(theirs)
+
+
+def test_in_the_foreground_keys_come_one_by_one_and_unseen_until_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = pty.openpty()
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
+    try:
+        before = termios.tcgetattr(theirs)
+        raw = [*before[:3], before[3] & ~(termios.ICANON | termios.ECHO)]
+        with Keyboard(theirs) as keys:
+            assert termios.tcgetattr(theirs)[:4] == raw
+            # After a stop, a shell may have left it as it was.
+            keys.take()
+            assert termios.tcgetattr(theirs)[:4] == raw
+        assert termios.tcgetattr(theirs) == before
+        with os.fdopen(os.dup(theirs), encoding="utf-8") as terminal:
+            monkeypatch.setattr(sys, "stdin", terminal)
+            assert keyboard() is not None
+            monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+            assert keyboard() is None
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+@pytest.mark.anyio
+async def test_the_terminal_is_given_back_before_the_program_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[object] = []
+
+    class Noted(Keyboard):
+        def take(self) -> None:
+            steps.append("take")
+
+        def give_back(self) -> None:
+            steps.append("give back")
+
+    async def signals() -> AsyncGenerator[signal.Signals, None]:
+        for number in (signal.SIGCONT, signal.SIGTSTP, signal.SIGTERM, signal.SIGTSTP):
+            yield number
+
+    monkeypatch.setattr(os, "kill", lambda process, number: steps.append((process, number)))
+    async with aclosing(signals()) as received:
+        await follow_job(Noted(0), received, partial(steps.append, "stopped"), partial(steps.append, "continued"))
+    stop = (os.getpid(), signal.SIGSTOP)
+    assert steps == ["take", "stopped", "give back", stop, "take", "continued"]
 
 
 class Session:

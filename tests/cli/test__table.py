@@ -1,4 +1,9 @@
+from collections.abc import Sequence
+
+import pytest
+
 from tfbus.cli._table import Column, table_lines
+from tfbus.cli.commands import compare, info, monitor, robot
 
 COLUMNS = (Column("name"), Column("least", importance=1), Column("count", right=True, importance=2))
 ROWS = [("a", "xyz", "1"), ("long name", "w", "1,000")]
@@ -36,3 +41,42 @@ def test_wide_letters_take_two_columns() -> None:
 
 def test_empty_columns_are_left_out() -> None:
     assert list(table_lines(COLUMNS, [("a", "", "1")], None)) == ["name  count", "a         1"]
+
+
+PLACES = {
+    "frames": info._FRAMES,
+    "times": info._TIMES,
+    "senders": info._SENDERS,
+    "topics": info._TOPICS,
+    "senders with times": (*info._SENDERS, *info._TIMES),
+    "monitor": monitor._COLUMNS,
+    "compare": compare._COLUMNS,
+    "robot": robot._COLUMNS,
+}
+
+
+@pytest.mark.parametrize(
+    ("table", "leave", "left_aligned"),
+    [
+        ("frames", "span, longest gap, samples, authority, kind, rate", "frame, parent, kind, authority"),
+        ("times", "period mean, period p99, delay mean, period max, delay p99, delay max", ""),
+        ("senders", "frames, samples", "sender"),
+        ("topics", "type, messages", "topic, type, read"),
+        (
+            "senders with times",
+            "period mean, period p99, delay mean, period max, delay p99, delay max, frames, samples",
+            "sender",
+        ),
+        ("monitor", "sender, jitter, late, lost, longest gap, p99, max, delay mean", "frame, sender"),
+        ("compare", "std, median, min, mean, max, rmse", "error, unit"),
+        ("robot", "type, joint", "frame, joint, type, position"),
+    ],
+)
+def test_the_columns_of_each_command_leave_in_one_order_and_numbers_stand_at_the_right(
+    table: str, leave: str, left_aligned: str
+) -> None:
+    columns: Sequence[Column] = PLACES[table]
+    optional = [column for column in columns if column.importance is not None]
+    assert ", ".join(column.title for column in sorted(optional, key=lambda column: column.importance or 0)) == leave
+    assert len({column.importance for column in optional}) == len(optional)
+    assert ", ".join(column.title for column in columns if not column.right) == left_aligned

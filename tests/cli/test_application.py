@@ -1,14 +1,19 @@
 """The options that all commands share."""
 
+import inspect
 import logging
+import pkgutil
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from support.commands import Command, check_wrong_call, nobody
 
 from tfbus import Bus
+from tfbus.cli import commands
 from tfbus.cli._overview import COMMANDS
+from tfbus.cli.arguments import Flag, JsonFlag
 from tfbus.cli.domain import LinkOptions
 
 
@@ -65,3 +70,14 @@ def test_completion_is_written_for_a_shell_with_all_commands(
     assert done.returncode == 0
     assert str(script) in (tmp_path / ".bashrc").read_text()
     assert set(COMMANDS) <= set(re.findall(r"\w+", script.read_text()))
+
+
+MODULES = [module.name for module in pkgutil.iter_modules(commands.__path__)]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_no_option_is_on_that_cannot_be_switched_off(name: str) -> None:
+    command = getattr(import_module(f"tfbus.cli.commands.{name}"), name)
+    parameters = inspect.signature(command).parameters.values()
+    flags = [each for each in parameters if each.annotation in (Flag, JsonFlag)]
+    assert [each.name for each in flags if each.default is not False] == []

@@ -32,6 +32,35 @@ def join(options: LinkOptions) -> None:
     options.run(stay_for_a_moment)
 
 
+def test_a_program_for_a_remote_buffer_gets_the_robot_and_the_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tfbus.links import zenoh
+
+    asked: list[tuple[str, dict[str, object]]] = []
+
+    class Client:
+        def __init__(self, domain: str, **options: object) -> None:
+            asked.append((domain, options))
+
+        async def __aenter__(self) -> "Client":
+            return self
+
+        async def __aexit__(self, *_: object) -> None:
+            pass
+
+    async def program(remote: object) -> bool:
+        await anyio.lowlevel.checkpoint()
+        return isinstance(remote, Client)
+
+    monkeypatch.setattr(zenoh, "BufferClient", Client)
+    listen, connect = ("tcp/127.0.0.1:1",), ("tcp/127.0.0.1:2", "tcp/127.0.0.1:3")
+    assert LinkOptions("yard", listen=listen, connect=connect, robots=("r1",)).run_remote(program)
+    assert LinkOptions("yard").run_remote(program)
+    assert asked == [
+        ("yard", {"robot": "r1", "listen": listen, "connect": connect}),
+        ("yard", {"robot": None, "listen": None, "connect": None}),
+    ]
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_two_programs_of_a_domain_hear_each_other_and_return_their_results(backend: str) -> None:
     options = LinkOptions(new_domain(), backend=backend)  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
 import anyio
 import pytest
 
-from tfbus import Buffer, Bus, SimulatedClock, Transform, TransformBroadcaster
+from tfbus import SECOND, Buffer, Bus, SimulatedClock, Transform, TransformBroadcaster
 from tfbus.cli import tutorial
 from tfbus.testing import simulate
 
@@ -33,11 +33,12 @@ async def test_the_first_line_comes_one_second_after_the_start() -> None:
 
 @pytest.mark.parametrize(("duration", "rate", "lines"), [(0.9, 1.0, 0), (0.3, 10.0, 3), (2.5, 2.0, 5)])
 async def test_the_number_of_lines_follows_from_duration_and_rate(duration: float, rate: float, lines: int) -> None:
-    clock = SimulatedClock()
+    start = 1_000 * SECOND
+    clock = SimulatedClock(start)
     output: list[str] = []
     await tutorial.run(clock, duration=duration, listen_rate=rate, output=output.append)
     assert len(output) == lines
-    assert clock.now() == round(duration * 1e9)
+    assert clock.now() == start + round(duration * 1e9)
 
 
 async def test_without_a_broadcaster_each_line_says_which_frame_is_missing() -> None:

@@ -15,6 +15,7 @@ from support.strategies import rotations, transforms, vectors
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformArray
 from tfbus.geometry.rows import Quaternion, Vector
+from tfbus.geometry.transform_array import from_rows
 from tfbus.tree._kernel import ONE_BY_ONE
 
 ONE = (0.0, 0.0, 0.0, 1.0)
@@ -418,3 +419,9 @@ def test_a_data_frame_has_a_row_for_each_transform(library: str) -> None:
 def test_a_data_frame_is_of_pandas_or_polars() -> None:
     with pytest.raises(ValueError, match="'pandas' or 'polars', not 'os'"):
         ahead(0.0).to_dataframe("os")
+
+
+def test_rows_become_as_many_transforms_and_none_become_none() -> None:
+    row = (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    assert [len(from_rows([row] * count)) for count in range(3)] == [0, 1, 2]
+    assert from_rows([row])[0] == Transform((1.0, 2.0, 3.0))

@@ -219,7 +219,11 @@ def test_gaps_in_the_numbers_of_a_peer_are_messages_that_were_lost(given: tuple[
         assert here.counts == (len(given), len(given), 0, lost)
 
 
-@pytest.mark.parametrize(("second", "told"), [(2, 1), (3, 0)], ids=["without a gap", "after one lost message"])
+@pytest.mark.parametrize(
+    ("second", "told"),
+    [(1, 1), (2, 1), (3, 0)],
+    ids=["of the same message", "without a gap", "after one lost message"],
+)
 def test_a_claim_after_a_lost_message_is_not_believed(second: int, told: int) -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=1, number=1)
@@ -260,6 +264,17 @@ def test_a_claim_that_is_near_a_large_number_is_believed() -> None:
         assert (mirror.number, here.reports) == (2**40 + 1, [])
 
 
+@pytest.mark.parametrize(("step", "refused"), [(2**32, []), (2**32 + 1, [("peer", "number")])])
+def test_a_claim_of_more_changes_than_anybody_makes_is_refused(step: int, refused: list[tuple[str, str]]) -> None:
+    with receiver() as here:
+        here.receive(moving("map", "a", 1), sequence=1, number=1)
+        peer = here.peers.find("peer")
+        assert peer is not None
+        peer.mirror = Mirror(10)
+        here.receive_bytes(encode(()), pack(2, [], StateStep(0, step, 0)))
+        assert here.reports == refused
+
+
 def test_each_peer_has_numbers_of_its_own_and_begins_anew_when_it_comes_back() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=1, number=2)
@@ -294,6 +309,15 @@ def test_other_origins_are_other_sources() -> None:
         here.receive(moving("map", "a", 10), origin=ORIGIN, sequence=5)
         here.receive(moving("map", "a", 9), origin=OTHER, sequence=1)
         assert here.counts == (2, 2, 0, 0)
+
+
+def test_a_moving_sample_does_not_replace_a_static_one_that_was_said_later() -> None:
+    with receiver() as here:
+        here.receive(static("map", "a", 1.0), origin=ORIGIN, sequence=5)
+        here.receive(moving("map", "a", 8), origin=OTHER, sequence=4)
+        assert here.heard == [(static("map", "a", 1.0),)]
+        here.receive(moving("map", "a", 9), origin=OTHER, sequence=6)
+        assert here.heard[1:] == [(moving("map", "a", 9),)]
 
 
 # What was removed.

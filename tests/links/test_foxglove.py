@@ -130,6 +130,8 @@ async def test_an_application_gets_the_static_frames_and_then_what_is_published(
         assert base == (START + 5, "map", "base", turned.translation, turned.rotation)
         assert arm == (START + 7, "map", "arm", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         assert (server.sent, server.not_sent) == (3, 0)
+        assert bus._subscribers.callbacks
+    assert not bus._subscribers.callbacks
 
 
 async def test_a_second_application_gets_the_static_frames_of_now(bus: Bus) -> None:
@@ -176,6 +178,14 @@ async def test_a_port_that_is_taken_is_an_error(bus: Bus) -> None:
     ):
         async with FoxgloveServer(bus, taken.getsockname()[1]):
             pytest.fail("entered")
+
+
+async def test_after_its_end_a_server_has_no_address_and_its_port_is_free(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0) as server:
+        port = int(server.address.rpartition(":")[2])
+    assert server.address == ""
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port))
 
 
 async def test_a_server_is_entered_once_and_not_on_a_closed_bus(bus: Bus) -> None:

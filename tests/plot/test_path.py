@@ -27,6 +27,26 @@ def test_a_circle_marks_the_start_and_a_square_the_end() -> None:
     assert marks == {"o": [1.0], "s": [5.0]}
 
 
+def test_the_lines_have_colours_of_their_own_and_a_legend() -> None:
+    [axes] = plot_path(TREE, "map", "a", "b").axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
+    colours = [line.get_color() for line in axes.lines]
+    assert colours == [colours[0]] * 3 + [colours[3]] * 3
+    assert colours[0] != colours[3]
+    assert axes.xaxis.get_gridlines()[0].get_visible()
+    assert axes.get_adjustable() == "datalim"
+
+
+def test_an_instant_without_an_answer_is_neither_start_nor_end() -> None:
+    tree = tree_of(*over("map", "a", (SECOND, 3 * SECOND), speed=1e-9), *over("map", "b", (0, 4 * SECOND)), keep=None)
+    [axes] = plot_path(tree, "b", "a").axes
+    marks = {line.get_marker(): np.asarray(line.get_xdata()).tolist() for line in axes.lines[1:]}
+    assert [len(places) for places in marks.values()] == [1, 1]
+    assert all(np.isfinite(places).all() for places in marks.values())
+
+
 def test_three_dimensions_have_three_axes() -> None:
     [axes] = plot_path(TREE, "map", "a", three_d=True).axes
     assert axes.name == "3d"

@@ -49,6 +49,16 @@ def test_several_frames_and_recordings_have_lines_and_names_of_their_own() -> No
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [str(line.get_label()) for line in lines]
 
 
+def test_the_axes_have_grids_and_share_their_time_and_the_legend_has_at_most_four_columns() -> None:
+    tree = tree_of(*over("map", "a", (0, SECOND)), *(static("a", f"b{k}", 1.0) for k in range(5)))
+    figure = plot_transforms(tree, "map", "a", *(f"b{k}" for k in range(5)))
+    first, *others = figure.axes
+    assert all(axes.xaxis.get_gridlines()[0].get_visible() for axes in figure.axes)
+    assert all(axes.get_shared_x_axes().joined(first, axes) for axes in others)
+    assert figure.legends[0]._ncols == 4  # type: ignore[attr-defined]
+    assert plot_transforms(tree, "map", "a", "b1").legends[0]._ncols == 2  # type: ignore[attr-defined]
+
+
 def test_changes_of_rounding_do_not_fill_an_axis() -> None:
     tree = TransformTree()
     for step in range(4):

@@ -1,5 +1,6 @@
 import sqlite3
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -275,3 +276,25 @@ def test_new_names_are_checked() -> None:
     for arguments in ({"rename": {"a": "/b"}}, {"rename": {"a": ""}}, {"prefix": "/r"}):
         with pytest.raises(ValueError, match="a frame name"):
             Edits(**arguments)
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="this system does not list open files")
+@pytest.mark.parametrize("ending", ["mcap", "bag", "db3"])
+def test_a_conversion_that_fails_leaves_no_file_and_keeps_none_open(tmp_path: Path, ending: str) -> None:
+    def fail(_: int) -> None:
+        raise EOFError
+
+    def opened() -> list[Path]:
+        found = []
+        for descriptor in Path("/proc/self/fd").iterdir():
+            # The one by which they are listed has gone.
+            with suppress(OSError):
+                found.append(descriptor.readlink())
+        return [path for path in found if tmp_path in path.parents or path == SMALL.resolve()]
+
+    with pytest.raises(EOFError) as raised:
+        convert([SMALL], tmp_path / f"copy.{ending}", progress=fail)
+    # Its traceback still refers to all that was opened.
+    assert raised.tb is not None
+    assert list(tmp_path.iterdir()) == []
+    assert opened() == []

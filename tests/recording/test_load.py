@@ -241,7 +241,7 @@ def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Pa
     # The same instant again: the sample that comes later counts.
     lines.insert(1_500, (14_990, moving("a", "b", 14_990, -1.0)))
     # Beyond the bound, each along another axis, and each in another block.
-    for place, far in ((1_950, (1e13, 0.0, 0.0)), (1_400, (0.0, 1e13, 0.0)), (900, (0.0, 0.0, 1e13))):
+    for place, far in ((1_950, (1e13, 0.0, 0.0)), (1_600, (0.0, 1e13, 0.0)), (1_300, (0.0, 0.0, 1e13))):
         lines.insert(place, (10 * place - 10, TransformStamped("a", "b", 10 * place - 5, Transform(far))))
     with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
@@ -254,3 +254,31 @@ def test_a_long_recording_is_loaded_in_blocks_as_message_by_message(tmp_path: Pa
     asked = [0, 5, 9_990, 14_980, 14_990, 15_000, 17_995, 19_990]
     expected = [0.0, 0.5, 999.0, 1_498.0, -1.0, 1_500.0, 1_799.5, 1_999.0]
     assert [x_of(tree, "a", "b", stamp) for stamp in asked] == expected
+
+
+@pytest.mark.parametrize("axis", [None, 0, 1, 2])
+def test_samples_that_change_no_edge_are_stored_at_once_unless_one_is_beyond_the_bound(
+    tmp_path: Path, axis: int | None
+) -> None:
+    # The blocks of so many messages are several, and the first one names the frame.
+    lines = [(k, moving("a", "b", 10 * k, float(k), "slam")) for k in range(8_192 + 300)]
+    if axis is not None:
+        far = [0.0, 0.0, 0.0]
+        far[axis] = -1e5
+        lines.insert(8_400, (8_400, TransformStamped("a", "b", 83_995, Transform(far), "slam")))
+    with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
+        output.write([(received, (sample,)) for received, sample in lines])
+        output.finish()
+    problems: Counter[str] = Counter()
+    tree = load(tmp_path / "run.mcap", problems=problems, max_translation=9e3)
+    assert problems == ({} if axis is None else {"not physical": 1})
+    (edge,) = tree.edges()
+    assert (edge.samples, edge.oldest, edge.newest, edge.authority) == (8_492, 0, 84_910, "slam")
+    assert [x_of(tree, "a", "b", stamp) for stamp in (81_915, 83_990, 84_000, 84_910)] == [
+        8_191.5,
+        8_399.0,
+        8_400.0,
+        8_491.0,
+    ]
+    tree.insert(moving("a", "b", 84_920, 8_492.0))
+    assert x_of(tree, "a", "b", 84_915) == 8_491.5

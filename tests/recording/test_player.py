@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import anyio
 import anyio.lowlevel
@@ -416,6 +417,45 @@ def test_each_message_is_published_at_its_time(
     heard: list[float] = []
     in_virtual_time(play)
     assert [time - heard[0] for time in heard] == pytest.approx([time / rate for time in times], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "options", [{"topics": ["/tf"], "namespaces": True}, {"prefix": "/r1"}, {"rate": 0.0}, {"since": 2, "until": 1}]
+)
+async def test_wrong_options_are_refused_at_once(options: dict[str, Any]) -> None:
+    with Bus() as bus, pytest.raises(ValueError, match=r"."):
+        Player(bus, "nowhere.mcap", **options)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_a_pause_and_a_new_rate_count_from_their_moment(tmp_path: Path, simulated: bool) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+    heard: list[float] = []
+
+    async def play() -> None:
+        # The clock of the loop is not at zero at the beginning.
+        await anyio.sleep(1_000.0)
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            first = anyio.Event()
+
+            def hear(_: Batch) -> None:
+                heard.append(anyio.current_time())
+                first.set()
+
+            bus.subscribe(hear)
+            player = Player(bus, path)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                await first.wait()
+                await anyio.sleep(3.0)
+                player.pause()
+                await anyio.sleep(100.0)
+                player.resume()
+                await anyio.sleep(2.0)
+                player.rate = 5.0
+
+    in_virtual_time(play)
+    assert heard[1] - heard[0] == pytest.approx(3.0 + 100.0 + 2.0 + (10.0 - 5.0) / 5.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])

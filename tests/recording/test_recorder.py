@@ -218,6 +218,19 @@ async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(tmp_path:
         await recorder.flush()
 
 
+async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, path) as recorder:
+            # So many are written at once, and a quarter of them more.
+            for number in range(5_120):
+                bus.publish(moving("map", "a", number))
+            await recorder.flush()
+            assert recorder.statistics().queue.pending == 0
+            with open_recording(path) as recording:
+                assert sum(map(len, recording.blocks())) == 5_120
+
+
 async def test_several_tasks_may_wait_for_a_flush(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:

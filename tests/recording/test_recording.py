@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
 from support.recorded import SMALL, as_ros2, messages_in, write_mcap
 from support.samples import moving, static
@@ -180,3 +181,17 @@ def test_without_a_package_the_error_names_the_extra() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("missing extra ")
     assert 'pip install "tfbus[bag]"' in done.stdout
+
+
+def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
+        moving_topic, _ = (writer.register_channel(topic, "cdr", schema) for topic in ("/tf", "/tf_static"))
+        writer.add_message(moving_topic, 1, encode([moving("map", "base", 1)]), 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with open_recording(path) as recording:
+        assert recording.count == 1
+        assert [topic.name for topic in recording.topics] == ["/tf", "/tf_static"]

@@ -23,6 +23,10 @@ def states(scene: Scene) -> dict[str, EdgeState]:
 
 def test_no_scene_has_nothing_to_draw() -> None:
     assert {len(part) for part in NO_SCENE} == {0}
+    some = read(tree_of(moving("map", "base", 0)), selected="base")
+    for none, one in zip(NO_SCENE, some, strict=True):
+        if isinstance(none, np.ndarray) and isinstance(one, np.ndarray):
+            assert (none.shape[1:], none.dtype) == (one.shape[1:], one.dtype)
 
 
 def test_poses_are_positions_and_quaternions_with_w_first() -> None:

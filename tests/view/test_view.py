@@ -151,6 +151,7 @@ async def test_what_happens_is_drawn_while_somebody_looks(
         # A picture that fails is told, and the next one is drawn.
         monkeypatch.setattr(view._page, "picture", lambda _: 1 / 0)
         view.add_points(PointCloud("map", LATEST, np.zeros((1, 3))))
+        assert list(view._screen._points) == ["points"]
         while "could not be drawn" not in caplog.text:  # noqa: ASYNC110 - a log line sets no event
             await anyio.sleep(0.001)
         monkeypatch.delattr(view._page, "picture")

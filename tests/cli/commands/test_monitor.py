@@ -5,6 +5,7 @@ from support.commands import Command, check_wrong_call
 from support.samples import moving, static
 
 from tfbus import SECOND, Bus
+from tfbus.cli.commands.monitor import Chain, text_lines
 
 
 async def publish(bus: Bus) -> None:
@@ -58,6 +59,18 @@ def test_it_is_printed_again_and_again_as_json_too(tfbus: Command) -> None:
     ]
     done = tfbus.on_domain(publish_for_a_while, "monitor", "--rate", "1")
     assert done.stdout.count("frame ") == 3
+
+
+def test_the_way_between_two_frames_is_folded_and_indented_on_a_narrow_terminal() -> None:
+    chain = Chain([f"frame_{number}" for number in range(9)], "frame_3", 0.25, "")
+    (whole, blank, none), (first, *others) = (list(text_lines([], chain, width)) for width in (None, 40))
+    assert (blank, none) == ("", "(no frames)")
+    assert whole.startswith("frame_0 ")
+    assert first.startswith("frame_0 ")
+    folded = others[: others.index("")]
+    assert len(folded) > 1
+    assert all(line.startswith("  ") and line[2] != " " for line in folded)
+    assert " ".join([first, *(line.strip() for line in folded)]) == whole
 
 
 def test_half_a_pair_is_a_usage_error(tfbus: Command) -> None:

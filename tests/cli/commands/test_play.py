@@ -1,5 +1,11 @@
+import os
 import re
-from collections.abc import Sequence
+import signal
+import sys
+from collections import Counter
+from collections.abc import AsyncGenerator, AsyncIterator, Iterator, Sequence
+from contextlib import aclosing, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 
 import anyio
@@ -9,10 +15,13 @@ from support.processes import new_domain
 from support.programs import free_address, start_tfbus
 from support.recorded import SMALL, WRONG_IN_SMALL, messages_in, write_mcap
 from support.samples import moving, static
-from support.terminal import on_a_terminal
+from support.terminal import Terminal, on_a_terminal
 
 from tfbus import SECOND, Bus, PeerJoined, SystemClock, TransformStamped
-from tfbus.cli.commands.play import press
+from tfbus.cli._keyboard import Keyboard
+from tfbus.cli.commands import play as play_module
+from tfbus.cli.commands.play import _print_summary, _show_progress, _steer, press
+from tfbus.recording import Player
 
 START = 1_700_000_000 * SECOND
 BACKENDS = ["asyncio", "trio"]
@@ -247,3 +256,100 @@ def test_each_key_does_one_thing(key: str, paused: bool, rate: float, done: str,
     press(player, key)  # type: ignore[arg-type]
     assert player.done == done
     assert player.rate == pytest.approx(after)
+
+
+class Typed(Keyboard):
+    """Keys that are typed at once, on no terminal."""
+
+    def __init__(self, *typed: str) -> None:
+        super().__init__(-1)
+        self._typed = typed
+        self.read = anyio.Event()
+
+    async def keys(self) -> AsyncIterator[str]:
+        for key in self._typed:
+            yield key
+        self.read.set()
+        await anyio.sleep_forever()
+
+
+@pytest.mark.anyio
+async def test_keys_steer_the_player_and_a_stopped_program_plays_on_unless_it_was_paused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    keys, player = Typed(" ", " ", "+"), Player(Bus(), "run.mcap")
+    paused: list[bool] = []
+    ended_by: list[int] = []
+
+    async def signals() -> AsyncGenerator[signal.Signals, None]:
+        await keys.read.wait()
+        for before in (False, True):
+            if before:
+                player.pause()
+            yield signal.SIGTSTP
+            paused.append(player.paused)
+        yield signal.SIGTERM
+
+    monkeypatch.setattr(os, "kill", lambda *_: paused.append(player.paused))
+    async with aclosing(signals()) as received:
+        monkeypatch.setattr(play_module, "job_signals", partial(nullcontext, received))
+        with anyio.fail_after(10), anyio.CancelScope() as everything:
+            await _steer(keys, player, everything, ended_by)
+    assert capsys.readouterr().err.splitlines() == ["paused", "playing", "playing at 2 x"]
+    assert paused == [True, False, True, True]
+    assert everything.cancelled_caught
+    assert ended_by == [signal.SIGTERM]
+
+
+def test_with_a_keyboard_it_names_the_keys_and_sigterm_ends_it(
+    tfbus: Command, ten_seconds: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def job_signals() -> Iterator[AsyncIterator[signal.Signals]]:
+        async def signals() -> AsyncIterator[signal.Signals]:
+            yield signal.SIGTERM
+
+        yield signals()
+
+    monkeypatch.setattr(play_module, "keyboard", Typed)
+    monkeypatch.setattr(play_module, "job_signals", job_signals)
+    done, _ = play(tfbus, ten_seconds)
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stderr.splitlines()[1].startswith("space pauses, s or the right arrow plays the next message")
+
+
+@pytest.mark.parametrize(
+    ("passes", "position", "told"),
+    [
+        (0, None, "7 samples in 5 messages played in 1.5 s"),
+        (1, 3 * SECOND, "7 samples in 5 messages played in 1.5 s, 2.0 s of the recording"),
+        (2, 3 * SECOND, "7 samples in 5 messages played in 1.5 s, 2 times to the end"),
+    ],
+)
+def test_the_last_line_counts_what_was_played(
+    capsys: pytest.CaptureFixture[str], passes: int, position: int | None, told: str
+) -> None:
+    with Bus() as bus:
+        player = Player(bus, "run.mcap")
+        player.played, player.messages, player.passes = 7, 5, passes
+        player.start, player.position = SECOND, position
+        _print_summary(player, bus, 1.5)
+        assert capsys.readouterr().err == f"{told}\n"
+        player.bad = Counter(nan=2)
+        _print_summary(player, bus, 1.5)
+        assert capsys.readouterr().err == f"{told}\ntfbus: left out: 2 x nan\n"
+
+
+@pytest.mark.anyio
+async def test_the_bar_shows_how_far_and_how_fast_it_plays(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    player = Player(Bus(), "run.mcap", rate=2.0)
+    player.start, player.end, player.position = 10 * SECOND, 14 * SECOND, 11 * SECOND
+    player.pause()
+    with anyio.move_on_after(0.0):
+        await _show_progress(player)
+    shown = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    assert "paused at 2 x" in shown
+    assert " 25%" in shown

@@ -1,16 +1,19 @@
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support import pr2
-from support.commands import START, Command, check_wrong_call
+from support.commands import START, Command, check_wrong_call, nobody
 from support.processes import new_domain, until
 from support.programs import free_address, start_tfbus
 
 from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
+from tfbus.cli.commands import robot
 from tfbus.cli.commands.robot import tree_lines
 
 CRANE = """<?xml version="1.0"?>
@@ -262,6 +265,55 @@ def test_following_needs_ros_and_no_positions(tfbus: Command, words: tuple[str, 
 @pytest.mark.parametrize("words", [(), ("--follow",), ("--follow", "--tree", "--ros", "dds")])
 def test_without_a_urdf_that_of_ros_is_followed(tfbus: Command, words: tuple[str, ...]) -> None:
     check_wrong_call(tfbus("robot", *words), "give")
+
+
+class Ros:
+    """Links to ROS that pass on a description and positions at once, and note what they were asked for."""
+
+    def __init__(self, description: str) -> None:
+        self._description = description
+        self.asked: list[tuple[str, str, object, object]] = []
+
+    @asynccontextmanager
+    async def link(self, _: Bus, place: str, *, send: bool, frames: object, **takes: Any) -> AsyncIterator[None]:
+        ((what, take),) = takes.items()
+        self.asked.append((place, what, send, frames))
+        if what == "robot_description":
+            take(self._description)
+        else:
+            take({"swing": 0.5}, 5 * SECOND)
+        yield
+
+
+def test_ros_describes_a_robot_and_moves_it(tfbus: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    ros, found = Ros(CRANE), list[TransformStamped]()
+    monkeypatch.setattr(robot, "ros_link", ros.link)
+
+    async def ask(bus: Bus) -> None:
+        with Buffer(bus) as buffer:
+            found.append(await buffer.lookup("r1/base", "r1/boom"))
+
+    done = tfbus.on_domain(ask, "robot", "--follow", "--ros", "dds:7", "--prefix", "r1/")
+    assert done.returncode == 130
+    assert done.stderr.splitlines()[:2] == [
+        "waiting for /robot_description of ROS at dds:7",
+        "publishing the frames of 'crane' as /joint_states of ROS at dds:7 says, until Ctrl-C",
+    ]
+    assert ros.asked == [("dds:7", "robot_description", False, ()), ("dds:7", "joint_states", False, ())]
+    assert found[0].stamp == 5 * SECOND
+    assert found[0].transform.as_rpy()[2] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"), [("/etc/passwd", "/robot_description holds no URDF"), ("<robot", "/robot_description: ")]
+)
+def test_a_description_of_ros_that_is_none_is_a_usage_error(
+    tfbus: Command, monkeypatch: pytest.MonkeyPatch, text: str, why: str
+) -> None:
+    monkeypatch.setattr(robot, "ros_link", Ros(text).link)
+    done = tfbus.on_domain(nobody, "robot", "--follow", "--ros", "dds")
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith(f"tfbus: {why}")
 
 
 @pytest.mark.thorough

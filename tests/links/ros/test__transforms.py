@@ -46,6 +46,15 @@ def test_a_transform_that_is_not_valid_is_refused_and_the_next_one_is_there(tran
     assert error.child in ("", "a", None)
 
 
+def test_the_shortest_transforms_are_not_taken_for_too_few_bytes() -> None:
+    # 76 bytes each, without a letter in their names.
+    shortest = ros1(*[(b"", b"", 1, 0, UNIT)] * 100)
+    assert len(shortest) == 4 + 100 * 76
+    decoded = decode_ros1(shortest)
+    assert decoded.samples == [None] * 100
+    assert {error.reason for error in decoded.errors} == {"frame name"}
+
+
 def test_no_bytes_raise_another_error_than_that_they_are_no_message() -> None:
     whole = ros1(*map(ros1_of, SAMPLES))
     for size in range(len(whole)):

@@ -1,3 +1,5 @@
+import json
+import math
 from typing import Any
 
 import anyio
@@ -7,6 +9,7 @@ pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
 from support.processes import until
 from support.rosbridge import rosbridge_server
+from support.samples import moving
 
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Presence, Received
@@ -66,3 +69,88 @@ async def test_attempts_to_come_back_are_ever_further_apart_up_to_a_limit(monkey
     for pause, longest in zip(pauses, [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0, 5.0], strict=True):
         assert longest / 2 <= pause <= longest
     assert len(set(pauses[5:])) == 3
+
+
+class Alone:
+    """A carrier that was not opened, what it could not send, and what it asks its server for."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, waits: list[bool] | None = None) -> None:
+        self.errors: list[Exception] = []
+        self.pauses: list[float] = []
+        self._waits = iter([] if waits is None else waits)
+        self.carrier = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({}), lookup_waits=lambda: next(self._waits))
+        self.carrier._report = self.report = SendReport(self.errors.append)
+        self._left = None if waits is None else len(waits)
+        monkeypatch.setattr(anyio, "sleep", self._sleep)
+
+    async def _sleep(self, seconds: float) -> None:
+        if len(self.pauses) == self._left:
+            raise EOFError
+        self.pauses.append(seconds)
+
+    def requests(self) -> list[tuple[str, str]]:
+        """Operation and topic of each request since the last call."""
+        taken = [json.loads(text) for text in self.carrier._requests]
+        self.carrier._requests.clear()
+        return [(request["op"], request["topic"]) for request in taken]
+
+
+def again(topic: str) -> list[tuple[str, str]]:
+    return [("unsubscribe", topic), ("subscribe", topic)]
+
+
+async def test_moving_frames_are_refused_while_the_server_is_away_or_hides_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alone = Alone(monkeypatch)
+    samples = [moving("map", "a", 1), moving("map", "b", 1)]
+    assert alone.carrier._publish(samples, static=False) is False
+    alone.carrier._socket = socket = object()  # type: ignore[assignment]
+    alone.carrier._held_until = math.inf
+    assert alone.carrier._publish(samples, static=False) is False
+    assert alone.report.not_sent == {"not connected": 2, "rejoining": 2}
+    assert ["is not connected" in str(alone.errors[0]), "which hides others" in str(alone.errors[1])] == [True, True]
+    alone.carrier._held_until = -math.inf
+    # The topic is advertised with the first ones; the oldest give way.
+    for _ in range(_carrier.MOST_QUEUED):
+        assert alone.carrier._publish(samples, static=False) is True
+    assert (alone.requests(), len(alone.errors)) == ([("advertise", "/tf")], 2)
+    assert alone.carrier._publish(samples[:1], static=False) is True
+    assert alone.report.not_sent["congested"] == 2
+    assert [count for _, count in alone.carrier._moving] == [2] * (_carrier.MOST_QUEUED - 1) + [1]
+    assert alone.carrier._socket is socket
+
+
+async def test_static_frames_are_asked_for_ever_more_seldom_while_a_lookup_waits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alone = Alone(monkeypatch, [True] * 6 + [False, True])
+    alone.carrier._heard_moving = True
+    with pytest.raises(EOFError):
+        await alone.carrier._ask_again()
+    assert alone.pauses == [1.0, 2.0, 4.0, 8.0, 16.0, 16.0, 16.0, 1.0]
+    assert alone.requests() == again("/tf_static") * 7
+
+
+@pytest.mark.parametrize(
+    ("heard", "advertised", "asks"), [(False, False, True), (True, False, False), (False, True, False)]
+)
+async def test_moving_frames_are_asked_for_again_if_none_has_come_and_none_is_sent(
+    monkeypatch: pytest.MonkeyPatch, heard: bool, advertised: bool, asks: bool
+) -> None:
+    alone = Alone(monkeypatch, [True])
+    alone.carrier._heard_moving, alone.carrier._advertised = heard, advertised
+    with pytest.raises(EOFError):
+        await alone.carrier._ask_again()
+    assert alone.requests() == again("/tf_static") + again("/tf") * asks
+
+
+async def test_the_time_of_holding_back_ends_with_a_new_subscription(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = Alone(monkeypatch)
+    await alone.carrier._end_holding()
+    assert (alone.pauses, alone.requests()) == ([0.0], [])
+    monkeypatch.setattr(_carrier, "monotonic", lambda: 100.0)
+    alone.carrier._held_until = 107.5
+    await alone.carrier._end_holding()
+    assert (alone.pauses[1:], alone.requests()) == ([7.5], again("/tf"))
+    assert alone.carrier._held_until == -math.inf

@@ -126,6 +126,7 @@ def test_positions_of_joints_are_read_in_every_encoding() -> None:
     numbered = struct.pack("<I", 256) + ros1[4:]
     for content in (cdr, ros1, numbered, fields, cbor2.loads(cbor2.dumps(tagged))):
         assert decode_joints(content) == (5, {"a": 0.5, "b": 1.5})
+    assert decode_joints({**fields, "name": ["a"]}) == (5, {"a": 0.5})
     assert json.loads(subscribe("/j", "cbor", JOINT_TYPE))["type"] == "sensor_msgs/JointState"
 
 
@@ -136,6 +137,11 @@ def test_positions_of_joints_are_read_in_every_encoding() -> None:
 def test_what_holds_no_positions_is_malformed(content: Any) -> None:
     with pytest.raises(MalformedMessageError):
         decode_joints(content)
+    strange = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": ["x" * 1_000]}
+    with pytest.raises(MalformedMessageError) as raised:
+        decode_joints(strange)
+    assert str(raised.value).count("x") < 200
+    assert str(raised.value).endswith("x")
     few = {"header": {"stamp": {"sec": 0, "nanosec": 5}}, "name": ["a"], "position": []}
     with pytest.raises(MalformedMessageError, match="1 names, and 0 positions"):
         decode_joints(few)

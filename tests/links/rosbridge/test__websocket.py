@@ -49,6 +49,31 @@ async def test_messages_come_whole_and_a_ping_is_answered() -> None:
         await socket.close()
 
 
+@pytest.mark.parametrize(
+    ("path", "target"), [("", "/"), ("/ros", "/ros"), ("?token=1", "/?token=1"), ("/ros?a=1&b=2", "/ros?a=1&b=2")]
+)
+async def test_the_path_and_the_query_of_the_url_are_asked_for(path: str, target: str) -> None:
+    asked: list[str] = []
+
+    async def answer(stream: anyio.abc.SocketStream) -> None:
+        async with stream:
+            server = WSConnection(ConnectionType.SERVER)
+            server.receive_data(await stream.receive())
+            for event in server.events():
+                assert isinstance(event, Request)
+                asked.append(event.target)
+            await stream.send(server.send(AcceptConnection()))
+
+    listener = await anyio.create_tcp_listener(local_host="127.0.0.1")
+    async with listener, anyio.create_task_group() as tasks:
+        tasks.start_soon(listener.serve, answer)
+        port = listener.extra(anyio.abc.SocketAttribute.local_port)
+        socket = await WebSocket.connect(f"ws://127.0.0.1:{port}{path}", 100, 5)
+        await socket.close()
+        tasks.cancel_scope.cancel()
+    assert asked == [target]
+
+
 async def test_a_message_that_is_too_large_is_cut_off_before_it_has_come() -> None:
     async with rosbridge_server() as server:
         socket = await WebSocket.connect(server.url, 100_000, 5)

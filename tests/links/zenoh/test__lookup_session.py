@@ -1,7 +1,11 @@
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
+import zenoh
 from support.processes import until
 
-from tfbus.links.zenoh._lookup_session import LookupSession
+from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 
 pytestmark = pytest.mark.anyio
 
@@ -29,3 +33,62 @@ async def test_servers_and_askers_of_one_robot_are_heard_of_and_no_others(addres
 
 async def test_without_a_domain_it_is_tf_and_without_a_robot_a_tilde() -> None:
     assert LookupSession(None, None, None, None, None, None, 2.0).key("@lookup", "a") == "tfbus/tf/~/@lookup/a"
+
+
+class Network:
+    """Notes the questions that are asked, and fails where the session has ended."""
+
+    def __init__(self, failing: bool = False) -> None:
+        self.asked: list[tuple[str, Any, dict[str, Any]]] = []
+        self._failing = failing
+
+    def get(self, key: str, handler: Any, **options: Any) -> None:
+        if self._failing:
+            raise zenoh.ZError("the session is closed")
+        self.asked.append((key, handler, options))
+
+
+@pytest.mark.parametrize(
+    ("replies", "answer"), [((), None), ((None,), None), ((None, b"yes"), b"yes"), ((b"yes", b"no"), b"yes")]
+)
+@pytest.mark.parametrize("to_all", [False, True])
+async def test_a_question_has_one_answer_or_none(
+    replies: tuple[bytes | None, ...], answer: bytes | None, to_all: bool
+) -> None:
+    session, network, took = LookupSession("yard", None, None, None, None, None, 2.0), Network(), list[bytes | None]()
+    session._session = network  # type: ignore[assignment]
+    session.ask(b"question", took.append, 3.0, to_all)
+    assert (session.unsent, took) == (1, [])
+    # As the session's thread does.
+    session._sending.get()()  # type: ignore[misc]
+    ((key, handler, options),) = network.asked
+    for reply in replies:
+        ok = None if reply is None else SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda reply=reply: reply))
+        handler.callback(SimpleNamespace(ok=ok))
+    handler.drop()
+    assert took == [answer]
+    assert (key, options["payload"], options["timeout"]) == ("tfbus/yard/~/lookup", b"question", 3.0)
+    assert options["target"] == (zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING)
+    # The sender must not wait in zenoh for others.
+    assert options["express"] is True
+
+
+async def test_a_question_of_a_session_that_has_ended_has_no_answer() -> None:
+    session, took = LookupSession("yard", None, None, None, None, None, 2.0), list[bytes | None]()
+    session._session = Network(failing=True)  # type: ignore[assignment]
+    session.ask(b"question", took.append, 3.0)
+    session._sending.get()()  # type: ignore[misc]
+    assert took == [None]
+
+
+async def test_an_answer_is_sent_at_once_and_the_question_ends_whether_or_not_the_asker_is_there() -> None:
+    done: list[object] = []
+    for failing in (False, True):
+
+        def reply(key: str, answer: bytes, express: bool, failing: bool = failing) -> None:
+            done.append((key, answer, express))
+            if failing:
+                raise zenoh.ZError("the asker has gone")
+
+        reply_now(SimpleNamespace(key_expr="k", reply=reply, drop=lambda: done.append("drop")), b"a")  # type: ignore[arg-type]
+    assert done == [("k", b"a", True), "drop"] * 2

@@ -1,8 +1,10 @@
 import errno
 import socket
-from collections.abc import Callable, Iterator
+import struct
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from queue import Queue
+from types import SimpleNamespace
 from typing import Any
 from uuid import uuid4
 
@@ -10,10 +12,12 @@ import pytest
 import zenoh
 from support.processes import PATIENCE
 
+from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._receive_queue import Answer, Presence, Received
+from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Received
+from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
-from tfbus.links.zenoh._session import MOST_QUESTIONS, ZenohSession
+from tfbus.links.zenoh._session import MOST_NAMES, MOST_QUESTIONS, ZenohSession
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError
 
@@ -114,8 +118,8 @@ def test_a_question_and_its_answer_are_received(join: Join) -> None:
 def test_a_question_tells_that_the_peer_is_heard_if_it_is(join: Join, domain: str) -> None:
     first, second = join(A), join(B)
     meet(first, second)
-    for heard in (False, True):
-        second.session.ask(A, 0, heard)
+    for heard in ({}, {"heard": True}):
+        second.session.ask(A, 0, **heard)
         first.next().content.handle.drop()
     assert first.heard_by.get(timeout=PATIENCE) == Keys(domain, B).token(FIRST_SESSION).encode()
     assert first.heard_by.empty()
@@ -282,3 +286,223 @@ def test_a_session_closed_before_it_was_open_does_not_stay_open(join: Join, doma
     assert first.next() == Received(third.id, Presence.JOINED)
     second.session.close()
     assert second.items.empty()
+
+
+def closed_end() -> End:
+    """An end that was not opened; a test calls it as zenoh's threads do."""
+    return End(A, "yard", zenoh.Config())
+
+
+class Payload(bytes):
+    """The bytes of a sample, as zenoh has them."""
+
+    def to_bytes(self) -> bytes:
+        return bytes(self)
+
+
+class Asked:
+    """A query, and whether it was dropped."""
+
+    key_expr = "tfbus/yard/~/history/" + A
+    attachment: Payload | None = None
+
+    def __init__(self, payload: bytes | None) -> None:
+        self.payload = None if payload is None else Payload(payload)
+        self.dropped = 0
+
+    def drop(self) -> None:
+        self.dropped += 1
+
+
+@pytest.mark.parametrize(
+    ("payload", "asked"),
+    [
+        (None, None),
+        (bytes(7), None),
+        (struct.pack("<d", 1.5), (1.5, "")),
+        (struct.pack("<d", 1.5) + b"lidar", (1.5, "lidar")),
+        (struct.pack("<d", 1.5) + b"x" * 2**16, (1.5, "x" * 2**16)),
+        (struct.pack("<d", 1.5) + b"x" * (2**16 + 1), None),
+        (struct.pack("<d", LONGEST_HISTORY), (LONGEST_HISTORY, "")),
+        (struct.pack("<d", LONGEST_HISTORY * 1.001), None),
+        (struct.pack("<d", 0.0), None),
+        (struct.pack("<d", float("nan")), None),
+        (struct.pack("<d", 1.5) + b"\xff", None),
+    ],
+)
+def test_a_question_for_the_last_seconds_is_received_or_dropped(
+    payload: bytes | None, asked: tuple[float, str] | None
+) -> None:
+    end, query = closed_end(), Asked(payload)
+    end.session._receive_history_question(query)  # type: ignore[arg-type]
+    assert query.dropped == (asked is None)
+    assert (end.items.qsize(), end.session._questions) == ((0, 0) if asked is None else (1, 1))
+    if asked is not None:
+        assert end.next() == Received("", HistoryQuestion(*asked, query))
+
+
+def test_of_what_a_question_brings_only_so_much_is_read() -> None:
+    end, query = closed_end(), Asked(bytes(8))
+    query.attachment = Payload(b"x" * (MOST_NAMES + 1))
+    end.session._receive_question(query)  # type: ignore[arg-type]
+    assert end.heard_by.get_nowait() == b"x" * MOST_NAMES
+    end.session._note_heard = None
+    end.session._receive_question(query)  # type: ignore[arg-type]
+    assert (end.items.qsize(), query.dropped) == (2, 0)
+
+
+def test_the_filters_of_others_come_and_go_and_wrong_ones_are_refused() -> None:
+    end = closed_end()
+    for link in (A, B):
+        token = Keys("yard", link, filter=write_filter(["*"], ["base"])).filter_token(FIRST_SESSION)
+        came = SimpleNamespace(key_expr=token, kind=zenoh.SampleKind.PUT)
+        went = SimpleNamespace(key_expr=token, kind=zenoh.SampleKind.DELETE)
+        end.session._receive_filter(came)  # type: ignore[arg-type]
+        # Its own is no peer's.
+        assert len(end.session._filters.wanted) == (link == B)
+    end.session._receive_filter(went)  # type: ignore[arg-type]
+    assert end.session._filters.wanted == {}
+    end.session._closed = True
+    end.session._receive_filter(came)  # type: ignore[arg-type]
+    assert end.session._filters.wanted == {}
+    assert end.items.empty()
+    end.session._closed = False
+    wrong = SimpleNamespace(key_expr="tfbus/yard/x", kind=zenoh.SampleKind.PUT)
+    end.session._receive_filter(wrong)  # type: ignore[arg-type]
+    assert end.next().content.reason == "key"
+
+
+def test_a_link_hears_presence_of_others_only() -> None:
+    end = closed_end()
+    for link in (A, B):
+        for kind in (zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE):
+            sample: Any = SimpleNamespace(key_expr=Keys("yard", link).token(FIRST_SESSION), kind=kind)
+            end.session._receive_presence(sample)
+    assert [end.next() for _ in range(2)] == [Received(B, Presence.JOINED), Received(B, Presence.LEFT)]
+    assert end.items.empty()
+
+
+def test_a_peer_without_the_filter_is_heard_by_its_live_key_alone() -> None:
+    end = closed_end()
+    end.session._keys = keys = Keys("yard", A, filter=write_filter(["*"], ["base"]))
+    live, part = (
+        SimpleNamespace(key_expr=key, kind=zenoh.SampleKind.PUT, payload=Payload(data), attachment=beside)
+        for key, data, beside in (
+            (Keys("yard", B).own("live"), b"all", None),
+            (Keys("yard", B).part(name_of(keys.filter)), b"part", Payload(b"!")),
+        )
+    )
+    end.session._receive_all(live)  # type: ignore[arg-type]
+    assert end.next() == Received(B, (b"all", b""), 3, moving=True)
+    end.session._receive_live(part)  # type: ignore[arg-type]
+    assert end.next() == Received(B, (b"part", b"!"), 5, moving=True)
+    end.session._unfiltered = {B: None}  # type: ignore[dict-item]
+    end.session._receive_live(part)  # type: ignore[arg-type]
+    live.kind = zenoh.SampleKind.DELETE
+    end.session._receive_all(live)  # type: ignore[arg-type]
+    assert end.items.empty()
+
+
+class Network:
+    """Notes the questions that a session asks; a test answers them as zenoh's threads do."""
+
+    def __init__(self, end: End, failing: bool = False) -> None:
+        self.asked: list[tuple[str, zenoh.handlers.Callback[Any], dict[str, Any]]] = []
+        self._failing = failing
+        end.session._session = self  # type: ignore[assignment]
+
+    def get(self, key: str, handler: Any, **options: Any) -> None:
+        if self._failing:
+            raise zenoh.ZError("the session is closed")
+        self.asked.append((key, handler, options))
+
+    def reply(self, payload: bytes | None, encoding: str = "", end: bool = True) -> None:
+        """Answer the newest question, and end it; an error for None."""
+        _, handler, _ = self.asked[-1]
+        sample = SimpleNamespace(payload=Payload(payload or b""), attachment=Payload(b"!"), encoding=encoding)
+        handler.callback(SimpleNamespace(ok=None if payload is None else sample))
+        if end:
+            handler.drop()  # type: ignore[misc]
+
+
+def test_an_answer_is_received_once_and_tells_whether_the_filter_is_served() -> None:
+    end, served = closed_end(), list[tuple[str, bool]]()
+    end.session._note_served = lambda *noted: served.append(noted)
+    network = Network(end)
+    end.session.ask(B, 5, heard=True)
+    network.reply(None, end=False)
+    network.reply(b"first", "tfbus/state;filters", end=False)
+    network.reply(b"second")
+    assert end.next() == Received(B, Answer((b"first", b"!")), 6)
+    end.session.ask(B, 6)
+    network.reply(b"older", "tfbus/state")
+    assert end.next() == Received(B, Answer((b"older", b"!")), 6)
+    end.session.ask_history(B, 1.5, "lidar")
+    network.reply(b"history", "tfbus/state")
+    assert end.next() == Received(B, HistoryAnswer((b"history", b"!")), 8)
+    assert served == [(B, True), (B, False)]
+    end.session.ask(B, 7)
+    network.reply(None)
+    assert end.next() == Received(B, Answer(None))
+    kinds = ("state", "state", "history", "state")
+    assert [key for key, _, _ in network.asked] == [f"tfbus/yard/*/{kind}/{B}" for kind in kinds]
+    options = [options for _, _, options in network.asked]
+    assert [each["payload"] for each in options[1:3]] == [struct.pack("<Q", 6), struct.pack("<d", 1.5) + b"lidar"]
+    assert [each["attachment"] for each in options[:3]] == [Keys("yard", A).token(FIRST_SESSION), None, None]
+    Network(end, failing=True)
+    end.session.ask(B, 8)
+    assert end.next() == Received(B, Answer(None))
+    assert end.items.empty()
+
+
+@pytest.mark.parametrize(
+    ("replies", "names"),
+    [
+        ((), None),
+        ((None,), None),
+        ((b"",), []),
+        ((None, b"0,x"), ["0", "x"]),
+        ((b"0", b"1"), ["0"]),
+        ((b"x" * MOST_NAMES + b"y",), ["x" * MOST_NAMES]),
+        ((b"\xff",), ["\ufffd"]),
+    ],
+)
+def test_the_sessions_that_a_peer_hears_are_told_once(replies: Sequence[bytes | None], names: list[str] | None) -> None:
+    end, told = closed_end(), list[list[str] | None]()
+    network = Network(end)
+    end.session.ask_hearing(B, told.append)
+    for reply in replies:
+        network.reply(reply, end=False)
+    ((key, handler, options),) = network.asked
+    handler.drop()  # type: ignore[misc]
+    assert told == [names]
+    assert (key, options["payload"]) == (f"tfbus/yard/*/hears/{B}", Keys("yard", A).token(FIRST_SESSION))
+    Network(end, failing=True)
+    end.session.ask_hearing(B, told.append)
+    assert told == [names]
+
+
+def test_whoever_asks_is_told_the_sessions_that_are_heard_of_it() -> None:
+    replies: list[tuple[str, str]] = []
+
+    class Heard(Asked):
+        def reply(self, key: str, names: str) -> None:
+            if self.payload is None:
+                raise zenoh.ZError("the asker has gone")
+            replies.append((key, names))
+
+    queries = [Heard(None), Heard(b"a"), Heard(b"b")]
+    names = [["gone"], ["0", "x"], ["x" * (MOST_NAMES + 1)]]
+    closed_end().session.answer_hearing(zip(queries, names, strict=True))  # type: ignore[arg-type]
+    own = f"tfbus/yard/~/hears/{A}"
+    assert replies == [(own, "0,x"), (own, "x" * MOST_NAMES)]
+    assert [query.dropped for query in queries] == [1, 1, 1]
+
+
+def test_connections_are_noted_by_session_and_address() -> None:
+    end, noted = closed_end(), list[tuple[str, str]]()
+    event: Any = SimpleNamespace(link=SimpleNamespace(zid=7, dst="tcp/127.0.0.1:1"))
+    end.session._receive_connection(event)
+    end.session._note_connection = lambda *connection: noted.append(connection)
+    end.session._receive_connection(event)
+    assert noted == [("7", "tcp/127.0.0.1:1")]

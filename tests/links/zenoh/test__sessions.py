@@ -2,6 +2,8 @@ from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from queue import Queue
 from time import monotonic
+from types import SimpleNamespace
+from typing import Any
 from uuid import uuid4
 
 import anyio
@@ -13,8 +15,9 @@ from tfbus.links._message import Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links.zenoh._dialing import Dialing
 from tfbus.links.zenoh._filters import write_filter
+from tfbus.links.zenoh._hearing import DEAF
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
-from tfbus.links.zenoh._sessions import ZenohSessions
+from tfbus.links.zenoh._sessions import _MOST_ASKING, ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
 from tfbus.links.zenoh._unmet import Unmet
 
@@ -228,3 +231,184 @@ async def test_whoever_asks_and_hears_directly_tells_so() -> None:
         joining.sessions.ask(here.id, 0)
         await here.next()
         assert told.empty()
+
+
+class Patch:
+    """A session to one peer that notes whether it was closed."""
+
+    is_open = True
+
+    def __init__(self) -> None:
+        self.closed = 0
+
+    def close(self) -> object:
+        self.closed += 1
+        return SimpleNamespace(is_alive=lambda: False)
+
+
+class Alone(End):
+    """The sessions of a link that was not opened, and a peer whose first session it hears."""
+
+    def __init__(self) -> None:
+        super().__init__(new_domain())
+        self.peer = uuid4().hex
+        self.sessions._main.addresses = lambda: {self.peer: "tcp/10.0.0.7:1"}  # type: ignore[method-assign]
+        self.patch: Any = Patch()
+
+    def hears(self, name: str = FIRST_SESSION) -> None:
+        self.sessions._note_directly(self.peer, name, Presence.JOINED)
+
+    def question(self, asker: str | None = None) -> Any:
+        """A question of a link whether it is heard, which notes whether it was dropped."""
+        token = None if asker == "" else Keys(self.domain, asker or self.peer).token(FIRST_SESSION).encode()
+        payload = None if token is None else SimpleNamespace(to_bytes=lambda: token)
+        dropped: list[bool] = []
+        return SimpleNamespace(payload=payload, drop=lambda: dropped.append(True), dropped=dropped)
+
+    async def note(self) -> None:
+        """Note the changes, as `keep_connected` does."""
+        changes, self.sessions._changes = self.sessions._changes, []
+        await self.sessions._note(changes)
+
+
+async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
+    alone = Alone()
+    alone.sessions._patches[alone.peer] = alone.patch
+    alone.hears()
+    alone.sessions._note_by_patch(alone.peer, "other", Presence.JOINED, alone.peer, alone.patch)
+    # Of a peer that was not dialled, and by a patch that was dropped.
+    alone.sessions._note_by_patch("another", "x", Presence.JOINED, alone.peer, alone.patch)
+    alone.sessions._note_by_patch(alone.peer, "late", Presence.JOINED, alone.peer, Patch())  # type: ignore[arg-type]
+    assert alone.sessions._present == {alone.peer: {(None, FIRST_SESSION), (alone.patch, "other")}}
+    assert [alone.items.get_nowait() for _ in range(1)] == [Received(alone.peer, Presence.JOINED)]
+    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT)
+    assert alone.items.empty()
+    # The end of a patch ends what came by it.
+    alone.sessions._filters.joined((alone.peer, alone.patch, "other"), write_filter(["*"], ["base"]))
+    assert list(alone.sessions.filters.values()) == [{"base"}]
+    alone.sessions._drop_patch(alone.peer)
+    assert alone.sessions.filters == {}
+    assert alone.items.get_nowait() == Received(alone.peer, Presence.LEFT)
+    assert (alone.sessions._present, alone.patch.closed, len(alone.sessions._closing)) == ({}, 1, 1)
+    assert alone.sessions._changes == [
+        (alone.peer, Presence.JOINED),
+        (alone.peer, Presence.LEFT),
+        (alone.peer, Presence.LEFT),
+    ]
+
+
+async def test_what_a_patch_receives_is_of_its_peer_or_of_nobody() -> None:
+    alone = Alone()
+    for sender in (alone.peer, "another", ""):
+        alone.sessions._receive_by_patch(Received(sender, b"x"), alone.peer)
+    assert [alone.items.get_nowait().sender for _ in range(2)] == [alone.peer, ""]
+    assert alone.items.empty()
+
+
+async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_there() -> None:
+    alone = Alone()
+    alone.hears()
+    await alone.note()
+    assert alone.peer in alone.sessions._hearing._checks
+    alone.sessions._patches[alone.peer] = alone.patch
+    alone.sessions._deaf.add(alone.peer)
+    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT)
+    await alone.note()
+    assert alone.dialing.is_dialled(alone.peer)
+    assert (alone.sessions._hearing._checks, alone.sessions._deaf, alone.sessions._patches) == ({}, set(), {})
+    alone.hears()
+    await alone.note()
+    assert not alone.dialing.is_dialled(alone.peer)
+    # It had gone and come again in between: nobody is lost.
+    alone.sessions._changes = [(alone.peer, Presence.LEFT)]
+    await alone.note()
+    assert not alone.dialing.is_dialled(alone.peer)
+    assert alone.peer in alone.sessions._hearing._checks
+
+
+@pytest.mark.parametrize("deaf", [False, True])
+async def test_a_peer_that_is_heard_directly_needs_a_patch_only_while_it_is_deaf(deaf: bool) -> None:
+    alone = Alone()
+    alone.sessions._patches[alone.peer] = alone.patch
+    if deaf:
+        alone.sessions._deaf.add(alone.peer)
+    # Another session than the first is no direct connection.
+    alone.hears("another")
+    await alone.note()
+    assert (alone.patch.closed, alone.sessions._hearing._checks) == (0, {})
+    alone.hears()
+    await alone.note()
+    assert alone.patch.closed == (not deaf)
+    assert list(alone.sessions._hearing._checks) == [alone.peer]
+
+
+@pytest.mark.parametrize("answer", [[], None])
+async def test_a_peer_that_does_not_hear_this_link_twice_is_dialled_until_it_does(answer: list[str] | None) -> None:
+    alone = Alone()
+    alone.hears()
+    await alone.note()
+    for number in range(DEAF):
+        assert not alone.dialing.is_dialled(alone.peer), number
+        alone.sessions._patches[alone.peer] = alone.patch
+        alone.sessions._judge(alone.peer, answer)
+    assert alone.dialing.is_dialled(alone.peer)
+    assert alone.sessions._deaf == {alone.peer}
+    assert alone.patch.closed == 1
+    # It hears the patch, but not the first session yet.
+    alone.sessions._patches[alone.peer] = again = Patch()  # type: ignore[assignment]
+    alone.sessions._judge(alone.peer, ["patch"])
+    assert (alone.dialing.is_dialled(alone.peer), alone.sessions._deaf, again.closed) == (True, {alone.peer}, 0)
+    alone.sessions._judge(alone.peer, [FIRST_SESSION, "patch"])
+    assert (alone.dialing.is_dialled(alone.peer), alone.sessions._deaf, again.closed) == (False, set(), 1)
+
+
+async def test_the_silence_of_a_peer_that_another_way_reaches_proves_nothing() -> None:
+    alone = Alone()
+    alone.hears("another")
+    alone.sessions._hearing.joined(alone.peer)
+    for _ in range(2 * DEAF):
+        alone.sessions._judge(alone.peer, None)
+    assert alone.sessions._deaf == set()
+
+
+async def test_whoever_asks_twice_whether_it_is_heard_and_is_not_is_dialled() -> None:
+    alone = Alone()
+    sessions, query = alone.sessions, alone.question()
+    for names in ([], [FIRST_SESSION], [], []):
+        assert not alone.dialing.is_dialled(alone.peer)
+        await sessions._note_unheard([(query, names), (alone.question(""), [])])
+    assert alone.dialing.is_dialled(alone.peer)
+    assert alone.dialing._addresses == {alone.peer: ["tcp/10.0.0.7:1"]}
+    # Its time is not put off by the next question.
+    due = alone.dialing.next_due()
+    await sessions._note_unheard([(query, [])])
+    assert alone.dialing.next_due() == due
+    assert sessions._unheard == {alone.peer: 3}
+    for count, left in ((_MOST_ASKING, _MOST_ASKING), (_MOST_ASKING + 1, 0)):
+        sessions._unheard.update(f"{count}, {k}" for k in range(count - len(sessions._unheard)))
+        await sessions._note_unheard([])
+        assert len(sessions._unheard) == left
+
+
+async def test_questions_and_those_who_hear_are_kept_up_to_a_bound_and_strangers_are_not() -> None:
+    alone = Alone()
+    alone.hears()
+    alone.hears("another")
+    query = alone.question()
+    assert alone.sessions._names_heard(query) == sorted([FIRST_SESSION, "another"])
+    assert alone.sessions._names_heard(alone.question(uuid4().hex)) == []
+    for unknown in (alone.question(""), alone.question("no id")):
+        alone.sessions._note_asked(unknown)
+        assert unknown.dropped == [True]
+    for number in range(_MOST_ASKING):
+        alone.sessions._note_asked(query)
+        alone.sessions._note_heard(Keys(alone.domain, f"{number + 1:032x}").token(FIRST_SESSION).encode())
+    assert query.dropped == []
+    alone.sessions._note_asked(query)
+    alone.sessions._note_heard(Keys(alone.domain, alone.peer).token(FIRST_SESSION).encode())
+    assert (query.dropped, len(alone.sessions._asking), len(alone.sessions._hearers)) == (
+        [True],
+        _MOST_ASKING,
+        _MOST_ASKING,
+    )
+    assert alone.peer not in alone.sessions._hearers

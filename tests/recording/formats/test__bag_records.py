@@ -76,6 +76,25 @@ def test_a_chunk_is_found_by_its_bytes() -> None:
     assert find_chunk(io.BytesIO(bytes(2**20 - 89) + record(fields)), 0) == 2**20 - 89
 
 
+def test_a_record_of_another_kind_with_the_mark_of_a_chunk_in_a_field_is_no_chunk() -> None:
+    mark = b"\x04\0\0\0op=\x05"
+    other = record(field(b"op", b"\2") + field(b"size", bytes(4)) + field(b"note", mark))
+    assert read_record(io.BytesIO(other), 0).kind == 2
+    assert find_chunk(io.BytesIO(other), 0) is None
+    # The mark is in the data of the chunk behind it, or before it begins.
+    chunk = record(field(b"size", bytes(4)) + field(b"op", b"\5"), mark)
+    assert find_chunk(io.BytesIO(mark + chunk), 0) == len(mark)
+    assert find_chunk(io.BytesIO(chunk), 1) is None
+
+
+def test_a_record_that_claims_more_than_its_bound_is_not_read() -> None:
+    file = io.BytesIO(CHUNK_RECORD)
+    found = read_record(file, 0)
+    assert found.read(file, 3) == b"abc"
+    with pytest.raises(ValueError, match="claims 3 bytes, and 2 is the bound"):
+        found.read(file, 2)
+
+
 def test_damage_is_an_error() -> None:
     with pytest.raises(CutOffError):
         read_record(io.BytesIO(CHUNK_RECORD[:10]), 0)

@@ -32,6 +32,8 @@ def test_times_before_1970_are_refused_where_a_format_has_none(tmp_path: Path) -
         copy = kind(tmp_path / "run", "run")
         with pytest.raises(CannotWriteError, match="no time before 1970"):
             copy.write(TF, -1, PAYLOAD)
+        # 1970 begins with 0.
+        copy.write(TF, 0, PAYLOAD)
         copy.close()
 
 

@@ -118,6 +118,12 @@ def test_any_bytes_are_transforms_or_malformed(encoding: str, payload: bytes) ->
         assert error.reason
 
 
+def test_a_message_in_another_encoding_is_told_by_its_header() -> None:
+    parse = parser_of(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"))
+    with pytest.raises(MalformedMessageError, match=r"its header is 00 07 00 00$"):
+        parse(b"\0\7\0\0\1\2\3\4")
+
+
 def test_a_message_is_bounded_compressed_or_not() -> None:
     assert bounded(b"abc") == b"abc"
     with pytest.raises(MalformedMessageError) as raised:
