@@ -31,7 +31,7 @@ HOSTS = 5
 WATCHED = ["1/a", "1/d", "2/b", "3/a", "3/c", "4/d", "moves"]
 WHOLE_AGAIN = float(os.environ.get("FAULT_LIMIT", "10"))
 """s; so long after a fault all buses are equal."""
-LEASE = 2.0
+LEASE = 4.0
 
 
 class Host:

@@ -34,10 +34,12 @@ def is_about(measured: float, seconds: float) -> bool:
 def test_a_peer_is_asked_soon_and_then_ever_more_seldom_until_it_leaves() -> None:
     scene = Scene()
     assert scene.wait(1_000) == []
+    assert scene.hearing.next_due() is None
     scene.hearing.joined("a")
     assert scene.wait(0) == []
     pause = FIRST_PAUSE
     for _ in range(6):
+        assert is_about((scene.hearing.next_due() or 0.0) - scene.time, pause)
         assert is_about(scene.until_due(), pause)
         assert not scene.hearing.is_deaf("a", hears=True)
         pause = min(2 * pause, LONGEST_PAUSE)

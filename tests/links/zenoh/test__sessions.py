@@ -1,3 +1,4 @@
+import math
 from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from queue import Queue
@@ -7,6 +8,7 @@ from typing import Any
 from uuid import uuid4
 
 import anyio
+import anyio.lowlevel
 import anyio.to_thread
 import pytest
 from support.processes import free_ports, new_domain, until
@@ -45,8 +47,13 @@ class End:
 
     def lose(self, other: "End") -> None:
         """Have another end be one that was lost."""
-        self.dialing.reached(other.id, other.address)
-        self.dialing.left(other.id)
+        self.lose_at(other.id, other.address)
+
+    def lose_at(self, peer: str, address: str) -> None:
+        self.dialing.reached(peer, address)
+        self.dialing.left(peer)
+        with self.sessions._lock:
+            self.sessions._stir()
 
 
 @asynccontextmanager
@@ -128,8 +135,7 @@ async def test_a_patch_ends_with_its_peer_and_is_made_again() -> None:
 @pytest.mark.thorough
 async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
     async with ends(3) as (here, there, gone):
-        here.dialing.reached(gone.id, there.address)
-        here.dialing.left(gone.id)
+        here.lose_at(gone.id, there.address)
         # It has seen the patch, which has noticed the mistake when it goes.
         assert await there.next() == Received(here.id, Presence.JOINED)
         assert await there.next() == Received(here.id, Presence.LEFT)
@@ -153,8 +159,7 @@ async def test_an_address_at_which_nobody_listens_is_forgotten_if_there_is_anoth
 @pytest.mark.thorough
 async def test_nobody_at_the_address_is_tried_again() -> None:
     async with ends() as (here, there):
-        here.dialing.reached(there.id, f"tcp/127.0.0.1:{free_ports(1)[0]}")
-        here.dialing.left(there.id)
+        here.lose_at(there.id, f"tcp/127.0.0.1:{free_ports(1)[0]}")
         await until(lambda: (here.dialing.next_due() or 0) > monotonic() + 0.5)
         assert here.items.empty()
         here.lose(there)
@@ -412,3 +417,30 @@ async def test_questions_and_those_who_hear_are_kept_up_to_a_bound_and_strangers
         _MOST_ASKING,
     )
     assert alone.peer not in alone.sessions._hearers
+
+
+async def test_nothing_is_done_until_something_comes() -> None:
+    here = End(new_domain())
+    here.sessions._waker.bind()
+    with anyio.move_on_after(0.02) as nothing_came:
+        await here.sessions._wait_for_work()
+    assert nothing_came.cancelled_caught
+    for note in (
+        lambda: here.sessions._note_directly("a", FIRST_SESSION, Presence.JOINED),
+        lambda: here.sessions._note_connection("a", here.address),
+        lambda: here.sessions._note_heard_by("a", None),
+        lambda: here.sessions._note_heard(here.sessions._keys.token(FIRST_SESSION).encode()),
+    ):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(here.sessions._wait_for_work)
+            await anyio.lowlevel.checkpoint()
+            await anyio.to_thread.run_sync(note)
+        # What comes before the wait begins is no less noted.
+        await here.sessions._wait_for_work()
+        here.sessions._noted_at = math.inf
+    await anyio.wait_all_tasks_blocked()
+    # Nothing comes, and somebody is due.
+    here.dialing.reached(here.id, here.address)
+    here.dialing.left(here.id)
+    await here.sessions._wait_for_work()
+    assert here.dialing.take_due() == [(here.id, here.address)]

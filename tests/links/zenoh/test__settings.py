@@ -2,6 +2,7 @@ import json
 import math
 import shutil
 import subprocess
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from support.processes import crowd, free_ports, new_domain, until
 from support.samples import moving, static
 
 from tfbus import Buffer, Bus
-from tfbus.links.zenoh import ZenohLink
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter
 from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, patch_settings, settings
 
 LISTEN, CONNECT = "listen/endpoints", "connect/endpoints"
@@ -109,6 +110,16 @@ def test_the_lease_is_in_milliseconds() -> None:
     assert read("transport/link/tx/lease", lease=1.5) == 1_500
     assert read("transport/link/tx/lease", lease=1) == 1_000
     assert read("transport/link/tx/lease", lease=1e-9) == 1
+
+
+def test_two_signs_of_life_go_out_in_a_lease_unless_zenoh_is_told_otherwise() -> None:
+    assert read("transport/link/tx/keep_alive") == 2
+    assert read("transport/link/tx/keep_alive", config={"transport/link/tx/keep_alive": 4}) == 4
+
+
+def test_links_routers_and_lookups_have_the_same_lease() -> None:
+    kinds: list[Any] = [ZenohLink, ZenohRouter, BufferServer, BufferClient]
+    assert [signature(kind).parameters["lease"].default for kind in kinds] == [4.0] * 4
 
 
 @pytest.mark.parametrize("lease", [0.0, -1.0, math.nan, math.inf])

@@ -2,6 +2,7 @@ from contextlib import ExitStack
 from queue import Queue
 from uuid import uuid4
 
+import pytest
 import zenoh
 
 from tfbus.links._receive_queue import Received
@@ -29,8 +30,10 @@ class Scene:
 
 def test_a_connection_is_looked_after_several_times_and_then_no_more() -> None:
     scene = Scene()
+    assert scene.unmet.next_due() is None
     scene.connected("a")
     for pause in PAUSES:
+        assert scene.unmet.next_due() == pytest.approx(scene.time + pause, abs=0.2)
         assert scene.wait(pause - 0.1) == []
         assert scene.wait(0.2) == ["a"]
     assert scene.wait(1_000) == []

@@ -54,6 +54,10 @@ class Hearing:
         """A peer is lost."""
         self._checks.pop(peer, None)
 
+    def next_due(self) -> float | None:
+        """The time of the next call of `take_due`; None while nobody is there."""
+        return min((check.due for check in self._checks.values()), default=None)
+
     def take_due(self) -> list[str]:
         """The peers to ask now."""
         now = self._now()

@@ -6,6 +6,7 @@ same mends a connection of which only one end hears the other; see `tfbus.links.
 one of them has accepted the connection, and knows no address at which the other one listens.
 """
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Set
@@ -18,6 +19,7 @@ import anyio
 import anyio.to_thread
 import zenoh
 
+from tfbus._aio.loop_waker import LoopWaker
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._dialing import Dialing, is_reachable
@@ -88,6 +90,9 @@ class ZenohSessions:
         self._hearers: set[str] = set()
         self._unheard: Counter[str] = Counter()
         self._closing: list[threading.Thread] = []
+        self._noted_at = math.inf
+        self._stirred = anyio.Event()
+        self._waker = LoopWaker(lambda: self._stirred.set())
 
     @property
     def session(self) -> zenoh.Session:
@@ -166,14 +171,20 @@ class ZenohSessions:
         self._patches.clear()
         return [*self._closing, *(session.close() for session in sessions)]
 
-    async def keep_connected(self, interval: float = 0.5) -> None:
-        """Dial peers that were lost, or do not hear this link, until cancelled."""
+    async def keep_connected(self, interval: float = 0.25) -> None:
+        """Dial peers that were lost, or do not hear this link, until cancelled.
+
+        What comes within an `interval`, in s, is looked after together; while nothing comes or is due, nothing is done.
+        """
+        self._waker.bind()
         async with anyio.create_task_group() as tasks:
             while True:
+                await self._wait_for_work()
                 began = monotonic()
                 await anyio.sleep(interval)
-                late = monotonic() - began > 2 * interval
                 with self._lock:
+                    late = monotonic() - min(began, self._noted_at) > 3 * interval
+                    self._noted_at = math.inf
                     changes, self._changes = self._changes, []
                     asking, self._asking = self._asking, []
                     connected, self._connected = self._connected, []
@@ -207,15 +218,34 @@ class ZenohSessions:
                     if peer not in self._patches:
                         tasks.start_soon(self._patch, peer, address)
 
+    async def _wait_for_work(self) -> None:
+        """Wait until zenoh's threads have noted something, or somebody is to be asked or dialled."""
+        self._stirred = anyio.Event()
+        if self._noted_at == math.inf:
+            times = (self._hearing.next_due(), self._dialing.next_due(), self._unmet.next_due())
+            due = min((time for time in times if time is not None), default=math.inf)
+            with anyio.move_on_after(due - monotonic()):
+                await self._stirred.wait()
+
+    def _stir(self) -> None:
+        """Have what was noted looked after soon; the lock is held."""
+        self._noted_at = min(self._noted_at, monotonic())
+        # Nobody keeps the sessions connected yet, or the event loop has ended.
+        with suppress(RuntimeError):
+            self._waker.wake()
+
     def _hear_unserved(self) -> None:
         """Hear the live keys of peers that do not serve this link's filter, by the last answer of each."""
         with self._lock:
             self._unserved &= self._present.keys()
             unserved = frozenset(self._unserved)
         for session in self._open():
-            # What cannot be declared is declared later, or the session has ended.
-            with suppress(zenoh.ZError):
+            try:
                 session.hear_all_of(unserved)
+            except zenoh.ZError:
+                # It is declared later, or the session has ended.
+                with self._lock:
+                    self._stir()
 
     async def _note(self, changes: list[tuple[str, Presence]]) -> None:
         for peer, presence in changes:
@@ -297,11 +327,13 @@ class ZenohSessions:
     def _note_connection(self, peer: str, address: str) -> None:
         with self._lock:
             self._connected.append((peer, address))
+            self._stir()
 
     def _note_asked(self, query: zenoh.Query) -> None:
         with self._lock:
             if len(self._asking) < _MOST_ASKING and self._asker(query) is not None:
                 self._asking.append(query)
+                self._stir()
                 return
         query.drop()
 
@@ -310,10 +342,12 @@ class ZenohSessions:
             peer = self._peer_of(token)
             if peer is not None and len(self._hearers) < _MOST_ASKING:
                 self._hearers.add(peer)
+                self._stir()
 
     def _note_heard_by(self, peer: str, names: list[str] | None) -> None:
         with self._lock:
             self._heard_by.append((peer, names))
+            self._stir()
 
     async def _patch(self, peer: str, address: str) -> None:
         try:
@@ -371,7 +405,10 @@ class ZenohSessions:
 
     def _note_served(self, peer: str, served: bool) -> None:
         with self._lock:
+            changed = served is (peer in self._unserved)
             (self._unserved.discard if served else self._unserved.add)(peer)
+            if changed and self._keys.filter:
+                self._stir()
 
     def _note_directly(self, link: str, name: str, presence: Presence) -> None:
         self._note_presence(link, (None, name), presence)
@@ -391,3 +428,4 @@ class ZenohSessions:
                 self._receive(Received(peer, presence))
             if is_present is not was_present or way == (None, FIRST_SESSION):
                 self._changes.append((peer, presence))
+                self._stir()

@@ -13,6 +13,11 @@ from tfbus.stamps import as_duration
 MEETING_POINT = "tcp/127.0.0.1:17447"
 """The address at which links on one machine find each other: the first one listens there, and all connect to it."""
 
+LEASE = 4.0
+"""s; the lease of a session that is given none: a peer that is cut off is lost soon enough to be found again in 5 s."""
+SIGNS_OF_LIFE = 2
+"""So many go out in each lease, so one may be late by half of it."""
+
 Addresses = str | Iterable[str]
 
 _ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
@@ -66,6 +71,8 @@ def settings(
         "connect/retry": {"period_init_ms": 200, "period_max_ms": 1_000, "period_increase_factor": 2},
         "scouting/delay": 100,
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
+        # zenoh's four cost fifty links that rest four times as much.
+        "transport/link/tx/keep_alive": SIGNS_OF_LIFE,
         # It would leave a file open for each link that has ended.
         "transport/shared_memory/enabled": False,
         # Larger messages are not even assembled.

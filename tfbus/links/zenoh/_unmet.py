@@ -88,6 +88,10 @@ class Unmet:
         look.due, look.number = self._now() + PAUSES[0], 1
         look.addresses = newest_first(address, look.addresses)
 
+    def next_due(self) -> float | None:
+        """The time of the next look; None while all that are connected have been met."""
+        return min((look.due for look in self._looks.values()), default=None)
+
     def take_due(self, present: Container[str]) -> list[tuple[str, list[str]]]:
         """The sessions to look after now, with their addresses; those that are present are left out for good."""
         now, due = self._now(), []

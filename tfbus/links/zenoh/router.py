@@ -11,7 +11,7 @@ import zenoh
 
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
 from tfbus.links.zenoh._session import as_os_error
-from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, settings
+from tfbus.links.zenoh._settings import LEASE, MEETING_POINT, Addresses, settings
 
 
 class ZenohRouter:
@@ -48,7 +48,7 @@ class ZenohRouter:
         *,
         connect: Addresses | None = None,
         config: Mapping[str, Any] | None = None,
-        lease: float = 2.0,
+        lease: float = LEASE,
     ) -> None:
         self._config = settings(listen, connect or [], {"mode": "router", **(config or {})}, lease)
         self._entered = False

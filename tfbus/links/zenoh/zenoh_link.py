@@ -18,7 +18,7 @@ from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
-from tfbus.links.zenoh._settings import Addresses, patch_settings, settings
+from tfbus.links.zenoh._settings import LEASE, Addresses, patch_settings, settings
 
 
 class ZenohLink(Link):
@@ -59,8 +59,8 @@ class ZenohLink(Link):
         Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
     lease : float
         Seconds of silence after which others take this link for lost, when it is frozen or cut off, and it takes them
-        for lost by theirs; a process that dies is lost at once. Four signs of life go out in each lease, so to be held
-        up for less than three quarters of it loses nobody.
+        for lost by theirs; a process that dies is lost at once. Two signs of life go out in each lease, so to be held
+        up for less than half of it loses nobody.
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
@@ -119,7 +119,7 @@ class ZenohLink(Link):
         slow_rate: float = 1.0,
         frames: Iterable[str] | None = None,
         drop_lost: bool = False,
-        lease: float = 2.0,
+        lease: float = LEASE,
         max_frames: int = 10_000,
         capacity: int = 10_000,
         history: float | None = None,
