@@ -19,7 +19,8 @@ from tfbus.links.zenoh._dialing import Dialing
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._hearing import DEAF
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
-from tfbus.links.zenoh._sessions import _MOST_ASKING, ZenohSessions
+from tfbus.links.zenoh._notes import MOST_ASKING
+from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
 from tfbus.links.zenoh._unmet import Unmet
 
@@ -53,7 +54,7 @@ class End:
         self.dialing.reached(peer, address)
         self.dialing.left(peer)
         with self.sessions._lock:
-            self.sessions._stir()
+            self.sessions._notes.stir()
 
 
 @asynccontextmanager
@@ -171,7 +172,7 @@ async def test_an_end_that_does_not_hear_those_who_ask_it_dials_them() -> None:
     async with ends(1) as (here,), joined_to(here) as joining:
         # As if zenoh had never told of it. The other end has accepted the connection, and cannot dial this one.
         joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
-        joining.sessions._changes.clear()
+        joining.sessions._notes.take()
         assert await joining.next() == Received(here.id, Presence.LEFT)
         assert await joining.next() == Received(here.id, Presence.JOINED)
         assert here.items.empty()
@@ -199,12 +200,12 @@ async def test_two_ends_that_are_connected_and_have_never_met_dial_each_other() 
         for end, other in ((here, joining), (joining, here)):
             # As if zenoh had told of their connection, and of nothing else.
             end.sessions._note_presence(other.id, (None, FIRST_SESSION), Presence.LEFT)
-            end.sessions._changes.clear()
+            end.sessions._notes.take()
             end.sessions._hearing.left(other.id)
             end.dialing._addresses.clear()
             assert await end.next() == Received(other.id, Presence.LEFT)
         for end, other in ((here, joining), (joining, here)):
-            end.sessions._note_connection(other.id, "tcp/127.0.0.1:1")
+            end.sessions._notes.add_connection(other.id, "tcp/127.0.0.1:1")
         for end, other in ((here, joining), (joining, here)):
             assert await end.next() == Received(other.id, Presence.JOINED)
 
@@ -215,7 +216,7 @@ async def test_a_peer_whose_connection_was_gone_before_anybody_looked_is_dialled
     # The connections behind which nobody was met are looked after much later.
     monkeypatch.setattr(Unmet, "connected", lambda *_: None)
     async with ends() as (here, there):
-        here.sessions._note_connection(there.id, there.address)
+        here.sessions._notes.add_connection(there.id, there.address)
         for presence in (Presence.JOINED, Presence.LEFT):
             here.sessions._note_presence(there.id, (None, FIRST_SESSION), presence)
             assert await here.next() == Received(there.id, presence)
@@ -230,8 +231,8 @@ async def test_whoever_asks_and_hears_directly_tells_so() -> None:
         joining.sessions.ask(here.id, 0)
         await here.next()
         token = told.get_nowait()
-        assert here.sessions._peer_of(token) == joining.id
-        assert here.sessions._peer_of(b"\xff") is None
+        assert here.sessions._keys.heard_link(token) == joining.id
+        assert here.sessions._keys.heard_link(b"\xff") is None
         joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
         joining.sessions.ask(here.id, 0)
         await here.next()
@@ -272,8 +273,7 @@ class Alone(End):
 
     async def note(self) -> None:
         """Note the changes, as `keep_connected` does."""
-        changes, self.sessions._changes = self.sessions._changes, []
-        await self.sessions._note(changes)
+        await self.sessions._note(self.sessions._notes.take().changes)
 
 
 async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
@@ -295,7 +295,7 @@ async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
     assert alone.sessions.filters == {}
     assert alone.items.get_nowait() == Received(alone.peer, Presence.LEFT)
     assert (alone.sessions._present, alone.patch.closed, len(alone.sessions._closing)) == ({}, 1, 1)
-    assert alone.sessions._changes == [
+    assert alone.sessions._notes.take().changes == [
         (alone.peer, Presence.JOINED),
         (alone.peer, Presence.LEFT),
         (alone.peer, Presence.LEFT),
@@ -325,7 +325,7 @@ async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_ther
     await alone.note()
     assert not alone.dialing.is_dialled(alone.peer)
     # It had gone and come again in between: nobody is lost.
-    alone.sessions._changes = [(alone.peer, Presence.LEFT)]
+    alone.sessions._notes.add_change(alone.peer, Presence.LEFT)
     await alone.note()
     assert not alone.dialing.is_dialled(alone.peer)
     assert alone.peer in alone.sessions._hearing._checks
@@ -389,7 +389,7 @@ async def test_whoever_asks_twice_whether_it_is_heard_and_is_not_is_dialled() ->
     await sessions._note_unheard([(query, [])])
     assert alone.dialing.next_due() == due
     assert sessions._unheard == {alone.peer: 3}
-    for count, left in ((_MOST_ASKING, _MOST_ASKING), (_MOST_ASKING + 1, 0)):
+    for count, left in ((MOST_ASKING, MOST_ASKING), (MOST_ASKING + 1, 0)):
         sessions._unheard.update(f"{count}, {k}" for k in range(count - len(sessions._unheard)))
         await sessions._note_unheard([])
         assert len(sessions._unheard) == left
@@ -405,42 +405,28 @@ async def test_questions_and_those_who_hear_are_kept_up_to_a_bound_and_strangers
     for unknown in (alone.question(""), alone.question("no id")):
         alone.sessions._note_asked(unknown)
         assert unknown.dropped == [True]
-    for number in range(_MOST_ASKING):
+    for number in range(MOST_ASKING):
         alone.sessions._note_asked(query)
         alone.sessions._note_heard(Keys(alone.domain, f"{number + 1:032x}").token(FIRST_SESSION).encode())
     assert query.dropped == []
     alone.sessions._note_asked(query)
     alone.sessions._note_heard(Keys(alone.domain, alone.peer).token(FIRST_SESSION).encode())
-    assert (query.dropped, len(alone.sessions._asking), len(alone.sessions._hearers)) == (
-        [True],
-        _MOST_ASKING,
-        _MOST_ASKING,
-    )
-    assert alone.peer not in alone.sessions._hearers
+    noted = alone.sessions._notes.take()
+    assert (query.dropped, len(noted.asking), len(noted.hearers)) == ([True], MOST_ASKING, MOST_ASKING)
+    assert alone.peer not in noted.hearers
 
 
-async def test_nothing_is_done_until_something_comes() -> None:
-    here = End(new_domain())
-    here.sessions._waker.bind()
-    with anyio.move_on_after(0.02) as nothing_came:
-        await here.sessions._wait_for_work()
-    assert nothing_came.cancelled_caught
-    for note in (
-        lambda: here.sessions._note_directly("a", FIRST_SESSION, Presence.JOINED),
-        lambda: here.sessions._note_connection("a", here.address),
-        lambda: here.sessions._note_heard_by("a", None),
-        lambda: here.sessions._note_heard(here.sessions._keys.token(FIRST_SESSION).encode()),
-    ):
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(here.sessions._wait_for_work)
-            await anyio.lowlevel.checkpoint()
-            await anyio.to_thread.run_sync(note)
-        # What comes before the wait begins is no less noted.
-        await here.sessions._wait_for_work()
-        here.sessions._noted_at = math.inf
-    await anyio.wait_all_tasks_blocked()
-    # Nothing comes, and somebody is due.
-    here.dialing.reached(here.id, here.address)
-    here.dialing.left(here.id)
-    await here.sessions._wait_for_work()
-    assert here.dialing.take_due() == [(here.id, here.address)]
+async def test_the_loop_sleeps_until_the_next_peer_is_due() -> None:
+    alone = Alone()
+    assert alone.sessions._next_due() == math.inf
+    alone.sessions._unmet.connected("a", "tcp/10.0.0.7:1")
+    times = [alone.sessions._next_due()]
+    alone.sessions._hearing.joined(alone.peer)
+    times.append(alone.sessions._next_due())
+    alone.dialing.reached(alone.peer, "tcp/10.0.0.7:1")
+    alone.dialing.left(alone.peer)
+    times.append(alone.sessions._next_due())
+    # Connections are looked after in 3 s, a peer is asked in 0.8 s or more, a lost one dialled in 0.3 s.
+    assert times == sorted(times, reverse=True)
+    assert len(set(times)) == 3
+    assert times[-1] == alone.dialing.next_due()

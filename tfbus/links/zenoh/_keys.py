@@ -18,6 +18,8 @@ Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digi
 import re
 from dataclasses import dataclass
 
+import zenoh
+
 from tfbus.links.zenoh._filters import name_of
 
 NO_ROBOT = "~"
@@ -95,6 +97,14 @@ class Keys:
         rest, _, session = key.rpartition("/")
         link = self.sender(rest, "@alive")
         return (link, session) if link is not None and _SESSION.fullmatch(session) else None
+
+    def heard_link(self, token: bytes) -> str | None:
+        """The link that a token belongs to; None for one that this link does not mean to hear."""
+        key = token.decode("ascii", "replace")
+        found = self.session(key)
+        if found is None or not any(zenoh.KeyExpr(heard).includes(key) for heard in self.heard("@alive")):
+            return None
+        return found[0]
 
     def filter_of(self, key: str) -> tuple[str, str, str] | None:
         """The link, the session and the filter that such a token's key belongs to; None if it names none."""

@@ -10,7 +10,6 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Set
-from contextlib import suppress
 from functools import partial
 from time import monotonic
 from uuid import uuid4
@@ -19,19 +18,18 @@ import anyio
 import anyio.to_thread
 import zenoh
 
-from tfbus._aio.loop_waker import LoopWaker
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._dialing import Dialing, is_reachable
 from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._notes import MOST_ASKING, Notes
 from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._unmet import Unmet
 
 _MEETING_TIME = 10.0
 """s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
-_MOST_ASKING = 1_000
 
 _Way = tuple[ZenohSession | None, str]
 """A connection between two links: the patch here, or None for the first session, and the name of the session there."""
@@ -64,6 +62,7 @@ class ZenohSessions:
         self._keys = keys
         self._receive = receive
         self._lock = threading.Lock()
+        self._notes = Notes(monotonic)
         self._filters = Filters(keys.robot)
         self._unserved: set[str] = set()
         self._main = ZenohSession(
@@ -72,27 +71,19 @@ class ZenohSessions:
             receive,
             self._note_directly,
             note_asked=self._note_asked,
-            note_connection=self._note_connection,
+            note_connection=self._notes.add_connection,
             note_heard=self._note_heard,
             filters=self._filters,
             note_served=self._note_served,
         )
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
-        self._changes: list[tuple[str, Presence]] = []
         self._dialing = Dialing(monotonic) if dialing is None else dialing
         self._hearing = Hearing(monotonic)
         self._unmet = Unmet(self._main, keys, monotonic)
         self._deaf: set[str] = set()
-        self._connected: list[tuple[str, str]] = []
-        self._asking: list[zenoh.Query] = []
-        self._heard_by: list[tuple[str, list[str] | None]] = []
-        self._hearers: set[str] = set()
         self._unheard: Counter[str] = Counter()
         self._closing: list[threading.Thread] = []
-        self._noted_at = math.inf
-        self._stirred = anyio.Event()
-        self._waker = LoopWaker(lambda: self._stirred.set())
 
     @property
     def session(self) -> zenoh.Session:
@@ -176,63 +167,43 @@ class ZenohSessions:
 
         What comes within an `interval`, in s, is looked after together; while nothing comes or is due, nothing is done.
         """
-        self._waker.bind()
+        self._notes.bind()
         async with anyio.create_task_group() as tasks:
             while True:
-                await self._wait_for_work()
+                await self._notes.wait(self._next_due())
                 began = monotonic()
                 await anyio.sleep(interval)
-                with self._lock:
-                    late = monotonic() - min(began, self._noted_at) > 3 * interval
-                    self._noted_at = math.inf
-                    changes, self._changes = self._changes, []
-                    asking, self._asking = self._asking, []
-                    connected, self._connected = self._connected, []
-                    heard_by, self._heard_by = self._heard_by, []
-                    hearers, self._hearers = self._hearers, set()
-                    answers = [(query, self._names_heard(query)) for query in asking]
-                for peer, address in connected:
+                late = monotonic() - min(began, self._notes.since) > 3 * interval
+                noted = self._notes.take()
+                for peer, address in noted.connected:
                     # Where this loop has no time, the connection may be gone when its address is asked for.
                     self._dialing.reached(peer, address)
-                await self._note(changes)
-                for peer, _ in connected:
+                await self._note(noted.changes)
+                for peer, _ in noted.connected:
                     if self._is_direct(peer):
                         self._hearing.joined(peer)
-                for peer in hearers:
+                for peer in noted.hearers:
                     self._hearing.is_heard(peer)
-                for peer, names in heard_by:
+                for peer, names in noted.heard_by:
                     # Where this loop has no time, nobody's silence proves anything.
                     if names is not None or not late:
                         self._judge(peer, names)
-                if answers:
-                    await self._note_unheard(answers)
-                    # zenoh may wait for a peer that is frozen.
-                    await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
+                if noted.asking:
+                    await self._answer_hearing(noted.asking)
                 if self._keys.filter:
                     self._hear_unserved()
                 for peer in self._hearing.take_due():
-                    self._main.ask_hearing(peer, partial(self._note_heard_by, peer))
+                    self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
-                unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
+                unmet = await self._unmet.find(noted.connected, self._present, self._dialing.is_dialled)
                 for peer, address in (*self._dialing.take_due(), *unmet):
                     if peer not in self._patches:
                         tasks.start_soon(self._patch, peer, address)
 
-    async def _wait_for_work(self) -> None:
-        """Wait until zenoh's threads have noted something, or somebody is to be asked or dialled."""
-        self._stirred = anyio.Event()
-        if self._noted_at == math.inf:
-            times = (self._hearing.next_due(), self._dialing.next_due(), self._unmet.next_due())
-            due = min((time for time in times if time is not None), default=math.inf)
-            with anyio.move_on_after(due - monotonic()):
-                await self._stirred.wait()
-
-    def _stir(self) -> None:
-        """Have what was noted looked after soon; the lock is held."""
-        self._noted_at = min(self._noted_at, monotonic())
-        # Nobody keeps the sessions connected yet, or the event loop has ended.
-        with suppress(RuntimeError):
-            self._waker.wake()
+    def _next_due(self) -> float:
+        """The time at which somebody is to be asked or dialled."""
+        times = (self._hearing.next_due(), self._dialing.next_due(), self._unmet.next_due())
+        return min((time for time in times if time is not None), default=math.inf)
 
     def _hear_unserved(self) -> None:
         """Hear the live keys of peers that do not serve this link's filter, by the last answer of each."""
@@ -244,8 +215,7 @@ class ZenohSessions:
                 session.hear_all_of(unserved)
             except zenoh.ZError:
                 # It is declared later, or the session has ended.
-                with self._lock:
-                    self._stir()
+                self._notes.stir()
 
     async def _note(self, changes: list[tuple[str, Presence]]) -> None:
         for peer, presence in changes:
@@ -288,6 +258,13 @@ class ZenohSessions:
             self._drop_patch(peer)
             self._dialing.left(peer)
 
+    async def _answer_hearing(self, asking: Iterable[zenoh.Query]) -> None:
+        with self._lock:
+            answers = [(query, self._names_heard(query)) for query in asking]
+        await self._note_unheard(answers)
+        # zenoh may wait for a peer that is frozen.
+        await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
+
     async def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
         """Dial those that have asked several times whether they are heard, and are not."""
         unheard: set[str] = set()
@@ -304,7 +281,7 @@ class ZenohSessions:
             for asker in unheard & addresses.keys():
                 self._dialing.reached(asker, addresses[asker])
                 self._dialing.left(asker)
-        if len(self._unheard) > _MOST_ASKING:
+        if len(self._unheard) > MOST_ASKING:
             self._unheard.clear()
 
     def _names_heard(self, query: zenoh.Query) -> list[str]:
@@ -314,40 +291,16 @@ class ZenohSessions:
 
     def _asker(self, query: zenoh.Query) -> str | None:
         """The link that asks whether it is heard; None for one that this link does not mean to hear."""
-        return self._peer_of(b"" if query.payload is None else query.payload.to_bytes())
-
-    def _peer_of(self, data: bytes) -> str | None:
-        """The link that a token belongs to; None for one that this link does not mean to hear."""
-        token = data.decode("ascii", "replace")
-        found = self._keys.session(token)
-        if found is None or not any(zenoh.KeyExpr(key).includes(token) for key in self._keys.heard("@alive")):
-            return None
-        return found[0]
-
-    def _note_connection(self, peer: str, address: str) -> None:
-        with self._lock:
-            self._connected.append((peer, address))
-            self._stir()
+        return self._keys.heard_link(b"" if query.payload is None else query.payload.to_bytes())
 
     def _note_asked(self, query: zenoh.Query) -> None:
-        with self._lock:
-            if len(self._asking) < _MOST_ASKING and self._asker(query) is not None:
-                self._asking.append(query)
-                self._stir()
-                return
-        query.drop()
+        if self._asker(query) is None or not self._notes.add_question(query):
+            query.drop()
 
     def _note_heard(self, token: bytes) -> None:
-        with self._lock:
-            peer = self._peer_of(token)
-            if peer is not None and len(self._hearers) < _MOST_ASKING:
-                self._hearers.add(peer)
-                self._stir()
-
-    def _note_heard_by(self, peer: str, names: list[str] | None) -> None:
-        with self._lock:
-            self._heard_by.append((peer, names))
-            self._stir()
+        peer = self._keys.heard_link(token)
+        if peer is not None:
+            self._notes.add_hearer(peer)
 
     async def _patch(self, peer: str, address: str) -> None:
         try:
@@ -407,8 +360,8 @@ class ZenohSessions:
         with self._lock:
             changed = served is (peer in self._unserved)
             (self._unserved.discard if served else self._unserved.add)(peer)
-            if changed and self._keys.filter:
-                self._stir()
+        if changed and self._keys.filter:
+            self._notes.stir()
 
     def _note_directly(self, link: str, name: str, presence: Presence) -> None:
         self._note_presence(link, (None, name), presence)
@@ -427,5 +380,4 @@ class ZenohSessions:
             if is_present is not was_present:
                 self._receive(Received(peer, presence))
             if is_present is not was_present or way == (None, FIRST_SESSION):
-                self._changes.append((peer, presence))
-                self._stir()
+                self._notes.add_change(peer, presence)

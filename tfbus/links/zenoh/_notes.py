@@ -1,0 +1,117 @@
+"""The notes that zenoh's threads make for the task that keeps the sessions of a link connected."""
+
+import math
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NamedTuple
+
+import anyio
+import zenoh
+
+from tfbus._aio.loop_waker import LoopWaker
+from tfbus.links._receive_queue import Presence
+
+MOST_ASKING = 1_000
+"""So many questions, and so many links that hear this one, are noted at once."""
+
+
+class Noted(NamedTuple):
+    """All that was noted since it was taken last."""
+
+    changes: list[tuple[str, Presence]]
+    """Peers that have come, or gone by one of their ways."""
+    connected: list[tuple[str, str]]
+    """Sessions and addresses to which connections have come or gone."""
+    asking: list[zenoh.Query]
+    """Questions of links whether they are heard."""
+    heard_by: list[tuple[str, list[str] | None]]
+    """Answers of peers to such questions: the sessions of this link that they hear, or None for no answer."""
+    hearers: set[str]
+    """Peers that have told by themselves that they hear this link."""
+
+
+class Notes:
+    """Takes notes from any thread, and wakes the event loop for them.
+
+    Parameters
+    ----------
+    now : callable
+        Returns a monotonic time in s.
+
+    Attributes
+    ----------
+    since : float
+        The time of the oldest note, in s; infinite while there is none.
+    """
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._lock = threading.Lock()
+        self._noted = Noted([], [], [], [], set())
+        self._stirred = anyio.Event()
+        self._waker = LoopWaker(lambda: self._stirred.set())
+        self.since = math.inf
+
+    def bind(self) -> None:
+        """Wake the running event loop from now on."""
+        self._waker.bind()
+
+    def add_change(self, peer: str, presence: Presence) -> None:
+        """Note that a peer has come or gone."""
+        with self._lock:
+            self._noted.changes.append((peer, presence))
+            self._stir()
+
+    def add_connection(self, session: str, address: str) -> None:
+        """Note that a connection to a session at an address has come or gone."""
+        with self._lock:
+            self._noted.connected.append((session, address))
+            self._stir()
+
+    def add_question(self, query: zenoh.Query) -> bool:
+        """Note a question whether its sender is heard; returns False, and notes nothing, if there are too many."""
+        with self._lock:
+            if len(self._noted.asking) >= MOST_ASKING:
+                return False
+            self._noted.asking.append(query)
+            self._stir()
+        return True
+
+    def add_answer(self, peer: str, names: list[str] | None) -> None:
+        """Note the answer of a peer to such a question."""
+        with self._lock:
+            self._noted.heard_by.append((peer, names))
+            self._stir()
+
+    def add_hearer(self, peer: str) -> None:
+        """Note that a peer hears this link, unless there are too many of them."""
+        with self._lock:
+            if len(self._noted.hearers) < MOST_ASKING:
+                self._noted.hearers.add(peer)
+                self._stir()
+
+    def stir(self) -> None:
+        """Wake the event loop for something that needs no note."""
+        with self._lock:
+            self._stir()
+
+    def take(self) -> Noted:
+        """Remove and return all notes."""
+        with self._lock:
+            noted, self._noted = self._noted, Noted([], [], [], [], set())
+            self.since = math.inf
+        return noted
+
+    async def wait(self, due: float) -> None:
+        """Wait until something is noted, or until a time."""
+        self._stirred = anyio.Event()
+        if self.since == math.inf:
+            with anyio.move_on_after(due - self._now()):
+                await self._stirred.wait()
+
+    def _stir(self) -> None:
+        self.since = min(self.since, self._now())
+        # The loop is not bound yet, or has ended.
+        with suppress(RuntimeError):
+            self._waker.wake()
