@@ -173,6 +173,16 @@ def test_a_link_claims_its_state_ever_less_often_while_nothing_happens() -> None
         made.leave()
 
 
+def test_a_peer_that_has_gone_is_asked_no_more() -> None:
+    domain = Domain()
+    end = domain.join(Bus(SimulatedClock()))
+    end.endpoint.handle(Received("a", Presence.JOINED))
+    assert end.endpoint.next_question() == domain.time
+    end.endpoint.handle(Received("a", Presence.LEFT))
+    assert end.endpoint.next_question() is None
+    end.leave()
+
+
 class Heard:
     """Notes the times that an endpoint hears, among what its bus publishes and removes."""
 

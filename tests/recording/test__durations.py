@@ -31,6 +31,15 @@ def test_mean_and_maximum_are_exact_and_the_quantile_is_within_1_percent(
     assert spread.p99 <= spread.max
 
 
+def test_two_of_two_hundred_are_beyond_the_quantile_and_three_are_not() -> None:
+    for late, p99 in ((2, 1.0), (3, 100.0)):
+        durations = Durations()
+        durations.add(np.array([SECOND] * (200 - late) + [100 * SECOND] * late))
+        spread = durations.spread()
+        assert spread is not None
+        assert (spread.p99, spread.max) == (pytest.approx(p99, rel=0.0101), 100.0)
+
+
 def test_zero_is_exact_and_nothing_has_no_spread() -> None:
     zero = Durations()
     zero.add(np.zeros(3, np.int64))

@@ -61,6 +61,7 @@ def test_the_official_reader_reads_topics_times_and_transforms(tmp_path: Path) -
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
+        assert [(entry.name, entry.metadata) for entry in reader.iter_metadata()] == [("rosbag2", {})]
         found = [
             (
                 *(schema.name, schema.encoding, channel.message_encoding, channel.topic),

@@ -58,6 +58,9 @@ def test_foxglove_messages_of_ros_have_the_layout_of_ros() -> None:
     single = b"\0\1\0\0" + struct.pack("<iI", 5, 6) + names
     single += bytes(-(len(single) - 4) % 8) + NUMBERS
     assert parser_of(foxglove("cdr", "foxglove_msgs/msg/FrameTransform"))(single) == [ONE]
+    assert parser_of(many)(write_cdr([ONE]) + bytes(3)) == [ONE]
+    with pytest.raises(MalformedMessageError, match=r": 4 bytes behind the last transform"):
+        parser_of(many)(write_cdr([ONE]) + bytes(4))
     ros1 = struct.pack("<II", 5, 6) + b"\3\0\0\0map\4\0\0\0base" + NUMBERS
     assert parser_of(foxglove("ros1", "foxglove_msgs/FrameTransform"))(ros1) == [ONE]
 
