@@ -491,6 +491,15 @@ class NumpyFreeLock:
             self.array_functions.append(frame.f_code.co_qualname)
 
 
+def test_a_policy_is_checked_although_no_stamp_needs_it() -> None:
+    tree = tree_of(*over("map", "cart", range(0, 101, 10)))
+    assert len(tree.lookup_many("map", "cart", [10, 25], tolerance=0.0)) == 2
+    wrong: list[dict[str, Any]] = [{"tolerance": -1.0}, {"tolerance": math.nan}, {"max_gap": -1.0}]
+    for options in wrong:
+        with pytest.raises(ValueError, match=next(iter(options))):
+            tree.lookup_many("map", "cart", [10, 25], **options)
+
+
 STAMPS = np.arange(10_000) % 2_001 * 10
 LOCKED_QUESTIONS: list[Any] = [
     pytest.param(lambda tree: tree.lookup_many("map", "cart", STAMPS), id="plain"),

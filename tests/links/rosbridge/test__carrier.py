@@ -62,9 +62,11 @@ async def test_attempts_to_come_back_are_ever_further_apart_up_to_a_limit(monkey
 
     found: Any = object()
     carrier = Refused("ws://127.0.0.1:1", settings_of({}))
-    carrier._report = SendReport(lambda _: None)
+    told: list[str] = []
+    carrier._report = SendReport(lambda error: told.append(str(error)))
     monkeypatch.setattr(anyio, "sleep", sleep)
     await carrier._come_back()
+    assert told == ["ws://127.0.0.1:1: refused"] * 7
     # Each is between a half of it and the whole, so that not all clients of a server come in one instant.
     for pause, longest in zip(pauses, [0.25, 0.5, 1.0, 2.0, 4.0, 5.0, 5.0, 5.0], strict=True):
         assert longest / 2 <= pause <= longest
