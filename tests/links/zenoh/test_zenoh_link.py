@@ -687,10 +687,10 @@ async def test_fifty_links_one_after_another_leave_no_thread_and_no_file_behind(
             before = held()
             for _ in range(50):
                 await open_one()
-            threads, files, bytes_held = (now - then for now, then in zip(held(), before, strict=True))
-    # zenoh and anyio keep a few idle threads for some seconds; what each link leaves would be fifty.
-    assert threads < 10
-    assert files < 10
+            # zenoh and anyio keep a few idle threads for some seconds, and a session that ends still has its files;
+            # what each link leaves would be fifty for good.
+            await until(lambda: all(now - then < 10 for now, then in zip(held()[:2], before[:2], strict=True)))
+            bytes_held = held()[2] - before[2]
     assert bytes_held < 10e6
 
 
