@@ -75,10 +75,10 @@ class Asker:
             if question.open and question.due <= now:
                 question.patience = min(2 * question.patience, LONGEST_PATIENCE)
                 self._pause(question)
-        room = MOST_OPEN - sum(question.open for question in self._questions.values())
+        already_open = sum(question.open for question in self._questions.values())
         due = [peer for peer, question in self._questions.items() if not question.open and question.due <= now]
-        asked = due[: max(room, 0)]
-        others = MOST_OPEN - room + len(asked) - 1
+        asked = due[: max(MOST_OPEN - already_open, 0)]
+        others = already_open + len(asked) - 1
         for peer in asked:
             question = self._questions[peer]
             question.open = True
