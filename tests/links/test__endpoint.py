@@ -169,6 +169,13 @@ def test_a_link_claims_its_state_ever_less_often_while_nothing_happens() -> None
     end.endpoint.send()
     wire.packets.clear()
     assert [round(time - sent, 6) for time in claims(until=sent + 7.5)] == [CLAIM_PERIOD, 3.0, 7.0]
+    # A claim goes to all peers, so many of them are told less often.
+    domain.time = joined = sent + 60.0
+    for number in range(38):
+        end.endpoint.handle(Received(f"one of 40, {number}", Presence.JOINED))
+    assert [round(time - joined, 6) for time in claims(until=joined + 80.0)] == [0.0, 16.0, 46.0, 76.0]
+    end.endpoint.handle(Received("one of 41", Presence.JOINED))
+    assert [round(time - joined, 6) for time in claims(until=joined + 90.0)] == [84.2]
     for made in (end, other):
         made.leave()
 

@@ -23,9 +23,14 @@ from tfbus.links._state_teller import StateTeller
 from tfbus.tf_message import MalformedMessageError
 
 CLAIM_PERIOD = 1.0
+CLAIM_PERIOD_EACH = 0.2
 LONGEST_CLAIM_PERIOD = 30.0
 """s; a link claims its state so long after it has sent something or met a peer, and then after twice that time, up to
-the longest."""
+the longest.
+
+A claim goes to all peers, so it is seldomer where there are many: the first time is so many seconds for each of them,
+if that is more.
+"""
 
 
 class Endpoint:
@@ -130,7 +135,7 @@ class Endpoint:
         if turn.entries or turn.statics or turn.time is not None:
             self._carrier.send(turn)
             self._claimed_at = self._now()
-            self._claim_period = CLAIM_PERIOD
+            self._claim_soon()
 
     def tell_time(self, stamp: int) -> None:
         """Tell peers the time of this bus's clock, in ns, with all that is published from now on."""
@@ -252,6 +257,9 @@ class Endpoint:
         else:
             self._reconciler.answered(sender, message)
 
+    def _claim_soon(self) -> None:
+        self._claim_period = min(max(CLAIM_PERIOD, CLAIM_PERIOD_EACH * len(self.peers)), LONGEST_CLAIM_PERIOD)
+
     def _peer_joined(self, sender: str) -> None:
         evicted = self.peers.make_room(sender)
         if evicted is not None:
@@ -260,7 +268,7 @@ class Endpoint:
         if peer is not None and not peer.present:
             peer.present = True
             # A peer that has never lost this link asks for nothing now, and may have missed something all the same.
-            self._claim_period = CLAIM_PERIOD
+            self._claim_soon()
             if self._reconciler is not None:
                 self._reconciler.joined(peer)
             if self.outbox.time is not None:

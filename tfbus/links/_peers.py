@@ -74,6 +74,10 @@ class Peers:
         self._reported_of_unknown = SeenKeys(_REMEMBERED_REASONS)
         self.rejected: Counter[str] = Counter()
 
+    def __len__(self) -> int:
+        """How many peers are known, present or not."""
+        return len(self._peers)
+
     @property
     def present(self) -> tuple[str, ...]:
         """The ids of the peers that have announced themselves, sorted."""
