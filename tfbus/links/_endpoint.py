@@ -24,7 +24,7 @@ from tfbus.tf_message import MalformedMessageError
 
 CLAIM_PERIOD = 1.0
 CLAIM_PERIOD_EACH = 0.2
-LONGEST_CLAIM_PERIOD = 30.0
+LONGEST_CLAIM_PERIOD = 120.0
 """s; a link claims its state so long after it has sent something or met a peer, and then after twice that time, up to
 the longest.
 
