@@ -21,8 +21,8 @@ MOST_FAILED = 0.01
 
 
 def seconds(stamp: int) -> float:
-    """The time of the day, or so: between two samples the answer is exact, however late the second one is."""
-    return stamp % 10**14 / 1e9
+    """Seconds since some day: between two samples the answer is exact, however late the second one is."""
+    return (stamp - 1_750_000_000 * 10**9) / 1e9
 
 
 class Program:

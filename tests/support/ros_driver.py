@@ -19,8 +19,8 @@ Answer = tuple[int, float]
 
 
 def seconds(stamp: int) -> float:
-    """The time of the day, or so: between two samples tf2 is exact, however late the second one is."""
-    return stamp % 10**14 / 1e9
+    """Seconds since some day: between two samples tf2 is exact, however late the second one is."""
+    return (stamp - 1_750_000_000 * 10**9) / 1e9
 
 
 class Driver:
