@@ -1,6 +1,7 @@
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from queue import Queue
+from typing import Any, ClassVar, cast
 from uuid import uuid4
 
 import anyio
@@ -12,6 +13,7 @@ from tfbus.links._carrier import SendReport
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._outbox import Turn
+from tfbus.links._part_writer import PartWriter
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links._state import StateStep
 from tfbus.links.zenoh._carrier import ZenohCarrier
@@ -133,6 +135,23 @@ async def test_nothing_is_written_while_nobody_hears_it_and_whoever_comes_back_s
         here.carrier.send(Turn([unsendable], {}))
         assert (here.report.messages, here.report.not_sent, here.errors) == (1, {}, [])
         assert here.carrier._writer.write([RemovedFrame(ORIGIN, 8, "c")])[0].number == message.number + 2
+
+
+async def test_sessions_serve_other_filters_as_soon_as_there_are_others() -> None:
+    class Sessions:
+        filters: ClassVar[dict[str, set[str]]] = {}
+        served: ClassVar[list[dict[str, set[str]]]] = []
+        serve = served.append
+
+    carrier = End(new_domain(), "tcp/127.0.0.1:0", listens=True).carrier
+    carrier._sessions = cast(Any, Sessions)
+    carrier._parts = PartWriter(SendReport(print))
+    carrier._filters = Sessions.filters
+    for filters in ({"near": {"a"}}, {}):
+        Sessions.filters = filters
+        carrier._serve_filters()
+        carrier._serve_filters()
+    assert Sessions.served == [{"near": {"a"}}, {}]
 
 
 async def test_failures_to_send_are_reported_and_never_raised() -> None:
