@@ -154,6 +154,30 @@ async def test_sessions_serve_other_filters_as_soon_as_there_are_others() -> Non
     assert Sessions.served == [{"near": {"a"}}, {}]
 
 
+@pytest.mark.parametrize(("heard", "sent"), [(True, 1), (False, 0)])
+async def test_the_newest_samples_are_sent_slowly_once_if_anybody_hears_them(
+    monkeypatch: pytest.MonkeyPatch, heard: bool, sent: int
+) -> None:
+    class Sessions:
+        put: ClassVar[list[object]] = []
+        is_heard_slowly = staticmethod(lambda: heard)
+        put_slowly = put.extend
+
+    carrier = End(new_domain(), "tcp/127.0.0.1:0", listens=True).carrier
+    carrier._sessions = cast(Any, Sessions)
+    carrier._newest.claim(StateStep(3, 5, 99))
+    periods = iter(range(3))
+
+    async def sleep(_: float) -> None:
+        if next(periods) == 2:
+            raise TimeoutError
+
+    monkeypatch.setattr(anyio, "sleep", sleep)
+    with pytest.raises(TimeoutError):
+        await carrier._send_slowly()
+    assert len(Sessions.put) == sent
+
+
 async def test_failures_to_send_are_reported_and_never_raised() -> None:
     async with ends() as (here, _):
         long = OutgoingBatch(ORIGIN, 1, (moving("map", "a", 2**62),))
