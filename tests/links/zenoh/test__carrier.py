@@ -137,7 +137,7 @@ async def test_nothing_is_written_while_nobody_hears_it_and_whoever_comes_back_s
         assert here.carrier._writer.write([RemovedFrame(ORIGIN, 8, "c")])[0].number == message.number + 2
 
 
-async def test_sessions_serve_other_filters_as_soon_as_there_are_others() -> None:
+def test_sessions_serve_other_filters_as_soon_as_there_are_others() -> None:
     class Sessions:
         filters: ClassVar[dict[str, set[str]]] = {}
         served: ClassVar[list[dict[str, set[str]]]] = []
