@@ -187,6 +187,11 @@ def test_a_peer_whose_answers_lead_nowhere_is_asked_no_more() -> None:
         assert not asker.goes_on("peer", message), "the same once more"
         assert asked == ["", "base"]
         assert not asker.goes_on("nobody", message)
+        for held, goes_on in ((MOST_HELD - 1, True), (MOST_HELD, False)):
+            full = HistoryAsker(5.0, lambda *_: None, lambda: 0.0)
+            full.joined("peer")
+            assert all(full.holds("peer", message) for _ in range(held))
+            assert full.goes_on("peer", message) is goes_on
 
 
 def test_it_has_to_be_a_time_that_passes() -> None:

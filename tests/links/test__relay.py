@@ -380,6 +380,20 @@ def test_without_drop_the_frames_of_a_lost_peer_stay_everywhere() -> None:
         assert [frames_of(bus) for bus in net.buses] == [{"s", "a"}] * 4
 
 
+def test_a_frame_that_stayed_is_of_the_peer_that_says_it_again() -> None:
+    with Network(PAIR) as net:
+        (domain,) = net.domains
+        here, there = domain.ends
+        here.bus.publish(static("map", "s"))
+        events = there.bus.events()
+        for _ in range(2):
+            net.settle()
+            domain.part(here, there)
+            net.settle()
+            domain.meet(here, there)
+        assert losses(events) == [(here.id, ("s",))] * 2
+
+
 def test_the_loss_of_a_bridge_removes_no_frame_from_its_publisher() -> None:
     with Network(TWO_BRIDGES, drop_lost=True) as net:
         source, first, _, far = net.buses

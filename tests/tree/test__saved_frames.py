@@ -105,7 +105,7 @@ def test_a_tree_goes_to_a_pool_of_new_processes() -> None:
 
 def test_the_samples_on_either_side_of_a_stamp_are_those_that_were_sent() -> None:
     first, second = moving("map", "base", 10, 1.0, "a"), moving("odom", "base", 20, 2.0, "b")
-    mount = static("base", "lidar", 3.0, 5, "urdf")
+    mount = static("base", "lidar", 3.0, 0, "urdf")
     tree = tree_of(first, second, mount)
     assert tree.samples_around("base", 15) == (first, second)
     assert tree.samples_around("base", 10) == (first, first)

@@ -216,6 +216,12 @@ def test_late_samples_that_form_a_loop_in_the_past_are_noted() -> None:
     assert looping(*before, moving("b", "a", 2)) == [("a", 4, ("a", "b", "a"))]
 
 
+def test_the_first_sample_of_a_root_may_form_a_loop_in_the_past() -> None:
+    before = [moving("a", "b", 0), moving("a", "b", 5), moving("odom", "b", 10)]
+    assert looping(*before, moving("b", "a", 3)) == [("a", 3, ("a", "b", "a"))]
+    assert looping(*before, moving("b", "a", 11)) == []
+
+
 def test_frames_that_change_places_in_one_batch_form_no_loop() -> None:
     known = forest(moving("c", "a", 0), moving("a", "b", 0))
     known.commit((moving("b", "a", 10), moving("c", "b", 10)))

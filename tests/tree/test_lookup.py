@@ -25,8 +25,10 @@ from tfbus import (
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.testing import assert_close
+from tfbus.tree.extrapolation import Extrapolation
 from tfbus.tree.forest import Forest
-from tfbus.tree.lookup import find, find_in_time_travel
+from tfbus.tree.lookup import Bounds, find, find_in_time_travel
+from tfbus.tree.policy import Policy
 from tfbus.tree.tree import forest_of
 
 
@@ -612,6 +614,15 @@ def test_a_stamp_beyond_64_bits_is_a_value_error(source: str) -> None:
 def test_a_frame_name_that_is_no_str_is_a_type_error(names: tuple[Any, Any]) -> None:
     with pytest.raises(TypeError, match="must be a str"):
         tree_of(moving("a", "b", 5)).lookup(*names)
+
+
+def test_what_is_too_old_for_latest_lacks_what_cannot_be_held() -> None:
+    forest = forest_of(tree_of(*over("map", "base", (5, 10)), moving("base", "arm", 5)))
+    extrapolation = Extrapolation(Policy(hold=3))
+    with pytest.raises(FutureExtrapolationError) as caught:
+        find(forest, "map", "arm", LATEST, Bounds(9, STAMP_MAX), extrapolation)
+    assert (caught.value.child, caught.value.stamp, caught.value.slack) == ("arm", 9, 3)
+    assert find(forest, "map", "arm", LATEST, Bounds(8, STAMP_MAX), extrapolation)[0] == 8
 
 
 def test_the_latest_answer_goes_the_way_that_an_answer_at_its_stamp_goes() -> None:

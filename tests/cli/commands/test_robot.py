@@ -14,7 +14,7 @@ from support.programs import free_address, start_tfbus
 
 from tfbus import SECOND, Buffer, Bus, RobotModel, TransformStamped
 from tfbus.cli.commands import robot
-from tfbus.cli.commands.robot import tree_lines
+from tfbus.cli.commands.robot import _layout, tree_lines
 
 CRANE = """<?xml version="1.0"?>
 <robot name="crane">
@@ -220,6 +220,12 @@ def test_other_programs_receive_the_frames_of_the_robot(crane: str) -> None:
         assert robot.end() == 130
     assert robot.output.text == ""
     assert len(robot.errors.text.splitlines()) == 1
+
+
+def test_levels_become_narrower_only_where_the_positions_would_lose_their_least_width() -> None:
+    rows = [("", "base", "", "", ""), ("└── ", "arm", "", "", 20 * "7")]
+    # 7 columns of frames, 2 between and 16 of positions; with narrow levels, 5 of frames.
+    assert [_layout(rows, width) for width in (None, 25, 24)] == [(4, 20), (4, 16), (2, 17)]
 
 
 def test_where_the_tree_does_not_fit_types_and_joints_go_and_mimics_are_shortened(crane: str) -> None:

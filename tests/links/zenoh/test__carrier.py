@@ -1,6 +1,7 @@
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from queue import Queue
+from typing import Any, ClassVar, cast
 from uuid import uuid4
 
 import anyio
@@ -12,6 +13,7 @@ from tfbus.links._carrier import SendReport
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._outbox import Turn
+from tfbus.links._part_writer import PartWriter
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links._state import StateStep
 from tfbus.links.zenoh._carrier import ZenohCarrier
@@ -133,6 +135,47 @@ async def test_nothing_is_written_while_nobody_hears_it_and_whoever_comes_back_s
         here.carrier.send(Turn([unsendable], {}))
         assert (here.report.messages, here.report.not_sent, here.errors) == (1, {}, [])
         assert here.carrier._writer.write([RemovedFrame(ORIGIN, 8, "c")])[0].number == message.number + 2
+
+
+def test_sessions_serve_other_filters_as_soon_as_there_are_others() -> None:
+    class Sessions:
+        filters: ClassVar[dict[str, set[str]]] = {}
+        served: ClassVar[list[dict[str, set[str]]]] = []
+        serve = served.append
+
+    carrier = End(new_domain(), "tcp/127.0.0.1:0", listens=True).carrier
+    carrier._sessions = cast(Any, Sessions)
+    carrier._parts = PartWriter(SendReport(print))
+    carrier._filters = Sessions.filters
+    for filters in ({"near": {"a"}}, {}):
+        Sessions.filters = filters
+        carrier._serve_filters()
+        carrier._serve_filters()
+    assert Sessions.served == [{"near": {"a"}}, {}]
+
+
+@pytest.mark.parametrize(("heard", "sent"), [(True, 1), (False, 0)])
+async def test_the_newest_samples_are_sent_slowly_once_if_anybody_hears_them(
+    monkeypatch: pytest.MonkeyPatch, heard: bool, sent: int
+) -> None:
+    class Sessions:
+        put: ClassVar[list[object]] = []
+        is_heard_slowly = staticmethod(lambda: heard)
+        put_slowly = put.extend
+
+    carrier = End(new_domain(), "tcp/127.0.0.1:0", listens=True).carrier
+    carrier._sessions = cast(Any, Sessions)
+    carrier._newest.claim(StateStep(3, 5, 99))
+    periods = iter(range(3))
+
+    async def sleep(_: float) -> None:
+        if next(periods) == 2:
+            raise TimeoutError
+
+    monkeypatch.setattr(anyio, "sleep", sleep)
+    with pytest.raises(TimeoutError):
+        await carrier._send_slowly()
+    assert len(Sessions.put) == sent
 
 
 async def test_failures_to_send_are_reported_and_never_raised() -> None:

@@ -156,6 +156,16 @@ def test_what_the_metadata_promise_and_the_files_do_not_have_is_told(
     metadata(tmp_path, "run_0.mcap", topic=topic, count=count)
     *_, lost = messages_in(tmp_path)
     assert says in str(lost.errors[0])
+    assert lost.received == 29
+
+
+def test_what_is_missing_of_several_files_is_told_behind_their_last_message(tmp_path: Path) -> None:
+    for part in range(2):
+        write_mcap(tmp_path / f"run_{part}.mcap", LINES[15 * part : 15 * part + 15])
+    metadata(tmp_path, "run_0.mcap", "run_1.mcap", count=31)
+    *_, last, lost = messages_in(tmp_path)
+    assert (last.received, lost.received) == (29, 29)
+    assert "promises 31 messages on '/tf', and 30 were found" in str(lost.errors[0])
 
 
 @pytest.mark.parametrize(
@@ -180,6 +190,16 @@ def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(tmp_
     write_mcap(tmp_path / "run_0.mcap", LINES)
     metadata(tmp_path, "run_0.mcap", topic="/gone", count=0)
     assert batches_in(tmp_path) == EXPECTED
+
+
+def test_a_compressed_file_that_is_smaller_than_a_buffer_is_read(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "run_0.mcap", LINES[:3])
+    assert path.stat().st_size < 8_192
+    (tmp_path / "run_0.mcap.zstd").write_bytes(zstandard.compress(path.read_bytes()))
+    path.unlink()
+    assert batches_in(tmp_path) == EXPECTED[:3]
+    with open_recording(tmp_path) as recording:
+        assert recording.finished
 
 
 def test_without_metadata_an_uncompressed_file_hides_the_compressed_one(tmp_path: Path) -> None:

@@ -89,6 +89,17 @@ def test_a_file_without_an_index_does_not_know_the_count_of_its_messages(write: 
         assert facts(recording) == (10, 99 + COUNT, None, False)
 
 
+def test_an_index_is_used_up_to_its_bound(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(LINES)
+    data = path.read_bytes()
+    # The footer says where the index begins.
+    size = len(data) - int.from_bytes(data[-28:-20], "little")
+    for bound, count in ((size, COUNT + 1), (size - 1, None)):
+        monkeypatch.setattr("tfbus.recording.formats._mcap.MAX_INDEX", bound)
+        with open_recording(path) as recording:
+            assert recording.count == count
+
+
 def test_a_message_at_log_time_zero_counts(write: Write) -> None:
     for finish in (True, False):
         path = write([(0, "/tf", [moving("a", "b", 0)])], finish=finish)
