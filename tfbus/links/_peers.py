@@ -75,7 +75,7 @@ class Peers:
         self.rejected: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        """How many peers are known, present or not."""
+        """The number of peers that are known, present or not."""
         return len(self._peers)
 
     @property
