@@ -197,7 +197,12 @@ def children_left() -> list[int]:
     """The processes that this one has started, but for those of pytest and multiprocessing; on Linux only."""
     found = []
     for children in Path("/proc/self/task").glob("*/children"):
-        for process in children.read_text().split():
+        try:
+            started = children.read_text().split()
+        except OSError:
+            # The thread has ended, and another one has its children.
+            continue
+        for process in started:
             with suppress(OSError):
                 # A process that ends, or is just beginning, has none.
                 command = Path("/proc", process, "cmdline").read_bytes()

@@ -30,11 +30,18 @@ def test_that_ends() -> None:
 LEAVING = """
 import subprocess
 from pathlib import Path
+import conftest
+
+class Proc(type(Path())):
+    def glob(self, pattern: str) -> list[Path]:
+        return [Path("/proc/self/task/0/children"), *super().glob(pattern)]
 
 def test_that_leaves_a_process() -> None:
     process = subprocess.Popen(["sh", "-c", "echo up; read end"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     process.stdout.readline()
     Path(__file__).with_name("left").write_text(str(process.pid))
+    # As if a thread had ended since it was listed.
+    conftest.Path = Proc
 """
 AFTER_IT = """
 import os
