@@ -28,8 +28,8 @@ LONGEST_CLAIM_PERIOD = 120.0
 """s; a link claims its state so long after it has sent something or met a peer, and then after twice that time, up to
 the longest.
 
-A claim goes to all peers, so it is seldomer where there are many: the first time is so many seconds for each of them,
-if that is more.
+A claim goes to all peers, so a link with many of them claims less often: the first time is `CLAIM_PERIOD_EACH` for each
+peer, if that is more than `CLAIM_PERIOD`.
 """
 
 
