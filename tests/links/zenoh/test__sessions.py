@@ -170,6 +170,7 @@ async def test_nobody_at_the_address_is_tried_again() -> None:
 @pytest.mark.thorough
 async def test_an_end_that_does_not_hear_those_who_ask_it_dials_them() -> None:
     async with ends(1) as (here,), joined_to(here) as joining:
+        await until(lambda: here.id in joining.dialing._addresses)
         # As if zenoh had never told of it. The other end has accepted the connection, and cannot dial this one.
         joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
         joining.sessions._notes.take()
@@ -258,7 +259,7 @@ class Alone(End):
     def __init__(self) -> None:
         super().__init__(new_domain())
         self.peer = uuid4().hex
-        self.sessions._main.addresses = lambda: {self.peer: "tcp/10.0.0.7:1"}  # type: ignore[method-assign]
+        self.dialing.reached(self.peer, "tcp/10.0.0.7:1")
         self.patch: Any = Patch()
 
     def hears(self, name: str = FIRST_SESSION) -> None:
@@ -271,9 +272,9 @@ class Alone(End):
         dropped: list[bool] = []
         return SimpleNamespace(payload=payload, drop=lambda: dropped.append(True), dropped=dropped)
 
-    async def note(self) -> None:
+    def note(self) -> None:
         """Note the changes, as `keep_connected` does."""
-        await self.sessions._note(self.sessions._notes.take().changes)
+        self.sessions._note(self.sessions._notes.take().changes)
 
 
 async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
@@ -313,20 +314,20 @@ async def test_what_a_patch_receives_is_of_its_peer_or_of_nobody() -> None:
 async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_there() -> None:
     alone = Alone()
     alone.hears()
-    await alone.note()
+    alone.note()
     assert alone.peer in alone.sessions._hearing._checks
     alone.sessions._patches[alone.peer] = alone.patch
     alone.sessions._deaf.add(alone.peer)
     alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT)
-    await alone.note()
+    alone.note()
     assert alone.dialing.is_dialled(alone.peer)
     assert (alone.sessions._hearing._checks, alone.sessions._deaf, alone.sessions._patches) == ({}, set(), {})
     alone.hears()
-    await alone.note()
+    alone.note()
     assert not alone.dialing.is_dialled(alone.peer)
     # It had gone and come again in between: nobody is lost.
     alone.sessions._notes.add_change(alone.peer, Presence.LEFT)
-    await alone.note()
+    alone.note()
     assert not alone.dialing.is_dialled(alone.peer)
     assert alone.peer in alone.sessions._hearing._checks
 
@@ -339,10 +340,10 @@ async def test_a_peer_that_is_heard_directly_needs_a_patch_only_while_it_is_deaf
         alone.sessions._deaf.add(alone.peer)
     # Another session than the first is no direct connection.
     alone.hears("another")
-    await alone.note()
+    alone.note()
     assert (alone.patch.closed, alone.sessions._hearing._checks) == (0, {})
     alone.hears()
-    await alone.note()
+    alone.note()
     assert alone.patch.closed == (not deaf)
     assert list(alone.sessions._hearing._checks) == [alone.peer]
 
@@ -351,7 +352,7 @@ async def test_a_peer_that_is_heard_directly_needs_a_patch_only_while_it_is_deaf
 async def test_a_peer_that_does_not_hear_this_link_twice_is_dialled_until_it_does(answer: list[str] | None) -> None:
     alone = Alone()
     alone.hears()
-    await alone.note()
+    alone.note()
     for number in range(DEAF):
         assert not alone.dialing.is_dialled(alone.peer), number
         alone.sessions._patches[alone.peer] = alone.patch
@@ -381,17 +382,17 @@ async def test_whoever_asks_twice_whether_it_is_heard_and_is_not_is_dialled() ->
     sessions, query = alone.sessions, alone.question()
     for names in ([], [FIRST_SESSION], [], []):
         assert not alone.dialing.is_dialled(alone.peer)
-        await sessions._note_unheard([(query, names), (alone.question(""), [])])
+        sessions._note_unheard([(query, names), (alone.question(""), [])])
     assert alone.dialing.is_dialled(alone.peer)
     assert alone.dialing._addresses == {alone.peer: ["tcp/10.0.0.7:1"]}
     # Its time is not put off by the next question.
     due = alone.dialing.next_due()
-    await sessions._note_unheard([(query, [])])
+    sessions._note_unheard([(query, [])])
     assert alone.dialing.next_due() == due
     assert sessions._unheard == {alone.peer: 3}
     for count, left in ((MOST_ASKING, MOST_ASKING), (MOST_ASKING + 1, 0)):
         sessions._unheard.update(f"{count}, {k}" for k in range(count - len(sessions._unheard)))
-        await sessions._note_unheard([])
+        sessions._note_unheard([])
         assert len(sessions._unheard) == left
 
 

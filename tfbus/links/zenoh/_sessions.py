@@ -176,9 +176,8 @@ class ZenohSessions:
                 late = monotonic() - min(began, self._notes.since) > 3 * interval
                 noted = self._notes.take()
                 for peer, address in noted.connected:
-                    # Where this loop has no time, the connection may be gone when its address is asked for.
                     self._dialing.reached(peer, address)
-                await self._note(noted.changes)
+                self._note(noted.changes)
                 for peer, _ in noted.connected:
                     if self._is_direct(peer):
                         self._hearing.joined(peer)
@@ -217,7 +216,7 @@ class ZenohSessions:
                 # It is declared later, or the session has ended.
                 self._notes.stir()
 
-    async def _note(self, changes: list[tuple[str, Presence]]) -> None:
+    def _note(self, changes: list[tuple[str, Presence]]) -> None:
         for peer, presence in changes:
             if presence is Presence.LEFT:
                 if peer not in self._present:
@@ -227,12 +226,7 @@ class ZenohSessions:
                     self._drop_patch(peer)
             else:
                 self._dialing.joined(peer)
-        joined = {peer for peer, presence in changes if presence is Presence.JOINED}
-        if joined:
-            addresses = await anyio.to_thread.run_sync(self._main.addresses)
-            for peer in joined & addresses.keys():
-                self._dialing.reached(peer, addresses[peer])
-        for peer in joined:
+        for peer in {peer for peer, presence in changes if presence is Presence.JOINED}:
             # A connection is not enough: zenoh may have it, and tell nothing of the other end.
             if self._is_direct(peer):
                 self._hearing.joined(peer)
@@ -261,13 +255,12 @@ class ZenohSessions:
     async def _answer_hearing(self, asking: Iterable[zenoh.Query]) -> None:
         with self._lock:
             answers = [(query, self._names_heard(query)) for query in asking]
-        await self._note_unheard(answers)
+        self._note_unheard(answers)
         # zenoh may wait for a peer that is frozen.
         await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
 
-    async def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
+    def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
         """Dial those that have asked several times whether they are heard, and are not."""
-        unheard: set[str] = set()
         for query, names in answers:
             asker = self._asker(query)
             if asker is None or names:
@@ -275,12 +268,7 @@ class ZenohSessions:
             else:
                 self._unheard[asker] += 1
                 if self._unheard[asker] >= DEAF and not self._dialing.is_dialled(asker):
-                    unheard.add(asker)
-        if unheard:
-            addresses = await anyio.to_thread.run_sync(self._main.addresses)
-            for asker in unheard & addresses.keys():
-                self._dialing.reached(asker, addresses[asker])
-                self._dialing.left(asker)
+                    self._dialing.left(asker)
         if len(self._unheard) > MOST_ASKING:
             self._unheard.clear()
 
