@@ -43,7 +43,7 @@ def test_questions_answers_and_those_who_join_overtake_what_waits_if_that_is_muc
     urgent = [Presence.JOINED, Question(0, None), Answer(None)]
     before, behind = list(range(waiting)), [-1]
     for content in (*before, *urgent, *behind):
-        queue.put(moving(content) if isinstance(content, int) else kept(content))
+        queue.put(Received("other", content, moving=True) if isinstance(content, int) else kept(content))
     assert len(queue) == waiting + 4
     assert drained(queue) == ([*urgent, *before] if waiting > MANY else [*before, *urgent]) + behind
 
@@ -65,11 +65,39 @@ def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() 
     for item in items:
         queue.put(item)
     assert drained(queue) == [item.content for item in items]
-    # Once the end was read, nothing holds those who join.
-    many = list(range(MANY + 1))
-    for item in (*map(moving, many), kept(Presence.JOINED)):
+    # What waits of others does not hold it up, whether it came before the many or after them.
+    others = [Received("other", number, moving=True) for number in range(MANY + 1)]
+    for item in (*others[:50], moving("last"), *others[50:], kept(Presence.LEFT), kept(Presence.JOINED)):
         queue.put(item)
-    assert drained(queue) == [Presence.JOINED, *many]
+    assert drained(queue) == ["last", Presence.LEFT, Presence.JOINED, *range(MANY + 1)]
+    for item in (kept(Presence.LEFT), *others, kept(Presence.JOINED)):
+        queue.put(item)
+    assert drained(queue) == [Presence.LEFT, Presence.JOINED, *range(MANY + 1)]
+
+
+@given(steps=st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["live", "state", *Presence, "get"]))))
+def test_nothing_is_lost_and_no_peer_is_read_in_another_order(steps: list[tuple[str, object]]) -> None:
+    put: dict[str, list[int]] = {"a": [], "b": [], "c": []}
+    got: dict[str, list[int]] = {"a": [], "b": [], "c": []}
+    queue = ReceiveQueue(1_000)
+
+    def get() -> bool:
+        item = queue.get()
+        if item is not None and item.sender:
+            got[item.sender].append(item.size)
+        return item is not None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tfbus.links._receive_queue.MANY", 2)
+        for number, (sender, step) in enumerate(steps):
+            if step == "get":
+                get()
+            else:
+                put[sender].append(number)
+                queue.put(Received(sender, step, number, moving=step == "live"))
+        while get():
+            pass
+    assert got == put
 
 
 def test_beyond_the_capacity_the_oldest_moving_items_are_dropped_and_the_others_stay_in_order() -> None:
@@ -143,6 +171,12 @@ def test_discarding_moving_items_counts_them_as_dropped() -> None:
         queue.put(moving(number))
     assert queue.statistics().dropped == 4
     assert drained(queue) == ["a", "b", 0, 1, 2]
+    queue = ReceiveQueue(1_000)
+    for item in (*map(moving, range(MANY + 1)), kept(Presence.LEFT), moving(-1)):
+        queue.put(item)
+    queue.discard_moving()
+    assert queue.statistics() == QueueStatistics("link", "drop_oldest", 1_000, pending=1, dropped=MANY + 2)
+    assert drained(queue) == [Presence.LEFT]
 
 
 STEPS = st.lists(st.sampled_from(("moving", "kept", "get", "get", "discard")), max_size=60)

@@ -83,8 +83,8 @@ class ReceiveQueue:
     """Holds what threads have received until the event loop reads it.
 
     Items are read in order, so that batches stay whole. But while more than `MANY` moving items wait, what brings two
-    ends to agree is read first: questions, answers, and that a peer has joined. The end of a peer is always read in
-    order, for its last messages come before it.
+    ends to agree is read first: questions, answers, and that a peer has come or gone. All that waits of this peer is
+    read before that, for its last messages come before its end.
 
     Parameters
     ----------
@@ -102,7 +102,6 @@ class ReceiveQueue:
         self._pending: deque[Received] = deque()
         self._bytes = 0
         self._moving = 0
-        self._ends = 0
         self._dropped = 0
 
     def __len__(self) -> int:
@@ -111,8 +110,12 @@ class ReceiveQueue:
     def put(self, item: Received) -> None:
         """Append an item, from any thread."""
         with self._lock:
-            (self._urgent if self._is_urgent(item) else self._pending).append(item)
-            self._ends += item.content is Presence.LEFT
+            if self._moving > MANY and isinstance(item.content, Presence | Question | Answer):
+                if isinstance(item.content, Presence):
+                    self._hurry(item.sender)
+                self._urgent.append(item)
+            else:
+                self._pending.append(item)
             self._bytes += _footprint(item)
             self._moving += item.moving
             while self._moving > self._capacity or self._bytes > MAX_BYTES:
@@ -129,10 +132,12 @@ class ReceiveQueue:
     def discard_moving(self) -> None:
         """Drop all moving items, because the clock has jumped back."""
         with self._lock:
-            kept = [item for item in (*self._kept, *self._pending) if not item.moving]
+            for queue in (self._urgent, self._kept, self._pending):
+                kept = [item for item in queue if not item.moving]
+                queue.clear()
+                queue.extend(kept)
             self._dropped += self._moving
-            self._kept, self._pending = deque(kept), deque()
-            self._bytes = sum(map(_footprint, (*self._urgent, *kept)))
+            self._bytes = sum(map(_footprint, (*self._urgent, *self._kept, *self._pending)))
             self._moving = 0
 
     def statistics(self) -> QueueStatistics:
@@ -150,16 +155,15 @@ class ReceiveQueue:
         item = queue.popleft()
         self._bytes -= _footprint(item)
         self._moving -= item.moving
-        self._ends -= item.content is Presence.LEFT
         return item
 
-    def _is_urgent(self, item: Received) -> bool:
-        if self._moving <= MANY:
-            return False
-        if item.content is Presence.JOINED:
-            # A peer that comes back comes after its end.
-            return not self._ends
-        return isinstance(item.content, Question | Answer)
+    def _hurry(self, sender: str) -> None:
+        """Have all that waits of a peer read before what waits of others."""
+        for queue in (self._kept, self._pending):
+            waiting = list(queue)
+            queue.clear()
+            for item in waiting:
+                (self._urgent if item.sender == sender else queue).append(item)
 
 
 def _footprint(item: Received) -> int:

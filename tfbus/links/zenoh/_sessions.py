@@ -17,6 +17,7 @@ from uuid import uuid4
 import anyio
 import anyio.to_thread
 import zenoh
+from anyio.abc import TaskGroup
 
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Presence, Received
@@ -30,6 +31,8 @@ from tfbus.links.zenoh._unmet import Unmet
 
 _MEETING_TIME = 10.0
 """s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
+MOST_DIALLED = 100
+"""So many peers are dialled at once, each in a worker thread: one that is cut off takes 3 s."""
 
 _Way = tuple[ZenohSession | None, str]
 """A connection between two links: the patch here, or None for the first session, and the name of the session there."""
@@ -79,6 +82,7 @@ class ZenohSessions:
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
         self._dialing = Dialing(monotonic) if dialing is None else dialing
+        self._dialers = anyio.CapacityLimiter(MOST_DIALLED)
         self._hearing = Hearing(monotonic)
         self._unmet = Unmet(self._main, keys, monotonic)
         self._deaf: set[str] = set()
@@ -187,6 +191,7 @@ class ZenohSessions:
                     # Where this loop has no time, nobody's silence proves anything.
                     if names is not None or not late:
                         self._judge(peer, names)
+                self._dial(self._dialing.take_due(), tasks)
                 if noted.asking:
                     await self._answer_hearing(noted.asking)
                 if self._keys.filter:
@@ -195,9 +200,12 @@ class ZenohSessions:
                     self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
                 unmet = await self._unmet.find(noted.connected, self._present, self._dialing.is_dialled)
-                for peer, address in (*self._dialing.take_due(), *unmet):
-                    if peer not in self._patches:
-                        tasks.start_soon(self._patch, peer, address)
+                self._dial((*self._dialing.take_due(), *unmet), tasks)
+
+    def _dial(self, due: Iterable[tuple[str, str]], tasks: TaskGroup) -> None:
+        for peer, address in due:
+            if peer not in self._patches:
+                tasks.start_soon(self._patch, peer, address)
 
     def _next_due(self) -> float:
         """The time at which somebody is to be asked or dialled."""
@@ -292,7 +300,10 @@ class ZenohSessions:
 
     async def _patch(self, peer: str, address: str) -> None:
         try:
-            reachable = await is_reachable(address)
+            # On a busy machine a few turns of the event loop take longer than a thread waits for an answer.
+            reachable = await anyio.to_thread.run_sync(
+                is_reachable, address, abandon_on_cancel=True, limiter=self._dialers
+            )
         except ConnectionRefusedError:
             self._dialing.refused(peer, address)
             return
@@ -309,7 +320,7 @@ class ZenohSessions:
         )
         self._patches[peer] = patch
         try:
-            await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)
+            await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True, limiter=self._dialers)
         except (OSError, zenoh.ZError):
             # It may also have been lost while it began.
             self._drop_patch(peer)
