@@ -21,13 +21,14 @@ import anyio
 
 from tfbus import Bus, Transform, TransformBroadcaster, TransformStamped
 from tfbus.links.zenoh import ZenohLink
+from tfbus.links.zenoh._settings import LEASE
 
 IMPORTS = "import start_together"
 PATIENCE = 120.0
 """Seconds from the last start; who has not all frames by then is counted as without them."""
 
 
-async def live(number: int, processes: int, frames: int, rate: float, domain: str, address: str) -> None:
+async def live(number: int, processes: int, frames: int, rate: float, lease: float, domain: str, address: str) -> None:
     """Be one of the processes."""
     wanted = processes * frames
     held: set[str] = set()
@@ -44,7 +45,7 @@ async def live(number: int, processes: int, frames: int, rate: float, domain: st
         broadcaster = TransformBroadcaster(bus, authority=f"p{number}")
         for frame in range(frames):
             broadcaster.send_static("map", f"static {number} {frame}", Transform())
-        async with ZenohLink(bus, domain, **side):  # type: ignore[arg-type]
+        async with ZenohLink(bus, domain, lease=lease, **side):  # type: ignore[arg-type]
             async for _ in bus.clock.ticks(rate):
                 broadcaster.send_all([("map", f"moving {number} {frame}", Transform()) for frame in range(frames)])
 
@@ -55,12 +56,13 @@ def free_address() -> str:
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
-def measure(processes: int = 50, frames: int = 20, rate: float = 20.0) -> list[float]:
+def measure(processes: int = 50, frames: int = 20, rate: float = 20.0, lease: float = LEASE) -> list[float]:
     """Seconds from the last start until each process has all static frames; infinite for one that has not."""
     task: dict[str, Any] = {
         "processes": processes,
         "frames": frames,
         "rate": rate,
+        "lease": lease,
         "domain": f"start-{uuid4().hex}",
         "address": free_address(),
     }
@@ -108,6 +110,7 @@ if __name__ == "__main__":
     parser.add_argument("--processes", type=int, default=50)
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--rate", type=float, default=20.0, help="Hz")
+    parser.add_argument("--lease", type=float, default=LEASE, help="s")
     parser.add_argument("--be", type=json.loads, help=argparse.SUPPRESS)
     arguments = vars(parser.parse_args())
     one = arguments.pop("be")

@@ -1,4 +1,5 @@
 import math
+import threading
 from collections.abc import AsyncIterator, Collection
 from contextlib import asynccontextmanager
 from queue import Queue
@@ -15,7 +16,7 @@ from support.processes import free_ports, new_domain, until
 
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
-from tfbus.links.zenoh._dialing import Dialing
+from tfbus.links.zenoh._dialing import FIRST_PAUSE, Dialing
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._hearing import DEAF
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
@@ -309,6 +310,35 @@ async def test_what_a_patch_receives_is_of_its_peer_or_of_nobody() -> None:
         alone.sessions._receive_by_patch(Received(sender, b"x"), alone.peer)
     assert [alone.items.get_nowait().sender for _ in range(2)] == [alone.peer, ""]
     assert alone.items.empty()
+
+
+async def test_a_peer_is_dialled_while_an_answer_waits_for_one_that_is_frozen() -> None:
+    alone = Alone()
+    answers, frozen, dialled = threading.Event(), threading.Event(), anyio.Event()
+
+    def answer(_: object) -> None:
+        answers.set()
+        frozen.wait(10)
+
+    async def dial(peer: str, address: str) -> None:
+        assert (peer, address) == (alone.peer, "tcp/10.0.0.7:1")
+        dialled.set()
+
+    alone.sessions._main.answer_hearing = answer  # type: ignore[method-assign]
+    alone.sessions._patch = dial  # type: ignore[method-assign]
+    alone.dialing.left(alone.peer)
+    alone.dialing._now = lambda: monotonic() + FIRST_PAUSE
+    alone.sessions._note_asked(alone.question())
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(alone.sessions.keep_connected, 0.0)
+        try:
+            with anyio.fail_after(5):
+                await dialled.wait()
+                await until(answers.is_set)
+            assert not frozen.is_set()
+        finally:
+            frozen.set()
+            tasks.cancel_scope.cancel()
 
 
 async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_there() -> None:

@@ -56,6 +56,29 @@ def test_a_connection_that_is_made_again_is_looked_after_anew() -> None:
     assert scene.wait(0.1) == ["a"]
 
 
+@pytest.mark.anyio
+async def test_zenoh_is_asked_nothing_before_somebody_was_not_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene()
+    asked: list[str] = []
+
+    def routers(_: ZenohSession) -> list[str]:
+        asked.append("routers")
+        return ["router"]
+
+    monkeypatch.setattr(ZenohSession, "routers", routers)
+    monkeypatch.setattr(ZenohSession, "addresses", lambda _: {})
+    connected = [("met", "tcp/x:1"), ("unmet", "tcp/y:1"), ("router", "tcp/z:1"), ("dialled", "tcp/u:1")]
+    assert await scene.unmet.find(connected, (), "dialled".__eq__) == []
+    assert asked == []
+    scene.time += PAUSES[0]
+    assert await scene.unmet.find([], ("met",), "dialled".__eq__) == [("unmet", "tcp/y:1")]
+    assert asked == ["routers"]
+    # One that is known for a router is looked after no more, nor asked about.
+    assert await scene.unmet.find([("router", "tcp/z:1")], (), "dialled".__eq__) == []
+    assert list(scene.unmet._looks) == ["unmet", "dialled"]
+    assert asked == ["routers"]
+
+
 def test_so_many_connections_are_remembered() -> None:
     scene = Scene()
     for number in range(MOST_UNMET + 1):
