@@ -324,7 +324,7 @@ async def test_a_peer_is_dialled_while_an_answer_waits_for_one_that_is_frozen() 
         assert (peer, address) == (alone.peer, "tcp/10.0.0.7:1")
         dialled.set()
 
-    alone.sessions._main.answer_hearing = answer  # type: ignore[method-assign]
+    alone.sessions._main.answer_hearing = answer  # type: ignore[assignment, method-assign]
     alone.sessions._patch = dial  # type: ignore[method-assign]
     alone.dialing.left(alone.peer)
     alone.dialing._now = lambda: monotonic() + FIRST_PAUSE
