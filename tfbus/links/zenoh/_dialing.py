@@ -1,9 +1,10 @@
 """The times at which a link dials peers that it has lost, at the addresses where it had reached them."""
 
 import re
-import socket
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+
+import anyio
 
 FIRST_PAUSE = 0.3
 SHORT_PAUSE = 2.0
@@ -101,8 +102,8 @@ def newest_first(address: str, known: Iterable[str]) -> list[str]:
     return [address, *(other for other in known if other != address)][:MOST_ADDRESSES]
 
 
-def is_reachable(address: str) -> bool:
-    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try; may block.
+async def is_reachable(address: str) -> bool:
+    """Whether somebody listens at an address; True for the kinds of addresses that only zenoh can try.
 
     Raises
     ------
@@ -113,9 +114,11 @@ def is_reachable(address: str) -> bool:
     if found is None:
         return True
     try:
-        socket.create_connection((found["six"] or found["four"], int(found["port"])), _PROBE_TIME).close()
-    except ConnectionRefusedError:
-        raise
-    except OSError:
+        with anyio.fail_after(_PROBE_TIME):
+            stream = await anyio.connect_tcp(found["six"] or found["four"], int(found["port"]))
+    except OSError as error:
+        if isinstance(error.__cause__, ConnectionRefusedError):
+            raise ConnectionRefusedError from error
         return False
+    await stream.aclose()
     return True

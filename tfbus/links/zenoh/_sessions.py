@@ -31,8 +31,6 @@ from tfbus.links.zenoh._unmet import Unmet
 
 _MEETING_TIME = 10.0
 """s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
-MOST_DIALLED = 100
-"""So many peers are dialled at once, each in a worker thread: one that is cut off takes 3 s."""
 
 _Way = tuple[ZenohSession | None, str]
 """A connection between two links: the patch here, or None for the first session, and the name of the session there."""
@@ -82,7 +80,6 @@ class ZenohSessions:
         self._patches: dict[str, ZenohSession] = {}
         self._present: dict[str, set[_Way]] = {}
         self._dialing = Dialing(monotonic) if dialing is None else dialing
-        self._dialers = anyio.CapacityLimiter(MOST_DIALLED)
         self._hearing = Hearing(monotonic)
         self._unmet = Unmet(self._main, keys, monotonic)
         self._deaf: set[str] = set()
@@ -300,10 +297,7 @@ class ZenohSessions:
 
     async def _patch(self, peer: str, address: str) -> None:
         try:
-            # On a busy machine a few turns of the event loop take longer than a thread waits for an answer.
-            reachable = await anyio.to_thread.run_sync(
-                is_reachable, address, abandon_on_cancel=True, limiter=self._dialers
-            )
+            reachable = await is_reachable(address)
         except ConnectionRefusedError:
             self._dialing.refused(peer, address)
             return
@@ -320,7 +314,7 @@ class ZenohSessions:
         )
         self._patches[peer] = patch
         try:
-            await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True, limiter=self._dialers)
+            await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)
         except (OSError, zenoh.ZError):
             # It may also have been lost while it began.
             self._drop_patch(peer)
