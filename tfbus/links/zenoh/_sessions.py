@@ -188,6 +188,7 @@ class ZenohSessions:
                     # Where this loop has no time, nobody's silence proves anything.
                     if names is not None or not late:
                         self._judge(peer, names)
+                # Before all that may wait for zenoh; who is due after this is dialled in the next round.
                 self._dial(self._dialing.take_due(), tasks)
                 if noted.asking:
                     await self._answer_hearing(noted.asking)
@@ -197,7 +198,7 @@ class ZenohSessions:
                     self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
                 unmet = await self._unmet.find(noted.connected, self._present, self._dialing.is_dialled)
-                self._dial((*self._dialing.take_due(), *unmet), tasks)
+                self._dial(unmet, tasks)
 
     def _dial(self, due: Iterable[tuple[str, str]], tasks: TaskGroup) -> None:
         for peer, address in due:
