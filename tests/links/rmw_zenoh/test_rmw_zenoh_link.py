@@ -154,7 +154,7 @@ async def test_positions_of_joints_go_to_who_takes_them() -> None:
             async with RmwZenohLink(bus, address, DOMAIN, joint_states=lambda *state: taken.append(state)):
                 with stranger(address) as session:
                     key = f"{DOMAIN}/joint_states/{JOINT_TYPE}/{JOINT_HASH}"
-                    session.put(key, joint_state(5, {"a": 0.5}))
+                    (await heard_publisher(session, key)).put(joint_state(5, {"a": 0.5}))
                     await until(lambda: taken == [({"a": 0.5}, 5)])
 
 
@@ -180,15 +180,22 @@ async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
     async with router() as address:
         with Bus() as bus, bus.events() as events, stranger(address) as session:
             async with RmwZenohLink(bus, address, DOMAIN) as link:
-                key = f"{DOMAIN}/tf/{TYPE}/{HASH}"
+                publisher = await heard_publisher(session, f"{DOMAIN}/tf/{TYPE}/{HASH}")
                 for payload in (b"", b"garbage", b"\0\1\0\0\xff\xff\xff\xff", bytes(5_000_000)) * 2:
-                    session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+                    publisher.put(payload)
                 for attachment in (b"", b"x", bytes(33)):
-                    session.put(key, encode([moving("map", f"f{len(attachment)}", 1)]), attachment=attachment)
+                    publisher.put(encode([moving("map", f"f{len(attachment)}", 1)]), attachment=attachment)
                 await until(lambda: link.statistics().received_samples == 3)
                 assert link.statistics().rejected == {"truncated": 6, "oversized": 2}
             told = [event.reason for event in iter(events.queue.get, None) if isinstance(event, PeerRejected)]
             assert told == ["truncated", "oversized"]
+
+
+async def heard_publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """A publisher that the link hears: the router knows of a subscription some time after the link is joined."""
+    publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+    await until(lambda: bool(publisher.matching_status.matching))  # type: ignore[attr-defined]
+    return publisher
 
 
 @contextmanager
