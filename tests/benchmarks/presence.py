@@ -21,7 +21,7 @@ import zenoh
 
 from tfbus import Bus
 from tfbus.links.zenoh import ZenohLink, ZenohRouter
-from tfbus.links.zenoh._settings import LEASE, settings
+from tfbus.links.zenoh._settings import settings
 
 PROCESSES = 2
 ALONE = {"scouting/gossip/enabled": False}
@@ -33,7 +33,7 @@ async def join(
     """Open links, or bare sessions."""
     own = task["config"] | more.pop("config", {})
     if task["bare"]:
-        config = settings(address.get("listen"), address.get("connect"), own, LEASE)
+        config = settings(address.get("listen"), address.get("connect"), own, None)
         return [await anyio.to_thread.run_sync(zenoh.open, config) for _ in range(how_many)]
     made = []
     for _ in range(how_many):

@@ -21,14 +21,15 @@ import anyio
 
 from tfbus import Bus, Transform, TransformBroadcaster, TransformStamped
 from tfbus.links.zenoh import ZenohLink
-from tfbus.links.zenoh._settings import LEASE
 
 IMPORTS = "import start_together"
 PATIENCE = 120.0
 """Seconds from the last start; who has not all frames by then is counted as without them."""
 
 
-async def live(number: int, processes: int, frames: int, rate: float, lease: float, domain: str, address: str) -> None:
+async def live(
+    number: int, processes: int, frames: int, rate: float, lease: float | None, domain: str, address: str
+) -> None:
     """Be one of the processes."""
     wanted = processes * frames
     held: set[str] = set()
@@ -56,7 +57,7 @@ def free_address() -> str:
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
 
 
-def measure(processes: int = 50, frames: int = 20, rate: float = 20.0, lease: float = LEASE) -> list[float]:
+def measure(processes: int = 50, frames: int = 20, rate: float = 20.0, lease: float | None = None) -> list[float]:
     """Seconds from the last start until each process has all static frames; infinite for one that has not."""
     task: dict[str, Any] = {
         "processes": processes,
@@ -110,7 +111,7 @@ if __name__ == "__main__":
     parser.add_argument("--processes", type=int, default=50)
     parser.add_argument("--frames", type=int, default=20)
     parser.add_argument("--rate", type=float, default=20.0, help="Hz")
-    parser.add_argument("--lease", type=float, default=LEASE, help="s")
+    parser.add_argument("--lease", type=float, help="s; by default, that of the link")
     parser.add_argument("--be", type=json.loads, help=argparse.SUPPRESS)
     arguments = vars(parser.parse_args())
     one = arguments.pop("be")

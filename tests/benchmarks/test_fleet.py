@@ -76,7 +76,7 @@ async def main(address):
 # Many robots, as what their links declare; the first publishes, the others are only there.
 ROBOTS = """
 async def main(domain, address, robots, frames, rate):
-    config = settings([], address, {"mode": "client"}, LEASE)
+    config = settings([], address, {"mode": "client"}, None)
     sessions = [zenoh.open(config) for _ in range(4)]
     declared = []
     for number in range(1, robots):
@@ -102,7 +102,7 @@ from support.samples import moving, static
 from tfbus import Buffer, Bus
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter
 from tfbus.links.zenoh._keys import Keys
-from tfbus.links.zenoh._settings import LEASE, settings
+from tfbus.links.zenoh._settings import settings
 """
 
 

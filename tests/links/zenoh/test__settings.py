@@ -12,7 +12,7 @@ from support.processes import crowd, free_ports, new_domain, until
 from support.samples import moving, static
 
 from tfbus import Buffer, Bus
-from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter, _settings
 from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, patch_settings, settings
 
 LISTEN, CONNECT = "listen/endpoints", "connect/endpoints"
@@ -24,7 +24,7 @@ def read(
     listen: Addresses | None = None,
     connect: Addresses | None = None,
     config: dict[str, Any] | None = None,
-    lease: float = 2.0,
+    lease: float | None = 2.0,
 ) -> Any:
     """The value of one of zenoh's settings."""
     return json.loads(settings(listen, connect, config, lease).get_json(path))
@@ -117,9 +117,15 @@ def test_two_signs_of_life_go_out_in_a_lease_unless_zenoh_is_told_otherwise() ->
     assert read("transport/link/tx/keep_alive", config={"transport/link/tx/keep_alive": 4}) == 4
 
 
-def test_links_routers_and_lookups_have_the_same_lease() -> None:
+def test_links_routers_and_lookups_have_by_default_the_lease_of_the_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     kinds: list[Any] = [ZenohLink, ZenohRouter, BufferServer, BufferClient]
-    assert [signature(kind).parameters["lease"].default for kind in kinds] == [4.0] * 4
+    assert [signature(kind).parameters["lease"].default for kind in kinds] == [None] * 4
+    for lease in (4.0, 10.0):
+        monkeypatch.setattr(_settings, "default_lease", lambda lease=lease: lease)
+        assert read("transport/link/tx/lease", lease=None) == lease * 1_000
+        patch = patch_settings("tcp/127.0.0.1:7000", None, None)
+        assert json.loads(patch.get_json("transport/link/tx/lease")) == lease * 1_000
+        assert read("transport/link/tx/lease", lease=3.0) == 3_000
 
 
 @pytest.mark.parametrize("lease", [0.0, -1.0, math.nan, math.inf])

@@ -59,7 +59,7 @@ class LookupSession:
         listen: Addresses | None,
         connect: Addresses | None,
         config: Mapping[str, Any] | None,
-        lease: float,
+        lease: float | None,
     ) -> None:
         if link is not None and not (domain is listen is connect is config is None):
             raise TypeError("domain, listen, connect and config are those of the link")

@@ -8,13 +8,12 @@ from typing import Any
 
 import zenoh
 
+from tfbus.links.zenoh._lease import default_lease
 from tfbus.stamps import as_duration
 
 MEETING_POINT = "tcp/127.0.0.1:17447"
 """The address at which links on one machine find each other: the first one listens there, and all connect to it."""
 
-LEASE = 4.0
-"""s; the lease of a session that is given none: a peer that is cut off is lost soon enough to be found again in 5 s."""
 SIGNS_OF_LIFE = 2
 """So many go out in each lease, so one may be late by half of it."""
 
@@ -26,7 +25,7 @@ _ON_MACHINE = re.compile(r"(unixsock-stream|unixpipe|serial|vsock)/.+")
 
 
 def settings(
-    listen: Addresses | None, connect: Addresses | None, config: Mapping[str, Any] | None, lease: float
+    listen: Addresses | None, connect: Addresses | None, config: Mapping[str, Any] | None, lease: float | None
 ) -> zenoh.Config:
     """The configuration of a session.
 
@@ -39,8 +38,9 @@ def settings(
     config : mapping of str to any, or None
         zenoh's own settings by their path, such as ``transport/link/tls/root_ca_certificate``; they override all
         others.
-    lease : float
-        Seconds of silence after which others take this end for lost; each end announces its own.
+    lease : float or None
+        Seconds of silence after which others take this end for lost; each end announces its own. None is for
+        `default_lease`.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def settings(
     own = dict(config or {})
     listens = listen is not None or _gives_addresses(own, "listen")
     addressed = listens or connect is not None or _gives_addresses(own, "connect")
-    silence = as_duration(lease, "lease")
+    silence = default_lease() if lease is None else as_duration(lease, "lease")
     if not 0 < silence < math.inf:
         raise ValueError(f"lease must be a time that passes, got {lease}")
     connects = [] if connect is None else _endpoints(connect)
@@ -93,7 +93,7 @@ def settings(
     return result
 
 
-def patch_settings(address: str, config: Mapping[str, Any] | None, lease: float) -> zenoh.Config:
+def patch_settings(address: str, config: Mapping[str, Any] | None, lease: float | None) -> zenoh.Config:
     """The configuration of a session that connects to one address, and to nobody that it hears of there."""
     own = {
         path: value

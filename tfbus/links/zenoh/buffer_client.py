@@ -17,7 +17,7 @@ from tfbus.errors import LookupTimeoutError, RemoteLookupError, TransformLookupE
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import Cancellation, RemoteQuestion, read_answer, write_question
 from tfbus.links.zenoh._lookup_session import LookupSession
-from tfbus.links.zenoh._settings import LEASE, Addresses
+from tfbus.links.zenoh._settings import Addresses
 from tfbus.links.zenoh.buffer_server import LONGEST_WAIT
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp
@@ -78,7 +78,7 @@ class BufferClient:
         listen: Addresses | None = None,
         connect: Addresses | None = None,
         config: Mapping[str, Any] | None = None,
-        lease: float = LEASE,
+        lease: float | None = None,
         capacity: int = 10_000,
     ) -> None:
         check_capacity(capacity)

@@ -29,7 +29,7 @@ from tfbus.links._remote_lookup import (
     write_answer,
 )
 from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
-from tfbus.links.zenoh._settings import LEASE, Addresses
+from tfbus.links.zenoh._settings import Addresses
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 from tfbus.statistics import BufferServerStatistics, QueueStatistics
 from tfbus.tree.policy import Hold
@@ -87,7 +87,7 @@ class BufferServer:
         listen: Addresses | None = None,
         connect: Addresses | None = None,
         config: Mapping[str, Any] | None = None,
-        lease: float = LEASE,
+        lease: float | None = None,
         capacity: int = 1_000,
         rate: float = 10_000.0,
     ) -> None:

@@ -11,7 +11,7 @@ import zenoh
 
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
 from tfbus.links.zenoh._session import as_os_error
-from tfbus.links.zenoh._settings import LEASE, MEETING_POINT, Addresses, settings
+from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, settings
 
 
 class ZenohRouter:
@@ -29,8 +29,9 @@ class ZenohRouter:
         The addresses of other routers.
     config : mapping of str to any, optional
         Settings of zenoh by their path: TLS, access control.
-    lease : float
-        Seconds of silence after which the router is taken for lost, and takes others for lost by theirs.
+    lease : float, optional
+        Seconds of silence after which the router is taken for lost, and takes others for lost by theirs; by default, as
+        that of a `ZenohLink`.
 
     Raises
     ------
@@ -48,7 +49,7 @@ class ZenohRouter:
         *,
         connect: Addresses | None = None,
         config: Mapping[str, Any] | None = None,
-        lease: float = LEASE,
+        lease: float | None = None,
     ) -> None:
         self._config = settings(listen, connect or [], {"mode": "router", **(config or {})}, lease)
         self._entered = False

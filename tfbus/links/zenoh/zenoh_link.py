@@ -18,7 +18,7 @@ from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
-from tfbus.links.zenoh._settings import LEASE, Addresses, patch_settings, settings
+from tfbus.links.zenoh._settings import Addresses, patch_settings, settings
 
 
 class ZenohLink(Link):
@@ -57,10 +57,11 @@ class ZenohLink(Link):
         filters to serve.
     drop_lost : bool
         Whether the frames of a peer leave the bus when it is lost, those that it was the last to publish.
-    lease : float
+    lease : float, optional
         Seconds of silence after which others take this link for lost, when it is frozen or cut off, and it takes them
         for lost by theirs; a process that dies is lost at once. Two signs of life go out in each lease, so to be held
-        up for less than half of it loses nobody.
+        up for less than half of it loses nobody. By default, it is 4 s, or 10 s where the machine is busy when the link
+        is made: under Linux, if more than eight threads for each CPU run or could run.
     max_frames : int
         How many frames one peer may have; samples of others are refused and counted.
     capacity : int
@@ -119,7 +120,7 @@ class ZenohLink(Link):
         slow_rate: float = 1.0,
         frames: Iterable[str] | None = None,
         drop_lost: bool = False,
-        lease: float = LEASE,
+        lease: float | None = None,
         max_frames: int = 10_000,
         capacity: int = 10_000,
         history: float | None = None,
