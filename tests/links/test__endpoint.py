@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
-from support.samples import moving
+from support.samples import moving, static
 from support.wires import Domain
 
 from tfbus import Bus, Event, SimulatedClock
@@ -16,7 +16,7 @@ from tfbus.links._endpoint import CLAIM_PERIOD, Endpoint
 from tfbus.links._message import Message
 from tfbus.links._outbox import Turn
 from tfbus.links._peers import MAX_PEERS
-from tfbus.links._receive_queue import Presence, Received
+from tfbus.links._receive_queue import Presence, Question, Received
 from tfbus.tf_message import MalformedMessageError
 
 
@@ -177,6 +177,21 @@ def test_a_link_claims_its_state_ever_less_often_while_nothing_happens() -> None
     end.endpoint.handle(Received("one of 41", Presence.JOINED))
     assert [round(time - joined, 6) for time in claims(until=joined + 80.0)] == [56.2, 72.6]
     for made in (end, other):
+        made.leave()
+
+
+def test_an_answer_does_not_overtake_the_batch_that_it_tells_of() -> None:
+    domain = Domain()
+    bus, other = Bus(SimulatedClock()), Bus(SimulatedClock())
+    heard: list[list[str]] = []
+    other.subscribe(lambda batch: heard.append([sample.child for sample in batch]))
+    end, asking = domain.join(bus), domain.join(other)
+    bus.publish([static("map", "lidar"), moving("map", "base", 1)])
+    # Before the turn in which it was published ends.
+    end.receive(asking.id, Question(0, asking.id))
+    domain.settle()
+    assert heard == [["lidar", "base"]]
+    for made in (end, asking):
         made.leave()
 
 

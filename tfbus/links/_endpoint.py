@@ -180,6 +180,8 @@ class Endpoint:
             elif isinstance(content, MalformedMessageError):
                 self.peers.reject(item.sender, content.reason, content)
             elif isinstance(content, Question):
+                # An answer must not overtake a batch whose changes it tells.
+                self.send()
                 self._answer(content)
             elif isinstance(content, Answer):
                 self._take_answer(item.sender, content)

@@ -111,7 +111,7 @@ def test_a_question_and_its_answer_are_received(join: Join) -> None:
     second.session.ask(A, 2**40)
     question = first.next()
     assert (question.sender, question.content.since, question.moving) == ("", 2**40, False)
-    first.session.answer([(question.content.handle, Message(b"payload", b"beside", 1))])
+    first.session.answer(question.content.handle, Message(b"payload", b"beside", 1))
     assert second.next() == Received(A, Answer((b"payload", b"beside")), 13)
 
 
@@ -142,10 +142,11 @@ def test_questions_are_limited_in_number_and_malformed_ones_are_dropped(join: Jo
         replies = [session.get(key, payload=bytes(8)) for _ in range(MOST_QUESTIONS + 1)]
         questions = [first.next().content for _ in range(MOST_QUESTIONS)]
         assert list(replies[-1]) == []
-        first.session.answer([(question.handle, Message(b"payload", b"", 0)) for question in questions])
+        for question in questions:
+            first.session.answer(question.handle, Message(b"payload", b"", 0))
         assert [len(list(reply)) for reply in replies[:-1]] == [1] * MOST_QUESTIONS
         again = session.get(key, payload=bytes(8))
-        first.session.answer([(first.next().content.handle, Message(b"payload", b"", 0))])
+        first.session.answer(first.next().content.handle, Message(b"payload", b"", 0))
         assert len(list(again)) == 1
 
 

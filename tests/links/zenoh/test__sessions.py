@@ -1,6 +1,6 @@
 import math
 import threading
-from collections.abc import AsyncIterator, Collection
+from collections.abc import AsyncIterator, Collection, Iterable
 from contextlib import asynccontextmanager
 from queue import Queue
 from time import monotonic
@@ -102,8 +102,7 @@ async def test_a_lost_peer_is_reached_again_by_a_patch_that_carries_everything()
             asking.sessions.ask(asked.id, 7)
             question = (await asked.next()).content
             assert isinstance(question, Question)
-            answers = [(question.handle, Message(b"answer", b"", 0))]
-            await anyio.to_thread.run_sync(asked.sessions.answer, answers)
+            asked.sessions.answer(question.handle, Message(b"answer", b"", 0))
             assert await asking.next() == Received(asked.id, Answer((b"answer", b"")), 6)
 
 
@@ -314,31 +313,42 @@ async def test_what_a_patch_receives_is_of_its_peer_or_of_nobody() -> None:
 
 async def test_a_peer_is_dialled_while_an_answer_waits_for_one_that_is_frozen() -> None:
     alone = Alone()
-    answers, frozen, dialled = threading.Event(), threading.Event(), anyio.Event()
+    frozen, dialled = threading.Event(), anyio.Event()
+    answered: list[list[Any]] = []
 
-    def answer(_: object) -> None:
-        answers.set()
+    def answer(answers: Iterable[Any]) -> None:
+        answered.append(list(answers))
         frozen.wait(10)
 
     async def dial(peer: str, address: str) -> None:
         assert (peer, address) == (alone.peer, "tcp/10.0.0.7:1")
         dialled.set()
 
-    alone.sessions._main.answer_hearing = answer  # type: ignore[assignment, method-assign]
+    alone.sessions._main.answer_hearing = answer  # type: ignore[method-assign]
     alone.sessions._patch = dial  # type: ignore[method-assign]
-    alone.dialing.left(alone.peer)
     alone.dialing._now = lambda: monotonic() + FIRST_PAUSE
-    alone.sessions._note_asked(alone.question())
+    questions = [alone.question() for _ in range(3)]
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(alone.sessions.keep_connected, 0.0)
         try:
             with anyio.fail_after(5):
+                alone.sessions._note_asked(questions[0])
+                await until(lambda: bool(answered))
+                alone.dialing.left(alone.peer)
+                # Who asks meanwhile asks again.
+                alone.sessions._note_asked(questions[1])
                 await dialled.wait()
-                await until(answers.is_set)
-            assert not frozen.is_set()
+                assert not frozen.is_set()
+                frozen.set()
+                waiting = alone.sessions._hearing_answers
+                assert waiting is not None
+                await until(waiting.done)
+                alone.sessions._note_asked(questions[2])
+                await until(lambda: len(answered) == 2)
         finally:
             frozen.set()
             tasks.cancel_scope.cancel()
+    assert answered == [[(questions[0], [])], [(questions[2], [])]]
 
 
 async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_there() -> None:

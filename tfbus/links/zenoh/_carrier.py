@@ -1,6 +1,5 @@
 """The carrier of links over zenoh."""
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence, Set
 from functools import partial
 
@@ -49,8 +48,6 @@ class ZenohCarrier:
         self._config = config
         self._patch_config = patch_config
         self._keys = keys
-        self._answers: deque[tuple[zenoh.Query, Message]] = deque()
-        self._woken = anyio.Event()
 
     @property
     def session(self) -> zenoh.Session:
@@ -110,27 +107,17 @@ class ZenohCarrier:
         return write_answer(entries, step)
 
     def answer(self, question: Question | HistoryQuestion, message: Message) -> None:
-        """Answer a question; a worker thread sends the answers, because zenoh may wait for a peer that is frozen."""
-        self._answers.append((question.handle, message))
-        self._woken.set()
+        """Answer a question."""
+        self._sessions.answer(question.handle, message)
 
     async def run(self) -> None:
-        """Send answers, and dial peers that were lost."""
+        """Dial peers that were lost, and send by the slow key."""
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
-        for task in (self._sessions.keep_connected, self._send_slowly, self._send_answers):
+        for task in (self._sessions.keep_connected, self._send_slowly):
             tasks.start_soon(task)
         # Ctrl-C comes to one of them, and leaves without a group.
         await close_task_group(tasks)
-
-    async def _send_answers(self) -> None:
-        while True:
-            self._woken = anyio.Event()
-            while self._answers:
-                batch = list(self._answers)
-                self._answers.clear()
-                await anyio.to_thread.run_sync(self._sessions.answer, batch)
-            await self._woken.wait()
 
     async def _send_slowly(self) -> None:
         while True:

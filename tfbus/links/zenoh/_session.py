@@ -265,23 +265,22 @@ class ZenohSession:
             )
 
     def answer_hearing(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
-        """Answer links that ask whether they are heard; for a worker thread, as `answer`."""
+        """Answer links that ask whether they are heard; may block, as `answer`."""
         for query, names in answers:
             with suppress(zenoh.ZError):
                 query.reply(self._keys.own("hears"), ",".join(names)[:MOST_NAMES])
             query.drop()
 
-    def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
-        """Answer questions; for a worker thread, because zenoh waits for a peer whose queue is full."""
+    def answer(self, question: zenoh.Query, message: Message) -> None:
+        """Answer a question; may block, because zenoh waits for a peer whose queue is full."""
         encoding = zenoh.Encoding(_SERVES_FILTERS) if self._filters.are_served else None
-        for query, message in answers:
-            # A peer that has gone needs no answer.
-            with suppress(zenoh.ZError):
-                kind = str(query.key_expr).rsplit("/", 2)[1]
-                query.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
-            query.drop()
-            with self._lock:
-                self._questions -= 1
+        # A peer that has gone needs no answer.
+        with suppress(zenoh.ZError):
+            kind = str(question.key_expr).rsplit("/", 2)[1]
+            question.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
+        question.drop()
+        with self._lock:
+            self._questions -= 1
 
     def close(self) -> threading.Thread:
         """Begin to close the session, also one that is still being opened.

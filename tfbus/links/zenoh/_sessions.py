@@ -10,6 +10,7 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Set
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from time import monotonic
 from uuid import uuid4
@@ -85,6 +86,10 @@ class ZenohSessions:
         self._deaf: set[str] = set()
         self._unheard: Counter[str] = Counter()
         self._closing: list[threading.Thread] = []
+        # Not a task that waits for a worker thread: where nobody has time, it would come to its next answers seconds
+        # later.
+        self._answering = ThreadPoolExecutor(1, thread_name_prefix="tfbus answers")
+        self._hearing_answers: Future[None] | None = None
 
     @property
     def session(self) -> zenoh.Session:
@@ -150,15 +155,16 @@ class ZenohSessions:
         patch = self._patches.get(peer)
         return patch if patch is not None and patch.is_open else self._main
 
-    def answer(self, answers: Iterable[tuple[zenoh.Query, Message]]) -> None:
-        """Answer questions; for a worker thread."""
-        self._main.answer(answers)
+    def answer(self, question: zenoh.Query, message: Message) -> None:
+        """Answer a question, in a thread, because zenoh may wait for a peer that is frozen."""
+        self._answering.submit(self._main.answer, question, message)
 
     def _open(self) -> list[ZenohSession]:
         return [self._main, *(patch for patch in tuple(self._patches.values()) if patch.is_open)]
 
     def close(self) -> list[threading.Thread]:
         """Begin to close all sessions; returns threads that end when they are closed."""
+        self._answering.shutdown(wait=False, cancel_futures=True)
         sessions = [self._main, *self._patches.values()]
         self._patches.clear()
         return [*self._closing, *(session.close() for session in sessions)]
@@ -191,7 +197,7 @@ class ZenohSessions:
                 # Before all that may wait for zenoh; who is due after this is dialled in the next round.
                 self._dial(self._dialing.take_due(), tasks)
                 if noted.asking:
-                    await self._answer_hearing(noted.asking)
+                    self._answer_hearing(noted.asking)
                 if self._keys.filter:
                     self._hear_unserved()
                 for peer in self._hearing.take_due():
@@ -258,12 +264,13 @@ class ZenohSessions:
             self._drop_patch(peer)
             self._dialing.left(peer)
 
-    async def _answer_hearing(self, asking: Iterable[zenoh.Query]) -> None:
+    def _answer_hearing(self, asking: Iterable[zenoh.Query]) -> None:
         with self._lock:
             answers = [(query, self._names_heard(query)) for query in asking]
         self._note_unheard(answers)
-        # zenoh may wait for a peer that is frozen.
-        await anyio.to_thread.run_sync(self._main.answer_hearing, answers)
+        # While zenoh waits for a peer that is frozen, others ask again.
+        if self._hearing_answers is None or self._hearing_answers.done():
+            self._hearing_answers = self._answering.submit(self._main.answer_hearing, answers)
 
     def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
         """Dial those that have asked several times whether they are heard, and are not."""
