@@ -126,7 +126,7 @@ def test_a_peer_is_asked_once_even_if_it_comes_back() -> None:
         s.deliver()
         assert stamps_of(s.heard, "base") == [1]
         s.domain.part(s.teller, s.asker)
-        s.source.publish(moving("map", "base", 2 * SECOND))
+        s.publish(moving("map", "base", 2 * SECOND))
         s.domain.meet(s.teller, s.asker)
         s.deliver()
         assert stamps_of(s.heard, "base") == [1]

@@ -1,4 +1,4 @@
-"""How long a session may be silent until others take it for lost.
+"""The lease of a session: the time of silence after which others take it for lost.
 
 zenoh counts the lease of a connection from the last message that was read from it. A process that waits for a CPU most
 of the time reads late, and takes ends for lost that have told all the while that they live. That costs it more time:
