@@ -2,7 +2,8 @@
 
 A `Transform` maps points of one frame into another: ``p_target = target_from_source.apply(p_source)``, and equal
 neighbours cancel in ``map_from_base @ base_from_lidar``. Quaternions are ``(x, y, z, w)``; transforms3d, which does the
-conversions, has ``w`` first, so every crossing says ``wxyz``.
+conversions, has ``w`` first, so every crossing says ``wxyz``. It is imported where it is used: programs that need no
+conversion start sooner without it.
 
 A transform holds one tuple of seven floats, a row; `tfbus.geometry.rows` has the arithmetic.
 """
@@ -13,7 +14,6 @@ from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
-from transforms3d import euler, quaternions
 
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.rows import (
@@ -101,6 +101,8 @@ class Transform:
             If the shape is not (4, 4), a number is not finite, the last row is not (0, 0, 0, 1), or the rotation part
             is not a rotation.
         """
+        from transforms3d.quaternions import mat2quat
+
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape != (4, 4):
             raise InvalidTransformError(f"matrix must have shape (4, 4), got {m.shape}", reason="wrong length")
@@ -113,24 +115,28 @@ class Transform:
             raise InvalidTransformError(
                 f"matrix is not rigid: no rotation is near {r.tolist()}", reason="not a rotation"
             )
-        return cls.from_wxyz(m[:3, 3], quaternions.mat2quat(r))
+        return cls.from_wxyz(m[:3, 3], mat2quat(r))
 
     @classmethod
     def from_xyz_rpy(cls, xyz: Numbers, rpy: Numbers) -> "Transform":
         """From a translation in m and roll, pitch, yaw in rad about the fixed axes x, y, z, as in URDF."""
+        from transforms3d.euler import euler2quat
+
         roll, pitch, yaw = as_floats(rpy, 3, "rpy")
-        return cls.from_wxyz(xyz, euler.euler2quat(roll, pitch, yaw, "sxyz"))
+        return cls.from_wxyz(xyz, euler2quat(roll, pitch, yaw, "sxyz"))
 
     @classmethod
     def from_axis_angle(cls, axis: Numbers, angle: float, translation: Numbers = (0.0, 0.0, 0.0)) -> "Transform":
         """From a rotation by `angle` (rad) about `axis` (any length but zero), and a translation in m."""
+        from transforms3d.quaternions import axangle2quat
+
         x, y, z = as_floats(axis, 3, "axis")
         length = math.hypot(x, y, z)
         if length == 0.0:
             raise InvalidTransformError(f"axis {(x, y, z)} has no direction", reason="zero axis")
         if not math.isfinite(angle):
             raise InvalidTransformError(f"angle {angle!r} is not finite", reason="not finite")
-        return cls.from_wxyz(translation, quaternions.axangle2quat((x / length, y / length, z / length), angle, True))
+        return cls.from_wxyz(translation, axangle2quat((x / length, y / length, z / length), angle, True))
 
     @classmethod
     def from_scipy(cls, translation: Numbers, rotation: Any) -> "Transform":
@@ -204,8 +210,10 @@ class Transform:
 
     def matrix(self) -> npt.NDArray[np.float64]:
         """A new homogeneous matrix of shape (4, 4)."""
+        from transforms3d.quaternions import quat2mat
+
         matrix = np.eye(4)
-        matrix[:3, :3] = quaternions.quat2mat(self.as_wxyz())
+        matrix[:3, :3] = quat2mat(self.as_wxyz())
         matrix[:3, 3] = self.translation
         return matrix
 
@@ -249,10 +257,12 @@ class Transform:
             except TypeError:
                 raise ValueError(f"a point is three numbers, not {points!r}; points go in an array") from None
             return float(tx + rx), float(ty + ry), float(tz + rz)
+        from transforms3d.quaternions import quat2mat
+
         if points.ndim == 0 or points.shape[-1] != 3:
             raise ValueError(f"points must have shape (..., 3), got {points.shape}")
         dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(np.float64)
-        rotation = quaternions.quat2mat(self.as_wxyz()).T.astype(dtype)
+        rotation = quat2mat(self.as_wxyz()).T.astype(dtype)
         with np.errstate(invalid="ignore"):
             moved: npt.NDArray[Any] = points @ rotation
             moved += np.asarray(self.translation, dtype)
