@@ -74,6 +74,27 @@ def test_only_a_link_with_a_listening_address_of_its_own_fails_if_it_cannot_list
     assert read("listen/exit_on_failure", config={LISTEN: ["tcp/127.0.0.1:7000"]}) is not False
 
 
+@pytest.mark.parametrize(
+    ("where", "one_dials"),
+    [
+        ({}, True),
+        ({"listen": "tcp/127.0.0.1:7000"}, True),
+        ({"connect": ["tcp/[::1]:7000", "udp/localhost:7000"]}, True),
+        # Whoever is greater might not reach the other one.
+        ({"listen": "tcp/192.168.1.5:7000"}, False),
+        ({"connect": "tcp/192.168.1.5:7000"}, False),
+        ({"connect": ["tcp/127.0.0.1:7000", "tcp/localhost.example:7000"]}, False),
+        ({"listen": "unixpipe//tmp/pipe"}, False),
+        ({"listen": []}, False),
+        ({"config": {"listen": {"endpoints": ["tcp/192.168.1.5:7000"]}}}, False),
+        ({"config": {"connect/endpoints": ["tcp/192.168.1.5:7000"]}}, False),
+    ],
+)
+def test_of_two_links_on_the_loopback_one_dials(where: dict[str, Any], one_dials: bool) -> None:
+    found = read("scouting/gossip/autoconnect_strategy", **where)
+    assert found == ({"peer": {"to_router": "always", "to_peer": "greater-zid"}} if one_dials else None)
+
+
 def test_settings_of_zenoh_win_over_those_of_the_link() -> None:
     config = {"scouting/multicast/enabled": True, "transport/link/tx/lease": 7_000, "mode": "client", LISTEN: []}
     assert read("scouting/multicast/enabled", config=config) is True

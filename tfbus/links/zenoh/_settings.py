@@ -21,6 +21,7 @@ Addresses = str | Iterable[str]
 
 _ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
 _ENCRYPTED = ("tls/", "quic/")
+_LOOPBACK = re.compile(r"[a-z]+/(127(\.\d{1,3}){3}|\[::1\]|localhost):.+")
 _ON_MACHINE = re.compile(r"(unixsock-stream|unixpipe|serial|vsock)/.+")
 
 
@@ -50,21 +51,26 @@ def settings(
         If an argument has another type.
     """
     own = dict(config or {})
-    listens = listen is not None or _gives_addresses(own, "listen")
-    addressed = listens or connect is not None or _gives_addresses(own, "connect")
+    own_listen, own_connect = _gives_addresses(own, "listen"), _gives_addresses(own, "connect")
+    listens = listen is not None or own_listen
     silence = default_lease() if lease is None else as_duration(lease, "lease")
     if not 0 < silence < math.inf:
         raise ValueError(f"lease must be a time that passes, got {lease}")
-    connects = [] if connect is None else _endpoints(connect)
-    loopback = ["tcp/127.0.0.1:0"] if addressed else [MEETING_POINT, "tcp/127.0.0.1:0"]
-    if connects and all(address.startswith(_ENCRYPTED) for address in connects):
+    if listens or connect is not None or own_connect:
+        connects_to = [] if connect is None else _endpoints(connect)
         # A link that proves itself to others by a certificate accepts nobody without one.
-        loopback = []
+        proven = connects_to and all(address.startswith(_ENCRYPTED) for address in connects_to)
+        listens_at = [] if proven else ["tcp/127.0.0.1:0"]
+    else:
+        connects_to = [MEETING_POINT]
+        listens_at = [MEETING_POINT, "tcp/127.0.0.1:0"]
+    if listen is not None:
+        listens_at = _endpoints(listen)
     values: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
-        "listen/endpoints": loopback if listen is None else _endpoints(listen),
-        "connect/endpoints": [] if addressed else [MEETING_POINT],
+        "listen/endpoints": listens_at,
+        "connect/endpoints": connects_to,
         # A peer may start before the other end and goes on trying; a client fails when nobody is there.
         "connect/exit_on_failure": False,
         "connect/timeout_ms": {"peer": -1, "router": -1, "client": 0},
@@ -81,8 +87,11 @@ def settings(
     if not listens:
         # Usually another link holds the meeting point.
         values |= {"listen/exit_on_failure": False, "listen/timeout_ms": 0}
-    if connect is not None:
-        values["connect/endpoints"] = connects
+    on_loopback = all(map(_LOOPBACK.fullmatch, (*listens_at, *connects_to)))
+    if listens_at and on_loopback and not own_listen and not own_connect:
+        # Whoever hears of another link reaches it, so one of the two dials. Where both do, zenoh closes half of the
+        # connections again, which doubles what it costs fifty links to meet.
+        values["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
     result = zenoh.Config()
     for path, value in (values | own).items():
         try:
