@@ -311,6 +311,19 @@ async def test_what_a_patch_receives_is_of_its_peer_or_of_nobody() -> None:
     assert alone.items.empty()
 
 
+async def test_an_answer_that_cannot_be_sent_is_logged_and_frees_its_place(caplog: pytest.LogCaptureFixture) -> None:
+    alone = Alone()
+    question = alone.question()
+    alone.sessions._main._questions = 1
+    alone.sessions.answer(question, Message(b"", b"", 0, 0))
+    await until(lambda: bool(caplog.records))
+    assert (question.dropped, alone.sessions._main._questions) == ([True], 0)
+    (record,) = caplog.records
+    assert (record.name, record.message) == ("tfbus", "an answer could not be sent")
+    assert record.exc_info is not None
+    assert isinstance(record.exc_info[1], AttributeError)
+
+
 async def test_a_peer_is_dialled_while_an_answer_waits_for_one_that_is_frozen() -> None:
     alone = Alone()
     frozen, dialled = threading.Event(), anyio.Event()

@@ -274,13 +274,15 @@ class ZenohSession:
     def answer(self, question: zenoh.Query, message: Message) -> None:
         """Answer a question; may block, because zenoh waits for a peer whose queue is full."""
         encoding = zenoh.Encoding(_SERVES_FILTERS) if self._filters.are_served else None
-        # A peer that has gone needs no answer.
-        with suppress(zenoh.ZError):
-            kind = str(question.key_expr).rsplit("/", 2)[1]
-            question.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
-        question.drop()
-        with self._lock:
-            self._questions -= 1
+        try:
+            # A peer that has gone needs no answer.
+            with suppress(zenoh.ZError):
+                kind = str(question.key_expr).rsplit("/", 2)[1]
+                question.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
+        finally:
+            question.drop()
+            with self._lock:
+                self._questions -= 1
 
     def close(self) -> threading.Thread:
         """Begin to close the session, also one that is still being opened.

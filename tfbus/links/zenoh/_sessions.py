@@ -6,6 +6,7 @@ same mends a connection of which only one end hears the other; see `tfbus.links.
 one of them has accepted the connection, and knows no address at which the other one listens.
 """
 
+import logging
 import math
 import threading
 from collections import Counter
@@ -157,7 +158,7 @@ class ZenohSessions:
 
     def answer(self, question: zenoh.Query, message: Message) -> None:
         """Answer a question, in a thread, because zenoh may wait for a peer that is frozen."""
-        self._answering.submit(self._main.answer, question, message)
+        self._answering.submit(self._main.answer, question, message).add_done_callback(_log_failure)
 
     def _open(self) -> list[ZenohSession]:
         return [self._main, *(patch for patch in tuple(self._patches.values()) if patch.is_open)]
@@ -271,6 +272,7 @@ class ZenohSessions:
         # While zenoh waits for a peer that is frozen, others ask again.
         if self._hearing_answers is None or self._hearing_answers.done():
             self._hearing_answers = self._answering.submit(self._main.answer_hearing, answers)
+            self._hearing_answers.add_done_callback(_log_failure)
 
     def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
         """Dial those that have asked several times whether they are heard, and are not."""
@@ -382,3 +384,8 @@ class ZenohSessions:
                 self._receive(Received(peer, presence))
             if is_present is not was_present or way == (None, FIRST_SESSION):
                 self._notes.add_change(peer, presence)
+
+
+def _log_failure(answer: Future[None]) -> None:
+    if not answer.cancelled() and answer.exception() is not None:
+        logging.getLogger("tfbus").error("an answer could not be sent", exc_info=answer.exception())
