@@ -37,15 +37,19 @@ def test_items_are_read_in_the_order_in_which_they_came() -> None:
     assert (len(queue), queue.get()) == (0, None)
 
 
-@pytest.mark.parametrize("waiting", [MANY, MANY + 1])
-def test_questions_answers_and_those_who_join_overtake_what_waits_if_that_is_much(waiting: int) -> None:
+@pytest.mark.parametrize("waiting", [0, 1, MANY - 1, MANY])
+def test_questions_answers_and_those_who_join_overtake_what_waits_of_others(waiting: int) -> None:
     queue = ReceiveQueue(1_000)
-    urgent = [Presence.JOINED, Question(0, None), Answer(None)]
-    before, behind = list(range(waiting)), [-1]
-    for content in (*before, *urgent, *behind):
-        queue.put(Received("other", content, moving=True) if isinstance(content, int) else kept(content))
-    assert len(queue) == waiting + 4
-    assert drained(queue) == ([*urgent, *before] if waiting > MANY else [*before, *urgent]) + behind
+    before = list(range(waiting))
+    for number in before:
+        queue.put(Received("other", number, moving=True))
+    own, urgent = [-1, False], [Presence.JOINED, Question(0, None), Answer(None), Presence.LEFT]
+    for item in (moving(-1), kept(False), *map(kept, urgent), moving(-2)):
+        queue.put(item)
+    assert len(queue) == waiting + 7
+    # What the peer sent before its answer is read before that, if that is not much.
+    first = [*urgent[:2], *own, *urgent[2:]] if waiting < MANY else [*urgent[:3], *own, *urgent[3:]]
+    assert drained(queue) == [*first, *before, -2]
 
 
 def test_what_overtakes_has_a_bound_too() -> None:
@@ -59,45 +63,59 @@ def test_what_overtakes_has_a_bound_too() -> None:
     assert queue.statistics().dropped == 2
 
 
+def test_what_is_read_before_the_end_of_a_peer_makes_room_too() -> None:
+    queue = ReceiveQueue(2)
+    for item in (moving(1), moving(2), kept(Presence.LEFT), kept("a"), moving(3)):
+        queue.put(item)
+    assert queue.statistics().dropped == 1
+    assert drained(queue) == [1, 2, Presence.LEFT, "a"], "what is to be read first is dropped last"
+    for item in (moving(1), moving(2), kept(Presence.LEFT), kept("a", MAX_BYTES - 2 * MIB), kept("b", MIB + 1)):
+        queue.put(item)
+    assert drained(queue) == [1, 2, Presence.LEFT, "a", "b"]
+    for item in (moving(1, MIB), kept(Presence.LEFT), kept("a", MAX_BYTES - MIB)):
+        queue.put(item)
+    assert drained(queue) == [Presence.LEFT, "a"], "moving items make room first"
+
+
 def test_the_end_of_a_peer_comes_after_its_messages_and_before_it_joins_again() -> None:
     queue = ReceiveQueue(1_000)
-    items = [*map(moving, range(MANY + 1)), kept(Presence.LEFT), moving(-1), kept(Presence.JOINED)]
-    for item in items:
+    for content in (*range(3), Presence.LEFT, -1, Presence.JOINED):
+        queue.put(moving(content) if isinstance(content, int) else kept(content))
+    assert drained(queue) == [*range(3), Presence.LEFT, Presence.JOINED, -1]
+    # What waits of others does not hold it up.
+    others = [Received("other", number, moving=True) for number in range(4)]
+    for item in (*others[:2], moving("last"), *others[2:], kept(Presence.LEFT), kept(Presence.JOINED)):
         queue.put(item)
-    assert drained(queue) == [item.content for item in items]
-    # What waits of others does not hold it up, whether it came before the many or after them.
-    others = [Received("other", number, moving=True) for number in range(MANY + 1)]
-    for item in (*others[:50], moving("last"), *others[50:], kept(Presence.LEFT), kept(Presence.JOINED)):
-        queue.put(item)
-    assert drained(queue) == ["last", Presence.LEFT, Presence.JOINED, *range(MANY + 1)]
-    for item in (kept(Presence.LEFT), *others, kept(Presence.JOINED)):
-        queue.put(item)
-    assert drained(queue) == [Presence.LEFT, Presence.JOINED, *range(MANY + 1)]
+    assert drained(queue) == ["last", Presence.LEFT, Presence.JOINED, *range(4)]
 
 
-@given(steps=st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["live", "state", *Presence, "get"]))))
-def test_nothing_is_lost_and_no_peer_is_read_in_another_order(steps: list[tuple[str, object]]) -> None:
-    put: dict[str, list[int]] = {"a": [], "b": [], "c": []}
-    got: dict[str, list[int]] = {"a": [], "b": [], "c": []}
+@given(
+    steps=st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["live", "state", Answer(1), *Presence, "get"])))
+)
+def test_nothing_is_lost_and_of_each_peer_only_its_coming_overtakes(steps: list[tuple[str, object]]) -> None:
+    put: dict[str, list[tuple[int, object]]] = {"a": [], "b": [], "c": []}
+    got: dict[str, list[tuple[int, object]]] = {"a": [], "b": [], "c": []}
     queue = ReceiveQueue(1_000)
 
     def get() -> bool:
         item = queue.get()
-        if item is not None and item.sender:
-            got[item.sender].append(item.size)
+        if item is not None:
+            got[item.sender].append((item.size, item.content))
         return item is not None
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tfbus.links._receive_queue.MANY", 2)
-        for number, (sender, step) in enumerate(steps):
-            if step == "get":
-                get()
-            else:
-                put[sender].append(number)
-                queue.put(Received(sender, step, number, moving=step == "live"))
-        while get():
-            pass
-    assert got == put
+    for number, (sender, step) in enumerate(steps):
+        if step == "get":
+            get()
+        else:
+            put[sender].append((number, step))
+            queue.put(Received(sender, step, number, moving=step == "live"))
+    while get():
+        pass
+    for sender, items in put.items():
+        assert sorted(got[sender], key=lambda item: item[0]) == items
+        for left_out in (("live", "state", Answer(1)), (Presence.JOINED,)):
+            kept_in = [item for item in items if item[1] not in left_out]
+            assert [item for item in got[sender] if item[1] not in left_out] == kept_in
 
 
 def test_beyond_the_capacity_the_oldest_moving_items_are_dropped_and_the_others_stay_in_order() -> None:

@@ -10,7 +10,7 @@ from tfbus.statistics import QueueStatistics
 
 MAX_BYTES = 64 * 2**20
 MANY = 100
-"""Moving items that wait, beyond which questions and answers overtake them."""
+"""Moving items that wait, beyond which an answer overtakes those of its own sender too."""
 _OVERHEAD = 256
 """Bytes that an item takes besides its content."""
 
@@ -82,9 +82,10 @@ class Received:
 class ReceiveQueue:
     """Holds what threads have received until the event loop reads it.
 
-    Items are read in order, so that batches stay whole. But while more than `MANY` moving items wait, what brings two
-    ends to agree is read first: questions, answers, and that a peer has come or gone. All that waits of this peer is
-    read before that, for its last messages come before its end.
+    Items are read in order, but what brings two ends to agree (questions, answers, and that a peer has come or gone) is
+    read first: where nobody has time, what waits may take seconds. All that waits of a peer is read before its end, for
+    it was sent before that, and before its answer, which would else split batches. Only while more than `MANY` moving
+    items wait, the answer does not wait for them.
 
     Parameters
     ----------
@@ -110,8 +111,9 @@ class ReceiveQueue:
     def put(self, item: Received) -> None:
         """Append an item, from any thread."""
         with self._lock:
-            if self._moving > MANY and isinstance(item.content, Presence | Question | Answer):
-                if isinstance(item.content, Presence):
+            if isinstance(item.content, Presence | Question | Answer):
+                few = self._moving <= MANY
+                if item.content is Presence.LEFT or (few and isinstance(item.content, Answer)):
                     self._hurry(item.sender)
                 self._urgent.append(item)
             else:
@@ -148,11 +150,15 @@ class ReceiveQueue:
     def _drop_oldest(self) -> None:
         while self._pending and not self._pending[0].moving:
             self._kept.append(self._pending.popleft())
-        self._pop(self._pending or self._kept or self._urgent)
+        if self._moving and not self._pending:
+            self._pop(self._urgent, next(place for place, item in enumerate(self._urgent) if item.moving))
+        else:
+            self._pop(self._pending or self._kept or self._urgent)
         self._dropped += 1
 
-    def _pop(self, queue: deque[Received]) -> Received:
-        item = queue.popleft()
+    def _pop(self, queue: deque[Received], place: int = 0) -> Received:
+        item = queue[place]
+        del queue[place]
         self._bytes -= _footprint(item)
         self._moving -= item.moving
         return item
