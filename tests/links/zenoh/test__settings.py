@@ -2,6 +2,7 @@ import json
 import math
 import shutil
 import subprocess
+from contextlib import AsyncExitStack
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from support.samples import moving, static
 
 from tfbus import Buffer, Bus
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter, _settings
-from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, patch_settings, settings
+from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, identity, patch_settings, settings
 
 LISTEN, CONNECT = "listen/endpoints", "connect/endpoints"
 LOOPBACK = "tcp/127.0.0.1:0"
@@ -88,11 +89,38 @@ def test_only_a_link_with_a_listening_address_of_its_own_fails_if_it_cannot_list
         ({"listen": []}, False),
         ({"config": {"listen": {"endpoints": ["tcp/192.168.1.5:7000"]}}}, False),
         ({"config": {"connect/endpoints": ["tcp/192.168.1.5:7000"]}}, False),
+        ({"config": {"id": "a"}}, False),
+        ({"config": {"transport/link/tx/keep_alive": 4}}, True),
     ],
 )
-def test_of_two_links_on_the_loopback_one_dials(where: dict[str, Any], one_dials: bool) -> None:
-    found = read("scouting/gossip/autoconnect_strategy", **where)
-    assert found == ({"peer": {"to_router": "always", "to_peer": "greater-zid"}} if one_dials else None)
+def test_a_link_on_the_loopback_dials_smaller_ids_only_and_has_a_greater_one_than_those_on_a_network(
+    where: dict[str, Any], one_dials: bool
+) -> None:
+    for _ in range(20):
+        id, own = identity(where.get("listen"), where.get("connect"), where.get("config"))  # noqa: A001
+        found = read("scouting/gossip/autoconnect_strategy", config=own)
+        assert found == ({"peer": {"to_router": "always", "to_peer": "greater-zid"}} if one_dials else None)
+        assert read("id", config=own) == id
+        assert len(id) == 32
+        for byte in (id[:2], id[-2:]):
+            assert ("c0" <= byte <= "ff") if one_dials else ("80" <= byte <= "bf")
+    assert identity(None, None, None)[0] != identity(None, None, None)[0]
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("attempt", range(4))
+async def test_links_on_the_loopback_dial_those_on_a_network_that_cannot_dial_them(attempt: int) -> None:
+    domain, (port, other) = new_domain(), free_ports(2)
+    meeting = f"tcp/127.0.0.1:{port}"
+    on_network = {"listen": f"tcp/0.0.0.0:{other}", "config": {"scouting/gossip/autoconnect": {"peer": []}}}
+    async with AsyncExitStack() as stack:
+        links = [ZenohLink(stack.enter_context(Bus()), domain, listen=meeting)]
+        for number in range(4):
+            side: dict[str, Any] = on_network if number == attempt else {}
+            links.append(ZenohLink(stack.enter_context(Bus()), domain, connect=meeting, **side))
+        for link in links:
+            await stack.enter_async_context(link)
+        await until(lambda: [len(link.peers) for link in links] == [4] * 5)
 
 
 def test_settings_of_zenoh_win_over_those_of_the_link() -> None:

@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
+from uuid import uuid4
 
 import zenoh
 
@@ -16,6 +17,8 @@ MEETING_POINT = "tcp/127.0.0.1:17447"
 
 SIGNS_OF_LIFE = 2
 """So many go out in each lease, so one may be late by half of it."""
+
+_WHO_DIALS = "scouting/gossip/autoconnect_strategy"
 
 Addresses = str | Iterable[str]
 
@@ -51,21 +54,11 @@ def settings(
         If an argument has another type.
     """
     own = dict(config or {})
-    own_listen, own_connect = _gives_addresses(own, "listen"), _gives_addresses(own, "connect")
-    listens = listen is not None or own_listen
+    listens = listen is not None or _gives_addresses(own, "listen")
     silence = default_lease() if lease is None else as_duration(lease, "lease")
     if not 0 < silence < math.inf:
         raise ValueError(f"lease must be a time that passes, got {lease}")
-    if listens or connect is not None or own_connect:
-        connects_to = [] if connect is None else _endpoints(connect)
-        # A link that proves itself to others by a certificate accepts nobody without one.
-        proven = connects_to and all(address.startswith(_ENCRYPTED) for address in connects_to)
-        listens_at = [] if proven else ["tcp/127.0.0.1:0"]
-    else:
-        connects_to = [MEETING_POINT]
-        listens_at = [MEETING_POINT, "tcp/127.0.0.1:0"]
-    if listen is not None:
-        listens_at = _endpoints(listen)
+    listens_at, connects_to = _addresses(listen, connect, own)
     values: dict[str, Any] = {
         "mode": "peer",
         "scouting/multicast/enabled": False,
@@ -87,11 +80,6 @@ def settings(
     if not listens:
         # Usually another link holds the meeting point.
         values |= {"listen/exit_on_failure": False, "listen/timeout_ms": 0}
-    on_loopback = all(map(_LOOPBACK.fullmatch, (*listens_at, *connects_to)))
-    if listens_at and on_loopback and not own_listen and not own_connect:
-        # Whoever hears of another link reaches it, so one of the two dials. Where both do, zenoh closes half of the
-        # connections again, which doubles what it costs fifty links to meet.
-        values["scouting/gossip/autoconnect_strategy"] = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
     result = zenoh.Config()
     for path, value in (values | own).items():
         try:
@@ -100,6 +88,36 @@ def settings(
             why = without_source_location(error)
             raise ValueError(f"zenoh does not take {value!r} for its setting {path!r}: {why}") from None
     return result
+
+
+def identity(
+    listen: Addresses | None, connect: Addresses | None, config: Mapping[str, Any] | None
+) -> tuple[str, dict[str, Any]]:
+    """The id of the session of a new link, and the settings that go with it.
+
+    Where two links that hear of each other both dial, zenoh makes many connections twice and closes half of them. That
+    nearly doubles the cost of the meeting of fifty links. So a link that is on the loopback only dials only those with
+    smaller ids; zenoh compares the bytes from the last to the first. Links on a network dial all, because others may
+    not reach them, and have smaller ids than those on the loopback, because they may not reach these.
+
+    Parameters
+    ----------
+    listen, connect, config
+        As for `settings`.
+    """
+    own = config or {}
+    listens_at, connects_to = _addresses(listen, connect, own)
+    on_loopback = (
+        bool(listens_at)
+        and all(map(_LOOPBACK.fullmatch, (*listens_at, *connects_to)))
+        and not any(path == "id" or str(path).partition("/")[0] in ("listen", "connect") for path in own)
+    )
+    id = bytearray(uuid4().bytes)  # noqa: A001 - zenoh calls it so
+    for place in (0, -1):
+        # Whatever the order of bytes. An id must not begin with 0.
+        id[place] = 0xC0 | id[place] if on_loopback else 0x80 | id[place] & 0x3F
+    one_dials = {_WHO_DIALS: {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
+    return id.hex(), {"id": id.hex()} | (one_dials if on_loopback else {})
 
 
 def patch_settings(address: str, config: Mapping[str, Any] | None, lease: float | None) -> zenoh.Config:
@@ -117,15 +135,31 @@ def without_source_location(error: Exception) -> str:
     return re.sub(r" at /\S+\.rs:\d+\.?", "", str(error))
 
 
+def _addresses(
+    listen: Addresses | None, connect: Addresses | None, own: Mapping[str, Any]
+) -> tuple[list[str], list[str]]:
+    """The addresses at which a session listens and to which it connects, unless zenoh's own settings say otherwise."""
+    given = listen is not None or connect is not None
+    if not given and not _gives_addresses(own, "listen") and not _gives_addresses(own, "connect"):
+        return [MEETING_POINT, "tcp/127.0.0.1:0"], [MEETING_POINT]
+    connects_to = [] if connect is None else endpoints(connect)
+    if listen is not None:
+        return endpoints(listen), connects_to
+    # A link that proves itself to others by a certificate accepts nobody without one.
+    proven = connects_to and all(address.startswith(_ENCRYPTED) for address in connects_to)
+    return [] if proven else ["tcp/127.0.0.1:0"], connects_to
+
+
 def _gives_addresses(own: Mapping[str, Any], which: str) -> bool:
     return any(path == which or str(path).startswith(f"{which}/endpoints") for path in own)
 
 
-def _endpoints(addresses: Addresses) -> list[str]:
-    endpoints = [addresses] if isinstance(addresses, str) else list(addresses)
-    for address in endpoints:
+def endpoints(addresses: Addresses) -> list[str]:
+    """One address or several, each checked; raises `ValueError`."""
+    found = [addresses] if isinstance(addresses, str) else list(addresses)
+    for address in found:
         # zenoh accepts some that it can never reach, and would try for ever.
         on_network = _ON_NETWORK.fullmatch(address)
         if not (int(on_network["port"]) < 2**16 if on_network else _ON_MACHINE.fullmatch(address)):
             raise ValueError(f"an address is like tcp/192.168.1.5:7447, not {address!r}")
-    return endpoints
+    return found

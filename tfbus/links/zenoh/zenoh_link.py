@@ -7,7 +7,6 @@ state come with the answers to questions; see `tfbus.links._state`.
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
-from uuid import uuid4
 
 import zenoh
 
@@ -18,7 +17,7 @@ from tfbus.links.link import Link
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
-from tfbus.links.zenoh._settings import Addresses, patch_settings, settings
+from tfbus.links.zenoh._settings import Addresses, endpoints, identity, patch_settings, settings
 
 
 class ZenohLink(Link):
@@ -142,9 +141,10 @@ class ZenohLink(Link):
         chosen = frames if frames is None or isinstance(frames, str) else frozenset(frames)
         self.domain = check_domain(domain)
         self.robot = robot
-        # Peers tell by the id of a session at which address they have reached a link. It must not begin with 0.
-        link = f"{uuid4().int | 1 << 127:032x}"
-        own = {"id": link, **(config or {})}
+        listen, connect = (None if given is None else endpoints(given) for given in (listen, connect))
+        # Peers tell by the id of a session at which address they have reached a link.
+        link, its_own = identity(listen, connect, config)
+        own = {**its_own, **(config or {})}
         carrier = ZenohCarrier(
             settings(listen, connect, own, lease),
             lambda address: patch_settings(address, config, lease),
