@@ -117,8 +117,12 @@ async def test_a_patch_carries_what_a_filter_wants_and_its_end_ends_that() -> No
         ((name, frames),) = here.sessions.filters.items()
         assert frames == {"base", "lidar"}
         assert not here.sessions.is_heard()
-        here.sessions.put(Message(b"all", b"", 1))
-        here.sessions.put_part(name, Message(b"part", b"", 1))
+        with anyio.fail_after(30):
+            # On a busy machine zenoh may drop one.
+            while there.items.empty():
+                here.sessions.put(Message(b"all", b"", 1))
+                here.sessions.put_part(name, Message(b"part", b"", 1))
+                await anyio.sleep(0.1)
         assert await there.next() == Received(here.id, (b"part", b""), 4, moving=True)
         here.sessions._drop_patch(there.id)
         assert here.sessions.filters == {}
