@@ -18,8 +18,6 @@ MEETING_POINT = "tcp/127.0.0.1:17447"
 SIGNS_OF_LIFE = 2
 """So many go out in each lease, so one may be late by half of it."""
 
-_WHO_DIALS = "scouting/gossip/autoconnect_strategy"
-
 Addresses = str | Iterable[str]
 
 _ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
@@ -90,10 +88,8 @@ def settings(
     return result
 
 
-def identity(
-    listen: Addresses | None, connect: Addresses | None, config: Mapping[str, Any] | None
-) -> tuple[str, dict[str, Any]]:
-    """The id of the session of a new link, and the settings that go with it.
+def identity(listen: Addresses | None, connect: Addresses | None, config: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The settings of zenoh that are a new link's own: its ``"id"``, and whom it dials.
 
     Where two links that hear of each other both dial, zenoh makes many connections twice and closes half of them. That
     nearly doubles the cost of the meeting of fifty links. So a link that is on the loopback only dials only those with
@@ -116,8 +112,11 @@ def identity(
     for place in (0, -1):
         # Whatever the order of bytes. An id must not begin with 0.
         id[place] = 0xC0 | id[place] if on_loopback else 0x80 | id[place] & 0x3F
-    one_dials = {_WHO_DIALS: {"peer": {"to_router": "always", "to_peer": "greater-zid"}}}
-    return id.hex(), {"id": id.hex()} | (one_dials if on_loopback else {})
+    own_settings: dict[str, Any] = {"id": id.hex()}
+    if on_loopback:
+        strategy = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
+        own_settings["scouting/gossip/autoconnect_strategy"] = strategy
+    return own_settings
 
 
 def patch_settings(address: str, config: Mapping[str, Any] | None, lease: float | None) -> zenoh.Config:

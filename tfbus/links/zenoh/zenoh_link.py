@@ -143,8 +143,8 @@ class ZenohLink(Link):
         self.robot = robot
         listen, connect = (None if given is None else endpoints(given) for given in (listen, connect))
         # Peers tell by the id of a session at which address they have reached a link.
-        link, its_own = identity(listen, connect, config)
-        own = {**its_own, **(config or {})}
+        its_own = identity(listen, connect, config)
+        link, own = its_own["id"], {**its_own, **(config or {})}
         carrier = ZenohCarrier(
             settings(listen, connect, own, lease),
             lambda address: patch_settings(address, config, lease),
