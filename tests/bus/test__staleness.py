@@ -3,6 +3,7 @@ from dataclasses import dataclass
 from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, static
+from support.wires import size_of
 
 from tfbus import FrameLive, FrameStale
 from tfbus.bus._staleness import Staleness
@@ -139,7 +140,7 @@ def test_clear_forgets_every_frame() -> None:
     world.send("a", 111)
     world.edges.clear()
     world.staleness.clear()
-    assert (len(world.staleness), world.staleness.due(), world.staleness.changes(500)) == (0, None, [])
+    assert (size_of(world.staleness), world.staleness.due(), world.staleness.changes(500)) == (0, None, [])
 
 
 def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
@@ -149,7 +150,7 @@ def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
         world.send(f"object {number}", 101 + number)
         world.staleness.changes(100)
         world.remove(f"object {number}")
-    assert len(world.staleness) < 200
+    assert size_of(world.staleness) < 200
     assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
 
 
@@ -157,10 +158,10 @@ def test_a_sample_of_a_live_frame_adds_no_entry() -> None:
     world = World()
     world.send("a", 0)
     world.staleness.changes(0)
-    before = len(world.staleness)
+    before = size_of(world.staleness)
     for stamp in range(1, 1_000):
         assert not world.send("a", stamp)
-    assert len(world.staleness) == before
+    assert size_of(world.staleness) == before
 
 
 STEPS = st.one_of(

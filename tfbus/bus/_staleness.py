@@ -35,9 +35,6 @@ class Staleness:
         self._stale: set[str] = set()
         self._noted: dict[str, None] = {}
 
-    def __len__(self) -> int:
-        return len(self._due) + len(self._live) + len(self._stale) + len(self._noted)
-
     def arrived(self, batch: Batch) -> bool:
         """Note accepted samples; return whether `changes` may have something new."""
         stale = self._stale

@@ -73,7 +73,7 @@ def spans_heard(frame: Reception) -> list[tuple[int, int]]:
         return []
     pauses = np.diff(times)
     usual = float(np.median(pauses)) if len(pauses) else 0.0
-    breaks = np.flatnonzero(pauses > GAP * usual) if usual > 0.0 else np.flatnonzero(pauses > 0)
+    breaks = np.flatnonzero(pauses > GAP * usual)
     begins = times[np.concatenate(([0], breaks + 1))]
     ends = times[np.concatenate((breaks, [len(times) - 1]))]
     return [(int(begin), int(end - begin)) for begin, end in zip(begins, ends, strict=True)]
