@@ -186,8 +186,12 @@ async def test_an_invalid_name_raises_at_once(bad: str) -> None:
 
 def test_a_buffer_with_a_prefix_cannot_name_frames_of_another_robot() -> None:
     _, _, _, (robot, _) = two_robots()
+    # The buffer keeps the path of an answer by its names on the bus.
+    robot.lookup_nowait("map", "arm")
     for name in ("robot2/arm", "robot1/arm", "/robot2/arm"):
         assert not robot.can_transform("map", name)
+        with pytest.raises(UnknownFrameError):
+            robot.lookup_nowait("map", name)
 
 
 def test_errors_have_bus_names() -> None:

@@ -652,6 +652,18 @@ def test_messages_of_too_many_peers_are_refused_and_counted() -> None:
         assert here.reports == [(f"{MAX_PEERS}", "too many peers")]
 
 
+def test_an_evicted_peer_that_comes_back_has_its_frames_again() -> None:
+    with receiver(drop_lost=True) as here:
+        here.receive(moving("map", "a", 1), sender="evicted")
+        for number in range(1, MAX_PEERS):
+            here.receive(moving("map", "b", number), origin=OTHER, sequence=number, sender=f"{number}")
+        here.end.receive("announced", Presence.JOINED)
+        here.lose("announced")
+        here.receive(moving("map", "a", 1), sender="evicted")
+        assert here.peers.rejected == {}
+        assert here.lose("evicted") == ("a",)
+
+
 @pytest.mark.thorough
 def test_removals_of_unknown_frames_do_not_reach_the_bus() -> None:
     entries: list[Entry] = [RemovedFrame(ORIGIN, number, f"no {number}") for number in range(MAX_ENTRIES)]

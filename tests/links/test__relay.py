@@ -658,6 +658,23 @@ def test_the_links_of_a_bus_share_a_relay_that_forgets_everything_when_the_last_
             domain.ends = [end for end in domain.ends if end.bus is not a]
 
 
+def test_frames_of_a_link_that_has_ended_are_of_the_peer_that_says_them_again_by_another_link() -> None:
+    with Network([[0, 1], [0, 2], [1, 3]], drop_lost=True) as net:
+        a, b, *_ = net.buses
+        b.publish([static("map", "s"), moving("map", "m", 1)])
+        net.settle()
+        for end in list(net.domains[0].ends):
+            end.leave()
+        net.domains[0].ends.clear()
+        assert frames_of(a) == {"s", "m"}
+        net.domains[1].join(b, drop_lost=True)
+        b.publish(moving("map", "m", 2))
+        net.settle()
+        net.domains[1].kill(net.domains[1].ends[-1])
+        net.settle()
+        assert frames_of(a) == set()
+
+
 def test_a_bus_that_is_linked_again_receives_none_of_its_own_samples() -> None:
     with Network(PAIR) as net:
         net.buses[0].publish(static("map", "s"))

@@ -1,3 +1,4 @@
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -49,6 +50,23 @@ def test_axes_dots_and_lines_are_where_the_scene_has_them() -> None:
         for place in (3, None, 99, 0):
             canvas._on_click(SimpleNamespace(instance_index=place))
     assert clicked == [picture.scene.frames[3], "map"]
+
+
+def test_a_dot_is_a_regular_icosahedron_whose_faces_look_outward() -> None:
+    with viser_page() as server:
+        canvas = Canvas(server, print)
+        canvas.draw(Page(tree_of(static("map", "base"))).picture(0), 0.2)
+        assert canvas._dots is not None
+        vertices, faces = canvas._dots.vertices, canvas._dots.faces
+    assert (vertices.shape, faces.shape) == ((12, 3), (20, 3))
+    radius = float(np.linalg.norm(vertices[0]))
+    assert np.linalg.norm(vertices, axis=1) == pytest.approx(np.full(12, radius))
+    edges = {(face[at - 1], face[at]) for face in faces.tolist() for at in range(3)}
+    assert len(edges) == 60, "each edge belongs to two faces, once in each direction"
+    assert edges == {(end, begin) for begin, end in edges}
+    edge = radius / math.sin(2.0 * math.pi / 5.0)
+    volume = np.linalg.det(vertices[faces].astype(np.float64)).sum() / 6.0
+    assert volume == pytest.approx(5.0 / 12.0 * (3.0 + math.sqrt(5.0)) * edge**3, rel=1e-6)
 
 
 def test_the_shapes_of_a_robot_are_drawn_with_each_picture() -> None:

@@ -1,4 +1,3 @@
-import math
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +23,8 @@ VISUALS = [
 
 def test_shapes_are_drawn_at_their_links_one_object_for_equal_triangles() -> None:
     tree = tree_of(static("map", "base", 2.0))
-    quarter = Transform.from_xyz_rpy((0.0, 0.0, 0.0), (0.0, 0.0, math.pi / 2))
-    tree.insert(TransformStamped("base", "tool", 0, quarter, static=True))
+    turned = Transform((0.0, 0.0, 0.0), (2 / 9, 4 / 9, 5 / 9, 6 / 9))
+    tree.insert(TransformStamped("base", "tool", 0, turned, static=True))
     page = Page(tree)
     with viser_page() as server:
         solids = Solids(server, solids_of(VISUALS, MeshFiles((), Path())))
@@ -33,9 +32,11 @@ def test_shapes_are_drawn_at_their_links_one_object_for_equal_triangles() -> Non
         boxes, spheres = solids._handles
         assert boxes is not None
         assert spheres is not None
-        # The box of the tool is 1 m along x of the tool, which is y of the map.
-        assert boxes.batched_positions == pytest.approx(np.array([[2.0, 0.0, 0.5], [2.0, 1.0, 0.0]]), abs=1e-6)
-        assert boxes.batched_wxyzs[1] == pytest.approx([math.sqrt(0.5), 0, 0, math.sqrt(0.5)])
+        # The box of the tool is 1 m along x of the tool: the first column of the matrix of (2, 4, 5, 6) / 9.
+        x, y, z = 1 - 2 * (4 * 4 + 5 * 5) / 81, 2 * (2 * 4 + 5 * 6) / 81, 2 * (2 * 5 - 4 * 6) / 81
+        positions = np.array([[2.0, 0.0, 0.5], [2.0 + x, y, z]])
+        assert boxes.batched_positions == pytest.approx(positions, abs=1e-6)
+        assert boxes.batched_wxyzs[1] == pytest.approx([6 / 9, 2 / 9, 4 / 9, 5 / 9])
         assert boxes.batched_scales == pytest.approx(np.array([[1.0, 2.0, 3.0], [0.1, 0.1, 0.1]]))
         assert boxes.batched_colors.tolist()[0] == [255, 0, 0]
         assert spheres.batched_positions.tolist() == [[2.0, 0.0, 0.0]]

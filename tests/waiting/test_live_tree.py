@@ -361,6 +361,17 @@ def test_a_waiter_is_woken_by_the_insertion_that_makes_it_hopeless(
     assert not isinstance(raised.value, FutureExtrapolationError)
 
 
+def test_nothing_is_left_of_a_waiter_that_a_sample_wakes_before_it_becomes_hopeless() -> None:
+    live = live_tree(10e-9)
+    live.insert((moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)))
+    woken: list[str] = []
+    park(live, "map", "b", 5, woken)
+    assert len(live.waiting.limits) == 1, "samples of the bus that are 10 ns newer drop those of b around the stamp"
+    live.insert((moving("map", "a", 5),))
+    assert woken == ["b"]
+    assert (len(live.waiting), live.waiting.by_frame, live.waiting.limits) == (0, {}, [])
+
+
 def test_another_question_of_a_waiter_that_becomes_hopeless_wakes_it() -> None:
     live = live_tree(10e-9)
     live.insert((moving("map", "a", 0), moving("map", "b", 0), moving("map", "b", 9)))

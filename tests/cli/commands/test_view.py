@@ -1,5 +1,7 @@
+import errno
 import signal
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
@@ -11,6 +13,8 @@ from support.processes import new_domain
 from support.programs import free_address, start_tfbus
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
+
+from tfbus import Buffer, Bus, view
 
 ROBOT = Path(__file__).parents[3] / "demos" / "robot_arm.urdf"
 
@@ -32,6 +36,36 @@ def test_the_page_of_a_domain_is_served_until_ctrl_c() -> None:
         address = view.output.expect("http://127.0.0.1:")
         assert httpx.get(address, trust_env=False).status_code == 200
         assert view.end(signal.SIGINT) == 130
+
+
+def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(
+    tmp_path: Path, tfbus: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[dict[str, object]] = []
+
+    class OccupiedView(view.View):
+        def __init__(self, bus: Bus, buffer: Buffer, port: int, **options: Any) -> None:
+            asked.append({"port": port, "edges": len(buffer.tree.edges()), **options})
+            super().__init__(bus, buffer, port, **options)
+
+        async def __aenter__(self) -> "OccupiedView":
+            raise OSError(errno.EADDRINUSE, "in use")
+
+    monkeypatch.setattr(view, "View", OccupiedView)
+    recording = write_mcap(tmp_path / "run.mcap", [(0, "/tf", [moving("map", "base", 5)])])
+    options = ("--fixed", "map", "--trail", "base", "--rate", "5", "--port", "8081")
+    check_wrong_call(tfbus("view", recording, *options), "cannot use port 8081: in use")
+    (given,) = asked
+    assert given == {
+        "port": 8081,
+        "edges": 1,
+        "fixed": "map",
+        "trails": ("base",),
+        "urdf": None,
+        "package_paths": (),
+        "rate": 5.0,
+        "live": False,
+    }
 
 
 @pytest.mark.parametrize(

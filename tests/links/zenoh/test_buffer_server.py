@@ -72,6 +72,35 @@ async def test_what_is_no_question_is_refused_and_harms_nobody(address: str, dom
                 assert (await client.lookup("map", "base")).static
 
 
+async def test_a_number_under_which_a_lookup_waits_is_refused_for_another_one(address: str, domain: str) -> None:
+    config = settings([], address, {"mode": "client"}, 2.0)
+    replies: list[Any] = []
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with BufferServer(buffer, domain, listen=address) as server:
+            session = await anyio.to_thread.run_sync(zenoh.open, config)
+            try:
+                for frame in ("base", "arm"):
+                    question = RemoteQuestion("me", 1, "map", frame, LATEST, timeout=PATIENCE)
+                    session.get(
+                        f"tfbus/{domain}/~/lookup",
+                        zenoh.handlers.Callback(replies.append, indirect=False),
+                        payload=write_question(question),
+                        timeout=PATIENCE,
+                    )
+                    await until(lambda: server.statistics().waiting == 1)
+                await until(lambda: len(replies) == 1)
+                bus.publish([static("map", "base", 2.0), static("map", "arm")])
+                await until(lambda: len(replies) == 2)
+            finally:
+                await anyio.to_thread.run_sync(session.close)
+            refused, answered = (read_answer(reply.ok.payload.to_bytes(), domain, None) for reply in replies)
+            assert isinstance(refused, RemoteLookupError)
+            assert refused.reason == "malformed"
+            assert isinstance(answered, TransformStamped)
+            assert answered.child == "base"
+            assert server.statistics().refused == {"malformed": 1}
+
+
 async def test_what_is_known_is_answered_while_the_event_loop_is_busy(address: str, domain: str) -> None:
     config = settings([], address, {"mode": "client"}, 2.0)
     question = RemoteQuestion("asker", 1, "map", "base", LATEST)

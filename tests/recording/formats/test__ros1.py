@@ -1,4 +1,5 @@
 import re
+import struct
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -218,6 +219,24 @@ def test_a_damaged_chunk_header_loses_one_chunk(tmp_path: Path, indexed: bool) -
     assert 0 < len(missing) < 25
     assert found == [line for line in EXPECTED if line not in missing]
     assert (f"the chunk at byte {second}: " if indexed else f"from byte {second} to byte {third}") in lost[0]
+
+
+def test_a_chunk_that_claims_to_hold_those_behind_it_hides_none_of_them(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(write_bag(path))
+    second, third = chunks_in(bytes(data))[1:3]
+    with path.open("rb") as file:
+        begin = read_record(file, second).data
+    data[begin - 1] ^= 0x40
+    place = data.index(b"index_pos=") + 10
+    data[place : place + 8] = bytes(8)
+    path.write_bytes(data)
+    found, lost = read(path)
+    missing = [line for line in EXPECTED if line not in found]
+    assert 0 < len(missing) < 25
+    assert found == [line for line in EXPECTED if line not in missing]
+    (size,) = struct.unpack_from("<I", data, begin - 4)
+    assert f"nothing can be read from byte {second} to byte {third}: a chunk claims {size:,} bytes" in lost[0]
 
 
 def test_a_chunk_that_claims_too_much_is_not_unfolded(tmp_path: Path) -> None:
