@@ -429,6 +429,14 @@ async def test_a_jump_back_drops_moving_samples_and_keeps_statics() -> None:
     assert buffer.can_transform("map", "laser", 91)
 
 
+def test_each_jump_back_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    clock = SimulatedClock(start=9)
+    with Bus(clock), caplog.at_level("WARNING", "tfbus"):
+        for stamp in (5, 8, 2):
+            clock.set(stamp)
+    assert caplog.messages == ["the clock jumped back: moving samples are dropped"] * 2
+
+
 def test_a_jump_forward_drops_nothing() -> None:
     clock = SimulatedClock(start=100)
     bus = Bus(clock)

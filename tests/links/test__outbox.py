@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, static
@@ -149,6 +151,25 @@ def test_an_echo_does_not_go_out_and_replaces_what_is_kept() -> None:
     sender.remove("u", origin=OTHER, echo=True)
     assert (sender.notified, sender.outbox.pending) == (2, 0)
     assert sender.turn() == ([], {"s": (theirs,), "t": None, "u": RemovedFrame(OTHER, 3, "u")})
+
+
+def test_a_turn_tells_what_it_changes_of_the_state_unless_an_echo_has_changed_it() -> None:
+    sender = Sender()
+    turns: list[Callable[[], None]] = [
+        lambda: sender.add(moving("map", "a", 1), static("map", "s")),
+        lambda: sender.add(moving("map", "a", 2)),
+        lambda: sender.remove("s"),
+        lambda: sender.add(static("map", "a"), origin=OTHER, echo=True),
+        lambda: sender.add(moving("map", "a", 4)),
+    ]
+    steps = []
+    for add in turns:
+        add()
+        step = sender.outbox.flush().step
+        assert step is not None
+        steps.append((step.since, step.number))
+    # By the fourth, another link brings "a", which no entry tells: peers are to ask.
+    assert steps == [(0, 2), (2, 2), (2, 3), (4, 4), (4, 5)]
 
 
 def test_an_echo_of_frames_that_are_not_kept_notifies_nobody() -> None:

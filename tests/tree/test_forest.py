@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from itertools import count
+from itertools import count, permutations
 from typing import Any
 
 import pytest
@@ -50,6 +50,19 @@ def test_a_changing_newest_path_is_kept_until_the_topology_changes() -> None:
     assert known.find_path("y", "b", LATEST) is not path
     with pytest.raises(DisconnectedError):
         known.find_path("z", "b", LATEST)
+
+
+def test_a_bounded_number_of_changing_newest_paths_is_kept() -> None:
+    known = forest()
+    names = [f"{number}" for number in range(80)]
+    for name in names:
+        known.insert_judged(moving("old", name, 0))
+        known.insert_judged(moving("new", name, 1))
+    pairs = list(permutations(names, 2))
+    for target, source in pairs:
+        assert known.find_path(target, source, LATEST).frames == (target, "new", source)
+    assert len(pairs) == 6_320
+    assert len(known.changing_paths) == 1_320, "5,000 are kept, and then none"
 
 
 # Recorded changes, from which a live tree finds the lookups to wake

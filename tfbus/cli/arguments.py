@@ -110,6 +110,8 @@ Backend = Literal["asyncio", "trio"]
 """An event loop."""
 Rate = Annotated[float, Parameter(validator=Number(gt=0, lt=float("inf")))]
 """A frequency in Hz."""
+Port = Annotated[int, Parameter(validator=Number(gte=0, lte=65_535))]
+"""A port of this machine; 0 for any that is free."""
 Speed = Annotated[float, Parameter(validator=Number(gt=0))]
 """A speed relative to real time; may be infinite."""
 Duration = Annotated[float, Parameter(validator=Number(gte=0))]

@@ -74,7 +74,7 @@ def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(
         (("nowhere.bag",), "there is no such file"),
         (("RUN", "--fixed", "/map"), "/map"),
         (("RUN", "--trail", ""), "empty"),
-        (("RUN", "--port", "70000"), "--port"),
+        (("RUN", "--port", "65536"), "--port"),
         (("RUN", "--urdf", "nowhere.urdf"), "cannot use nowhere.urdf: No such file"),
         (("RUN", "--urdf", "RUN"), "not well-formed"),
     ],

@@ -1,17 +1,11 @@
 """``tfbus foxglove``."""
 
-from typing import Annotated
-
 import anyio
-from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from tfbus.bus.bus import Bus
-from tfbus.cli.arguments import UsageError
+from tfbus.cli.arguments import Port, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import print_now, say
-
-Port = Annotated[int, Parameter(validator=Number(gte=0, lte=65_535))]
 
 
 def foxglove(*, port: Port = 8765, link: LinkOptions = DEFAULT_LINK) -> None:

@@ -6,19 +6,16 @@ from typing import Annotated
 
 import anyio
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
-from tfbus.cli.arguments import Rate, UsageError
+from tfbus.cli.arguments import Port, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import print_now, say
 from tfbus.cli.recorded_tree import load_tree
 from tfbus.errors import InvalidRobotError, InvalidTransformError
 from tfbus.frames import check_frame
-
-Port = Annotated[int, Parameter(validator=Number(gte=0, lte=65_535))]
 
 
 def view(
