@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.errors import DisconnectedError
 from tfbus.stamps import SECOND, Stamps
 from tfbus.tree.tree import TransformTree
 
@@ -65,11 +64,7 @@ def read_series(tree: TransformTree, target: str, source: str, samples: int = SA
     first, last = _span(tree)
     start, end = (first, last) if newest.static else _common_span(tree, target, source, newest.stamp)
     stamps = start + ((end - start) * np.arange(samples, dtype=object) // (samples - 1)).astype(np.int64)
-    try:
-        found = tree.lookup_many(target, source, stamps, out_of_range="nan")
-    except DisconnectedError:
-        stamps = np.array([newest.stamp], np.int64)
-        found = tree.lookup_many(target, source, stamps)
+    found = tree.lookup_many(target, source, stamps, out_of_range="nan")
     seconds = (stamps - first).astype(np.float64) / SECOND
     return Series(target, source, stamps, seconds, found.translations, np.degrees(found.as_rpy()), newest.static)
 
