@@ -657,6 +657,13 @@ def test_deskewing_keeps_the_other_fields_and_does_not_modify_the_cloud() -> Non
     assert (points.tolist(), stamps.tolist()) == ([[0.0] * 3] * 2, [0, SECOND])
 
 
+def test_deskewing_follows_a_sensor_to_its_next_parent() -> None:
+    tree = tree_of(static("map", "dock", 5.0), moving("map", "lidar", 0), moving("map", "lidar", 10, 10.0), keep=None)
+    tree.insert_many([moving("dock", "lidar", 20, 20.0), moving("dock", "lidar", 30, 30.0)])
+    found = tree.deskew(scan(np.zeros((4, 3)), [0, 5, 20, 25], 30), "map", "map")
+    assert found.points.tolist() == [[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [25.0, 0.0, 0.0], [30.0, 0.0, 0.0]]
+
+
 def test_a_cloud_stamped_latest_gets_the_stamp_of_its_newest_point() -> None:
     tree = along(straight)
     cloud = scan(np.zeros((3, 3)), [SECOND // 4, SECOND // 2, 0])
