@@ -26,7 +26,8 @@ def default_lease(load: str | os.PathLike[str] = _LOAD) -> float:
         Linux's `/proc/loadavg`, whose fourth field tells how many threads are runnable; see proc(5). Where it cannot be
         read, no machine is busy.
     """
-    with suppress(OSError, ValueError, IndexError), open(load, encoding="ascii") as file:  # noqa: PTH123 - pathlib costs 0.4 MB
+    # Nothing else that a link imports needs pathlib, which costs 0.4 MB.
+    with suppress(OSError, ValueError, IndexError), open(load, encoding="ascii") as file:  # noqa: PTH123
         runnable = int(file.read().split()[3].partition("/")[0])
         if runnable > MOST_RUNNABLE * (os.cpu_count() or 1):
             return BUSY_LEASE
