@@ -54,8 +54,10 @@ settings.register_profile("default", EXAMPLES, max_examples=10, derandomize=True
 settings.register_profile("thorough", EXAMPLES, max_examples=100, derandomize="CI" in os.environ)
 
 
-# pytest-xdist sets it in its workers, where commands would take it for the width of their output.
+# Commands would take it for the width of their output. pytest-xdist sets it in its workers, and readline in the
+# environment of C only, of which `os.environ` knows nothing and programs inherit it all the same.
 os.environ.pop("COLUMNS", None)
+os.unsetenv("COLUMNS")
 
 
 def is_default_suite(config: pytest.Config) -> bool:

@@ -1,6 +1,5 @@
 """Programs as a user runs them, each in a process of its own; a test waits for the lines that they print."""
 
-import os
 import re
 import signal
 import subprocess
@@ -75,8 +74,6 @@ class Program:
     """A process that is killed at the end of the ``with``, unless it has ended before."""
 
     def __init__(self, *command: str | Path, environment: Mapping[str, str] | None = None) -> None:
-        # Not the environment of C, in which readline sets COLUMNS.
-        environment = os.environ if environment is None else environment
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="utf-8", env=environment
         )
