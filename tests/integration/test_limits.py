@@ -30,6 +30,7 @@ BOUNDS = {
     "links._history": "LONGEST_HISTORY MOST_OF_FRAME MOST_HELD",
     "links.zenoh._dialing": "MOST_PEERS MOST_ADDRESSES",
     "links.zenoh._unmet": "MOST_UNMET",
+    "links.zenoh._introductions": "MOST_NAMED MOST_MISSING",
     "links.zenoh._filters": "MOST_FILTERS LONGEST_FILTER",
     "links._asker": "MOST_OPEN",
     "links.zenoh._session": "MOST_QUESTIONS",

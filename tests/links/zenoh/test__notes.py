@@ -15,9 +15,12 @@ pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 QUERY: Any = object()
 NOTES: list[tuple[Callable[[Notes], object], Noted]] = [
     (lambda notes: notes.add_change("a", Presence.LEFT), Noted([("a", Presence.LEFT)], [], [], [], set())),
-    (lambda notes: notes.add_connection("a", "tcp/x:1"), Noted([], [("a", "tcp/x:1")], [], [], set())),
+    (
+        lambda notes: notes.add_connection("a", "tcp/x:1", "tcp/y:2"),
+        Noted([], [("a", "tcp/x:1", "tcp/y:2")], [], [], set()),
+    ),
     (lambda notes: notes.add_question(QUERY), Noted([], [], [QUERY], [], set())),
-    (lambda notes: notes.add_answer("a", None), Noted([], [], [], [("a", None)], set())),
+    (lambda notes: notes.add_answer("a", None, b""), Noted([], [], [], [("a", None, b"")], set())),
     (lambda notes: notes.add_hearer("a"), Noted([], [], [], [], {"a"})),
     (Notes.stir, Noted([], [], [], [], set())),
 ]
@@ -51,13 +54,13 @@ async def test_without_a_note_the_wait_ends_when_somebody_is_due() -> None:
 async def test_notes_before_there_is_a_loop_are_kept_with_the_time_of_the_first() -> None:
     time = 3.0
     notes = Notes(lambda: time)
-    notes.add_answer("a", ["0"])
+    notes.add_answer("a", ["0"], b"x")
     time = 4.0
-    notes.add_answer("b", [])
+    notes.add_answer("b", [], b"")
     assert notes.since == 3.0
     notes.bind()
     await notes.wait(math.inf)
-    assert notes.take().heard_by == [("a", ["0"]), ("b", [])]
+    assert notes.take().heard_by == [("a", ["0"], b"x"), ("b", [], b"")]
 
 
 async def test_questions_and_hearers_have_a_bound() -> None:

@@ -16,7 +16,7 @@ from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Received
 from tfbus.links.zenoh._filters import name_of, write_filter
-from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT, Keys
 from tfbus.links.zenoh._session import MOST_NAMES, MOST_QUESTIONS, ZenohSession
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError
@@ -33,8 +33,8 @@ class End:
         self.heard_by: Queue[bytes] = Queue()
         self.session = ZenohSession(config, Keys(domain, id), self.items.put, self._note, note_heard=self.heard_by.put)
 
-    def _note(self, link: str, name: str, presence: Presence) -> None:
-        assert name == FIRST_SESSION
+    def _note(self, link: str, name: str, presence: Presence, robot: str) -> None:
+        assert (name, robot) == (FIRST_SESSION, NO_ROBOT)
         self.items.put(Received(link, presence))
 
     def next(self) -> Received:
@@ -469,41 +469,42 @@ def test_an_answer_is_received_once_and_tells_whether_the_filter_is_served() -> 
     ],
 )
 def test_the_sessions_that_a_peer_hears_are_told_once(replies: Sequence[bytes | None], names: list[str] | None) -> None:
-    end, told = closed_end(), list[list[str] | None]()
+    end, told = closed_end(), list[tuple[list[str] | None, bytes]]()
     network = Network(end)
-    end.session.ask_hearing(B, told.append)
+    end.session.ask_hearing(B, lambda *answer: told.append(answer), b"known")
     for reply in replies:
         network.reply(reply, end=False)
     ((key, handler, options),) = network.asked
     handler.drop()  # type: ignore[misc]
-    assert told == [names]
+    assert told == [(names, b"" if names is None else b"!")]
     assert (key, options["payload"]) == (f"tfbus/yard/*/hears/{B}", Keys("yard", A).token(FIRST_SESSION))
+    assert options["attachment"] == b"known"
     Network(end, failing=True)
-    end.session.ask_hearing(B, told.append)
-    assert told == [names]
+    end.session.ask_hearing(B, lambda *answer: told.append(answer))
+    assert len(told) == 1
 
 
 def test_whoever_asks_is_told_the_sessions_that_are_heard_of_it() -> None:
-    replies: list[tuple[str, str]] = []
+    replies: list[tuple[str, str, bytes | None]] = []
 
     class Heard(Asked):
-        def reply(self, key: str, names: str) -> None:
+        def reply(self, key: str, names: str, attachment: bytes | None) -> None:
             if self.payload is None:
                 raise zenoh.ZError("the asker has gone")
-            replies.append((key, names))
+            replies.append((key, names, attachment))
 
-    queries = [Heard(None), Heard(b"a"), Heard(b"b")]
+    queries: list[Any] = [Heard(None), Heard(b"a"), Heard(b"b")]
     names = [["gone"], ["0", "x"], ["x" * (MOST_NAMES + 1)]]
-    closed_end().session.answer_hearing(zip(queries, names, strict=True))  # type: ignore[arg-type]
+    closed_end().session.answer_hearing(zip(queries, names, (b"", b"named", b""), strict=True))
     own = f"tfbus/yard/~/hears/{A}"
-    assert replies == [(own, "0,x"), (own, "x" * MOST_NAMES)]
+    assert replies == [(own, "0,x", b"named"), (own, "x" * MOST_NAMES, None)]
     assert [query.dropped for query in queries] == [1, 1, 1]
 
 
-def test_connections_are_noted_by_session_and_address() -> None:
-    end, noted = closed_end(), list[tuple[str, str]]()
-    event: Any = SimpleNamespace(link=SimpleNamespace(zid=7, dst="tcp/127.0.0.1:1"))
+def test_connections_are_noted_with_their_session_and_both_addresses() -> None:
+    end, noted = closed_end(), list[tuple[str, str, str]]()
+    event: Any = SimpleNamespace(link=SimpleNamespace(zid=7, src="tcp/127.0.0.1:1", dst="tcp/127.0.0.1:2"))
     end.session._receive_connection(event)
     end.session._note_connection = lambda *connection: noted.append(connection)
     end.session._receive_connection(event)
-    assert noted == [("7", "tcp/127.0.0.1:1")]
+    assert noted == [("7", "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")]

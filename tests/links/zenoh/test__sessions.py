@@ -5,13 +5,14 @@ from contextlib import asynccontextmanager
 from queue import Queue
 from time import monotonic
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 from uuid import uuid4
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+import zenoh
 from support.processes import free_ports, new_domain, until
 
 from tfbus.links._message import Message
@@ -19,7 +20,7 @@ from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links.zenoh._dialing import FIRST_PAUSE, Dialing
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._hearing import DEAF
-from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT, Keys
 from tfbus.links.zenoh._notes import MOST_ASKING
 from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
@@ -37,7 +38,8 @@ class End:
         self.address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
         self.items: Queue[Received] = Queue()
         self.dialing = Dialing(monotonic)
-        config = settings(self.address, connect or [], {"id": self.id}, 2.0)
+        # Without gossip they hear of others only from each other.
+        config = settings(self.address, connect or [], {"id": self.id, "scouting/gossip/enabled": False}, 2.0)
         keys = Keys(domain, self.id, filter="" if frames is None else write_filter(["*"], frames))
         self.sessions = ZenohSessions(
             config, lambda where: patch_settings(where, None, 2.0), keys, self.items.put, self.dialing
@@ -138,15 +140,42 @@ async def test_a_patch_ends_with_its_peer_and_is_made_again() -> None:
 
 
 @pytest.mark.thorough
-async def test_whoever_else_is_at_the_address_now_is_no_peer() -> None:
+async def test_whoever_else_is_at_the_address_of_a_lost_peer_now_is_met_instead() -> None:
     async with ends(3) as (here, there, gone):
         here.lose_at(gone.id, there.address)
-        # It has seen the patch, which has noticed the mistake when it goes.
-        assert await there.next() == Received(here.id, Presence.JOINED)
-        assert await there.next() == Received(here.id, Presence.LEFT)
-        assert here.items.empty()
-        # It is dialled no more.
-        assert here.dialing.next_due() is None
+        assert await here.next() == Received(there.id, Presence.JOINED)
+        # It may have seen the patch that looked for the other one, which is dialled there no more.
+        await until(lambda: there.sessions._present.keys() == {here.id})
+        assert here.sessions._present.keys() == here.sessions._patches.keys() == {there.id}
+        assert here.dialing.addresses(gone.id) == []
+        await until(lambda: here.dialing.next_due() is None)
+
+
+async def test_whoever_is_no_link_at_the_address_of_a_lost_peer_is_not_dialled_for_ever(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tfbus.links.zenoh._sessions._MEETING_TIME", 0.3)
+    here, bare, gone = End(new_domain()), f"{1 << 127:032x}", f"{(1 << 127) + 1:032x}"
+    address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    with zenoh.open(settings(address, [], {"id": bare}, 2.0)):
+        async with running(here):
+            here.lose_at(gone, address)
+            await until(lambda: here.sessions._unmet.next_due() is not None)
+            assert not any(map(here.dialing.is_dialled, (bare, gone)))
+            assert here.sessions._unmet.take_due(()) == []
+            assert here.dialing.addresses(gone) == []
+
+
+async def test_two_ends_that_never_reached_each_other_meet_through_a_third(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FIRST_PAUSE", "MISSING_TIME"):
+        monkeypatch.setattr(f"tfbus.links.zenoh._introductions.{name}", 0.2)
+    async with ends(1) as (third,), joined_to(third) as here, joined_to(third) as there:
+        # zenoh tells them nothing of each other.
+        for end, other in ((here, there), (there, here)):
+            assert await end.next() == Received(other.id, Presence.JOINED)
+        here.sessions.put(Message(b"to there", b"", 1))
+        await until(lambda: not there.items.empty())
+        assert await there.next() == Received(here.id, (b"to there", b""), 8, moving=True)
 
 
 async def test_an_address_at_which_nobody_listens_is_forgotten_if_there_is_another() -> None:
@@ -176,7 +205,7 @@ async def test_an_end_that_does_not_hear_those_who_ask_it_dials_them() -> None:
     async with ends(1) as (here,), joined_to(here) as joining:
         await until(lambda: here.id in joining.dialing._addresses)
         # As if zenoh had never told of it. The other end has accepted the connection, and cannot dial this one.
-        joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
+        joining.sessions._present.note(here.id, (None, FIRST_SESSION), Presence.LEFT)
         joining.sessions._notes.take()
         assert await joining.next() == Received(here.id, Presence.LEFT)
         assert await joining.next() == Received(here.id, Presence.JOINED)
@@ -188,14 +217,14 @@ async def test_a_peer_that_does_not_hear_this_end_is_dialled_until_it_does() -> 
     # Both are connected by their first sessions, as when a connection has come back.
     async with ends(1) as (here,), joined_to(here) as joining:
         # As after faults in which zenoh has lost it at that end only.
-        here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.LEFT)
+        here.sessions._present.note(joining.id, (None, FIRST_SESSION), Presence.LEFT)
         assert await here.next() == Received(joining.id, Presence.LEFT)
         assert await here.next() == Received(joining.id, Presence.JOINED)
-        assert {name for _, name in here.sessions._present[joining.id]} != {FIRST_SESSION}
+        assert (None, FIRST_SESSION) not in here.sessions._present[joining.id]
         assert joining.items.empty()
         # Now it hears the first session again, so the other one ends.
-        here.sessions._note_presence(joining.id, (None, FIRST_SESSION), Presence.JOINED)
-        await until(lambda: {name for _, name in here.sessions._present[joining.id]} == {FIRST_SESSION})
+        here.sessions._present.note(joining.id, (None, FIRST_SESSION), Presence.JOINED)
+        await until(lambda: here.sessions._present[joining.id] == {(None, FIRST_SESSION)})
         assert here.items.empty()
 
 
@@ -204,13 +233,13 @@ async def test_two_ends_that_are_connected_and_have_never_met_dial_each_other() 
     async with ends(1) as (here,), joined_to(here) as joining:
         for end, other in ((here, joining), (joining, here)):
             # As if zenoh had told of their connection, and of nothing else.
-            end.sessions._note_presence(other.id, (None, FIRST_SESSION), Presence.LEFT)
+            end.sessions._present.note(other.id, (None, FIRST_SESSION), Presence.LEFT)
             end.sessions._notes.take()
             end.sessions._hearing.left(other.id)
             end.dialing._addresses.clear()
             assert await end.next() == Received(other.id, Presence.LEFT)
         for end, other in ((here, joining), (joining, here)):
-            end.sessions._notes.add_connection(other.id, "tcp/127.0.0.1:1")
+            end.sessions._notes.add_connection(other.id, "tcp/127.0.0.1:1", other.address)
         for end, other in ((here, joining), (joining, here)):
             assert await end.next() == Received(other.id, Presence.JOINED)
 
@@ -221,9 +250,9 @@ async def test_a_peer_whose_connection_was_gone_before_anybody_looked_is_dialled
     # The connections behind which nobody was met are looked after much later.
     monkeypatch.setattr(Unmet, "connected", lambda *_: None)
     async with ends() as (here, there):
-        here.sessions._notes.add_connection(there.id, there.address)
+        here.sessions._notes.add_connection(there.id, "tcp/127.0.0.1:1", there.address)
         for presence in (Presence.JOINED, Presence.LEFT):
-            here.sessions._note_presence(there.id, (None, FIRST_SESSION), presence)
+            here.sessions._present.note(there.id, (None, FIRST_SESSION), presence)
             assert await here.next() == Received(there.id, presence)
         assert await here.next() == Received(there.id, Presence.JOINED)
         assert await there.next() == Received(here.id, Presence.JOINED)
@@ -238,7 +267,7 @@ async def test_whoever_asks_and_hears_directly_tells_so() -> None:
         token = told.get_nowait()
         assert here.sessions._keys.heard_link(token) == joining.id
         assert here.sessions._keys.heard_link(b"\xff") is None
-        joining.sessions._note_presence(here.id, (None, FIRST_SESSION), Presence.LEFT)
+        joining.sessions._present.note(here.id, (None, FIRST_SESSION), Presence.LEFT)
         joining.sessions.ask(here.id, 0)
         await here.next()
         assert told.empty()
@@ -249,7 +278,8 @@ class Patch:
 
     is_open = True
 
-    def __init__(self) -> None:
+    def __init__(self, peer: str) -> None:
+        self.peer = peer
         self.closed = 0
 
     def close(self) -> object:
@@ -264,17 +294,17 @@ class Alone(End):
         super().__init__(new_domain())
         self.peer = uuid4().hex
         self.dialing.reached(self.peer, "tcp/10.0.0.7:1")
-        self.patch: Any = Patch()
+        self.patch: Any = Patch(self.peer)
 
     def hears(self, name: str = FIRST_SESSION) -> None:
-        self.sessions._note_directly(self.peer, name, Presence.JOINED)
+        self.sessions._note_directly(self.peer, name, Presence.JOINED, NO_ROBOT)
 
     def question(self, asker: str | None = None) -> Any:
         """A question of a link whether it is heard, which notes whether it was dropped."""
         token = None if asker == "" else Keys(self.domain, asker or self.peer).token(FIRST_SESSION).encode()
         payload = None if token is None else SimpleNamespace(to_bytes=lambda: token)
         dropped: list[bool] = []
-        return SimpleNamespace(payload=payload, drop=lambda: dropped.append(True), dropped=dropped)
+        return SimpleNamespace(payload=payload, attachment=None, drop=lambda: dropped.append(True), dropped=dropped)
 
     def note(self) -> None:
         """Note the changes, as `keep_connected` does."""
@@ -285,13 +315,12 @@ async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
     alone = Alone()
     alone.sessions._patches[alone.peer] = alone.patch
     alone.hears()
-    alone.sessions._note_by_patch(alone.peer, "other", Presence.JOINED, alone.peer, alone.patch)
-    # Of a peer that was not dialled, and by a patch that was dropped.
-    alone.sessions._note_by_patch("another", "x", Presence.JOINED, alone.peer, alone.patch)
-    alone.sessions._note_by_patch(alone.peer, "late", Presence.JOINED, alone.peer, Patch())  # type: ignore[arg-type]
+    alone.sessions._note_by_patch(alone.patch, "other", Presence.JOINED, NO_ROBOT)
+    # By a patch that was dropped.
+    alone.sessions._note_by_patch(cast(Any, Patch(alone.peer)), "late", Presence.JOINED, NO_ROBOT)
     assert alone.sessions._present == {alone.peer: {(None, FIRST_SESSION), (alone.patch, "other")}}
     assert [alone.items.get_nowait() for _ in range(1)] == [Received(alone.peer, Presence.JOINED)]
-    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT)
+    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT, NO_ROBOT)
     assert alone.items.empty()
     # The end of a patch ends what came by it.
     alone.sessions._filters.joined((alone.peer, alone.patch, "other"), write_filter(["*"], ["base"]))
@@ -299,20 +328,12 @@ async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
     alone.sessions._drop_patch(alone.peer)
     assert alone.sessions.filters == {}
     assert alone.items.get_nowait() == Received(alone.peer, Presence.LEFT)
-    assert (alone.sessions._present, alone.patch.closed, len(alone.sessions._closing)) == ({}, 1, 1)
+    assert (dict(alone.sessions._present), alone.patch.closed, len(alone.sessions._closing)) == ({}, 1, 1)
     assert alone.sessions._notes.take().changes == [
         (alone.peer, Presence.JOINED),
         (alone.peer, Presence.LEFT),
         (alone.peer, Presence.LEFT),
     ]
-
-
-async def test_what_a_patch_receives_is_of_its_peer_or_of_nobody() -> None:
-    alone = Alone()
-    for sender in (alone.peer, "another", ""):
-        alone.sessions._receive_by_patch(Received(sender, b"x"), alone.peer)
-    assert [alone.items.get_nowait().sender for _ in range(2)] == [alone.peer, ""]
-    assert alone.items.empty()
 
 
 async def test_an_answer_that_cannot_be_sent_is_logged_and_frees_its_place(caplog: pytest.LogCaptureFixture) -> None:
@@ -365,7 +386,7 @@ async def test_a_peer_is_dialled_while_an_answer_waits_for_one_that_is_frozen() 
         finally:
             frozen.set()
             tasks.cancel_scope.cancel()
-    assert answered == [[(questions[0], [])], [(questions[2], [])]]
+    assert answered == [[(questions[0], [], b"")], [(questions[2], [], b"")]]
 
 
 async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_there() -> None:
@@ -375,7 +396,7 @@ async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_ther
     assert alone.peer in alone.sessions._hearing._checks
     alone.sessions._patches[alone.peer] = alone.patch
     alone.sessions._deaf.add(alone.peer)
-    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT)
+    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT, NO_ROBOT)
     alone.note()
     assert alone.dialing.is_dialled(alone.peer)
     assert (alone.sessions._hearing._checks, alone.sessions._deaf, alone.sessions._patches) == ({}, set(), {})
@@ -418,7 +439,7 @@ async def test_a_peer_that_does_not_hear_this_link_twice_is_dialled_until_it_doe
     assert alone.sessions._deaf == {alone.peer}
     assert alone.patch.closed == 1
     # It hears the patch, but not the first session yet.
-    alone.sessions._patches[alone.peer] = again = Patch()  # type: ignore[assignment]
+    alone.sessions._patches[alone.peer] = again = Patch(alone.peer)  # type: ignore[assignment]
     alone.sessions._judge(alone.peer, ["patch"])
     assert (alone.dialing.is_dialled(alone.peer), alone.sessions._deaf, again.closed) == (True, {alone.peer}, 0)
     alone.sessions._judge(alone.peer, [FIRST_SESSION, "patch"])
@@ -439,12 +460,12 @@ async def test_whoever_asks_twice_whether_it_is_heard_and_is_not_is_dialled() ->
     sessions, query = alone.sessions, alone.question()
     for names in ([], [FIRST_SESSION], [], []):
         assert not alone.dialing.is_dialled(alone.peer)
-        sessions._note_unheard([(query, names), (alone.question(""), [])])
+        sessions._note_unheard([(query, names, b""), (alone.question(""), [], b"")])
     assert alone.dialing.is_dialled(alone.peer)
     assert alone.dialing._addresses == {alone.peer: ["tcp/10.0.0.7:1"]}
     # Its time is not put off by the next question.
     due = alone.dialing.next_due()
-    sessions._note_unheard([(query, [])])
+    sessions._note_unheard([(query, [], b"")])
     assert alone.dialing.next_due() == due
     assert sessions._unheard == {alone.peer: 3}
     for count, left in ((MOST_ASKING, MOST_ASKING), (MOST_ASKING + 1, 0)):

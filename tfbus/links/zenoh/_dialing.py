@@ -45,7 +45,7 @@ class Dialing:
         self._lost: dict[str, _Lost] = {}
 
     def reached(self, peer: str, address: str) -> None:
-        """A peer has been reached at an address, or has reached us from there, which leads nowhere later."""
+        """A peer has been reached at an address, or listens there."""
         self._addresses[peer] = newest_first(address, self._addresses.pop(peer, []))
         if len(self._addresses) > MOST_PEERS:
             oldest = next(iter(self._addresses))
@@ -66,6 +66,10 @@ class Dialing:
             if not known:
                 del self._addresses[peer]
                 self._lost.pop(peer, None)
+
+    def addresses(self, peer: str) -> list[str]:
+        """The addresses of a peer, the newest first."""
+        return list(self._addresses.get(peer, ()))
 
     def is_dialled(self, peer: str) -> bool:
         """Whether a peer is lost, and dialled now and then."""

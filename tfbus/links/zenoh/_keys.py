@@ -8,7 +8,8 @@ Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digi
     tfbus/domain/robot/slow/link      the newest sample of each moving frame, now and then, while somebody subscribes
     tfbus/domain/robot/state/link     a queryable: the link's state, or what has changed of it since a number
     tfbus/domain/robot/history/link   a queryable: the last seconds of the link's moving frames
-    tfbus/domain/robot/hears/link     a queryable: whom the link hears; see `tfbus.links.zenoh._hearing`
+    tfbus/domain/robot/hears/link     a queryable: whether the link hears the asker; see `tfbus.links.zenoh._hearing`;
+                                      and whom it knows that the asker lacks; see `tfbus.links.zenoh._introductions`
     tfbus/domain/robot/@alive/link/session
                                       a liveliness token for each session of the link; the first session is ``0``
     tfbus/domain/robot/@only/link/session/filter
@@ -62,7 +63,11 @@ class Keys:
 
     def token(self, session: str) -> str:
         """The key of the liveliness token of one of this link's sessions."""
-        return f"{self.own('@alive')}/{session}"
+        return self.token_of(self.robot, self.link, session)
+
+    def token_of(self, robot: str, link: str, session: str) -> str:
+        """The key of the liveliness token of a session of a link of the domain."""
+        return f"tfbus/{self.domain}/{robot}/@alive/{link}/{session}"
 
     def part(self, name: str) -> str:
         """The key of this link for what is about the frames of one filter."""
@@ -97,6 +102,10 @@ class Keys:
         rest, _, session = key.rpartition("/")
         link = self.sender(rest, "@alive")
         return (link, session) if link is not None and _SESSION.fullmatch(session) else None
+
+    def robot_of(self, key: str) -> str:
+        """The robot that a key of the domain belongs to."""
+        return key.removeprefix(f"tfbus/{self.domain}/").partition("/")[0]
 
     def heard_link(self, token: bytes) -> str | None:
         """The link that a token belongs to; None for one that this link does not mean to hear."""

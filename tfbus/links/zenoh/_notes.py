@@ -21,12 +21,13 @@ class Noted(NamedTuple):
 
     changes: list[tuple[str, Presence]]
     """Peers that have come, or gone by one of their ways."""
-    connected: list[tuple[str, str]]
-    """Sessions and addresses to which connections have come or gone."""
+    connected: list[tuple[str, str, str]]
+    """Connections that have come or gone: the session at the far end, and the addresses of the near and the far end."""
     asking: list[zenoh.Query]
     """Questions of links whether they are heard."""
-    heard_by: list[tuple[str, list[str] | None]]
-    """Answers of peers to such questions: the sessions of this link that they hear, or None for no answer."""
+    heard_by: list[tuple[str, list[str] | None, bytes]]
+    """Answers of peers to such questions: the sessions of this link that they hear, or None for no answer, and whom
+    else they know."""
     hearers: set[str]
     """Peers that have told by themselves that they hear this link."""
 
@@ -63,10 +64,10 @@ class Notes:
             self._noted.changes.append((peer, presence))
             self._stir()
 
-    def add_connection(self, session: str, address: str) -> None:
-        """Note that a connection to a session at an address has come or gone."""
+    def add_connection(self, session: str, near: str, far: str) -> None:
+        """Note that a connection to a session, between two addresses, has come or gone."""
         with self._lock:
-            self._noted.connected.append((session, address))
+            self._noted.connected.append((session, near, far))
             self._stir()
 
     def add_question(self, query: zenoh.Query) -> bool:
@@ -78,10 +79,10 @@ class Notes:
             self._stir()
         return True
 
-    def add_answer(self, peer: str, names: list[str] | None) -> None:
+    def add_answer(self, peer: str, names: list[str] | None, named: bytes) -> None:
         """Note the answer of a peer to such a question."""
         with self._lock:
-            self._noted.heard_by.append((peer, names))
+            self._noted.heard_by.append((peer, names, named))
             self._stir()
 
     def add_hearer(self, peer: str) -> None:

@@ -50,11 +50,12 @@ class ZenohSession:
         Called in zenoh's threads with each `Received` item but presence; a message's content is a payload and its
         attachment.
     note_presence : callable
-        Called in zenoh's threads with a link, the name of a session of it, and its `Presence`.
+        Called in zenoh's threads with a link, the name of a session of it, its `Presence`, and the robot of the link.
     note_asked : callable, optional
         Called in zenoh's threads with each query of a link that asks whether it is heard; without it, none is answered.
     note_connection : callable, optional
-        Called in zenoh's threads with the id and address of a session to which a connection was made or has broken.
+        Called in zenoh's threads with each connection that is made or breaks: the session at the far end, the address
+        of the near end, and that of the far end.
     note_heard : callable, optional
         Called in zenoh's threads with the token of each link that tells that it hears this one.
     filters : Filters, optional
@@ -76,10 +77,10 @@ class ZenohSession:
         config: zenoh.Config,
         keys: Keys,
         receive: Callable[[Received], object],
-        note_presence: Callable[[str, str, Presence], object],
+        note_presence: Callable[[str, str, Presence, str], object],
         name: str = FIRST_SESSION,
         note_asked: Callable[[zenoh.Query], object] | None = None,
-        note_connection: Callable[[str, str], object] | None = None,
+        note_connection: Callable[[str, str, str], object] | None = None,
         note_heard: Callable[[bytes], object] | None = None,
         filters: Filters | None = None,
         note_served: Callable[[str, bool], object] = lambda *_: None,
@@ -182,12 +183,12 @@ class ZenohSession:
                 self._keys.of("live", peer), directly(self._receive_all), allowed_origin=zenoh.Locality.REMOTE
             )
 
-    def addresses(self) -> dict[str, str]:
-        """The address at which each directly connected session is reached, by the id of the session; may block."""
+    def connected(self) -> set[str]:
+        """The directly connected sessions; may block."""
         try:
-            return {str(link.zid): link.dst for link in self.session.info.links()}
+            return {str(link.zid) for link in self.session.info.links()}
         except zenoh.ZError:
-            return {}
+            return set()
 
     def routers(self) -> list[str]:
         """The sessions of directly connected routers; may block."""
@@ -238,8 +239,11 @@ class ZenohSession:
         except zenoh.ZError:
             self._receive(Received(peer, answer(None)))
 
-    def ask_hearing(self, peer: str, take: Callable[[list[str] | None], object]) -> None:
-        """Ask a peer which sessions of this link it hears; `take` is called in zenoh's threads, None for no answer."""
+    def ask_hearing(self, peer: str, take: Callable[[list[str] | None, bytes], object], known: bytes = b"") -> None:
+        """Ask a peer which sessions of this link it hears, and whom it knows beside those that are `known`.
+
+        `take` is called in zenoh's threads, with None for no answer, and with what the peer has answered to `known`.
+        """
         answered = False
 
         def take_reply(reply: zenoh.Reply) -> None:
@@ -247,11 +251,12 @@ class ZenohSession:
             if reply.ok is not None and not answered:
                 answered = True
                 names = reply.ok.payload.to_bytes()[:MOST_NAMES].decode("ascii", "replace")
-                take(names.split(",") if names else [])
+                named = b"" if reply.ok.attachment is None else reply.ok.attachment.to_bytes()
+                take(names.split(",") if names else [], named)
 
         def end() -> None:
             if not answered:
-                take(None)
+                take(None, b"")
 
         # What cannot be asked is asked again.
         with suppress(zenoh.ZError):
@@ -262,13 +267,14 @@ class ZenohSession:
                 timeout=_HEARING_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
                 priority=_URGENT,
+                attachment=known or None,
             )
 
-    def answer_hearing(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
-        """Answer links that ask whether they are heard; may block, as `answer`."""
-        for query, names in answers:
+    def answer_hearing(self, answers: Iterable[tuple[zenoh.Query, list[str], bytes]]) -> None:
+        """Answer links that ask whether they are heard, and whom this link knows; may block, as `answer`."""
+        for query, names, named in answers:
             with suppress(zenoh.ZError):
-                query.reply(self._keys.own("hears"), ",".join(names)[:MOST_NAMES])
+                query.reply(self._keys.own("hears"), ",".join(names)[:MOST_NAMES], attachment=named or None)
             query.drop()
 
     def answer(self, question: zenoh.Query, message: Message) -> None:
@@ -336,12 +342,13 @@ class ZenohSession:
             self._receive(Received(sender, message, size, moving=True))
 
     def _receive_presence(self, sample: zenoh.Sample) -> None:
-        found = self._keys.session(str(sample.key_expr))
+        key = str(sample.key_expr)
+        found = self._keys.session(key)
         if found is None:
             self._refuse_key(sample)
         elif found[0] != self._keys.link:
             present = sample.kind == zenoh.SampleKind.PUT
-            self._note_presence(*found, Presence.JOINED if present else Presence.LEFT)
+            self._note_presence(*found, Presence.JOINED if present else Presence.LEFT, self._keys.robot_of(key))
 
     def _receive_filter(self, sample: zenoh.Sample) -> None:
         found = self._keys.filter_of(str(sample.key_expr))
@@ -357,7 +364,7 @@ class ZenohSession:
 
     def _receive_connection(self, event: zenoh.LinkEvent) -> None:
         if self._note_connection is not None:
-            self._note_connection(str(event.link.zid), event.link.dst)
+            self._note_connection(str(event.link.zid), event.link.src, event.link.dst)
 
     def _receive_question(self, query: zenoh.Query) -> None:
         if query.attachment is not None and self._note_heard is not None:

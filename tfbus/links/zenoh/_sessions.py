@@ -14,7 +14,6 @@ from collections.abc import Callable, Container, Iterable, Mapping, Set
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from time import monotonic
-from uuid import uuid4
 
 import anyio
 import anyio.to_thread
@@ -26,16 +25,17 @@ from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._dialing import Dialing, is_reachable
 from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._hearing import DEAF, Hearing
+from tfbus.links.zenoh._introductions import Introductions
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._listening import Listening
 from tfbus.links.zenoh._notes import MOST_ASKING, Notes
+from tfbus.links.zenoh._patch import Patch
+from tfbus.links.zenoh._present import Present
 from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._unmet import Unmet
 
 _MEETING_TIME = 10.0
 """s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
-
-_Way = tuple[ZenohSession | None, str]
-"""A connection between two links: the patch here, or None for the first session, and the name of the session there."""
 
 
 class ZenohSessions:
@@ -79,11 +79,13 @@ class ZenohSessions:
             filters=self._filters,
             note_served=self._note_served,
         )
-        self._patches: dict[str, ZenohSession] = {}
-        self._present: dict[str, set[_Way]] = {}
+        self._patches: dict[str, Patch] = {}
+        self._present = Present(receive, self._notes.add_change)
         self._dialing = Dialing(monotonic) if dialing is None else dialing
         self._hearing = Hearing(monotonic)
         self._unmet = Unmet(self._main, keys, monotonic)
+        self._listening = Listening(config)
+        self._introductions = Introductions(keys, self._listening, self._dialing, monotonic)
         self._deaf: set[str] = set()
         self._unheard: Counter[str] = Counter()
         self._closing: list[threading.Thread] = []
@@ -136,9 +138,9 @@ class ZenohSessions:
 
     def is_heard(self) -> bool:
         """Whether a peer without a filter is there, or anybody subscribes to the live key; raises `zenoh.ZError`."""
-        with self._lock:
-            heard = bool(self._present) and not self._filters.cover(self._present)
-        return heard or any(session.publishers.is_heard() for session in self._open())
+        if self._present and not self._filters.cover(self._present):
+            return True
+        return any(session.publishers.is_heard() for session in self._open())
 
     def is_heard_slowly(self) -> bool:
         """Whether anybody subscribes to the slow key."""
@@ -146,7 +148,7 @@ class ZenohSessions:
 
     def ask(self, peer: str, since: int) -> None:
         """Ask a peer for the changes of its state behind a number."""
-        self._to(peer).ask(peer, since, heard=self._is_direct(peer))
+        self._to(peer).ask(peer, since, heard=self._present.is_direct(peer))
 
     def ask_history(self, peer: str, seconds: float, after: str) -> None:
         """Ask a peer for the last seconds of its moving frames."""
@@ -183,18 +185,18 @@ class ZenohSessions:
                 await anyio.sleep(interval)
                 late = monotonic() - min(began, self._notes.since) > 3 * interval
                 noted = self._notes.take()
-                for peer, address in noted.connected:
-                    self._dialing.reached(peer, address)
+                connected = [self._reached(*connection) for connection in noted.connected]
                 self._note(noted.changes)
-                for peer, _ in noted.connected:
-                    if self._is_direct(peer):
+                for peer, _ in connected:
+                    if self._present.is_direct(peer):
                         self._hearing.joined(peer)
                 for peer in noted.hearers:
                     self._hearing.is_heard(peer)
-                for peer, names in noted.heard_by:
+                for peer, names, named in noted.heard_by:
                     # Where this loop has no time, nobody's silence proves anything.
                     if names is not None or not late:
                         self._judge(peer, names)
+                    self._introductions.take(named, self._present)
                 # Before all that may wait for zenoh; who is due after this is dialled in the next round.
                 self._dial(self._dialing.take_due(), tasks)
                 if noted.asking:
@@ -203,9 +205,17 @@ class ZenohSessions:
                     self._hear_unserved()
                 for peer in self._hearing.take_due():
                     self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
+                self._ask_for_missing()
                 self._closing = [closing for closing in self._closing if closing.is_alive()]
-                unmet = await self._unmet.find(noted.connected, self._present, self._dialing.is_dialled)
+                unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
                 self._dial(unmet, tasks)
+
+    def _reached(self, peer: str, near: str, far: str) -> tuple[str, str | None]:
+        """Note a connection that has come or gone; returns where the peer listens, or None if it has dialled."""
+        address = far if self._listening.is_dialled(near, far) else None
+        if address is not None:
+            self._dialing.reached(peer, address)
+        return peer, address
 
     def _dial(self, due: Iterable[tuple[str, str]], tasks: TaskGroup) -> None:
         for peer, address in due:
@@ -214,8 +224,19 @@ class ZenohSessions:
 
     def _next_due(self) -> float:
         """The time at which somebody is to be asked or dialled."""
-        times = (self._hearing.next_due(), self._dialing.next_due(), self._unmet.next_due())
-        return min((time for time in times if time is not None), default=math.inf)
+        parts = (self._hearing, self._dialing, self._unmet, self._introductions)
+        return min((time for part in parts if (time := part.next_due()) is not None), default=math.inf)
+
+    def _ask_for_missing(self) -> None:
+        """Ask one of the peers for those that this link has not met."""
+        peer = self._introductions.take_due(self._present, self._answers)
+        if peer is not None:
+            known = self._introductions.question(self._present)
+            self._to(peer).ask_hearing(peer, partial(self._notes.add_answer, peer), known)
+
+    def _answers(self, peer: str) -> bool:
+        """Whether a peer can answer here; by its patches, it does not."""
+        return self._present.is_direct(peer) or peer in self._patches
 
     def _hear_unserved(self) -> None:
         """Hear the live keys of peers that do not serve this link's filter, by the last answer of each."""
@@ -230,6 +251,8 @@ class ZenohSessions:
                 self._notes.stir()
 
     def _note(self, changes: list[tuple[str, Presence]]) -> None:
+        if changes:
+            self._introductions.changed()
         for peer, presence in changes:
             if presence is Presence.LEFT:
                 if peer not in self._present:
@@ -241,23 +264,20 @@ class ZenohSessions:
                 self._dialing.joined(peer)
         for peer in {peer for peer, presence in changes if presence is Presence.JOINED}:
             # A connection is not enough: zenoh may have it, and tell nothing of the other end.
-            if self._is_direct(peer):
+            if self._present.is_direct(peer):
                 self._hearing.joined(peer)
                 if peer not in self._deaf:
                     self._drop_patch(peer)
-
-    def _is_direct(self, peer: str) -> bool:
-        return (None, FIRST_SESSION) in self._present.get(peer, ())
 
     def _judge(self, peer: str, names: list[str] | None) -> None:
         """Note which sessions of this link a peer hears, and have it dialled if there is none."""
         if names and FIRST_SESSION in names and peer in self._deaf:
             self._deaf.discard(peer)
             self._dialing.joined(peer)
-            if self._is_direct(peer):
+            if self._present.is_direct(peer):
                 self._drop_patch(peer)
         if names is None:
-            deaf = self._is_direct(peer) and self._hearing.is_silent(peer)
+            deaf = self._present.is_direct(peer) and self._hearing.is_silent(peer)
         else:
             deaf = self._hearing.is_deaf(peer, bool(names))
         if deaf:
@@ -266,17 +286,16 @@ class ZenohSessions:
             self._dialing.left(peer)
 
     def _answer_hearing(self, asking: Iterable[zenoh.Query]) -> None:
-        with self._lock:
-            answers = [(query, self._names_heard(query)) for query in asking]
+        answers = [(query, self._names_heard(query), self._named(query)) for query in asking]
         self._note_unheard(answers)
         # While zenoh waits for a peer that is frozen, others ask again.
         if self._hearing_answers is None or self._hearing_answers.done():
             self._hearing_answers = self._answering.submit(self._main.answer_hearing, answers)
             self._hearing_answers.add_done_callback(_log_failure)
 
-    def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str]]]) -> None:
+    def _note_unheard(self, answers: Iterable[tuple[zenoh.Query, list[str], bytes]]) -> None:
         """Dial those that have asked several times whether they are heard, and are not."""
-        for query, names in answers:
+        for query, names, _ in answers:
             asker = self._asker(query)
             if asker is None or names:
                 self._unheard.pop(asker or "", None)
@@ -288,9 +307,15 @@ class ZenohSessions:
             self._unheard.clear()
 
     def _names_heard(self, query: zenoh.Query) -> list[str]:
-        """The sessions, by their names, that are heard of the link that asks; the lock is held."""
+        """The sessions, by their names, that are heard of the link that asks."""
+        return self._present.names(self._asker(query) or "")
+
+    def _named(self, query: zenoh.Query) -> bytes:
+        """The peers that the link that asks has not met."""
         asker = self._asker(query)
-        return sorted({name for _, name in self._present.get(asker or "", ())})
+        if asker is None or query.attachment is None:
+            return b""
+        return self._introductions.answer(query.attachment.to_bytes(), asker, self._present.robots())
 
     def _asker(self, query: zenoh.Query) -> str | None:
         """The link that asks whether it is heard; None for one that this link does not mean to hear."""
@@ -313,15 +338,8 @@ class ZenohSessions:
             return
         if not reachable or peer in self._patches:
             return
-        patch = ZenohSession(
-            self._patch_config(address),
-            self._keys,
-            lambda item: self._receive_by_patch(item, peer),
-            lambda link, name, presence: self._note_by_patch(link, name, presence, peer, patch),
-            uuid4().hex,
-            filters=self._filters,
-            note_served=self._note_served,
-        )
+        config = self._patch_config(address)
+        patch = Patch(config, self._keys, peer, self._receive, self._note_by_patch, self._filters, self._note_served)
         self._patches[peer] = patch
         try:
             await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)
@@ -329,35 +347,38 @@ class ZenohSessions:
             # It may also have been lost while it began.
             self._drop_patch(peer)
             return
-        with anyio.move_on_after(_MEETING_TIME):
-            while peer not in self._present:  # noqa: ASYNC110 - zenoh's threads wake no event here
-                await anyio.sleep(0.05)
-        if peer not in self._present:
-            found = await anyio.to_thread.run_sync(patch.addresses)
-            if found and peer not in found:
-                self._dialing.taken(peer, address)
-        if peer not in self._present or (self._is_direct(peer) and peer not in self._deaf):
+        await patch.meet(lambda: peer in self._present, _MEETING_TIME)
+        found = patch.found_instead()
+        if peer not in self._present and found is not None:
+            self._dialing.taken(peer, address)
+            self._note_found(*found, address)
+        if peer not in self._present or (self._present.is_direct(peer) and peer not in self._deaf):
             self._drop_patch(peer)
+
+    def _note_found(self, session: str, is_link: bool, address: str) -> None:
+        """Note who is at an address where another one was looked for."""
+        if session == self._keys.link:
+            return
+        self._dialing.reached(session, address)
+        if not is_link:
+            self._unmet.connected(session, address)
+        elif session not in self._present:
+            self._dialing.left(session)
 
     def _drop_patch(self, peer: str) -> None:
         patch = self._patches.pop(peer, None)
         if patch is not None:
             self._closing.append(patch.close())
-            with self._lock:
-                ways = [way for way in self._present.get(peer, ()) if way[0] is patch]
-            for way in ways:
-                # It will not tell any more.
-                self._note_presence(peer, way, Presence.LEFT)
+            # It will not tell any more.
+            self._present.end(peer, patch)
             self._filters.lose(patch)
 
-    def _receive_by_patch(self, item: Received, peer: str) -> None:
-        # Somebody else may be at that address now.
-        if item.sender in ("", peer):
-            self._receive(item)
+    def _note_by_patch(self, patch: Patch, name: str, presence: Presence, robot: str) -> None:
+        if presence is Presence.LEFT or self._patches.get(patch.peer) is patch:
+            self._present.note(patch.peer, (patch, name), presence, robot)
 
-    def _note_by_patch(self, link: str, name: str, presence: Presence, peer: str, patch: ZenohSession) -> None:
-        if link == peer and (presence is Presence.LEFT or self._patches.get(peer) is patch):
-            self._note_presence(peer, (patch, name), presence)
+    def _note_directly(self, link: str, name: str, presence: Presence, robot: str) -> None:
+        self._present.note(link, (None, name), presence, robot)
 
     def _note_served(self, peer: str, served: bool) -> None:
         with self._lock:
@@ -365,25 +386,6 @@ class ZenohSessions:
             (self._unserved.discard if served else self._unserved.add)(peer)
         if changed and self._keys.filter:
             self._notes.stir()
-
-    def _note_directly(self, link: str, name: str, presence: Presence) -> None:
-        self._note_presence(link, (None, name), presence)
-
-    def _note_presence(self, peer: str, way: _Way, presence: Presence) -> None:
-        with self._lock:
-            ways = self._present.setdefault(peer, set())
-            was_present = bool(ways)
-            if presence is Presence.JOINED:
-                ways.add(way)
-            else:
-                ways.discard(way)
-            is_present = bool(ways)
-            if not is_present:
-                del self._present[peer]
-            if is_present is not was_present:
-                self._receive(Received(peer, presence))
-            if is_present is not was_present or way == (None, FIRST_SESSION):
-                self._notes.add_change(peer, presence)
 
 
 def _log_failure(answer: Future[None]) -> None:

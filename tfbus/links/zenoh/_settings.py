@@ -149,6 +149,11 @@ def _addresses(
     return [] if proven else ["tcp/127.0.0.1:0"], connects_to
 
 
+def is_on_this_machine(address: str) -> bool:
+    """Whether an address leads to the same machine wherever it is used, and so to another one from elsewhere."""
+    return bool(_LOOPBACK.fullmatch(address) or _ON_MACHINE.fullmatch(address))
+
+
 def _gives_addresses(own: Mapping[str, Any], which: str) -> bool:
     return any(path == which or str(path).startswith(f"{which}/endpoints") for path in own)
 

@@ -3,7 +3,7 @@
 Where two dial each other at once, or have little time, connections break and are made again from both ends. In the end
 zenoh sometimes has none, or one of which both ends have lost all that the other end has declared. Then neither hears
 the other, so neither asks whether it is heard, as in `tfbus.links.zenoh._hearing`. All that they know is that they are
-connected, or were, and at which address.
+connected, or were, and at which address, if they have dialled.
 """
 
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -52,14 +52,14 @@ class Unmet:
         self._routers: dict[str, None] = {}
 
     async def find(
-        self, connected: Sequence[tuple[str, str]], present: Container[str], is_dialled: Callable[[str], bool]
+        self, connected: Sequence[tuple[str, str | None]], present: Container[str], is_dialled: Callable[[str], bool]
     ) -> list[tuple[str, str]]:
         """The sessions to dial now, each with an address.
 
         Parameters
         ----------
-        connected : sequence of (str, str)
-            Sessions and addresses to which connections have come or gone since the last call.
+        connected : sequence of (str, str or None)
+            Sessions to which connections have come or gone since the last call, and where they listen, if it is known.
         present : container of str
             The peers that are there.
         is_dialled : callable
@@ -83,13 +83,14 @@ class Unmet:
             del self._routers[next(iter(self._routers))]
         self._looks.pop(session, None)
 
-    def connected(self, session: str, address: str) -> None:
-        """A connection to a session at an address has come or gone; it is looked after unless a peer is behind it."""
+    def connected(self, session: str, address: str | None) -> None:
+        """A connection to a session has come or gone; it is looked after unless a peer is behind it."""
         if session in self._routers or (session not in self._looks and len(self._looks) >= MOST_UNMET):
             return
         look = self._looks.setdefault(session, _Look())
         look.due, look.number = self._now() + PAUSES[0], 1
-        look.addresses = newest_first(address, look.addresses)
+        if address is not None:
+            look.addresses = newest_first(address, look.addresses)
 
     def next_due(self) -> float | None:
         """The time of the next look; None while all that are connected have been met."""
@@ -118,14 +119,14 @@ def find_deaf(own: ZenohSession, keys: Keys, sessions: Iterable[tuple[str, list[
     own : ZenohSession
     keys : Keys
     sessions : iterable of (str, list of str)
-        Each with its known addresses; one that is connected is dialled at the end of its connection.
+        Each with its known addresses.
     """
-    connected = own.addresses()
+    connected = own.connected()
     return [
         (session, address)
         for session, known in sessions
         if session not in connected or not _is_of_others(own, keys, session)
-        for address in ([connected[session]] if session in connected else known)
+        for address in known
     ]
 
 
