@@ -5,7 +5,8 @@ The last process publishes nothing, and hears only some frames; it holds those, 
 `FAULT_SECONDS` and `FAULT_SEED` in the environment make it last longer, or begin otherwise; `FAULT_KINDS` has the names
 of the faults: a process is killed and another one takes its place (``kill``), also while it cannot reach one of the
 others (``late``), one is stopped for a while, a pair of hosts is cut off from each other, one host from all others, or
-all from all. `FAULT_LIMIT` is the time until all are equal. More than four minutes need longer limits:
+all from all, or one loses three of ten packets for a while, where the program nft is installed. `FAULT_LIMIT` is the
+time until all are equal. More than four minutes need longer limits:
 ``THOROUGH_LIMIT=800 FAULT_SECONDS=600 pytest -o faulthandler_timeout=900 ...``
 """
 
@@ -27,7 +28,8 @@ pytestmark = pytest.mark.thorough
 
 SECONDS = float(os.environ.get("FAULT_SECONDS", "60"))
 SEED = int(os.environ.get("FAULT_SEED", "1"))
-KINDS = os.environ.get("FAULT_KINDS", "kill late stop cut isolate all").split()
+LOSSY = " lossy" if shutil.which("nft") else ""
+KINDS = os.environ.get("FAULT_KINDS", f"kill late stop cut isolate all{LOSSY}").split()
 HOSTS = 5
 WATCHED = ["1/a", "1/d", "2/b", "3/a", "3/c", "4/d", "moves"]
 WHOLE_AGAIN = float(os.environ.get("FAULT_LIMIT", "10"))
@@ -51,6 +53,13 @@ class Host:
 
     def mend(self, other: "Host") -> None:
         self.run("ip", "route", "delete", "blackhole", f"{other.address}/32")
+
+    def begin_to_lose(self) -> None:
+        chain = "add table inet lossy; add chain inet lossy input { type filter hook input priority 0; }"
+        self.run("nft", f"{chain}; add rule inet lossy input numgen random mod 100 < 30 drop")
+
+    def end_to_lose(self) -> None:
+        self.run("nft", "delete table inet lossy")
 
 
 @pytest.fixture
@@ -94,6 +103,7 @@ class World:
         self._numbers = count()
         self._cut: list[tuple[Host, Host]] = []
         self._stopped: list[PeerProcess] = []
+        self._lossy: list[Host] = []
         self.faults = ["start"]
         self.times: list[tuple[float, str]] = []
         self.members: list[PeerProcess] = []
@@ -137,6 +147,9 @@ class World:
         elif kind == "stop":
             self.members[victim].signal(signal.SIGSTOP)
             self._stopped.append(self.members[victim])
+        elif kind == "lossy":
+            hosts[victim].begin_to_lose()
+            self._lossy.append(hosts[victim])
 
     def cut(self, one: Host, other: Host) -> None:
         """Cut two hosts off from each other, until all is repaired."""
@@ -163,8 +176,10 @@ class World:
             other.mend(one)
         for process in self._stopped:
             process.signal(signal.SIGCONT)
-        self._cut.clear()
-        self._stopped.clear()
+        for host in self._lossy:
+            host.end_to_lose()
+        for broken in (self._cut, self._stopped, self._lossy):
+            broken.clear()
 
     def check_equal(self) -> None:
         """Wait until all buses hold the same frames with the same values."""
