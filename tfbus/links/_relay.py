@@ -17,10 +17,10 @@ when it is started again holds against what it has said before, although it know
 What has gone is remembered with its number; see `tfbus.links._removals`.
 """
 
+import os
 from collections.abc import Callable, Container, Iterable
 from itertools import groupby
 from time import time_ns
-from uuid import uuid4
 
 from tfbus.bus.bus import Bus
 from tfbus.errors import UnknownFrameError
@@ -63,7 +63,7 @@ class Relay:
     _registration: Registration
 
     def __init__(self, bus: Bus, number: int) -> None:
-        self.origin = uuid4().bytes
+        self.origin = os.urandom(16)
         self._number = number
         self._bus = bus
         self._outboxes: list[Outbox] = []

@@ -9,10 +9,10 @@ because another one does. Their memory is bounded; a peer that asks for changes 
 """
 
 from bisect import bisect_right
-from hashlib import blake2b
 from typing import NamedTuple
 
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
+from tfbus.links._hash import hash_bytes
 
 MOST_GONE = 10_000
 CHUNK = 500
@@ -135,4 +135,4 @@ def digest_moving(frame: str) -> int:
 
 
 def _digest(data: bytes) -> int:
-    return int.from_bytes(blake2b(data, digest_size=8).digest(), "little")
+    return int.from_bytes(hash_bytes(data, 8), "little")

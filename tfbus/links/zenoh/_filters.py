@@ -9,9 +9,10 @@ import threading
 from base64 import urlsafe_b64decode, urlsafe_b64encode
 from collections import Counter
 from collections.abc import Collection, Mapping
-from hashlib import blake2b
 
 import zenoh
+
+from tfbus.links._hash import hash_bytes
 
 MOST_FILTERS = 100
 """So many filters are served; whoever has another one hears all."""
@@ -57,7 +58,7 @@ def read_filter(chunk: str) -> tuple[list[zenoh.KeyExpr], frozenset[str]]:
 
 def name_of(chunk: str) -> str:
     """The name of a filter in the keys of messages: 32 hexadecimal digits."""
-    return blake2b(chunk.encode(), digest_size=16).hexdigest()
+    return hash_bytes(chunk.encode(), 16).hex()
 
 
 class Filters:

@@ -1,7 +1,7 @@
 """A session that mends a broken connection to one peer."""
 
+import os
 from collections.abc import Callable
-from uuid import uuid4
 
 import anyio
 import zenoh
@@ -53,7 +53,7 @@ class Patch(ZenohSession):
             keys,
             self._receive_any,
             self._note_any,
-            uuid4().hex,
+            os.urandom(16).hex(),
             note_connection=lambda session, *_: self._ends.setdefault(session),
             filters=filters,
             note_served=note_served,

@@ -2,10 +2,10 @@
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping
 from typing import Any
-from uuid import uuid4
 
 import zenoh
 
@@ -108,7 +108,7 @@ def identity(listen: Addresses | None, connect: Addresses | None, config: Mappin
         and all(map(_LOOPBACK.fullmatch, (*listens_at, *connects_to)))
         and not any(path == "id" or str(path).partition("/")[0] in ("listen", "connect") for path in own)
     )
-    id = bytearray(uuid4().bytes)  # noqa: A001 - zenoh calls it so
+    id = bytearray(os.urandom(16))  # noqa: A001 - zenoh calls it so
     for place in (0, -1):
         # Whatever the order of bytes. An id must not begin with 0.
         id[place] = 0xC0 | id[place] if on_loopback else 0x80 | id[place] & 0x3F

@@ -1,13 +1,13 @@
 """Lookups in the buffer of another process, which a `BufferServer` there answers."""
 
 import math
+import os
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
 from time import monotonic
 from types import TracebackType
 from typing import Any, Self
-from uuid import uuid4
 
 import anyio
 
@@ -84,7 +84,7 @@ class BufferClient:
         check_capacity(capacity)
         self._session = LookupSession(domain, robot, link, listen, connect, config, lease)
         self._capacity = capacity
-        self._id = uuid4().hex
+        self._id = os.urandom(16).hex()
         self._entered = False
         self._is_open = False
         self._number = 0

@@ -1,5 +1,6 @@
 """The server of a buffer: other processes ask it, and wait for the answers, instead of hearing all that it holds."""
 
+import os
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -8,7 +9,6 @@ from functools import partial
 from time import monotonic
 from types import TracebackType
 from typing import Any, Self
-from uuid import uuid4
 
 import anyio
 import anyio.abc
@@ -131,7 +131,7 @@ class BufferServer:
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._take_all, self._tasks)
         self._session.follow("@asking", self._note_asker)
-        self._session.answer(self._receive, uuid4().hex)
+        self._session.answer(self._receive, os.urandom(16).hex())
         return self
 
     async def __aexit__(
