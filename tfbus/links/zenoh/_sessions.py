@@ -193,10 +193,11 @@ class ZenohSessions:
                 for peer in noted.hearers:
                     self._hearing.is_heard(peer)
                 for peer, names, named in noted.heard_by:
-                    # Where this loop has no time, nobody's silence proves anything.
+                    # Where this loop has no time, nobody's silence proves anything, and many have not come yet.
                     if names is not None or not late:
                         self._judge(peer, names)
-                    self._introductions.take(named, self._present)
+                    if not late:
+                        self._introductions.take(named, self._present)
                 # Before all that may wait for zenoh; who is due after this is dialled in the next round.
                 self._dial(self._dialing.take_due(), tasks)
                 if noted.asking:
