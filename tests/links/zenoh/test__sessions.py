@@ -389,6 +389,24 @@ async def test_a_peer_is_dialled_while_an_answer_waits_for_one_that_is_frozen() 
     assert answered == [[(questions[0], [], b"")], [(questions[2], [], b"")]]
 
 
+async def test_missing_peers_are_noted_only_while_the_loop_has_time() -> None:
+    alone, missing = Alone(), uuid4().hex
+    answer = f"{Keys(alone.domain, missing).token(FIRST_SESSION)} tcp/127.0.0.1:1".encode()
+
+    async def tell(interval: float) -> None:
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(alone.sessions.keep_connected, interval)
+            alone.sessions._notes.add_answer(alone.peer, None, answer)
+            await until(lambda: alone.sessions._notes.since == math.inf)
+            tasks.cancel_scope.cancel()
+
+    # Any time is more than three times nothing.
+    await tell(0.0)
+    assert alone.sessions._introductions._missing == {}
+    while missing not in alone.sessions._introductions._missing:
+        await tell(0.1)
+
+
 async def test_a_peer_that_is_lost_is_dialled_and_asked_no_more_until_it_is_there() -> None:
     alone = Alone()
     alone.hears()
