@@ -26,7 +26,8 @@ MISSING_TIME = 1.5
 """s between the first and the last answer that names a peer which is then dialled; until then it may come by itself."""
 MOST_NAMED = 100
 """So many peers are named in one answer, drawn from all that the asker lacks."""
-MOST_MISSING = 1_000
+MOST_MISSING = 100
+"""So many missing peers are remembered, so whoever invents peers has few addresses dialled."""
 MOST_BYTES = 2**18
 """So much is read of a question or of an answer."""
 _MOST_EXPRESSIONS = 1_000
