@@ -11,4 +11,4 @@ except ImportError:  # A Python that has it elsewhere.
 
 def hash_bytes(data: bytes, size: int) -> bytes:
     """The BLAKE2b hash of some bytes; `size` is its own, from 1 to 64 bytes."""
-    return bytes(blake2b(data, digest_size=size).digest())
+    return blake2b(data, digest_size=size).digest()

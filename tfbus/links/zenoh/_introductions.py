@@ -123,9 +123,12 @@ class Introductions:
             return b""
         has = {known[start : start + _DIGITS] for start in range(0, len(known), _DIGITS)} | {asker[:_DIGITS]}
         named = []
-        for peer in [peer for peer in robots if peer[:_DIGITS] not in has]:
-            token = self._keys.token_of(robots[peer], peer, FIRST_SESSION)
-            if any(expression.includes(zenoh.KeyExpr(token)) for expression in wanted):
+        for peer, robot in robots.items():
+            if peer[:_DIGITS] in has:
+                continue
+            token = self._keys.token_of(robot, peer, FIRST_SESSION)
+            key = zenoh.KeyExpr(token)
+            if any(expression.includes(key) for expression in wanted):
                 named.append(" ".join((token, *self._useful(self._dialing.addresses(peer)))))
         if len(named) > MOST_NAMED:
             named = self._random.sample(named, MOST_NAMED)
