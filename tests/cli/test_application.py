@@ -81,3 +81,13 @@ def test_no_option_is_on_that_cannot_be_switched_off(name: str) -> None:
     parameters = inspect.signature(command).parameters.values()
     flags = [each for each in parameters if each.annotation in (Flag, JsonFlag)]
     assert [each.name for each in flags if each.default is not False] == []
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_help_shows_the_defaults_that_do_something_and_has_no_option_for_an_empty_list(
+    name: str, tfbus: Command
+) -> None:
+    text = tfbus(name, "--help").stdout
+    assert not set(re.findall(r"\[default:[\s│]*([^\]]*)\]", text)) & {"None", "False", "()", '""'}
+    assert "--empty" not in text
+    assert "[default: warning]" in text

@@ -28,6 +28,11 @@ def _version() -> str:
     return f"{version('tfbus')} ({kernel} kernel)"
 
 
+def _shown_default(default: object) -> str | None:
+    """A default as the help shows it; None where the option changes nothing unless it is given."""
+    return None if default is None or default is False or default in ("", ()) else str(default)
+
+
 def application(command: str | None) -> App:
     """The command line with all its subcommands, none of which is loaded before it is parsed.
 
@@ -44,6 +49,7 @@ def application(command: str | None) -> App:
         # To load a parser of Markdown takes as long as all the rest of the list of commands.
         help_format="plaintext" if command is None else "markdown",
         suppress_keyboard_interrupt=False,
+        default_parameter=Parameter(negative_iterable="", show_default=_shown_default),
     )
     for name, summary in COMMANDS.items():
         app.command(f"tfbus.cli.commands.{name}:{name}", name=name, help=None if name == command else summary)

@@ -120,11 +120,11 @@ Instant = Annotated[Time, Parameter(converter=_convert_time, n_tokens=1, accepts
 """An instant of a recording."""
 Step = Annotated[Seconds, Parameter(converter=_convert_step)]
 """A period in ns, greater than zero."""
-Flag = Annotated[bool, Parameter(negative="", show_default=False)]
+Flag = Annotated[bool, Parameter(negative="")]
 """An option without a value."""
 Positive = Annotated[float, Parameter(validator=Number(gt=0))]
 """A number greater than zero; may be infinite."""
-JsonFlag = Annotated[bool, Parameter(name="--json", negative="", show_default=False)]
+JsonFlag = Annotated[bool, Parameter(name="--json", negative="")]
 """The flag ``--json``."""
 
 
@@ -144,9 +144,9 @@ class TopicOptions:
         Put this before the names of all frames.
     """
 
-    topic: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    topic: tuple[str, ...] = ()
     namespaces: Flag = False
-    prefix: Annotated[str, Parameter(show_default=False)] = ""
+    prefix: str = ""
 
     def open(self, file: Path) -> Recording:
         """Open a recording.

@@ -62,11 +62,11 @@ class LinkOptions:
     """
 
     domain: Annotated[str, Parameter(env_var="TFBUS_DOMAIN")] = "tf"
-    listen: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False, env_var="TFBUS_CONNECT")] = ()
-    robot: Annotated[str | None, Parameter(show_default=False)] = None
-    robots: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
-    ros: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = ()
+    listen: tuple[str, ...] = ()
+    connect: Annotated[tuple[str, ...], Parameter(env_var="TFBUS_CONNECT")] = ()
+    robot: str | None = None
+    robots: tuple[str, ...] = ()
+    ros: tuple[str, ...] = ()
     backend: Backend = "asyncio"
 
     @property

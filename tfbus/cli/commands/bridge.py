@@ -17,8 +17,8 @@ def bridge(
     second: str,
     /,
     *,
-    listen: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
-    connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False, env_var="TFBUS_CONNECT")] = (),
+    listen: tuple[str, ...] = (),
+    connect: Annotated[tuple[str, ...], Parameter(env_var="TFBUS_CONNECT")] = (),
     backend: Backend = "asyncio",
 ) -> None:
     """Pass on all frames between FIRST and SECOND, both ways, until Ctrl-C.

@@ -33,11 +33,11 @@ def compare(
     estimate: Path,
     /,
     *,
-    pair: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
+    pair: tuple[str, ...] = (),
     scale: Flag = False,
     max_difference: Duration = 0.01,
     delta: int = 1,
-    as_csv: Annotated[bool, Parameter(name="--csv", negative="", show_default=False)] = False,
+    as_csv: Annotated[bool, Parameter(name="--csv", negative="")] = False,
     as_json: JsonFlag = False,
     topics: TopicOptions = DEFAULT_TOPICS,
 ) -> None:

@@ -14,8 +14,6 @@ from tfbus.recording.convert import convert as convert_recordings
 from tfbus.recording.edits import Edits
 from tfbus.recording.recording import open_recording
 
-_Names = Annotated[tuple[str, ...], Parameter(negative="", show_default=False)]
-
 
 def convert(
     source: Path,
@@ -23,12 +21,12 @@ def convert(
     *further: Path,
     since: Annotated[Instant | None, Parameter(name="--from")] = None,
     until: Annotated[Instant | None, Parameter(name="--to")] = None,
-    topics: _Names = (),
-    frames: _Names = (),
-    rename: _Names = (),
-    prefix: Annotated[str, Parameter(show_default=False)] = "",
+    topics: tuple[str, ...] = (),
+    frames: tuple[str, ...] = (),
+    rename: tuple[str, ...] = (),
+    prefix: str = "",
     drop_static: Flag = False,
-    static_to_yaml: Annotated[Path | None, Parameter(show_default=False)] = None,
+    static_to_yaml: Path | None = None,
     overwrite: Flag = False,
     schema: Literal["ros", "foxglove"] = "ros",
 ) -> None:

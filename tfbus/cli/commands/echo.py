@@ -3,15 +3,12 @@
 import json
 import math
 from collections.abc import Callable, Iterable
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli._width import cells, terminal_width, wrapped
-from tfbus.cli.arguments import Duration, JsonFlag, Rate, UsageError
+from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions, RemoteLookups
 from tfbus.cli.output import format_seconds, print_now, say
 from tfbus.clock import Clock, SystemClock
@@ -35,7 +32,7 @@ def echo(
     rate: Rate = 1.0,
     max_age: Duration = math.inf,
     as_json: JsonFlag = False,
-    remote: Annotated[bool, Parameter(negative="", show_default=False)] = False,
+    remote: Flag = False,
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
     """Print the transform of SOURCE in TARGET again and again, until Ctrl-C.

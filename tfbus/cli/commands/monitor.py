@@ -4,9 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from tfbus.analysis.arrivals import Arrival, Arrivals
 from tfbus.buffer.buffer import Buffer
@@ -58,8 +56,8 @@ class Chain:
 
 
 def monitor(
-    target: Annotated[str | None, Parameter(show_default=False)] = None,
-    source: Annotated[str | None, Parameter(show_default=False)] = None,
+    target: str | None = None,
+    source: str | None = None,
     /,
     *,
     window: Positive = 10.0,

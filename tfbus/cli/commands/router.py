@@ -1,10 +1,8 @@
 """``tfbus router``."""
 
 import os
-from typing import Annotated
 
 import anyio
-from cyclopts import Parameter
 
 from tfbus.cli._event_loop import run
 from tfbus.cli.arguments import Backend, UsageError
@@ -16,8 +14,8 @@ _MEETING_POINT = "tcp/127.0.0.1:17447"
 
 def router(
     *,
-    listen: Annotated[tuple[str, ...], Parameter(negative="")] = (_MEETING_POINT,),
-    connect: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
+    listen: tuple[str, ...] = (_MEETING_POINT,),
+    connect: tuple[str, ...] = (),
     backend: Backend = "asyncio",
 ) -> None:
     """Pass on what programs of all domains send each other, until Ctrl-C.

@@ -26,13 +26,13 @@ _FILES = (".json", ".yaml", ".yml")
 
 def static(
     parent: str,
-    child: Annotated[str | None, Parameter(show_default=False)] = None,
+    child: str | None = None,
     /,
     *further: Annotated[str, Parameter(show=False)],
-    xyz: Annotated[Vector, Parameter(negative="")] = (0.0, 0.0, 0.0),
-    rpy: Annotated[Vector | None, Parameter(negative="")] = None,
-    rpy_deg: Annotated[Vector | None, Parameter(negative="")] = None,
-    quaternion: Annotated[Quaternion | None, Parameter(negative="")] = None,
+    xyz: Vector = (0.0, 0.0, 0.0),
+    rpy: Vector | None = None,
+    rpy_deg: Vector | None = None,
+    quaternion: Quaternion | None = None,
     authority: str = "tfbus static",
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:

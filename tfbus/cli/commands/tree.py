@@ -3,10 +3,9 @@
 import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import anyio.to_thread
-from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
@@ -30,7 +29,7 @@ _NAMED = 5
 
 def tree(
     *,
-    duration: Annotated[Duration | None, Parameter(show_default=False)] = None,
+    duration: Duration | None = None,
     watch: Flag = False,
     rate: Rate = 1.0,
     dot: Path | None = None,

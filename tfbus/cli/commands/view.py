@@ -2,10 +2,8 @@
 
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Annotated
 
 import anyio
-from cyclopts import Parameter
 
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
@@ -23,9 +21,9 @@ def view(
     /,
     *,
     urdf: Path | None = None,
-    package_path: Annotated[tuple[Path, ...], Parameter(negative="", show_default=False)] = (),
+    package_path: tuple[Path, ...] = (),
     fixed: str | None = None,
-    trail: Annotated[tuple[str, ...], Parameter(negative="", show_default=False)] = (),
+    trail: tuple[str, ...] = (),
     port: Port = 8080,
     rate: Rate = 30.0,
     link: LinkOptions = DEFAULT_LINK,
