@@ -49,3 +49,13 @@ def test_the_speed_of_a_turn_is_its_angle_over_the_time(angle: float, sign: floa
     jump, turn = samples.findings(Limits(speed=9.9, turn_rate=0.3))
     assert [(found.kind, found.at) for found in (jump, turn)] == [("jump", 5 * 10**8), ("turn", 5 * 10**8)]
     assert [jump.worst, turn.worst] == pytest.approx([10.0, 2 * angle])
+
+
+@pytest.mark.parametrize(("moves", "kinds"), [(19, []), (20, ["jump"])])
+def test_a_step_stands_out_among_twenty_and_not_among_fewer(moves: int, kinds: list[str]) -> None:
+    # 1 cm every second, and 10 m at last.
+    x = np.append(np.arange(moves) * 0.01, 10.0)
+    rows = np.column_stack((x, np.zeros((len(x), 5)), np.ones(len(x))))
+    stamps, none = np.arange(len(x)) * 10**9, np.zeros(len(x), np.int64)
+    samples = MovingSamples("base", stamps, rows, none, none, None)
+    assert [found.kind for found in samples.findings(Limits())] == kinds

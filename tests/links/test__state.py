@@ -103,6 +103,16 @@ def test_of_very_many_frames_that_went_the_oldest_are_forgotten_and_who_missed_t
     assert (names(entries)[:1], step.since) == (["1"], 2)
 
 
+def test_a_frame_that_has_come_back_is_not_forgotten_with_those_that_went() -> None:
+    state = LinkState()
+    state.change("s", gone("s"))
+    entry = kept("s", 3)
+    state.change("s", entry)
+    for number in range(MOST_GONE + 1):
+        state.change(f"{number}", gone(f"{number}"))
+    assert (state.entry("s"), state.entry("0")) == (entry, None)
+
+
 def test_a_frame_that_changes_for_ever_takes_no_more_memory() -> None:
     state = LinkState()
     for number in range(10_000):

@@ -195,3 +195,17 @@ def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -
     with open_recording(path) as recording:
         assert recording.count == 1
         assert [topic.name for topic in recording.topics] == ["/tf", "/tf_static"]
+
+
+def test_two_channels_of_one_topic_and_type_are_one_topic_with_the_messages_of_both(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
+        first, second = (writer.register_channel("/tf", "cdr", schema, {"sender": name}) for name in "ab")
+        for stamp, channel in ((1, first), (2, second), (3, second)):
+            writer.add_message(channel, stamp, encode([moving("map", "base", stamp)]), stamp)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with open_recording(path) as recording:
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 3)]

@@ -45,6 +45,15 @@ def test_shapes_are_drawn_at_their_links_one_object_for_equal_triangles() -> Non
         assert spheres.batched_positions.tolist() == [[3.0, 0.0, 0.0]]
 
 
+def test_the_root_may_have_a_shape() -> None:
+    page = Page(tree_of(static("base", "tool", 1.0)))
+    with viser_page() as server:
+        solids = Solids(server, solids_of(VISUALS[:1], MeshFiles((), Path())))
+        solids.draw(page.picture(0).scene)
+        assert solids._handles[0] is not None
+        assert solids._handles[0].batched_positions.tolist() == [[0.0, 0.0, 0.5]]
+
+
 def test_shapes_of_links_without_a_pose_and_of_a_hidden_robot_are_left_out() -> None:
     tree = tree_of(static("map", "base", 2.0), static("base", "tool", 1.0))
     page = Page(tree)

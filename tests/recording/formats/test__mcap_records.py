@@ -1,10 +1,11 @@
 import struct
+from io import BytesIO
 
 import pytest
 from mcap.records import McapRecord
 
 from tfbus.recording.formats import _mcap_records
-from tfbus.recording.formats._mcap_records import Chunk, split_chunk, split_message
+from tfbus.recording.formats._mcap_records import Chunk, read_records, split_chunk, split_message
 from tfbus.recording.formats._storage import Channel
 from tfbus.recording.formats._unfold import UnfoldError
 
@@ -40,6 +41,12 @@ def test_a_message_without_its_header_is_damage() -> None:
     with pytest.raises(ValueError, match="too short"):
         split(struct.pack("<BQ", 5, 3) + b"abc" + bytes(30))
     assert split_message(message(3, 10, b"x")[9:]) == (10, 3, b"x")
+
+
+def test_kinds_of_records_from_128_on_are_private_and_others_that_are_unknown_are_told() -> None:
+    kinds = (127, 128, 255)
+    data = b"".join(struct.pack("<BQ", kind, 1) + b"x" for kind in kinds) + struct.pack("<BQ", 2, 0)
+    assert list(read_records(BytesIO(data), len(data))) == [(0, 127, None)]
 
 
 def chunk(data: bytes, size: int, crc: int = 0, compression: bytes = b"") -> bytes:

@@ -10,6 +10,7 @@ from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
+from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
 from tfbus.tf_message import encode
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -130,6 +131,18 @@ def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="it cannot be read as a recording of ROS 2") as raised:
         open_recording(path)
     assert raised.value.reason == "damaged"
+
+
+def test_a_computed_column_cannot_claim_more_than_a_message_may_have(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        file.execute("ALTER TABLE messages RENAME TO stored")
+        size = MAX_OTHER_MESSAGE + 1
+        file.execute(f"CREATE TABLE messages(id INTEGER, topic_id, timestamp, data BLOB AS (zeroblob({size})))")
+        file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, 50)")
+    file.close()
+    errors = [error for message in messages_in(path) for error in message.errors]
+    assert "too big" in str(errors[0])
 
 
 def test_a_file_that_is_cut_is_refused_or_gives_what_is_left_and_says_so(tmp_path: Path) -> None:
