@@ -162,6 +162,9 @@ def test_trees_that_are_not_connected_are_found_by_the_newest_parents() -> None:
     found = examine([static("a", "b"), static("x", "y")])
     assert found["disconnected", None].count == 2
     assert found["disconnected", None].detail == "separate trees, below 'a', 'x'"
+    for roots, shown in (("abcde", "'a', 'b', 'c', 'd', 'e'"), ("abcdef", "'a', 'b', 'c', 'd', 'e', ...")):
+        found = examine([static(root, f"of {root}") for root in roots])
+        assert found["disconnected", None].detail == f"separate trees, below {shown}"
 
 
 def test_norms_and_refusals_are_told() -> None:

@@ -224,6 +224,16 @@ def test_a_loop_of_the_owners_own_edges_or_those_of_other_owners_is_refused() ->
     assert bus.statistics().rejected == {"cycle": 3}
 
 
+def test_only_the_owner_of_a_frame_has_edges_of_others_removed() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.reserve("base", "owner"):
+        TransformBroadcaster(bus, "stranger").send("x", "map", Transform())
+        with pytest.raises(InvalidTransformError, match="loop"):
+            TransformBroadcaster(bus, "another").send("map", "x", Transform())
+    assert [(event.parent, event.frame) for event in bus._topology.known()] == [("x", "map")]
+    assert bus.statistics().rejected == {"cycle": 1}
+
+
 def test_in_one_batch_the_edge_of_the_other_is_refused() -> None:
     bus = Bus(SimulatedClock())
     batch = [moving("base", "map", 1, authority="stranger"), moving("map", "base", 1, authority="owner")]

@@ -151,6 +151,8 @@ def test_an_echo_does_not_go_out_and_replaces_what_is_kept() -> None:
     sender.remove("u", origin=OTHER, echo=True)
     assert (sender.notified, sender.outbox.pending) == (2, 0)
     assert sender.turn() == ([], {"s": (theirs,), "t": None, "u": RemovedFrame(OTHER, 3, "u")})
+    sender.add(static("map", "s", 8.0), origin=OTHER, echo=True)
+    assert sender.notified == 3
 
 
 def test_a_turn_tells_what_it_changes_of_the_state_unless_an_echo_has_changed_it() -> None:

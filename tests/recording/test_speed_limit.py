@@ -42,6 +42,9 @@ def test_candidates_are_bounded() -> None:
     places = [1e3 * 4**k for k in range(40)]
     found, dropped = kept(*places)
     assert (len(found), dropped) == (1, {"speed": 39})
+    # The oldest one is forgotten, so what comes back to its place confirms nothing.
+    found, dropped = kept(*places, places[0])
+    assert (len(found), dropped) == (1, {"speed": 40})
 
 
 def test_frames_parents_and_kinds_are_apart() -> None:

@@ -79,6 +79,15 @@ def test_a_step_goes_to_the_nearest_sample_of_any_frame() -> None:
     assert line.stamp == 20
 
 
+def test_a_step_reaches_a_sample_one_nanosecond_away() -> None:
+    forest = forest_of(tree_of(*over("map", "a", (10, 11)), keep=None))
+    line = Timeline()
+    line.choose(10, (10, 11))
+    for forward, stamp in ((True, 11), (False, 10)):
+        line.step(forest, forward)
+        assert line.stamp == stamp
+
+
 def test_the_span_reaches_from_the_oldest_to_the_newest_sample_of_any_frame() -> None:
     assert span_of(forest_of(tree_of(*over("map", "a", (10, 30)), *over("map", "b", (5, 20))))) == (5, 30)
     assert span_of(forest_of(tree_of(static("map", "a")))) is None

@@ -37,6 +37,14 @@ def test_the_table_shows_every_frame_and_counts_invalid_transforms(tfbus: Comman
     assert len(rows) == 13
 
 
+def test_the_senders_are_shown_with_their_frames_and_samples(tmp_path: Path, tfbus: Command) -> None:
+    senders = tfbus("info", SMALL, "--wide").stdout.partition("\nsender ")[2].splitlines()
+    assert [line.split()[:3] for line in senders[1:3]] == [["arm", "2", "400"], ["calibration", "3", "3"]]
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1), moving("a", "b", 2)])])
+    unknown = tfbus("info", path, "--wide").stdout.partition("\nsender ")[2].splitlines()
+    assert unknown[1].split()[:3] == ["(unknown)", "1", "2"]
+
+
 def test_json_has_all_digits(tfbus: Command) -> None:
     done = tfbus("info", SMALL, "--json")
     assert (done.returncode, done.stderr) == (0, "")
