@@ -1,3 +1,6 @@
+import subprocess
+import sys
+import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -79,6 +82,36 @@ async def test_a_question_of_a_session_that_has_ended_has_no_answer() -> None:
     session.ask(b"question", took.append, 3.0)
     session._sending.get()()  # type: ignore[misc]
     assert took == [None]
+
+
+async def test_what_waits_to_be_sent_is_sent_before_the_session_ends(address: str, domain: str) -> None:
+    session, ending, sent = LookupSession(domain, None, None, address, None, None, 2.0), threading.Event(), list[bool]()
+    await session.open()
+    opened = session._opened()
+    session._declared.append(SimpleNamespace(undeclare=ending.set))
+    session.soon(lambda: ending.wait(10))
+    session.soon(lambda: sent.append(opened.is_closed()))
+    await session.close()
+    assert sent == [False]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("end", ["await session.close()", "pass"])
+def test_the_interpreter_ends_after_the_thread_that_sends(end: str) -> None:
+    """A thread that comes back from a call of zenoh after the end of the interpreter aborts the process."""
+    program = f"""
+import time, anyio
+from tfbus.links.zenoh import _lookup_session
+_lookup_session._CLOSING_TIME = 0.01
+session = _lookup_session.LookupSession(None, None, None, "tcp/127.0.0.1:0", None, None, 2.0)
+async def main():
+    await session.open()
+    session.soon(lambda: (time.sleep(0.5), print("sent")))
+    {end}
+anyio.run(main)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert (done.stdout.strip(), done.stderr) == ("sent", "")
 
 
 async def test_an_answer_is_sent_at_once_and_the_question_ends_whether_or_not_the_asker_is_there() -> None:

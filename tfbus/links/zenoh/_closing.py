@@ -1,7 +1,8 @@
 """The end of zenoh's sessions, for which nobody waits for ever.
 
 A session closes within milliseconds; zenoh gives up waiting for a frozen peer after 10 s. The event loop waits a second
-for that, and the interpreter, at its end, a few: a callback of zenoh after that end would abort the process.
+for that, and the interpreter, at its end, a few: a callback of zenoh after that end would abort the process, and so
+would a thread that comes back from a call of zenoh.
 """
 
 import atexit
@@ -16,7 +17,7 @@ from tfbus._aio.threads import join_all, wait_for_all
 CLOSING_TIME = 1.0
 LONGEST_CLOSE = 15.0
 """s; so long the event loop and the interpreter wait."""
-_NAME = "tfbus closes a session of zenoh"
+_NAME = "tfbus and zenoh end"
 
 
 def close_session(session: zenoh.Session | None) -> None:
@@ -40,6 +41,11 @@ async def wait_until_closed(closing: Sequence[threading.Thread]) -> TimeoutError
     if await wait_for_all(closing, CLOSING_TIME):
         return None
     return TimeoutError(f"zenoh has not closed its session within {CLOSING_TIME:g} s, and goes on in the background")
+
+
+def wait_at_exit(thread: threading.Thread) -> None:
+    """Have the interpreter, at its end, wait for a thread that is to end."""
+    thread.name = _NAME
 
 
 @atexit.register

@@ -19,7 +19,7 @@ import anyio
 import anyio.to_thread
 import zenoh
 
-from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
+from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_at_exit, wait_until_closed
 from tfbus.links.zenoh._keys import NO_ROBOT, check_domain, check_robot
 from tfbus.links.zenoh._session import as_os_error, directly
 from tfbus.links.zenoh._settings import Addresses, settings
@@ -74,6 +74,7 @@ class LookupSession:
         self._session: zenoh.Session | None = None
         self._declared: list[Any] = []
         self._sending: _Sending = SimpleQueue()
+        self._sender: threading.Thread | None = None
         self._close_at_exit: weakref.finalize[..., LookupSession] | None = None
 
     def key(self, *parts: str) -> str:
@@ -97,10 +98,11 @@ class LookupSession:
                 self._session = await anyio.to_thread.run_sync(zenoh.open, self._config)
             except zenoh.ZError as error:
                 raise as_os_error(error) from error
-        threading.Thread(target=_send_all, args=(self._sending,), daemon=True).start()
+        self._sender = threading.Thread(target=_send_all, args=(self._sending,), daemon=True)
+        self._sender.start()
         # A program may exit without the end of its server.
         own = None if self._link is not None else self._session
-        self._close_at_exit = weakref.finalize(self, _end_sending, self._sending, own)
+        self._close_at_exit = weakref.finalize(self, _end_at_exit, self._sender, self._sending, own)
 
     def answer(self, receive: Callable[[zenoh.Query], object], server: str) -> None:
         """Have questions received in zenoh's threads, and announce a server."""
@@ -175,14 +177,15 @@ class LookupSession:
         self._sending.put(partial(reply_now, query, answer))
 
     async def close(self) -> None:
-        """End what was declared, and the session if it is not the link's."""
+        """End what was declared, send what waits for that, and end the session if it is not the link's."""
         declared, self._declared = self._declared, []
         session, self._session = self._session, None
         if self._close_at_exit is not None:
             self._close_at_exit.detach()
-        self._sending.put(None)
-        with anyio.move_on_after(_CLOSING_TIME, shield=True):
-            await anyio.to_thread.run_sync(_end, declared, abandon_on_cancel=True)
+        if self._sender is not None:
+            _end_sending(self._sender, self._sending)
+            with anyio.move_on_after(_CLOSING_TIME, shield=True):
+                await anyio.to_thread.run_sync(_end, declared, self._sender, abandon_on_cancel=True)
         if self._link is None:
             await wait_until_closed([begin_to_close(session)])
 
@@ -206,13 +209,21 @@ def _send_all(sending: _Sending) -> None:
         del send
 
 
-def _end_sending(sending: _Sending, session: zenoh.Session | None) -> None:
+def _end_sending(sender: threading.Thread, sending: _Sending) -> None:
+    """Have a session's thread end after all that waits."""
     sending.put(None)
+    wait_at_exit(sender)
+
+
+def _end_at_exit(sender: threading.Thread, sending: _Sending, session: zenoh.Session | None) -> None:
+    _end_sending(sender, sending)
     close_session(session)
 
 
-def _end(declared: list[Any]) -> None:
+def _end(declared: list[Any], sender: threading.Thread) -> None:
     for one in declared:
         # The link may have ended before, and its session with it.
         with suppress(zenoh.ZError):
             one.undeclare()
+    # A peer that is frozen takes nothing.
+    sender.join(_CLOSING_TIME)
