@@ -96,13 +96,23 @@ async def test_what_waits_to_be_sent_is_sent_before_the_session_ends(address: st
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("end", ["await session.close()", "pass"])
-def test_the_interpreter_ends_after_the_thread_that_sends(end: str) -> None:
+@pytest.mark.parametrize(
+    ("first", "limit", "end"),
+    [
+        ("", 0.01, "await session.close()"),
+        ("", 0.01, "pass"),
+        # The finalizers of a program that has some before are called after all else at its end.
+        ("weakref.finalize(weakref, str)", 60.0, "pass"),
+    ],
+)
+def test_the_interpreter_ends_after_the_thread_that_sends(first: str, limit: float, end: str) -> None:
     """A thread that comes back from a call of zenoh after the end of the interpreter aborts the process."""
     program = f"""
-import time, anyio
+import time, weakref
+{first}
+import anyio
 from tfbus.links.zenoh import _lookup_session
-_lookup_session._CLOSING_TIME = 0.01
+_lookup_session._CLOSING_TIME = {limit}
 session = _lookup_session.LookupSession(None, None, None, "tcp/127.0.0.1:0", None, None, 2.0)
 async def main():
     await session.open()

@@ -218,6 +218,9 @@ def _end_sending(sender: threading.Thread, sending: _Sending) -> None:
 def _end_at_exit(sender: threading.Thread, sending: _Sending, session: zenoh.Session | None) -> None:
     _end_sending(sender, sending)
     close_session(session)
+    # The interpreter may have waited before. That thread itself comes here if what it has sent held the last reference.
+    if sender is not threading.current_thread():
+        sender.join(_CLOSING_TIME)
 
 
 def _end(declared: list[Any], sender: threading.Thread) -> None:
