@@ -13,7 +13,7 @@ from support.commands import Command, check_wrong_call, nobody
 from tfbus import Bus
 from tfbus.cli import commands
 from tfbus.cli._overview import COMMANDS
-from tfbus.cli.arguments import Flag, JsonFlag
+from tfbus.cli.arguments import CsvFlag, Flag, JsonFlag
 from tfbus.cli.domain import LinkOptions
 
 
@@ -79,7 +79,7 @@ MODULES = [module.name for module in pkgutil.iter_modules(commands.__path__)]
 def test_no_option_is_on_that_cannot_be_switched_off(name: str) -> None:
     command = getattr(import_module(f"tfbus.cli.commands.{name}"), name)
     parameters = inspect.signature(command).parameters.values()
-    flags = [each for each in parameters if each.annotation in (Flag, JsonFlag)]
+    flags = [each for each in parameters if each.annotation in (Flag, JsonFlag, CsvFlag)]
     assert [each.name for each in flags if each.default is not False] == []
 
 

@@ -5,6 +5,7 @@ import socket
 import struct
 import subprocess
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pytest
@@ -183,29 +184,29 @@ def test_without_a_package_the_error_names_the_extra() -> None:
     assert 'pip install "tfbus[bag]"' in done.stdout
 
 
-def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
+def write_channels(path: Path, topics: Sequence[str], lines: Iterable[tuple[int, int]]) -> Path:
+    """A file with a channel for each of some topics, and a message for each stamp and place of a channel."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
         schema = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
-        moving_topic, _ = (writer.register_channel(topic, "cdr", schema) for topic in ("/tf", "/tf_static"))
-        writer.add_message(moving_topic, 1, encode([moving("map", "base", 1)]), 1)
+        channels = [
+            writer.register_channel(topic, "cdr", schema, {"number": str(number)})
+            for number, topic in enumerate(topics)
+        ]
+        for stamp, channel in lines:
+            writer.add_message(channels[channel], stamp, encode([moving("map", "base", stamp)]), stamp)
         writer.finish()  # type: ignore[no-untyped-call]
-    with open_recording(path) as recording:
+    return path
+
+
+def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -> None:
+    with open_recording(write_channels(tmp_path / "run.mcap", ("/tf", "/tf_static"), [(1, 0)])) as recording:
         assert recording.count == 1
         assert [topic.name for topic in recording.topics] == ["/tf", "/tf_static"]
 
 
 def test_two_channels_of_one_topic_and_type_are_one_topic_with_the_messages_of_both(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
-        first, second = (writer.register_channel("/tf", "cdr", schema, {"sender": name}) for name in "ab")
-        for stamp, channel in ((1, first), (2, second), (3, second)):
-            writer.add_message(channel, stamp, encode([moving("map", "base", stamp)]), stamp)
-        writer.finish()  # type: ignore[no-untyped-call]
+    path = write_channels(tmp_path / "run.mcap", ("/tf", "/tf"), [(1, 0), (2, 1), (3, 1)])
     with open_recording(path) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 3)]

@@ -124,8 +124,10 @@ Flag = Annotated[bool, Parameter(negative="")]
 """An option without a value."""
 Positive = Annotated[float, Parameter(validator=Number(gt=0))]
 """A number greater than zero; may be infinite."""
-JsonFlag = Annotated[bool, Parameter(name="--json", negative="")]
+JsonFlag = Annotated[Flag, Parameter(name="--json")]
 """The flag ``--json``."""
+CsvFlag = Annotated[Flag, Parameter(name="--csv")]
+"""The flag ``--csv``."""
 
 
 @Parameter(name="*")

@@ -6,15 +6,13 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
-
-from cyclopts import Parameter
+from typing import Any
 
 from tfbus.analysis import Comparison
 from tfbus.analysis.compare import compare as compare_trees
 from tfbus.cli._table import Column, table_lines
 from tfbus.cli._width import terminal_width, wrapped
-from tfbus.cli.arguments import DEFAULT_TOPICS, Duration, Flag, JsonFlag, TopicOptions, UsageError
+from tfbus.cli.arguments import DEFAULT_TOPICS, CsvFlag, Duration, Flag, JsonFlag, TopicOptions, UsageError
 from tfbus.cli.output import format_counts, format_seconds, printable, progress, warn
 from tfbus.recording.load import Problems, fill
 from tfbus.tree.tree import TransformTree
@@ -37,7 +35,7 @@ def compare(
     scale: Flag = False,
     max_difference: Duration = 0.01,
     delta: int = 1,
-    as_csv: Annotated[bool, Parameter(name="--csv", negative="")] = False,
+    as_csv: CsvFlag = False,
     as_json: JsonFlag = False,
     topics: TopicOptions = DEFAULT_TOPICS,
 ) -> None:

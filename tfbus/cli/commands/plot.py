@@ -22,7 +22,7 @@ def plot(
     *frames: str,
     output: Annotated[Path | None, Parameter(name=("--output", "-o"))] = None,
     path: Flag = False,
-    three_d: Annotated[bool, Parameter(name="--3d", negative="")] = False,
+    three_d: Annotated[Flag, Parameter(name="--3d")] = False,
     gaps: Flag = False,
     text: Flag = False,
     compare: Path | None = None,

@@ -3,14 +3,22 @@
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
-from cyclopts import Parameter
 
 from tfbus.cli._transform_rows import Format, Row, print_rows, write_parquet
-from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, Instant, JsonFlag, Positive, Step, TopicOptions, UsageError
+from tfbus.cli.arguments import (
+    DEFAULT_TOPICS,
+    CsvFlag,
+    Flag,
+    Instant,
+    JsonFlag,
+    Positive,
+    Step,
+    TopicOptions,
+    UsageError,
+)
 from tfbus.cli.output import format_seconds, track, warn
 from tfbus.cli.recorded_tree import load_tree
 from tfbus.errors import DisconnectedError
@@ -31,7 +39,7 @@ def query(
     at: Instant | None = None,
     every: Step | None = None,
     stamps_of: str | None = None,
-    as_csv: Annotated[bool, Parameter(name="--csv", negative="")] = False,
+    as_csv: CsvFlag = False,
     as_json: JsonFlag = False,
     tum: Flag = False,
     parquet: Path | None = None,
