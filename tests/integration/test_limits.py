@@ -24,6 +24,7 @@ BOUNDS = {
     "tf_message": "MAX_NAME",
     "links._message": "MAX_BYTES",
     "links._attachment": "MAX_BYTES MAX_ENTRIES",
+    "links.zenoh._settings": "UNSENT",
     "links._receive_queue": "MAX_BYTES MANY",
     "links._peers": "MAX_PEERS MAX_AUTHORITIES",
     "links._state": "MOST_GONE",

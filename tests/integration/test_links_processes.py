@@ -203,6 +203,19 @@ def test_a_process_that_is_held_up_for_a_part_of_its_lease_is_not_lost(processes
     assert not listener.said(event="PeerLost")
 
 
+def test_a_process_that_stands_still_for_a_moment_misses_nothing(processes: Crowd, place: Place) -> None:
+    # The sockets take some 250 KB of some 500; with less still, TCP itself stands still.
+    config = {"transport/link/tcp/so_sndbuf": 2**16, "transport/link/tcp/so_rcvbuf": 2**16}
+    here = processes.add(place.first(config=config))
+    there = processes.add(place.other(config=config))
+    meet(here, there)
+    there.signal(signal.SIGSTOP)
+    here.ask("stream", authority="burst", batches=190, rate=1_000)
+    there.signal(signal.SIGCONT)
+    there.ask("until", last={"burst": 189})
+    assert there.ask("facts")["tallies"]["burst"]["batches"] == 190
+
+
 def test_a_slow_and_a_frozen_process_delay_no_other(processes: Crowd, place: Place) -> None:
     # The lease outlasts the test, so no peer is spared by being lost.
     broadcaster = processes.add(place.first(lease=60.0))

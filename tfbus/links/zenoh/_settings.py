@@ -18,6 +18,10 @@ MEETING_POINT = "tcp/127.0.0.1:17447"
 SIGNS_OF_LIFE = 2
 """So many go out in each lease, so one may be late by half of it."""
 
+UNSENT = 8
+"""So many buffers of 64 KiB may wait for each peer before live messages are dropped; zenoh's two are full whenever its
+thread waits for a CPU for some ms."""
+
 Addresses = str | Iterable[str]
 
 _ON_NETWORK = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[^\]]+\]|[^:/?#\s]+):(?P<port>\d{1,5})([?#].*)?")
@@ -70,6 +74,7 @@ def settings(
         "transport/link/tx/lease": max(1, round(silence * 1_000)),
         # zenoh's four cost fifty links that rest four times as much.
         "transport/link/tx/keep_alive": SIGNS_OF_LIFE,
+        "transport/link/tx/queue/size/data": UNSENT,
         # It would leave a file open for each link that has ended.
         "transport/shared_memory/enabled": False,
         # Larger messages are not even assembled.
