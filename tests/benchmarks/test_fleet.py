@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import count
 from statistics import median
 from typing import IO, Any
 
@@ -19,6 +20,7 @@ from support.processes import crowd, free_ports, new_domain
 from support.samples import moving, static
 
 from tfbus import Buffer, Bus, TransformStamped
+from tfbus._aio.loop_waker import LoopWaker
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
 
 pytest_plugins = ["side_by_side"]
@@ -37,16 +39,15 @@ async def main(domain, address, frames):
             print(time.perf_counter() - began)
 """
 
-# A robot's own buffer, and beside it a bare queryable whose answer is as long.
+# A robot's own buffer, and beside it a bare queryable.
 SERVER = """
+from test_fleet import answer_at_once
+
 async def main(domain, address):
     with Bus() as bus, Buffer(bus, keep=None) as buffer:
         bus.publish([static("base", "lidar", x=2.0), moving("map", "base", 5, x=1.0), moving("map", "base", 9, x=5.0)])
         async with BufferServer(buffer, domain, listen=address) as server:
-            answer = zenoh.handlers.Callback(
-                lambda query: (query.reply(query.key_expr, bytes(400), express=True), query.drop()), indirect=False
-            )
-            declared = server._session._opened().declare_queryable(f"bare/{domain}", answer)
+            declared = answer_at_once(server, domain, lambda: None)
             print("ready", flush=True)
             await anyio.to_thread.run_sync(sys.stdin.read)
             del declared
@@ -62,6 +63,18 @@ async def main(domain, address, count):
         for _ in range(count):
             tasks.start_soon(client.lookup, "map", "base", stamp)
         await anyio.sleep_forever()
+"""
+
+# The same without tfbus.
+BARE_ASKER = """
+async def main(domain, address, count):
+    session = zenoh.open(settings([], address, None, None))
+    print("ready", flush=True)
+    sys.stdin.readline()
+    take = zenoh.handlers.Callback(lambda reply: None, indirect=False)
+    for _ in range(count):
+        session.get(f"bare/{domain}", take, payload=bytes(300), express=True)
+    await anyio.sleep_forever()
 """
 
 # A router that tells its CPU time for each line of input.
@@ -104,6 +117,18 @@ from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._settings import settings
 """
+
+
+def answer_at_once(server: BufferServer, domain: str, note: Callable[[], object]) -> object:
+    """Declare a bare queryable whose answers are as long as those of a server, for as long as the result is held."""
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(query.key_expr, bytes(400), express=True)
+        query.drop()
+        note()
+
+    callback: Any = zenoh.handlers.Callback(answer, indirect=False)
+    return server._session._opened().declare_queryable(f"bare/{domain}", callback)
 
 
 def command(program: str, *arguments: Any) -> list[str]:
@@ -227,9 +252,34 @@ def test_what_nobody_hears(table: Table) -> None:
 
 
 def test_remote_waits(table: Table) -> None:
-    """The server's CPU time for lookups that have to wait, and for as many local ones whose answers go to a queue."""
+    """The server's CPU time for lookups that have to wait, and for what they need at least.
+
+    That is as many local ones whose answers go to a queue, and as many bare questions that are answered at once.
+    """
     domain, address = new_domain(), f"tcp/127.0.0.1:{free_ports(1)[0]}"
     figures: dict[str, list[float]] = {}
+    answered = count()
+
+    async def spend_on_bare_questions(server: BufferServer) -> None:
+        ended = anyio.Event()
+        note = LoopWaker(ended.set)
+        note.bind()
+        last = next(answered) + ASKED
+
+        def count_answer() -> None:
+            if next(answered) == last:
+                note.wake()
+
+        queryable = answer_at_once(server, domain, count_answer)
+        with running(BARE_ASKER, domain, address, ASKED) as asker:
+            assert asker.stdin is not None
+            await anyio.sleep(0.5)
+            before = time.process_time()
+            asker.stdin.write("\n")
+            asker.stdin.flush()
+            await ended.wait()
+            figures.setdefault("bare", []).append((time.process_time() - before) / ASKED * 1e6)
+        del queryable
 
     async def main() -> None:
         with Bus() as bus, Buffer(bus, keep=None) as buffer:
@@ -274,6 +324,7 @@ def test_remote_waits(table: Table) -> None:
                         )
                         for _ in range(ASKED):
                             receive.receive_nowait()
+                        await spend_on_bare_questions(server)
                         with running(ASKER, domain, address, ASKED) as asker:
                             pipe = asker.stdin
                             assert pipe is not None
@@ -299,7 +350,12 @@ def test_remote_waits(table: Table) -> None:
     for what, unit in (("", "a wait"), (", publish", "a publish that wakes none")):
         remote, local = medians[f"remote{what}"], medians[f"local{what}"]
         label = f"{unit}, {ASKED} remote ones"
-        table.add(label, f"{remote:.0f} us CPU", f"local {local:.0f} us", f"{remote / local:.2f}", "no more")
+        parts = f"local {local:.0f} us"
+        if not what:
+            # Somebody else has to ask, and to be answered.
+            parts += f", bare question {medians['bare']:.0f} us"
+            local += medians["bare"]
+        table.add(label, f"{remote:.0f} us CPU", parts, f"{remote / local:.2f}", "no more")
 
 
 def test_frozen_peer(table: Table) -> None:
