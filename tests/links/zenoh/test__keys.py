@@ -2,7 +2,7 @@ import pytest
 import zenoh
 
 from tfbus.links.zenoh._filters import name_of, write_filter
-from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
+from tfbus.links.zenoh._keys import ANY_ROBOT, NO_ROBOT, Keys, check_domain, check_robot, robots_expression
 
 A, B = "a" * 32, "b" * 32
 
@@ -50,7 +50,8 @@ def test_the_sender_is_in_a_key(robot: str) -> None:
     assert [keys.session(other.token(name)) for name in ("0", A, "x", "")] == [(B, "0"), (B, A), None, None]
     assert keys.session(other.own("@alive")) is None
     assert keys.sender(other.own("state"), "live") is None
-    assert zenoh.KeyExpr(keys.of("state", B)).intersects(zenoh.KeyExpr(other.own("state")))
+    assert keys.of("state", B, robot) == other.own("state")
+    assert zenoh.KeyExpr(keys.of("state", B, ANY_ROBOT)).includes(zenoh.KeyExpr(other.own("state")))
 
 
 @pytest.mark.parametrize(

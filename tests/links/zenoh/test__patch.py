@@ -28,6 +28,7 @@ class Scene:
             lambda *noted: self.noted.append(noted),
             Filters(NO_ROBOT),
             lambda *_: None,
+            lambda _: NO_ROBOT,
         )
 
     def connects(self, session: str) -> None:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT
+from tfbus.links.zenoh._keys import ANY_ROBOT, FIRST_SESSION, NO_ROBOT
 from tfbus.links.zenoh._present import DIRECT, Present, Way
 
 PATCH: Any = object()
@@ -54,6 +54,21 @@ def test_the_end_of_a_patch_ends_what_it_reaches_of_one_peer() -> None:
     assert scene.present.robots() == {"a": "robot of a", "b": "robot of b"}
     scene.present.end("nobody", PATCH)
     assert set(scene.present) == {"a", "b"}
+
+
+def test_the_robot_of_a_peer_is_not_sure_if_somebody_has_announced_the_peer_with_another() -> None:
+    scene = Scene()
+    for way, robot in ((DIRECT, "r1"), ((PATCH, "x"), "r1")):
+        scene.present.note("a", way, Presence.JOINED, robot)
+        assert scene.present.robot("a") == "r1"
+    scene.present.note("a", (None, "x"), Presence.JOINED, "r2")
+    assert scene.present.robot("a") == ANY_ROBOT
+    assert scene.present.robots() == {"a": "r1"}
+    for way in WAYS:
+        scene.present.note("a", way, Presence.LEFT, "r1")
+    assert scene.present.robot("a") == ANY_ROBOT
+    scene.present.note("a", DIRECT, Presence.JOINED, "r2")
+    assert scene.present.robot("a") == "r2"
 
 
 def test_whoever_is_not_there_has_no_ways() -> None:

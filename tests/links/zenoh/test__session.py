@@ -1,5 +1,3 @@
-import errno
-import socket
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -253,22 +251,6 @@ def test_the_largest_message_is_received(join: Join, address: str, domain: str) 
         session.put(f"tfbus/{domain}/~/live/{B}", bytes(MAX_BYTES), congestion_control=block)
         item = first.next()
     assert (item.size, item.content) == (MAX_BYTES, (bytes(MAX_BYTES), b""))
-
-
-def test_a_port_in_use_is_an_os_error_with_its_number(domain: str) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        config = settings(f"tcp/127.0.0.1:{server.getsockname()[1]}", None, None, 2.0)
-        with pytest.raises(OSError, match="zenoh cannot open a session") as caught:
-            ZenohSession(config, Keys(domain, A), print, print).open()
-    assert caught.value.errno == errno.EADDRINUSE
-    assert ".rs:" not in str(caught.value)
-
-
-def test_an_os_error_that_only_zenoh_has_found_has_no_number(domain: str) -> None:
-    config = settings("tls/127.0.0.1:0", None, None, 2.0)
-    with pytest.raises(OSError, match="private key") as caught:
-        ZenohSession(config, Keys(domain, A), print, print).open()
-    assert caught.value.errno is None
 
 
 def test_a_client_that_reaches_nobody_raises(domain: str, address: str) -> None:

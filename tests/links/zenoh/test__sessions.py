@@ -104,6 +104,7 @@ async def test_a_lost_peer_is_reached_again_by_a_patch_that_carries_everything()
             asking.sessions.ask(asked.id, 7)
             question = (await asked.next()).content
             assert isinstance(question, Question)
+            assert str(question.handle.key_expr) == asked.sessions._keys.own("state")
             asked.sessions.answer(question.handle, Message(b"answer", b"", 0))
             assert await asking.next() == Received(asked.id, Answer((b"answer", b"")), 6)
 
@@ -256,6 +257,16 @@ async def test_a_peer_whose_connection_was_gone_before_anybody_looked_is_dialled
             assert await here.next() == Received(there.id, presence)
         assert await here.next() == Received(there.id, Presence.JOINED)
         assert await there.next() == Received(here.id, Presence.JOINED)
+
+
+async def test_a_peer_is_asked_by_its_own_key_which_costs_a_router_nothing_for_other_robots() -> None:
+    async with ends(1) as (here,), joined_to(here) as joining:
+        joining.sessions.ask(here.id, 0)
+        joining.sessions.ask_history(here.id, 1.0, "")
+        for kind in ("state", "history"):
+            question = await here.next()
+            assert str(question.content.handle.key_expr) == here.sessions._keys.own(kind)
+            question.content.handle.drop()
 
 
 async def test_whoever_asks_and_hears_directly_tells_so() -> None:

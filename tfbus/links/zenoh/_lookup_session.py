@@ -21,7 +21,8 @@ import zenoh
 
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_at_exit, wait_until_closed
 from tfbus.links.zenoh._keys import NO_ROBOT, check_domain, check_robot
-from tfbus.links.zenoh._session import as_os_error, directly
+from tfbus.links.zenoh._opening import open_session
+from tfbus.links.zenoh._session import directly
 from tfbus.links.zenoh._settings import Addresses, settings
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 
@@ -94,10 +95,7 @@ class LookupSession:
         if self._link is not None:
             self._session = self._link._zenoh_session()
         else:
-            try:
-                self._session = await anyio.to_thread.run_sync(zenoh.open, self._config)
-            except zenoh.ZError as error:
-                raise as_os_error(error) from error
+            self._session = await anyio.to_thread.run_sync(open_session, self._config)
         self._sender = threading.Thread(target=_send_all, args=(self._sending,), daemon=True)
         self._sender.start()
         # A program may exit without the end of its server.

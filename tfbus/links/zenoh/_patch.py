@@ -25,7 +25,7 @@ class Patch(ZenohSession):
     note_presence : callable
         Called in zenoh's threads with this patch, the name of a session of the peer, its `Presence`, and its robot.
     filters : Filters
-    note_served : callable
+    note_served, robot_of : callable
         As for `ZenohSession`.
 
     Attributes
@@ -42,6 +42,7 @@ class Patch(ZenohSession):
         note_presence: Callable[["Patch", str, Presence, str], object],
         filters: Filters,
         note_served: Callable[[str, bool], object],
+        robot_of: Callable[[str], str],
     ) -> None:
         self.peer = peer
         self._receive_of_peer = receive
@@ -57,6 +58,7 @@ class Patch(ZenohSession):
             note_connection=lambda session, *_: self._ends.setdefault(session),
             filters=filters,
             note_served=note_served,
+            robot_of=robot_of,
         )
 
     async def meet(self, is_present: Callable[[], bool], seconds: float) -> None:

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT
+from tfbus.links.zenoh._keys import ANY_ROBOT, FIRST_SESSION, NO_ROBOT
 from tfbus.links.zenoh._session import ZenohSession
 
 Way = tuple[ZenohSession | None, str]
@@ -28,7 +28,7 @@ class Present(Mapping[str, frozenset[Way]]):
         self._note_change = note_change
         self._lock = threading.Lock()
         self._ways: dict[str, frozenset[Way]] = {}
-        self._robots: dict[str, str] = {}
+        self._robots: dict[str, dict[str, None]] = {}
 
     def __getitem__(self, peer: str) -> frozenset[Way]:
         return self._ways[peer]
@@ -51,9 +51,14 @@ class Present(Mapping[str, frozenset[Way]]):
         return sorted({name for _, name in self._ways.get(peer, ())})
 
     def robots(self) -> dict[str, str]:
-        """The robot of each peer."""
+        """The robot of each peer; if it was announced with several, the first."""
         with self._lock:
-            return dict(self._robots)
+            return {peer: next(iter(robots)) for peer, robots in self._robots.items()}
+
+    def robot(self, peer: str) -> str:
+        """The robot of a peer; `ANY_ROBOT` if that is not known, or somebody has announced the peer with another."""
+        robots = tuple(self._robots.get(peer, ()))
+        return robots[0] if len(robots) == 1 else ANY_ROBOT
 
     def note(self, peer: str, way: Way, presence: Presence, robot: str = NO_ROBOT) -> None:
         """Note that a peer has come or gone by one of its ways."""
@@ -62,7 +67,7 @@ class Present(Mapping[str, frozenset[Way]]):
             after = before | {way} if presence is Presence.JOINED else before - {way}
             if after:
                 self._ways[peer] = after
-                self._robots.setdefault(peer, robot)
+                self._robots.setdefault(peer, {})[robot] = None
             elif before:
                 del self._ways[peer], self._robots[peer]
             changed = bool(after) is not bool(before)

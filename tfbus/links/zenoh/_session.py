@@ -1,6 +1,5 @@
 """One zenoh session of a link: its keys, and what zenoh's threads receive."""
 
-import re
 import struct
 import threading
 import weakref
@@ -17,10 +16,10 @@ from tfbus.links._message import MAX_BYTES, Message
 from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links.zenoh._closing import begin_to_close, close_session
 from tfbus.links.zenoh._filters import Filters
-from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._keys import ANY_ROBOT, FIRST_SESSION, Keys
 from tfbus.links.zenoh._newest import Thinning
+from tfbus.links.zenoh._opening import open_session
 from tfbus.links.zenoh._publishers import Publishers
-from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import MalformedMessageError
 
 _LONGEST_SHOWN_KEY = 200
@@ -62,6 +61,8 @@ class ZenohSession:
         Is told of the filters of other links.
     note_served : callable, optional
         Called in zenoh's threads with each link that has answered a question, and whether it serves this link's filter.
+    robot_of : callable, optional
+        Returns the robot of a link, or `ANY_ROBOT`.
     name : str
         The name of this session among those of the link.
 
@@ -84,6 +85,7 @@ class ZenohSession:
         note_heard: Callable[[bytes], object] | None = None,
         filters: Filters | None = None,
         note_served: Callable[[str, bool], object] = lambda *_: None,
+        robot_of: Callable[[str], str] = lambda _: ANY_ROBOT,
     ) -> None:
         self._config = config
         self._note_presence = note_presence
@@ -92,6 +94,7 @@ class ZenohSession:
         self._note_heard = note_heard
         self._filters = Filters(keys.robot) if filters is None else filters
         self._note_served = note_served
+        self._robot_of = robot_of
         self._unfiltered: dict[str, zenoh.Subscriber[None]] = {}
         self._name = name
         self._keys = keys
@@ -127,10 +130,7 @@ class ZenohSession:
         opened.result()
 
     def _open(self) -> None:
-        try:
-            session = zenoh.open(self._config)
-        except zenoh.ZError as error:
-            raise as_os_error(error) from error
+        session = open_session(self._config)
         with self._lock:
             self._session = session
             abandoned = self._closed
@@ -180,7 +180,9 @@ class ZenohSession:
             del self._unfiltered[peer]
         for peer in peers - self._unfiltered.keys():
             self._unfiltered[peer] = self.session.declare_subscriber(
-                self._keys.of("live", peer), directly(self._receive_all), allowed_origin=zenoh.Locality.REMOTE
+                self._keys.of("live", peer, ANY_ROBOT),
+                directly(self._receive_all),
+                allowed_origin=zenoh.Locality.REMOTE,
             )
 
     def connected(self) -> set[str]:
@@ -227,7 +229,7 @@ class ZenohSession:
 
         try:
             self.session.get(
-                self._keys.of(kind, peer),
+                self._key(kind, peer),
                 zenoh.handlers.Callback(take, end, indirect=False),
                 payload=payload,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -261,7 +263,7 @@ class ZenohSession:
         # What cannot be asked is asked again.
         with suppress(zenoh.ZError):
             self.session.get(
-                self._keys.of("hears", peer),
+                self._key("hears", peer),
                 zenoh.handlers.Callback(take_reply, end, indirect=False),
                 payload=self._keys.token(FIRST_SESSION),
                 timeout=_HEARING_TIME,
@@ -392,6 +394,9 @@ class ZenohSession:
             # Whoever means it asks again.
             query.drop()
 
+    def _key(self, kind: str, peer: str) -> str:
+        return self._keys.of(kind, peer, self._robot_of(peer))
+
     def _sender(self, sample: zenoh.Sample, kind: str) -> str | None:
         """The peer that a sample is from; None for this link's own, and for a key without an id, which is refused."""
         key = str(sample.key_expr)
@@ -411,10 +416,3 @@ class ZenohSession:
 def directly(callback: Callable[[Any], object]) -> Any:
     # Otherwise each subscriber has a thread of its own, and one overtakes the other.
     return zenoh.handlers.Callback(callback, indirect=False)
-
-
-def as_os_error(error: zenoh.ZError) -> OSError:
-    """The error of a session that cannot be opened, with its `errno`, if there is one."""
-    text = f"zenoh cannot open a session: {without_source_location(error)}"
-    number = re.search(r"\(os error (\d+)\)", text)
-    return OSError(int(number[1]), text) if number else OSError(text)

@@ -68,6 +68,7 @@ class ZenohSessions:
         self._notes = Notes(monotonic)
         self._filters = Filters(keys.robot)
         self._unserved: set[str] = set()
+        self._present = Present(receive, self._notes.add_change)
         self._main = ZenohSession(
             config,
             keys,
@@ -78,9 +79,9 @@ class ZenohSessions:
             note_heard=self._note_heard,
             filters=self._filters,
             note_served=self._note_served,
+            robot_of=self._present.robot,
         )
         self._patches: dict[str, Patch] = {}
-        self._present = Present(receive, self._notes.add_change)
         self._dialing = Dialing(monotonic) if dialing is None else dialing
         self._hearing = Hearing(monotonic)
         self._unmet = Unmet(self._main, keys, monotonic)
@@ -340,7 +341,16 @@ class ZenohSessions:
         if not reachable or peer in self._patches:
             return
         config = self._patch_config(address)
-        patch = Patch(config, self._keys, peer, self._receive, self._note_by_patch, self._filters, self._note_served)
+        patch = Patch(
+            config,
+            self._keys,
+            peer,
+            self._receive,
+            self._note_by_patch,
+            self._filters,
+            self._note_served,
+            self._present.robot,
+        )
         self._patches[peer] = patch
         try:
             await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)

@@ -10,7 +10,7 @@ import anyio.to_thread
 import zenoh
 
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
-from tfbus.links.zenoh._session import as_os_error
+from tfbus.links.zenoh._opening import open_session
 from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, settings
 
 
@@ -59,10 +59,7 @@ class ZenohRouter:
         if self._entered:
             raise RuntimeError("a router is entered once: make another one")
         self._entered = True
-        try:
-            self._session = await anyio.to_thread.run_sync(zenoh.open, self._config)
-        except zenoh.ZError as error:
-            raise as_os_error(error) from error
+        self._session = await anyio.to_thread.run_sync(open_session, self._config)
         # A program may exit without the end of its router.
         self._close_at_exit = weakref.finalize(self, close_session, self._session)
         return self
