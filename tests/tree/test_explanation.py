@@ -179,6 +179,10 @@ def test_for_latest_every_edge_that_lags_behind_the_oldest_common_stamp_has_an_e
     ]
     assert isinstance(found.errors[0].__cause__, PastExtrapolationError)
     assert [(edge.before, edge.after) for edge in found.edges] == [(10, 10), (1, 20), (None, 30)]
+    # Within the tolerance, a sample may stand in.
+    for tolerance, blocking in ((9, ["a", "b"]), (10, ["a"]), (19, ["a"])):
+        errors = tree.explain("map", "c", tolerance=tolerance * NANO).errors
+        assert [error.child for error in errors if isinstance(error, FutureExtrapolationError)] == blocking
 
 
 def test_for_an_answer_that_is_too_old_every_edge_that_is_too_old_has_an_error() -> None:
@@ -274,6 +278,12 @@ def test_the_text_of_an_answer_is_a_heading_and_a_line_for_each_edge() -> None:
         "  base_link <- torso   static                       from 'calibration'",
         "  torso <- arm         50.0 Hz  age 7 ms  12.493 s  from 'arm driver'",
         "  arm <- gripper       static                       from 'calibration'",
+    ]
+    assert str(robot().explain("base_link", "gripper", from_seconds(12.433))).splitlines() == [
+        "'gripper' in 'base_link' at 12.433 s",
+        "  base_link <- torso  static                       from 'calibration'",
+        "  torso <- arm        50.0 Hz  age 7 ms  12.433 s  from 'arm driver'",
+        "  arm <- gripper      static                       from 'calibration'",
     ]
 
 

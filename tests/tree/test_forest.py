@@ -2,6 +2,7 @@ from collections.abc import Callable
 from itertools import count, permutations
 from typing import Any
 
+import numpy as np
 import pytest
 from support.samples import moving, static
 
@@ -22,6 +23,67 @@ def test_insert_judged_returns_the_outcome() -> None:
     assert known.insert_judged(moving("a", "b", 4)) is Outcome.EXPIRED
     assert known.insert_judged(moving("a", "b", 5)) is Outcome.INSERTED
     assert known.insert_judged(moving("a", "b", 5)) is Outcome.REPLACED
+
+
+def test_a_commit_counts_each_sample_of_a_batch_by_its_outcome() -> None:
+    known = forest(moving("a", "b", 10), window=5)
+    known.forget_changes()
+    plain = (moving("a", "b", 11), moving("a", "b", 12))
+    mixed = (
+        moving("a", "b", 13),
+        moving("a", "new", 1),
+        *(moving("a", "b", stamp) for stamp in (14, 15, 16)),
+        *(moving("a", "b", stamp) for stamp in (16, 10, 15, 12)),
+        *(moving("a", "new", stamp) for stamp in (2, 3)),
+    )
+    version = known.version
+    assert known.commit(plain)
+    assert (known.inserted, known.replaced, known.expired) == (3, 0, 0)
+    assert not known.commit(mixed)
+    assert known.version > version
+    assert (known.inserted, known.replaced, known.expired) == (3 + 5 + 2, 3, 1)
+    assert known.expired_frames == ["b"]
+    assert known.insert((moving("a", "b", 17), moving("a", "b", 17), moving("a", "b", 3))) == [
+        Outcome.INSERTED,
+        Outcome.REPLACED,
+        Outcome.EXPIRED,
+    ]
+    assert (known.inserted, known.replaced, known.expired, known.expired_frames) == (11, 4, 2, [])
+
+
+@pytest.mark.parametrize(
+    ("stamps", "appended"),
+    [
+        ([11], True),
+        ([10], False),
+        ([9], False),
+        ([11, 12, 20], True),
+        ([10, 11], False),
+        ([11, 11], False),
+        ([12, 11], False),
+        ([11, 13, 12], False),
+    ],
+)
+def test_samples_are_appended_together_if_each_is_newer_than_those_before(stamps: list[int], appended: bool) -> None:
+    known = forest(moving("a", "b", 9, authority="me"), moving("a", "b", 10, authority="me"))
+    asked = np.array(stamps)
+    assert known.can_append("a", "b", "me", asked) is appended
+    for other in (("z", "b", "me"), ("a", "z", "me"), ("a", "b", "you")):
+        assert not known.can_append(*other, asked)
+    if appended:
+        version = known.version
+        known.append("b", asked, np.full((len(stamps), 7), 0.5))
+        assert known.version > version
+        assert known.inserted == 2 + len(stamps)
+        history = known.frames["b"]
+        assert [history.sample(i)[0] for i in range(len(history))] == [9, 10, *stamps]
+        assert history.sample(2)[1] == (0.5,) * 7
+
+
+def test_nothing_is_appended_to_a_static_an_emptied_or_a_reparented_frame() -> None:
+    known = forest(static("a", "still"), moving("a", "empty", 5), moving("z", "moved", 4), moving("a", "moved", 5))
+    known.frames["empty"].clear()
+    assert not any(known.can_append("a", child, "", np.array([9])) for child in ("still", "empty", "moved"))
 
 
 def test_a_permanent_path_is_cached() -> None:

@@ -16,6 +16,7 @@ from tfbus import (
 )
 from tfbus.geometry.rows import IDENTITY
 from tfbus.geometry.transform import from_row
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.path import Path, find_path, path_at
 
@@ -191,6 +192,13 @@ def test_of_several_future_extrapolations_that_of_the_most_lagging_edge_decides(
     assert type(error) is FutureExtrapolationError
     assert (error.child, error.newest) == ("1", 10)
     assert path_over((0, 12), None, (0, 10)).deciding_error(15).child == "1"
+    # A stamp that some edges have reached is the oldest that the others lack.
+    last = STAMP_MAX
+    assert path_over((0, last), (0, last - 1)).deciding_error(last).child == "1"
+    assert path_over((0, last - 1), (0, last)).deciding_error(last).child == "0"
+    # Of two that lag as far, the first one.
+    assert path_over((0, 20), (0, 10), (0, 10)).deciding_error(15).child == "1"
+    assert path_over((0, 20), None, (STAMP_MIN, STAMP_MIN)).deciding_error(15).child == "1"
 
 
 @given(

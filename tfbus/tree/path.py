@@ -124,7 +124,7 @@ class Path(Chain):
         return error
 
     def _own_error(self, at: int) -> ExtrapolationError:
-        lagging, reached = self.moving[0], STAMP_MAX + 1
+        lagging, reached = self.moving[0], STAMP_MAX
         for edge in self.moving:
             oldest, newest = edge.oldest, edge.newest
             if oldest is not None and newest is not None and newest >= at:
