@@ -216,8 +216,11 @@ def test_pop_all_gives_every_waiter_in_order_of_arrival_and_empties_the_index() 
 def test_a_given_waiter_can_be_parked_again_with_another_error() -> None:
     index = WaitingIndex()
     waiting = parked(index, unknown("camera"))
-    index.pop_unblocked("camera", None)
-    index.park(waiting, short_of("camera", 20))
+    for error in (short_of("camera", 30), short_of("camera", 20)):
+        assert index.names == {"map", "tool"}
+        assert index.pop_asking_for({"tool"}) == [waiting]
+        assert index.names == set()
+        index.park(waiting, error)
     assert index.pop_unblocked("camera", 19) == []
     assert index.pop_unblocked("camera", 20) == [waiting]
 
@@ -237,6 +240,8 @@ def test_pending_lists_each_question_with_its_error() -> None:
     [pending] = index.pending()
     assert (pending.question, pending.since, pending.blocked_by) == (question, 12, error)
     assert str(pending) == "'camera' in 'map': frame 'camera' is not known"
+    with pytest.raises(AttributeError):
+        pending.since = 0  # type: ignore[misc]
 
 
 def test_the_index_wakes_no_waiter_itself() -> None:
