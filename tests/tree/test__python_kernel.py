@@ -422,6 +422,9 @@ def test_there_is_no_row_outside_the_window_nor_in_a_mixed_or_empty_history(kern
     edge = history(kernel, [(stamp, x(stamp)) for stamp in range(166)], keep=160)
     path = kernel.Chain((edge,), ())
     assert (path.row(4), path.row(5)) == (None, x(5.0))
+    # The samples that have left the window are still in memory here.
+    slack = kernel.Chain((history(kernel, [(at, x(at)) for at in (0, 4, 10, 164)], keep=160),), ())
+    assert [slack.row(at) for at in (0, 2, 3, 4, 7, 10)] == [None, None, None, x(4.0), x(7.0), x(10.0)]
     late = history(kernel, [(0, x(0.0)), (10, x(1.0))], keep=5)
     assert (kernel.Chain((late,), ()).row(9), kernel.Chain((late,), ()).row(10)) == (None, x(1.0))
     edge.mixed = True

@@ -248,7 +248,7 @@ def _other_way(frames: Frames, way: Path, at: int) -> tuple[Path | None, tuple[s
     while (edge := frames.get(here)) is not None and here not in beyond:
         beyond[here] = edge
         here = edge.parent_at(at)
-        if here == way.root or here not in way.frames:
+        if here not in way.frames:
             continue
         ups, downs = _edges(frames, way)
         for side, other in ((ups, downs), (downs, ups)):
