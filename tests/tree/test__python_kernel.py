@@ -66,8 +66,21 @@ def test_an_empty_history_has_no_stamps(kernel: ModuleType) -> None:
     assert (edge.count, edge.oldest, edge.newest, edge.find(0), edge.keep) == (0, None, None, 0, 7)
     assert edge.newest_record == b""
     assert (edge.parent, edge.authority, edge.mixed) == ("parent", "", False)
-    with pytest.raises(IndexError):
-        edge.sample(0)
+    for read in (edge.sample, edge.stamp):
+        with pytest.raises(IndexError):
+            read(0)
+
+
+@on_both
+def test_there_are_samples_from_the_oldest_in_the_window_to_the_newest(kernel: ModuleType) -> None:
+    # What has left the window is still in memory here.
+    edge = history(kernel, [(stamp, x(stamp)) for stamp in range(166)], keep=160)
+    assert [edge.stamp(index) for index in (0, 1, 160)] == [5, 6, 165]
+    assert [edge.sample(index) for index in (0, 160)] == [(5, x(5.0)), (165, x(165.0))]
+    for read in (edge.sample, edge.stamp):
+        for index in (-1, -5, 161):
+            with pytest.raises(IndexError, match="no sample has this index"):
+                read(index)
 
 
 @on_both

@@ -11,6 +11,15 @@ from tfbus.tree.question import question_of
 POLICY = Policy(tolerance=5)
 
 
+@pytest.mark.parametrize("at", [5, LATEST])
+@pytest.mark.parametrize(
+    "more", [{"source_at": 5}, {"source_at": 0}, {"fixed": "map"}, {"max_age": 0.0}, {"policy": Policy()}]
+)
+def test_only_a_question_of_nothing_but_a_stamp_is_plain(at: int | Latest, more: dict[str, Any]) -> None:
+    assert Question("map", "tool", at).is_plain
+    assert not Question("map", "tool", at, **more).is_plain
+
+
 class Smell:
     """Data with a frame and a stamp, of a type that is not registered."""
 

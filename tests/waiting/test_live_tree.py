@@ -13,6 +13,7 @@ from tfbus import (
     BufferStatistics,
     ClockResetError,
     DisconnectedError,
+    Edge,
     ExtrapolationError,
     FutureExtrapolationError,
     InvalidTransformError,
@@ -471,13 +472,17 @@ def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:
 def test_changing_the_tree_of_a_buffer_directly_is_an_error() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
-    for change in (
-        partial(tree_over(live).insert, moving("map", "a", 2)),
-        partial(tree_over(live).remove_frame, "a"),
-        tree_over(live).clear,
+    tree = tree_over(live)
+    for change, instead in (
+        (partial(tree.insert, moving("map", "a", 2)), "use bus.publish"),
+        (partial(tree.insert_many, [moving("map", "a", 2)]), "use bus.publish"),
+        (partial(tree.remove_frame, "a"), "use bus.remove_frame"),
+        (tree.clear, "clear a copy"),
+        (partial(tree.forget_before, 2), "its samples leave it after `keep` seconds"),
     ):
-        with pytest.raises(RuntimeError, match="a bus feeds this tree"):
+        with pytest.raises(RuntimeError, match=f"a bus feeds this tree: {instead}"):
             change()
+    assert tree.edges() == [Edge("map", "a", False, 1, 1, 1, "")]
     own = tree_over(live).copy()
     own.insert(moving("map", "a", 2))
     assert (tree_over(live).latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)
