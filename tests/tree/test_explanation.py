@@ -223,6 +223,23 @@ def test_two_trees_are_explained_up_to_their_roots() -> None:
     assert error.roots == ("map", "world")
 
 
+def test_an_edge_that_has_changed_its_parent_is_explained_as_it_was_at_the_stamp() -> None:
+    tree = tree_of(*over("old", "a", (10, 20)), *over("new", "a", (30, 40)), static("old", "new"), static("a", "b"))
+    for at, chain, around, stamp in (
+        (15, ("old", "a", "b"), (10, 20), 15),
+        (25, ("old", "a", "b"), (20, 30), 25),
+        (35, ("old", "new", "a", "b"), (30, 40), 35),
+        (45, ("old", "new", "a", "b"), (40, None), None),
+        (5, ("old", "a", "b"), (None, 10), None),
+        (LATEST, ("old", "new", "a", "b"), (40, 40), 40),
+    ):
+        found = tree.explain("old", "b", at)
+        (edge,) = (edge for edge in found.edges if edge.child == "a")
+        assert (found.chain, (edge.before, edge.after), found.stamp) == (chain, around, stamp)
+        assert found.errors == (() if edge.error is None else (edge.error,))
+        assert (edge.error is None) == (stamp is not None)
+
+
 def test_a_loop_in_the_past_is_shown_once() -> None:
     tree = tree_of(moving("a", "b", 10), moving("map", "b", 30), moving("other", "x", 5))
     tree.insert_many([moving("b", "a", 10), moving("map", "a", 30)])

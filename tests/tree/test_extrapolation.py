@@ -103,6 +103,14 @@ def test_a_sample_with_another_parent_is_never_read_instead(parents: dict[int, s
             assert parents[found.stamp] == edge.parent_at(at)
 
 
+def test_a_later_sample_stands_in_only_if_the_parent_stays() -> None:
+    edge = history({10: "odom", 20: "odom", 30: "map", 40: "map"})
+    asked = [14, 16, 24, 26, 34, 36]
+    stamps, away, _ = read_stamps_at_many(samples_around(edge, asked), np.array(asked), Policy(4, 5, 0))
+    assert away.tolist() == [4, 4, 4, -1, 4, 4]
+    assert stamps[[0, 1, 2, 4, 5]].tolist() == [10, 20, 20, 30, 40]
+
+
 def test_distances_beyond_64_bits_are_not_within_a_tolerance() -> None:
     edge = history([STAMP_MIN, STAMP_MAX])
     policy = Policy(tolerance=5, max_gap=5)
