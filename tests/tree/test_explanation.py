@@ -344,6 +344,11 @@ def test_the_text_of_two_trees_lists_one_after_the_other() -> None:
         "    eye -> drone  static",
         "! no path from 'eye' to 'a': they are in different trees, with roots 'map' and 'drone'",
     ]
+    assert str(tree.explain("a", "drone")).splitlines()[1:-1] == [
+        "  up from 'a' to 'map'",
+        "    a -> map  one sample  age 0 ns  from 'slam'",
+        "  'drone' is a root",
+    ]
     assert str(tree.explain("map", "drone", SECOND)).splitlines() == [
         "'drone' in 'map' at 1.000 s: no answer",
         "  'map' is a root",
