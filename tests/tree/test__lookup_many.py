@@ -297,6 +297,16 @@ def test_an_edge_that_is_reversed_has_at_each_stamp_the_direction_of_that_time(a
 
 
 @few_and_many
+def test_of_two_ways_round_a_loop_the_one_with_samples_counts_at_each_stamp(asked: Asked) -> None:
+    tree = tree_of(moving("b", "a", 0, 1.0), moving("c", "b", 30), moving("b", "a", 10, 1.0))
+    # Late, b comes onto a as well: that counts where a has no sample.
+    tree.insert_many([moving("a", "b", 5, 7.0), moving("a", "b", 20, 7.0)])
+    stamps = asked([0, 9, 10, 11, 12, 20])
+    assert xs(tree.lookup_many("a", "b", stamps))[:6] == [-1.0, -1.0, -1.0, 7.0, 7.0, 7.0]
+    assert xs(tree.lookup_many("b", "a", stamps))[:6] == [1.0, 1.0, 1.0, -7.0, -7.0, -7.0]
+
+
+@few_and_many
 def test_an_edge_without_samples_covers_no_stamp(asked: Asked) -> None:
     tree = tree_of(*over("a", "b", [0, 10]), static("b", "c"))
     tree.clear()
