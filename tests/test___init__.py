@@ -1,4 +1,5 @@
 import ast
+from dataclasses import FrozenInstanceError, fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +21,21 @@ def test_the_version_is_that_of_the_installed_package() -> None:
 def test_another_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'tfbus' has no attribute 'Transfrom'"):
         tfbus.Transfrom  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_values_that_users_get_cannot_be_changed_and_have_slots() -> None:
+    found = {
+        kind
+        for room in ("tfbus", "tfbus.analysis", "tfbus.data", "tfbus.recording", "tfbus.robot")
+        for kind in vars(import_module(room)).values()
+        if isinstance(kind, type) and is_dataclass(kind)
+    }
+    assert len(found) > 20
+    for kind in found - {tfbus.recording.Conversion}:
+        value = kind.__new__(kind)
+        with pytest.raises(FrozenInstanceError):
+            setattr(value, fields(kind)[0].name, 0)
+        assert not hasattr(value, "__dict__"), kind
 
 
 def test_type_checkers_read_the_names_and_modules_that_are_loaded() -> None:

@@ -9,9 +9,10 @@ from tfbus.geometry._python_sample import Sample
 
 def test_the_sample_in_python_reads_its_fields() -> None:
     sample = Sample()
-    sample._fields = "a", "b", 5, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0), "me", True
+    sample._fields = "a", "b", 5, (3.0, 4.0, 12.0, 0.0, 0.0, 0.0, 1.0), "me", True
     assert (sample.parent, sample.child, sample.stamp, sample.authority, sample.static) == ("a", "b", 5, "me", True)
-    assert sample._row == (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    assert sample._row == (3.0, 4.0, 12.0, 0.0, 0.0, 0.0, 1.0)
+    assert sample._square == 13.0**2
 
 
 class Marked(TransformStamped):

@@ -17,6 +17,14 @@ def test_a_translation_of_just_the_bound_is_within_and_a_longer_one_is_not() -> 
     assert not is_within(sample, math.nextafter(13.0, 0.0))
 
 
+def test_a_rotation_makes_no_translation_longer() -> None:
+    sample = TransformStamped("a", "b", 0, Transform((3.0, -4.0, 12.0), (1.0, 0.0, 0.0, 0.0)))
+    assert is_within(sample, 13.0)
+    assert str(not_physical(sample, 5.0)) == (
+        "the translation of 'b' in 'a' is 13 m long, which is not physical (at most 5 m)"
+    )
+
+
 def test_the_error_says_how_long_it_is_where_it_is_and_what_is_allowed() -> None:
     near, far = moving("a", "b", 0, 1e12), moving("b", "c", 0, 2e12, "peer")
     with pytest.raises(InvalidTransformError) as caught:

@@ -3,6 +3,7 @@ import json
 import math
 import pickle
 from collections.abc import Sequence
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from support.strategies import angles, rotations, small_angles, transforms, unit
 from transforms3d import affines, axangles, euler, quaternions
 
 from tfbus import InvalidTransformError, Transform, TransformError
-from tfbus.geometry.rows import Quaternion, Vector
+from tfbus.geometry.rows import NORM_TOLERANCE, Quaternion, Vector
 
 HALF = math.sqrt(0.5)
 QUARTER_TURN_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)
@@ -234,6 +235,33 @@ def test_both_parts_are_checked_and_the_error_names_the_part(
     assert caught.value.reason == reason
 
 
+@pytest.mark.parametrize("kind", [tuple, list])
+def test_every_part_of_a_quaternion_counts_in_its_norm(kind: type) -> None:
+    def turned(one: float, other: float) -> Transform:
+        rotation = [0.0, 0.0, 0.0, 0.0]
+        rotation[first], rotation[second] = one, other
+        return Transform((0.0, 0.0, 0.0), kind(rotation))
+
+    for first, second in permutations(range(4), 2):
+        found = turned(0.6, -0.8).rotation
+        assert (found[first], found[second]) == (0.6, -0.8)
+        # One is the difference of the first two squares, and twice a half, but the square of none of the norms.
+        for one, other in ((1.25, 0.75), (0.5, 0.0), (-0.5, 0.0)):
+            with pytest.raises(InvalidTransformError, match="not a unit quaternion"):
+                turned(one, other)
+
+
+@pytest.mark.parametrize("off", [NORM_TOLERANCE, -NORM_TOLERANCE])
+@pytest.mark.parametrize("place", range(3))
+def test_the_last_row_of_a_matrix_may_be_off_by_just_the_tolerance(place: int, off: float) -> None:
+    matrix = np.eye(4)
+    matrix[3, place] = off
+    assert Transform.from_matrix(matrix) == Transform()
+    matrix[3, place] = np.nextafter(off, 2.0 * off)
+    with pytest.raises(InvalidTransformError, match="last row"):
+        Transform.from_matrix(matrix)
+
+
 SHEARED = np.eye(4)
 SHEARED[0, 1] = 0.1
 MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
@@ -413,6 +441,15 @@ def test_close_means_within_the_tolerances_and_no_further(tolerance: float, a: T
     assert not close(a @ Transform.from_axis_angle(axis, outside))
     assert close(shifted(a, axis, inside))
     assert not close(shifted(a, axis, outside))
+
+
+def test_what_is_just_at_a_tolerance_is_close() -> None:
+    shift, half_turn = Transform((3.0, 4.0, 12.0)), Transform(rotation=(0.0, 0.0, 1.0, 0.0))
+    here = Transform()
+    assert here.is_close(shift, translation_tolerance=13.0)
+    assert not here.is_close(shift, translation_tolerance=math.nextafter(13.0, 0.0))
+    assert here.is_close(half_turn, rotation_tolerance=math.pi)
+    assert not here.is_close(half_turn, rotation_tolerance=math.nextafter(math.pi, 0.0))
 
 
 def shifted(a: Transform, axis: Vector, distance: float) -> Transform:

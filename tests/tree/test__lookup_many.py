@@ -297,6 +297,16 @@ def test_an_edge_that_is_reversed_has_at_each_stamp_the_direction_of_that_time(a
 
 
 @few_and_many
+def test_of_two_ways_round_a_loop_the_one_with_samples_counts_at_each_stamp(asked: Asked) -> None:
+    tree = tree_of(moving("b", "a", 0, 1.0), moving("c", "b", 30), moving("b", "a", 10, 1.0))
+    # Late, b comes onto a as well: that counts where a has no sample.
+    tree.insert_many([moving("a", "b", 5, 7.0), moving("a", "b", 20, 7.0)])
+    stamps = asked([0, 9, 10, 11, 12, 20])
+    assert xs(tree.lookup_many("a", "b", stamps))[:6] == [-1.0, -1.0, -1.0, 7.0, 7.0, 7.0]
+    assert xs(tree.lookup_many("b", "a", stamps))[:6] == [1.0, 1.0, 1.0, -7.0, -7.0, -7.0]
+
+
+@few_and_many
 def test_an_edge_without_samples_covers_no_stamp(asked: Asked) -> None:
     tree = tree_of(*over("a", "b", [0, 10]), static("b", "c"))
     tree.clear()
@@ -317,6 +327,17 @@ def test_source_at_is_one_stamp_for_each_answer_or_one_for_all(asked: Asked) -> 
     assert xs(found)[:3] == pytest.approx([-5.0, 7.0, -10.0])
     found = tree.lookup_many("cart", "cart", stamps, source_at=4, fixed="map")
     assert xs(found)[:3] == pytest.approx([-4.0, 2.0, -6.0])
+
+
+@few_and_many
+def test_time_travel_leads_over_the_fixed_frame_though_a_path_without_it_is_known(asked: Asked) -> None:
+    tree = tree_of(*over("map", "a", [0, 10]), *over("a", "b", [0, 10]), *over("map", "f", [0, 4], speed=2.0))
+    # The fixed frame has had two parents, so that its path depends on the stamp.
+    tree.insert_many(over("a", "f", [8, 10], speed=2.0))
+    assert tree.lookup("map", "b", 3).transform.translation[0] == 6.0
+    found = tree.lookup_many("map", "b", asked([1, 9]), source_at=asked([9, 2]), fixed="f")
+    # At 1, f is 2 in map; at 9 it is 18 in a, and b is 9 in a; at 2, it is 4 in map, and b is 2 + 2 there.
+    assert xs(found)[:2] == pytest.approx([2.0 + (9.0 - 18.0), (9.0 + 18.0) + (4.0 - 4.0)])
 
 
 @few_and_many

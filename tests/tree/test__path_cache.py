@@ -3,7 +3,7 @@ from threading import Lock
 from support.histories import moving_edge
 
 from tfbus import Transform
-from tfbus.tree._path_cache import PathCache
+from tfbus.tree._path_cache import _GENERATION, PathCache
 from tfbus.tree.path import Path, find_path
 
 
@@ -39,7 +39,7 @@ def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() ->
 
 def test_as_many_pairs_as_a_generation_has_stay_known_however_often_they_are_asked_for_in_turn() -> None:
     cache, kept = PathCache(Lock()), path()
-    names = [str(number) for number in range(9_999)]
+    names = [str(number) for number in range(_GENERATION)]
     found = 0
     for _ in range(3):
         for name in names:

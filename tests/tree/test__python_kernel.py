@@ -66,8 +66,21 @@ def test_an_empty_history_has_no_stamps(kernel: ModuleType) -> None:
     assert (edge.count, edge.oldest, edge.newest, edge.find(0), edge.keep) == (0, None, None, 0, 7)
     assert edge.newest_record == b""
     assert (edge.parent, edge.authority, edge.mixed) == ("parent", "", False)
-    with pytest.raises(IndexError):
-        edge.sample(0)
+    for read in (edge.sample, edge.stamp):
+        with pytest.raises(IndexError):
+            read(0)
+
+
+@on_both
+def test_there_are_samples_from_the_oldest_in_the_window_to_the_newest(kernel: ModuleType) -> None:
+    # What has left the window is still in memory here.
+    edge = history(kernel, [(stamp, x(stamp)) for stamp in range(166)], keep=160)
+    assert [edge.stamp(index) for index in (0, 1, 160)] == [5, 6, 165]
+    assert [edge.sample(index) for index in (0, 160)] == [(5, x(5.0)), (165, x(165.0))]
+    for read in (edge.sample, edge.stamp):
+        for index in (-1, -5, 161):
+            with pytest.raises(IndexError, match="no sample has this index"):
+                read(index)
 
 
 @on_both
@@ -422,6 +435,9 @@ def test_there_is_no_row_outside_the_window_nor_in_a_mixed_or_empty_history(kern
     edge = history(kernel, [(stamp, x(stamp)) for stamp in range(166)], keep=160)
     path = kernel.Chain((edge,), ())
     assert (path.row(4), path.row(5)) == (None, x(5.0))
+    # The samples that have left the window are still in memory here.
+    slack = kernel.Chain((history(kernel, [(at, x(at)) for at in (0, 4, 10, 164)], keep=160),), ())
+    assert [slack.row(at) for at in (0, 2, 3, 4, 7, 10)] == [None, None, None, x(4.0), x(7.0), x(10.0)]
     late = history(kernel, [(0, x(0.0)), (10, x(1.0))], keep=5)
     assert (kernel.Chain((late,), ()).row(9), kernel.Chain((late,), ()).row(10)) == (None, x(1.0))
     edge.mixed = True

@@ -41,6 +41,21 @@ def test_each_stamp_has_the_name_that_a_plain_dict_of_all_samples_gives_it(
             assert runs.changes() == changes
 
 
+def test_a_name_is_forgotten_once_the_next_one_holds_from_the_oldest_stamp_on() -> None:
+    runs = Runs()
+    for stamp, name, newest in ((10, "b", "a"), (20, "c", "b"), (30, "c", "c")):
+        runs.push(stamp, name, newest)
+    assert (runs.forget_before(9), runs.names(), runs.changes()) == (False, ("a", "b", "c"), [10, 20])
+    assert (runs.forget_before(10), runs.names(), runs.changes()) == (True, ("b", "c"), [20])
+    assert (runs.forget_before(19), runs.names(), [runs.at(stamp) for stamp in (5, 19, 20)]) == (
+        False,
+        ("b", "c"),
+        ["b", "b", "c"],
+    )
+    assert (runs.forget_before(40), bool(runs)) == (True, False)
+    assert not runs.forget_before(50)
+
+
 def test_a_copy_is_independent() -> None:
     runs = Runs()
     runs.push(2, "b", "a")

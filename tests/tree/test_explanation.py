@@ -179,6 +179,10 @@ def test_for_latest_every_edge_that_lags_behind_the_oldest_common_stamp_has_an_e
     ]
     assert isinstance(found.errors[0].__cause__, PastExtrapolationError)
     assert [(edge.before, edge.after) for edge in found.edges] == [(10, 10), (1, 20), (None, 30)]
+    # Within the tolerance, a sample may stand in.
+    for tolerance, blocking in ((9, ["a", "b"]), (10, ["a"]), (19, ["a"])):
+        errors = tree.explain("map", "c", tolerance=tolerance * NANO).errors
+        assert [error.child for error in errors if isinstance(error, FutureExtrapolationError)] == blocking
 
 
 def test_for_an_answer_that_is_too_old_every_edge_that_is_too_old_has_an_error() -> None:
@@ -217,6 +221,23 @@ def test_two_trees_are_explained_up_to_their_roots() -> None:
     (error,) = found.errors
     assert isinstance(error, DisconnectedError)
     assert error.roots == ("map", "world")
+
+
+def test_an_edge_that_has_changed_its_parent_is_explained_as_it_was_at_the_stamp() -> None:
+    tree = tree_of(*over("old", "a", (10, 20)), *over("new", "a", (30, 40)), static("old", "new"), static("a", "b"))
+    for at, chain, around, stamp in (
+        (15, ("old", "a", "b"), (10, 20), 15),
+        (25, ("old", "a", "b"), (20, 30), 25),
+        (35, ("old", "new", "a", "b"), (30, 40), 35),
+        (45, ("old", "new", "a", "b"), (40, None), None),
+        (5, ("old", "a", "b"), (None, 10), None),
+        (LATEST, ("old", "new", "a", "b"), (40, 40), 40),
+    ):
+        found = tree.explain("old", "b", at)
+        (edge,) = (edge for edge in found.edges if edge.child == "a")
+        assert (found.chain, (edge.before, edge.after), found.stamp) == (chain, around, stamp)
+        assert found.errors == (() if edge.error is None else (edge.error,))
+        assert (edge.error is None) == (stamp is not None)
 
 
 def test_a_loop_in_the_past_is_shown_once() -> None:
@@ -275,6 +296,12 @@ def test_the_text_of_an_answer_is_a_heading_and_a_line_for_each_edge() -> None:
         "  torso <- arm         50.0 Hz  age 7 ms  12.493 s  from 'arm driver'",
         "  arm <- gripper       static                       from 'calibration'",
     ]
+    assert str(robot().explain("base_link", "gripper", from_seconds(12.433))).splitlines() == [
+        "'gripper' in 'base_link' at 12.433 s",
+        "  base_link <- torso  static                       from 'calibration'",
+        "  torso <- arm        50.0 Hz  age 7 ms  12.433 s  from 'arm driver'",
+        "  arm <- gripper      static                       from 'calibration'",
+    ]
 
 
 def test_the_text_marks_edges_with_errors_and_lists_the_errors_below() -> None:
@@ -316,6 +343,11 @@ def test_the_text_of_two_trees_lists_one_after_the_other() -> None:
         "  up from 'eye' to 'drone'",
         "    eye -> drone  static",
         "! no path from 'eye' to 'a': they are in different trees, with roots 'map' and 'drone'",
+    ]
+    assert str(tree.explain("a", "drone")).splitlines()[1:-1] == [
+        "  up from 'a' to 'map'",
+        "    a -> map  one sample  age 0 ns  from 'slam'",
+        "  'drone' is a root",
     ]
     assert str(tree.explain("map", "drone", SECOND)).splitlines() == [
         "'drone' in 'map' at 1.000 s: no answer",

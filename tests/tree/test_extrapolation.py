@@ -19,7 +19,7 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree.extrapolation import ReadStamp, read_stamp, read_stamps_at_many
+from tfbus.tree.extrapolation import ReadStamp, read_stamp, read_stamps, read_stamps_at_many
 from tfbus.tree.history import FrameHistory, Samples
 from tfbus.tree.policy import Policy
 
@@ -103,6 +103,14 @@ def test_a_sample_with_another_parent_is_never_read_instead(parents: dict[int, s
             assert parents[found.stamp] == edge.parent_at(at)
 
 
+def test_a_later_sample_stands_in_only_if_the_parent_stays() -> None:
+    edge = history({10: "odom", 20: "odom", 30: "map", 40: "map"})
+    asked = [14, 16, 24, 26, 34, 36]
+    stamps, away, _ = read_stamps_at_many(samples_around(edge, asked), np.array(asked), Policy(4, 5, 0))
+    assert away.tolist() == [4, 4, 4, -1, 4, 4]
+    assert stamps[[0, 1, 2, 4, 5]].tolist() == [10, 20, 20, 30, 40]
+
+
 def test_distances_beyond_64_bits_are_not_within_a_tolerance() -> None:
     edge = history([STAMP_MIN, STAMP_MAX])
     policy = Policy(tolerance=5, max_gap=5)
@@ -149,6 +157,27 @@ def test_a_gap_error_has_the_stamps_of_both_samples() -> None:
         "frame 'robot': asked for 2.000 s, between samples at 1.000 s and 4.000 s, which are 3 s apart (at most 1 s), "
         "from 'odometry'"
     )
+
+
+def test_an_error_that_waiting_cannot_help_decides_else_that_of_the_edge_that_lags_most() -> None:
+    empty, earliest, lagging, nearly = history([]), history([STAMP_MIN]), history([0, 15]), history([10, 20])
+    past, gap = history([40, 50]), history([0, 100])
+    for edges, decisive in (
+        ((empty, past), past),
+        ((past, empty), past),
+        ((earliest, gap), gap),
+        ((past, gap), past),
+        ((gap, past), gap),
+        ((nearly, lagging), lagging),
+        ((nearly, earliest), earliest),
+        ((nearly, empty), empty),
+        ((earliest, empty), earliest),
+        ((empty, earliest), empty),
+    ):
+        with pytest.raises(ExtrapolationError) as caught:
+            read_stamps(edges, 30, Policy(max_gap=20))
+        assert (caught.value.oldest, caught.value.newest) == (decisive.oldest, decisive.newest)
+        assert isinstance(caught.value, FutureExtrapolationError) == (decisive not in (past, gap))
 
 
 @pytest.mark.parametrize(("policy", "slack"), [((0, 0), 0), ((5, 0), 5), ((5, 8), 8), ((0, 8), 8), ((8, 5), 8)])

@@ -1,11 +1,14 @@
 from collections.abc import Callable
+from functools import partial
 from itertools import count, permutations
 from typing import Any
 
+import numpy as np
 import pytest
 from support.samples import moving, static
 
 from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped, TransformTree
+from tfbus.tree._saved_frames import save_frame
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 
@@ -22,6 +25,67 @@ def test_insert_judged_returns_the_outcome() -> None:
     assert known.insert_judged(moving("a", "b", 4)) is Outcome.EXPIRED
     assert known.insert_judged(moving("a", "b", 5)) is Outcome.INSERTED
     assert known.insert_judged(moving("a", "b", 5)) is Outcome.REPLACED
+
+
+def test_a_commit_counts_each_sample_of_a_batch_by_its_outcome() -> None:
+    known = forest(moving("a", "b", 10), window=5)
+    known.forget_changes()
+    plain = (moving("a", "b", 11), moving("a", "b", 12))
+    mixed = (
+        moving("a", "b", 13),
+        moving("a", "new", 1),
+        *(moving("a", "b", stamp) for stamp in (14, 15, 16)),
+        *(moving("a", "b", stamp) for stamp in (16, 10, 15, 12)),
+        *(moving("a", "new", stamp) for stamp in (2, 3)),
+    )
+    version = known.version
+    assert known.commit(plain)
+    assert (known.inserted, known.replaced, known.expired) == (3, 0, 0)
+    assert not known.commit(mixed)
+    assert known.version > version
+    assert (known.inserted, known.replaced, known.expired) == (3 + 5 + 2, 3, 1)
+    assert known.expired_frames == ["b"]
+    assert known.insert((moving("a", "b", 17), moving("a", "b", 17), moving("a", "b", 3))) == [
+        Outcome.INSERTED,
+        Outcome.REPLACED,
+        Outcome.EXPIRED,
+    ]
+    assert (known.inserted, known.replaced, known.expired, known.expired_frames) == (11, 4, 2, [])
+
+
+@pytest.mark.parametrize(
+    ("stamps", "appended"),
+    [
+        ([11], True),
+        ([10], False),
+        ([9], False),
+        ([11, 12, 20], True),
+        ([10, 11], False),
+        ([11, 11], False),
+        ([12, 11], False),
+        ([11, 13, 12], False),
+    ],
+)
+def test_samples_are_appended_together_if_each_is_newer_than_those_before(stamps: list[int], appended: bool) -> None:
+    known = forest(moving("a", "b", 9, authority="me"), moving("a", "b", 10, authority="me"))
+    asked = np.array(stamps)
+    assert known.can_append("a", "b", "me", asked) is appended
+    for other in (("z", "b", "me"), ("a", "z", "me"), ("a", "b", "you")):
+        assert not known.can_append(*other, asked)
+    if appended:
+        version = known.version
+        known.append("b", asked, np.full((len(stamps), 7), 0.5))
+        assert known.version > version
+        assert known.inserted == 2 + len(stamps)
+        history = known.frames["b"]
+        assert [history.sample(i)[0] for i in range(len(history))] == [9, 10, *stamps]
+        assert history.sample(2)[1] == (0.5,) * 7
+
+
+def test_nothing_is_appended_to_a_static_an_emptied_or_a_reparented_frame() -> None:
+    known = forest(static("a", "still"), moving("a", "empty", 5), moving("z", "moved", 4), moving("a", "moved", 5))
+    known.frames["empty"].clear()
+    assert not any(known.can_append("a", child, "", np.array([9])) for child in ("still", "empty", "moved"))
 
 
 def test_a_permanent_path_is_cached() -> None:
@@ -102,6 +166,27 @@ def test_the_expiry_of_an_old_parent_is_recorded_as_a_change() -> None:
     known.insert_judged(moving("new", "b", 11))
     assert known.changed == {"b"}
     assert "old" not in known.names
+    known.forget_changes()
+    known.insert_judged(moving("new", "b", 12))
+    assert known.changed == set(), "it is recorded once"
+
+
+def test_a_static_sample_sent_again_leaves_the_path_and_one_that_moves_its_frame_does_not() -> None:
+    known = forest(static("a", "b", 1.0), moving("b", "c", 5))
+    path = known.find_path("a", "c", LATEST)
+    known.insert_judged(static("a", "b", 1.0, stamp=9))
+    assert known.find_path("a", "c", LATEST) is path
+    known.insert_judged(static("a", "b", 2.0))
+    assert known.find_path("a", "c", LATEST).row_at(5)[0] == 2.0
+
+
+def test_after_all_samples_are_dropped_a_frame_has_its_newest_parent_and_the_next_sample_changes_nothing() -> None:
+    known = forest(moving("old", "b", 0), moving("new", "b", 10))
+    known.clear()
+    known.forget_changes()
+    assert known.names.sorted() == ("b", "new")
+    known.insert_judged(moving("new", "b", 0))
+    assert known.changed == set()
 
 
 def test_the_first_parent_of_a_new_frame_and_of_a_root_are_recorded() -> None:
@@ -110,6 +195,39 @@ def test_the_first_parent_of_a_new_frame_and_of_a_root_are_recorded() -> None:
     known.new_parents.clear()
     known.insert_judged(moving("root", "a", 0))
     assert (known.new_parents, known.changed) == ({"root"}, {"a"})
+
+
+def test_no_change_is_recorded_any_longer_once_it_is_forgotten_or_was_inserted_without_a_bus() -> None:
+    known = forest(moving("a", "b", 0), window=5)
+
+    def changes() -> list[int]:
+        return [len(each) for each in (known.changed, known.new_parents, known.looping, known.expired_frames)]
+
+    batch = (moving("a", "b", 8), moving("z", "b", 9), moving("a", "b", 1), moving("b", "z", 9), moving("b", "z", 8))
+    known.commit(batch)
+    assert min(changes()) > 0
+    known.forget_changes()
+    assert changes() == [0, 0, 0, 0]
+    known.insert((moving("y", "b", 10), moving("y", "b", 1)))
+    assert changes() == [0, 0, 0, 0]
+
+
+def test_the_version_is_another_one_after_each_change() -> None:
+    known = forest(moving("a", "b", 0), moving("a", "c", 0))
+    versions = [known.version]
+    for change in (
+        lambda: known.commit((moving("a", "b", 1),)),
+        lambda: known.insert((moving("a", "b", 2),)),
+        lambda: known.insert((moving("a", "b", 0),)),
+        known.clear,
+        lambda: known.commit((moving("z", "b", 3),)),
+        lambda: known.remove("c"),
+        lambda: known.append("b", np.array([4]), np.full((1, 7), 0.5)),
+        known.clear,
+    ):
+        change()
+        versions.append(known.version)
+    assert len(set(versions)) == 9
 
 
 def test_names_below_include_those_under_every_parent_in_the_window() -> None:
@@ -126,8 +244,10 @@ def test_names_below_include_those_under_every_parent_in_the_window() -> None:
 def test_edges_without_samples_are_forgotten_if_a_new_edge_forms_a_loop_with_them() -> None:
     known = forest(moving("map", "odom", 0), moving("odom", "base", 0), static("base", "camera"))
     known.clear()
+    known.forget_changes()
     assert known.find_path("map", "camera", LATEST).frames == ("map", "odom", "base", "camera")
     known.insert_judged(moving("base", "map", 1))
+    assert known.changed == {"map", "odom", "base"}
     assert known.find_path("base", "map", LATEST).frames == ("base", "map")
     assert sorted(known.frames) == ["camera", "map"]
 
@@ -181,6 +301,38 @@ def test_frames_that_change_while_others_are_read_are_read_again() -> None:
     assert found.keys() == known.frames.keys()
     assert "f1" not in found
     assert len(seen) <= 254
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda known: known.insert((moving("root", "f0", 1),)),
+        lambda known: known.insert((moving("root", "f0", 0, 1.0), moving("f1", "f0", 1))),
+        lambda known: known.commit((moving("root", "f0", 1),)),
+        lambda known: known.commit((moving("f1", "f0", 1), moving("f0", "new", 1))),
+        lambda known: known.append("f0", np.array([1]), np.full((1, 7), 0.5)),
+        lambda known: known.remove("f0"),
+        lambda known: known.clear(),
+        lambda known: known.rebuild(save_frame),
+    ],
+    ids=["insert", "insert closely", "commit", "commit closely", "append", "remove", "clear", "rebuild"],
+)
+def test_every_kind_of_change_is_seen_by_those_who_read_meanwhile(change: Callable[[Forest], object]) -> None:
+    known = forest(*(moving("root", f"f{number}", 0) for number in range(150)))
+    seen: list[str] = []
+
+    def history_itself(history: FrameHistory) -> tuple[FrameHistory, int | None]:
+        seen.append(history.child)
+        if len(seen) == 120:
+            known.lock.release()
+            change(known)
+            known.lock.acquire()
+        return history, history.newest
+
+    found = known.read_all(history_itself)
+    # Without the frame that was just being read, which no change can reach while the lock is held.
+    del found["f119"], known.frames["f119"]
+    assert found == {child: (history, history.newest) for child, history in known.frames.items()}
 
 
 def test_reading_ends_although_all_frames_change_all_the_time() -> None:
@@ -249,6 +401,10 @@ def test_the_notes_of_loops_are_emptied_and_their_number_stays() -> None:
     assert [found.sample for found in known.looping] == [moving("b", "a", 5)]
     known.forget_changes()
     assert (known.looping, known.looped) == ([], 1)
+    known.commit((moving("b", "a", 6),))
+    assert known.looped == 2
+    known.commit((moving("root", "c", 0),))
+    assert known.looped == 2, "none is noted twice"
 
 
 # Searches without the lock
@@ -295,6 +451,18 @@ def test_a_new_path_is_searched_while_others_may_insert(ask: Callable[[Transform
     ask(deep_tree(held.append))
     assert held.count(False) >= DEEP
     assert held.count(True) < 5
+
+
+@pytest.mark.parametrize("batch", [(), (moving("elsewhere", "f25", 20), moving("f24", "f25", 30))])
+def test_a_path_that_is_kept_is_not_searched_again(batch: tuple[TransformStamped, ...]) -> None:
+    held: list[bool] = []
+    tree = deep_tree(held.append)
+    tree.insert_many(batch)
+    for lookup in (tree.lookup, partial(tree.lookup, tolerance=1e-9)):
+        lookup("f0", "f50")
+        held.clear()
+        lookup("f0", "f50")
+        assert held == []
 
 
 def test_a_path_that_was_found_while_a_parent_changed_is_not_used() -> None:

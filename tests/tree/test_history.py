@@ -224,7 +224,11 @@ def test_clear_drops_the_samples_and_keeps_the_newest_parent() -> None:
     samples.clear()
     assert (samples.oldest, samples.newest, len(samples)) == (None, None, 0)
     assert (samples.parent, samples.authority, samples.named_parents) == ("new", "sender", ("new",))
-    assert samples.insert("new", 3, row(1.0), "") is INSERTED, "the window starts anew, so time may run again"
+    assert (samples.parent_changes(), samples.beginnings()) == ([], [])
+    assert samples.insert("new", 3, row(1.0), "sender") is INSERTED, "the window starts anew, so time may run again"
+    assert samples.beginnings() == [3]
+    taken = samples.samples_between(0, 5)
+    assert (taken.parents, taken.authorities) == (None, None)
 
 
 def test_an_extrapolation_error_has_all_facts() -> None:
@@ -234,6 +238,7 @@ def test_an_extrapolation_error_has_all_facts() -> None:
     assert type(future) is FutureExtrapolationError
     assert (future.child, future.stamp, future.oldest, future.newest) == ("child", 31, 10, 30)
     assert future.authority == "odometry"
+    assert (future.slack, samples.extrapolation_error(31, 5).slack) == (0, 5)
     past = samples.extrapolation_error(9)
     assert type(past) is PastExtrapolationError
     assert (past.child, past.stamp, past.oldest, past.newest) == ("child", 9, 10, 30)
@@ -419,6 +424,18 @@ def test_samples_between_have_their_parents_if_there_are_several() -> None:
         samples.insert("new", stamp, row(0.0), "")
     taken = samples.samples_between(15, 35)
     assert (list(taken.stamps), taken.parents) == ([10, 20, 30, 40], ["parent", "parent", "new", "new"])
+    assert taken.authorities is None
+
+
+def test_samples_between_have_their_authorities_as_long_as_there_are_several_in_the_window() -> None:
+    samples = history(keep=20)
+    for stamp, authority in ((10, "first"), (20, "second"), (30, "second")):
+        samples.insert("parent", stamp, row(0.0), authority)
+    taken = samples.samples_between(10, 30)
+    assert (taken.parents, taken.authorities) == (None, ["first", "second", "second"])
+    samples.insert("parent", 40, row(0.0), "second")
+    assert samples.samples_between(10, 40).authorities is None
+    assert taken.authorities == ["first", "second", "second"], "those that were taken stay"
 
 
 def test_samples_between_are_inside_the_window() -> None:

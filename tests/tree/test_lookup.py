@@ -596,11 +596,14 @@ def test_a_stamp_that_is_no_integer_is_a_type_error(stamp: Any, source: str) -> 
             tree.lookup("a", source, 5, source_at=stamp, fixed="a")
 
 
-def test_a_numpy_integer_is_a_stamp_and_is_returned_as_an_int() -> None:
-    tree = tree_of(moving("a", "b", 5))
-    for found in (tree.lookup("a", "b", np.int64(5)), tree.lookup("a", "b", np.int64(5), tolerance=1.0)):
-        assert type(found.stamp) is int
-        assert found.stamp == 5
+@pytest.mark.parametrize("at", [np.int64(5), np.datetime64(5, "ns")])
+def test_a_number_or_a_date_of_numpy_is_a_stamp_and_is_returned_as_an_int(at: Any) -> None:
+    tree = tree_of(moving("a", "b", 5), moving("z", "c", 1), moving("b", "c", 5), static("a", "d"))
+    for question in ({}, {"tolerance": 1.0}, {"source_at": 5, "fixed": "a"}, {"source_at": at, "fixed": "a"}):
+        for source in "bcd":
+            found = tree.lookup("a", source, at, **question)
+            assert type(found.stamp) is int
+            assert found.stamp == 5
 
 
 @pytest.mark.parametrize("source", ["b", "c", "a"])

@@ -16,6 +16,7 @@ from tfbus import (
 )
 from tfbus.geometry.rows import IDENTITY
 from tfbus.geometry.transform import from_row
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.path import Path, find_path, path_at
 
@@ -51,6 +52,15 @@ TREE = {"b": "a", "c": "b", "d": "c", "e": "b", "f": "e", "g": "a"}
 )
 def test_a_path_goes_through_the_lowest_common_ancestor(target: str, source: str, frames: str) -> None:
     assert "".join(find_path(static_frames(TREE), target, source, None).frames) == frames
+
+
+def test_a_path_has_the_children_of_its_edges_and_the_newest_stamp_of_its_static_samples() -> None:
+    stamps = {"b": ("a", 9), "c": ("b", 3), "d": ("c", 5), "e": ("b", 4)}
+    frames = frames_of(*(static_edge(parent, child, Transform(), at) for child, (parent, at) in stamps.items()))
+    path = find_path(frames, "d", "e", None)
+    assert (path.root, path.children, path.static_stamp) == ("b", ["c", "d", "e"], 5)
+    frames["e"] = moving_edge("b", "e", [(7, Transform())])
+    assert find_path(frames, "c", "e", None).static_stamp == 3
 
 
 def test_the_search_climbs_above_the_common_ancestor_no_further_than_the_shorter_side() -> None:
@@ -191,6 +201,13 @@ def test_of_several_future_extrapolations_that_of_the_most_lagging_edge_decides(
     assert type(error) is FutureExtrapolationError
     assert (error.child, error.newest) == ("1", 10)
     assert path_over((0, 12), None, (0, 10)).deciding_error(15).child == "1"
+    # A stamp that some edges have reached is the oldest that the others lack.
+    last = STAMP_MAX
+    assert path_over((0, last), (0, last - 1)).deciding_error(last).child == "1"
+    assert path_over((0, last - 1), (0, last)).deciding_error(last).child == "0"
+    # Of two that lag as far, the first one.
+    assert path_over((0, 20), (0, 10), (0, 10)).deciding_error(15).child == "1"
+    assert path_over((0, 20), None, (STAMP_MIN, STAMP_MIN)).deciding_error(15).child == "1"
 
 
 @given(
@@ -239,6 +256,23 @@ def test_the_newest_path_counts_at_each_stamp_at_which_it_holds_and_has_samples(
     assert early.rival is not None
     assert {early.moving, early.rival.moving} == {(frames["b"], frames["a"]), (frames["a"], frames["c"])}
     assert (late.moving, late.rival) == (newest.moving, None)
+
+
+def test_both_ways_round_a_loop_have_all_their_edges() -> None:
+    # Before 10, b was above c, and so the sides of the newest path met in b as well.
+    top = moving_edge("b", "c", [(0, Transform()), (10, Transform())])
+    top.insert("root", 20, IDENTITY, "")
+    parents = {"p": "c", "a": "p", "q": "c", "s": "q", "b": "s"}
+    sides = [moving_edge(parent, child, [(0, Transform()), (30, Transform())]) for child, parent in parents.items()]
+    frames = frames_of(top, *sides)
+    for target, source in (("a", "b"), ("b", "a")):
+        path = at_stamp(frames, target, source, -1)
+        assert path.rival is not None
+        way, other = ["a", "p", "c", "q", "s", "b"], ["a", "p", "c", "b"]
+        found = sorted(list(each.frames)[:: 1 if target == "a" else -1] for each in (path, path.rival))
+        assert found == [other, way]
+        assert {each.root for each in (path, path.rival)} == {"b", "c"}
+        assert {edge.child for edge in path.moving} | {edge.child for edge in path.rival.moving} == set("pcaqsb")
 
 
 @pytest.mark.parametrize("at", [0, 5, 10, 99])

@@ -85,6 +85,10 @@ def test_an_edge_without_a_sample_at_the_stamp_keeps_its_nearest_one() -> None:
     assert (x_in(late, "base"), x_in(late, "lidar")) == (20.0, 21.0)
     assert (x_in(early, "base"), x_in(early, "lidar")) == (10.0, 11.0)
     assert late.answered.tolist() == early.answered.tolist() == [True, False, False]
+    for at in (10, 11, 20):
+        found = read(tree, "map", at)
+        assert (x_in(found, "base"), found.answered.tolist()) == (float(at), [True, True, True])
+    assert [read(tree, "map", at).answered.tolist()[1] for at in (9, 21)] == [False, False]
 
 
 def test_frames_behind_an_edge_without_samples_have_no_pose() -> None:

@@ -11,6 +11,17 @@ from tfbus.tree.question import question_of
 POLICY = Policy(tolerance=5)
 
 
+@pytest.mark.parametrize("at", [5, LATEST])
+@pytest.mark.parametrize(
+    "more", [{"source_at": 5}, {"source_at": 0}, {"fixed": "map"}, {"max_age": 0.0}, {"policy": Policy()}]
+)
+def test_only_a_question_of_nothing_but_a_stamp_is_plain(at: int | Latest, more: dict[str, Any]) -> None:
+    assert Question("map", "tool", at).is_plain
+    question, same = (Question("map", "tool", at, **more) for _ in range(2))
+    assert not question.is_plain
+    assert {question: "found"}[same] == "found"
+
+
 class Smell:
     """Data with a frame and a stamp, of a type that is not registered."""
 
@@ -22,6 +33,17 @@ class Message:
     """Registered data that have their frame and stamp in a header, as a message of ROS."""
 
     header = ("base", 0)
+
+
+class Note:
+    """Registered data with a frame, but no stamp."""
+
+    frame = "map"
+
+
+@do_transform.register
+def _(data: Note, transform: TransformStamped) -> Note:  # noqa: ARG001
+    return data
 
 
 @do_transform.register
@@ -71,6 +93,7 @@ POINT = PointStamped("laser", 2, (1.0, 0.0, 0.0))
             "a Message has no frame and stamp of its own: look the transform up and call do_transform",
             id="no frame and stamp",
         ),
+        pytest.param(Note(), None, None, "a Note has no frame and stamp of its own", id="no stamp"),
         pytest.param(POINT, 5, None, "at and fixed go together", id="at alone"),
         pytest.param(POINT, LATEST, None, "at and fixed go together", id="latest alone"),
         pytest.param(POINT, None, "map", "at and fixed go together", id="fixed alone"),

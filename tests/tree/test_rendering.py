@@ -232,9 +232,13 @@ def test_a_tree_draws_its_own_edges() -> None:
     assert set(parsed(tree.to_yaml())) == {"base_link", "lidar"}
 
 
-def test_the_rate_of_a_slow_edge_is_not_zero() -> None:
-    slow = Edge("map", "dock", static=False, samples=2, oldest=0, newest=50 * SECOND, authority="")
-    assert "0.02 Hz" in describe([slow])
+@pytest.mark.parametrize(
+    ("samples", "seconds", "rate"),
+    [(2, 50, "0.02 Hz"), (2, 3, "0.33 Hz"), (100, 100, "0.99 Hz"), (101, 100, "1.0 Hz"), (125, 100, "1.2 Hz")],
+)
+def test_a_rate_has_two_digits_and_that_of_a_slow_edge_is_not_zero(samples: int, seconds: int, rate: str) -> None:
+    edge = Edge("map", "dock", static=False, samples=samples, oldest=0, newest=seconds * SECOND, authority="")
+    assert describe([edge]).split("  ")[1] == rate
 
 
 def test_dot_with_a_stamp_shows_all_facts_in_the_colour_of_the_state() -> None:
@@ -246,6 +250,7 @@ def test_dot_with_a_stamp_shows_all_facts_in_the_colour_of_the_state() -> None:
     assert '    "base_link" -> "lidar" [label="static", style=dashed, color="#0072b2", fontcolor="#0072b2"];' in lines
     assert any('"arm" [label="one sample' in line and "#d55e00" in line for line in lines)
     assert any('"tool" [label="no samples", color="#767676"' in line for line in lines)
+    assert to_dot(EDGES, None, {"base_link": 0.012}) == to_dot(EDGES)
 
 
 def test_the_dot_of_a_tree_takes_a_stamp() -> None:

@@ -45,6 +45,7 @@ def test_without_a_stamp_or_a_path_there_are_none(question: Question) -> None:
 
 def test_an_edge_that_keeps_everything_has_none() -> None:
     assert limits(*TWO_EDGES, keep=None) == []
+    assert limits(moving("map", "tip", 0), moving("map", "tip", 90), keep=None) == []
 
 
 def test_the_first_sample_of_an_edge_decides() -> None:
@@ -78,6 +79,16 @@ def test_time_travel_has_the_limits_of_both_halves() -> None:
     assert limits(*TWO_EDGES, question=question) == [("mid", 130), ("tip", 120)]
     latest = Question("map", "tip", LATEST, source_at=25, fixed="mid")
     assert limits(*TWO_EDGES, question=latest) == [("tip", 120)]
+
+
+def test_both_ways_round_a_loop_above_the_path_have_their_limits() -> None:
+    # Until 10, b is above c; then the newest path from b over c to a holds as well, but has no samples before 0.
+    live = live_tree(100e-9)
+    live.insert((moving("b", "c", 0), moving("b", "c", 10), moving("root", "c", 20)))
+    live.insert((moving("c", "a", 0), moving("c", "b", 0), moving("c", "a", 30), moving("c", "b", 30)))
+    assert live.forest.find_path("a", "b", LATEST).permanent
+    assert {child for child, _ in limits_of(live.forest, Question("a", "b", -1), None)} == {"a", "b", "c"}
+    assert {child for child, _ in limits_of(live.forest, Question("a", "c", 50), None)} == {"a"}
 
 
 def test_frames_that_form_a_loop_are_connected_once_one_of_them_loses_the_stamp() -> None:

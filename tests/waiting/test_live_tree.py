@@ -13,6 +13,7 @@ from tfbus import (
     BufferStatistics,
     ClockResetError,
     DisconnectedError,
+    Edge,
     ExtrapolationError,
     FutureExtrapolationError,
     InvalidTransformError,
@@ -361,15 +362,41 @@ def test_a_waiter_is_woken_by_the_insertion_that_makes_it_hopeless(
     assert not isinstance(raised.value, FutureExtrapolationError)
 
 
-def test_nothing_is_left_of_a_waiter_that_a_sample_wakes_before_it_becomes_hopeless() -> None:
+@pytest.mark.parametrize("far_ahead", [False, True])
+def test_nothing_is_left_of_a_waiter_that_a_sample_wakes_before_it_becomes_hopeless(far_ahead: bool) -> None:
     live = live_tree(10e-9)
     live.insert((moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)))
     woken: list[str] = []
+    if far_ahead:
+        live.insert((moving("map", "other", 0),))
+        park(live, "map", "other", 5, [])
+        live.insert((moving("map", "other", 600),))
+        live.waiting.pop_limited(600)
     park(live, "map", "b", 5, woken)
-    assert len(live.waiting.limits) == 1, "samples of the bus that are 10 ns newer drop those of b around the stamp"
+    assert len(live.waiting.limits) == (not far_ahead), "samples that are 10 ns newer drop those of b around the stamp"
+    assert ("b" in live.waiting.by_frame) is far_ahead
     live.insert((moving("map", "a", 5),))
     assert woken == ["b"]
     assert (len(live.waiting), live.waiting.by_frame, live.waiting.limits) == (0, {}, [])
+
+
+def test_a_frame_far_ahead_wakes_no_waiter_whose_own_edges_have_only_come_to_their_limits() -> None:
+    live = live_tree(10e-9)
+    live.insert((moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 10), moving("map", "other", 0)))
+    woken: list[str] = []
+    park(live, "map", "b", 5, woken)
+    live.insert((moving("map", "other", 600),))
+    assert woken == []
+    live.insert((moving("a", "b", 11),))
+    assert woken == ["b"]
+
+
+def test_an_expired_sample_of_a_frame_that_is_static_by_the_end_of_its_batch_is_not_ahead() -> None:
+    live = live_tree(10e-9)
+    live.is_ahead = lambda _child, newest, _authority: newest > 0
+    live.insert((moving("map", "a", 100), moving("map", "b", 100)))
+    live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "b")))
+    assert (live.statistics(5).expired, live.expired_ahead) == (2, 1)
 
 
 def test_another_question_of_a_waiter_that_becomes_hopeless_wakes_it() -> None:
@@ -445,13 +472,17 @@ def test_an_error_of_one_waiter_does_not_keep_others_from_being_woken() -> None:
 def test_changing_the_tree_of_a_buffer_directly_is_an_error() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1),))
-    for change in (
-        partial(tree_over(live).insert, moving("map", "a", 2)),
-        partial(tree_over(live).remove_frame, "a"),
-        tree_over(live).clear,
+    tree = tree_over(live)
+    for change, instead in (
+        (partial(tree.insert, moving("map", "a", 2)), "use bus.publish"),
+        (partial(tree.insert_many, [moving("map", "a", 2)]), "use bus.publish"),
+        (partial(tree.remove_frame, "a"), "use bus.remove_frame"),
+        (tree.clear, "clear a copy"),
+        (partial(tree.forget_before, 2), "its samples leave it after `keep` seconds"),
     ):
-        with pytest.raises(RuntimeError, match="a bus feeds this tree"):
+        with pytest.raises(RuntimeError, match=f"a bus feeds this tree: {instead}"):
             change()
+    assert tree.edges() == [Edge("map", "a", False, 1, 1, 1, "")]
     own = tree_over(live).copy()
     own.insert(moving("map", "a", 2))
     assert (tree_over(live).latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)

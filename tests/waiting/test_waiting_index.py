@@ -1,5 +1,7 @@
+import weakref
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -16,7 +18,8 @@ from tfbus import (
     TransformLookupError,
     UnknownFrameError,
 )
-from tfbus.waiting.waiting_index import Waiter, WaitingIndex, blocking_frames
+from tfbus.waiting import waiting_index
+from tfbus.waiting.waiting_index import Waiter, WaitingIndex, blocking_frames, without_traceback
 
 
 def waiter(wake: Callable[[], object] = list) -> Waiter:
@@ -132,7 +135,7 @@ def test_a_waiter_is_looked_at_when_any_frame_passes_its_first_limit() -> None:
     index.park(late, short_of("tool", 5), [("arm", 40), ("hand", 30)])
     index.park(early, short_of("tool", 5), [("arm", 20)])
     index.park(without, short_of("tool", 5))
-    assert index.limit == 20
+    assert (index.limit, len(index.limits)) == (20, 2)
     assert index.pop_limited(20) == []
     assert index.pop_limited(30) == [early]
     assert (index.limit, len(index)) == (30, 3)
@@ -213,8 +216,11 @@ def test_pop_all_gives_every_waiter_in_order_of_arrival_and_empties_the_index() 
 def test_a_given_waiter_can_be_parked_again_with_another_error() -> None:
     index = WaitingIndex()
     waiting = parked(index, unknown("camera"))
-    index.pop_unblocked("camera", None)
-    index.park(waiting, short_of("camera", 20))
+    for error in (short_of("camera", 30), short_of("camera", 20)):
+        assert index.names == {"map", "tool"}
+        assert index.pop_asking_for({"tool"}) == [waiting]
+        assert index.names == set()
+        index.park(waiting, error)
     assert index.pop_unblocked("camera", 19) == []
     assert index.pop_unblocked("camera", 20) == [waiting]
 
@@ -234,6 +240,8 @@ def test_pending_lists_each_question_with_its_error() -> None:
     [pending] = index.pending()
     assert (pending.question, pending.since, pending.blocked_by) == (question, 12, error)
     assert str(pending) == "'camera' in 'map': frame 'camera' is not known"
+    with pytest.raises(AttributeError):
+        pending.since = 0  # type: ignore[misc]
 
 
 def test_the_index_wakes_no_waiter_itself() -> None:
@@ -246,6 +254,73 @@ def test_the_index_wakes_no_waiter_itself() -> None:
     for waiting in given:
         waiting.wake()
     assert woken == ["first", "second"]
+
+
+def test_without_traceback_has_none_in_the_error_and_in_all_its_causes() -> None:
+    def fail() -> None:
+        try:
+            try:
+                raise unknown("camera")
+            except UnknownFrameError as first:
+                raise disconnected("map", "odom") from first
+        except DisconnectedError as second:
+            raise short_of("tool", 5) from second
+
+    with pytest.raises(FutureExtrapolationError) as caught:
+        fail()
+    error = without_traceback(caught.value)
+    assert error is caught.value
+    chain = [error, error.__cause__, error.__cause__ and error.__cause__.__cause__]
+    assert [type(part) for part in chain] == [FutureExtrapolationError, DisconnectedError, UnknownFrameError]
+    assert [part and part.__traceback__ for part in chain] == [None, None, None]
+
+
+class Watched(Waiter):
+    """A waiter whose end can be noticed."""
+
+
+@pytest.mark.parametrize(
+    "let_go",
+    [
+        lambda index, _waiting: index.pop_unblocked("tool", 5),
+        lambda index, _waiting: index.pop_unblocked("hand", 31),
+        lambda index, _waiting: index.pop_asking_for({"map"}),
+        lambda index, _waiting: index.pop_all(),
+        lambda index, waiting: index.remove(waiting),
+    ],
+    ids=["unblocked", "beyond a limit", "asked for", "all", "removed"],
+)
+def test_no_reference_cycle_keeps_a_waiter_that_has_left_the_index(
+    let_go: Callable[[WaitingIndex, Waiter], object],
+) -> None:
+    index = WaitingIndex()
+    index.pop_limited(100)
+    waiting = Watched(Question("map", "tool", 5), since=0, wake=list)
+    index.park(waiting, short_of("tool", 5), [("hand", 30), ("arm", 40), ("base", 500)])
+    assert index.names == {"map", "tool"}
+    let_go(index, waiting)
+    assert (len(index), index.by_frame, index.limits, set(index.names)) == (0, {}, [], set())
+    gone = weakref.ref(waiting)
+    del waiting
+    assert gone() is None
+
+
+@pytest.mark.parametrize("others_need", [4, 6])
+def test_a_waiter_for_which_there_is_no_memory_leaves_nothing_and_disturbs_no_other(
+    monkeypatch: pytest.MonkeyPatch, others_need: int
+) -> None:
+    index = WaitingIndex()
+    other = parked(index, short_of("tool", others_need))
+
+    def fail(_places: list[Any], _place: Any) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(waiting_index, "insort", fail)
+        with pytest.raises(MemoryError):
+            index.park(waiter(), short_of("tool", 5))
+    assert index.pop_unblocked("tool", 9) == [other]
+    assert (len(index), index.by_frame) == (0, {})
 
 
 FRAMES = st.sampled_from("abc")

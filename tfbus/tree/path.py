@@ -124,7 +124,7 @@ class Path(Chain):
         return error
 
     def _own_error(self, at: int) -> ExtrapolationError:
-        lagging, reached = self.moving[0], STAMP_MAX + 1
+        lagging, reached = self.moving[0], STAMP_MAX
         for edge in self.moving:
             oldest, newest = edge.oldest, edge.newest
             if oldest is not None and newest is not None and newest >= at:
@@ -248,7 +248,7 @@ def _other_way(frames: Frames, way: Path, at: int) -> tuple[Path | None, tuple[s
     while (edge := frames.get(here)) is not None and here not in beyond:
         beyond[here] = edge
         here = edge.parent_at(at)
-        if here == way.root or here not in way.frames:
+        if here not in way.frames:
             continue
         ups, downs = _edges(frames, way)
         for side, other in ((ups, downs), (downs, ups)):

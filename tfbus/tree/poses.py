@@ -309,7 +309,7 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
             elif before is None or newest < before:
                 stamp = newest
         stamps.append(stamp)
-        if place == 0 or before is None or before == stamp:
+        if before is None or before == stamp:
             above = own[origin] if place else 0
         else:
             assert stamp is not None

@@ -123,11 +123,9 @@ def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, f
             '    edge [fontname="Helvetica", fontsize=9];',
         ]
     for edge in edges:
-        known = facts(edge, now or 0)
+        known = {"rate": _rate(edge)} if now is None else facts(edge, now)
         known["authority"] = edge.authority
-        if now is None:
-            known = {"rate": known["rate"], "authority": edge.authority}
-        elif delays is not None and edge.child in delays:
+        if now is not None and delays is not None and edge.child in delays:
             known["delay"] = f"delay {format_duration(round(delays[edge.child] * SECOND))}"
         label = "\n".join(filter(None, known.values()))
         style = ", style=dashed" if edge.static else ""
