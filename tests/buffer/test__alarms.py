@@ -84,12 +84,13 @@ def test_one_timer_serves_all_alarms_that_follow_each_other() -> None:
     heap = _AlarmHeap(loop)
     for _ in range(10_000):
         heap.add(60.0, list)()
+        heap.add(60.0, list)()
         loop.move(0.001)
     assert loop.set == 1
     assert len(heap._alarms) < 200
 
 
-def test_an_alarm_that_raises_keeps_the_later_ones() -> None:
+def test_an_alarm_that_raises_is_logged_and_keeps_the_later_ones(caplog: pytest.LogCaptureFixture) -> None:
     loop = HandLoop()
     heap = _AlarmHeap(loop)
     rung: list[str] = []
@@ -103,6 +104,7 @@ def test_an_alarm_that_raises_keeps_the_later_ones() -> None:
     assert rung == []
     loop.move(1.0)
     assert rung == ["later"]
+    assert caplog.messages == ["a timer raised"]
 
 
 @pytest.mark.parametrize(

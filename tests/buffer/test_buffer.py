@@ -32,6 +32,7 @@ from tfbus import (
     Vector3Stamped,
     do_transform,
 )
+from tfbus.buffer.buffer import _DESCRIBED
 
 pytestmark = pytest.mark.anyio
 
@@ -465,6 +466,19 @@ async def test_samples_of_other_edges_wake_none_of_ten_thousand_waiters() -> Non
         tasks.cancel_scope.cancel()
     assert waiting(bus) == 0
     assert buffer.pending() == ()
+
+
+@pytest.mark.parametrize("more", range(3))
+async def test_a_description_has_ten_waiting_lookups_and_the_number_of_all_others(more: int) -> None:
+    _, _, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        for number in range(_DESCRIBED + more):
+            tasks.start_soon(buffer.lookup, "map", f"frame{number}")
+        await settle()
+        waiting = [line for line in buffer.describe().splitlines() if line.startswith("waiting: ")]
+        tasks.cancel_scope.cancel()
+    assert ["see pending()" in line for line in waiting] == [False] * _DESCRIBED + [True] * (more > 0)
+    assert not more or waiting[-1] == f"waiting: {more} more lookups, see pending()"
 
 
 @pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])

@@ -257,7 +257,7 @@ def test_a_batch_that_is_refused_for_another_reason_removes_nothing() -> None:
             with pytest.raises(InvalidTransformError):
                 bus.publish([good, bad])
         assert [event.frame for event in bus._topology.known()] == ["map", "q"]
-        bus.publish([good, moving("q", "p", 1)], invalid="drop")
+        bus.publish([good, moving("q", "p", 1), moving("map", "w", 1, 1e13)], invalid="drop")
     assert [event.frame for event in bus._topology.known()] == ["q", "base"]
 
 

@@ -136,6 +136,7 @@ def test_clear_forgets_every_frame() -> None:
     world = World()
     world.send("a", 100)
     world.send("b", 100)
+    world.send("c", 150)
     world.staleness.changes(111)
     world.send("a", 111)
     world.edges.clear()

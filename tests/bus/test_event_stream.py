@@ -246,6 +246,21 @@ async def test_a_jump_back_is_an_event_and_pending_events_stay() -> None:
         ], "a moving frame is forgotten by a jump back, so it is new"
 
 
+async def test_a_frame_that_was_stale_before_a_jump_back_is_new_and_not_live_again() -> None:
+    clock = SimulatedClock(start=10 * SECOND)
+    bus = Bus(clock)
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events(stale_after=1.0) as events:
+            tasks.start_soon(read, events, got)
+            bus.publish(driving("map", "base", 5.0))
+            await settle()
+            clock.set(2 * SECOND)
+            bus.publish(driving("map", "base", 2.0))
+            await settle()
+    assert [type(event) for event in got] == [FrameAdded, FrameStale, ClockReset, FrameAdded]
+
+
 # The end
 
 

@@ -176,6 +176,16 @@ async def test_publishing_before_the_with_raises() -> None:
     assert "with" in str(error)
 
 
+async def test_after_a_with_that_failed_to_begin_publishing_raises() -> None:
+    bus = Bus()
+    publish = bus.threadsafe()
+    bus.close()
+    with pytest.raises(BusClosedError):
+        publish.__enter__()
+    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
+    assert isinstance(error, BusClosedError)
+
+
 def test_the_with_is_entered_on_an_event_loop_only() -> None:
     bus = Bus()
     with pytest.raises(RuntimeError), bus.threadsafe():
