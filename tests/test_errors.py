@@ -342,6 +342,15 @@ def test_of_thousands_of_names_only_the_likely_ones_are_compared_in_full(frame: 
     assert CountedName.compared <= errors.LOOKED_AT
 
 
+def test_a_name_of_the_same_length_is_likelier_than_a_thousand_short_or_long_ones() -> None:
+    for others in (
+        [f"x{number}" for number in range(1_000)],
+        [f"robot1/base_link/{'x' * 30}/{n}" for n in range(1_000)],
+    ):
+        error = UnknownFrameError(frame="robot1/base_lnik", known=[*others, "robot1/base_link"])
+        assert error.close_matches[0] == "robot1/base_link"
+
+
 def test_many_errors_about_one_frame_compute_similar_names_once() -> None:
     known = frames_of_many_robots()
     CountedName.compared = 0

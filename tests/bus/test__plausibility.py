@@ -206,8 +206,8 @@ def test_a_clock_of_the_machine_that_was_set_back_is_noticed_when_samples_expire
     bus = Bus(clock)
     Buffer(bus)
     bus.publish(moving("map", "base", NOW, authority="odometry"))
-    clock.step = -HOUR
     with bus.events() as events:
+        clock.step = -HOUR
         bus.publish(moving("map", "base", NOW - HOUR, authority="odometry"))
         found = [events.queue.get() for _ in range(len(events.queue))]
     assert StampAhead(NOW - HOUR, "base", NOW, "odometry") in found
