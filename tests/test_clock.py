@@ -257,6 +257,7 @@ async def test_sleep_until_ends_when_a_jump_passes_its_stamp() -> None:
         await settle()
         assert on_the_stamp.ended
         assert not later.ended
+        assert len(clock._timers) == 1, "the jump has put another in its place"
         await clock.advance(2.999)
         assert not later.ended
         await clock.advance(0.001)
@@ -356,8 +357,9 @@ async def test_an_outer_move_on_after_that_expires_first_cancels_only_its_own_sc
 
     async with anyio.create_task_group() as tasks:
         asked = Asked(tasks, wait)
-        await clock.advance(5.0)
+        await clock.advance(1.0)
         assert asked.answer == (True, False)
+        assert clock._timers == []
 
 
 @pytest.mark.parametrize("make", CLOCKS)
@@ -481,6 +483,7 @@ async def test_a_cancelled_sleeper_leaves_no_timer() -> None:
         for asked in cancelled:
             asked.cancel()
         await settle()
+        assert len(clock._timers) == 1, "that of the one who stays"
         clock.set(10 * SECOND)
         await clock.advance(1.0)
         assert all(asked.cancelled for asked in cancelled)

@@ -147,7 +147,11 @@ def test_alarms_on_one_loop_ring_although_another_one_ran_meanwhile() -> None:
         await done.wait()
 
     async def on_the_other() -> None:
+        there = anyio.Event()
         alarms.call_after(60.0, partial(rung.append, "never"))()
+        alarms.call_after(0.001, there.set)
+        with anyio.fail_after(10.0):
+            await there.wait()
 
     anyio.run(on_the_first)
     assert rung == ["first"]

@@ -144,6 +144,17 @@ def test_samples_of_a_prefill_that_are_ahead_of_the_bus_give_way_when_the_bus_re
     assert [(edge.parent, edge.newest) for edge in late.tree.edges()] == [("b", 70)]
 
 
+@pytest.mark.parametrize("heard", [89, 90, 91])
+def test_samples_of_a_prefill_stay_when_the_bus_reparents_later_than_them(heard: int) -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus, prefill=tree_of(*over("a", "x", (50, 90)), keep=None))
+    bus.publish(moving("a", "x", heard))
+    assert len(bus._late) == (heard < 90)
+    bus.publish(moving("b", "x", 95))
+    assert [late.tree.parent("x", stamp) for stamp in (50, 94, 95)] == ["a", "a", "b"]
+    assert late.tree.edges()[0].samples == len({50, 90, 95, heard})
+
+
 # Any history
 
 samples = any_samples(FRAMES, 12)
