@@ -209,6 +209,20 @@ def test_of_several_edges_of_others_the_one_that_was_published_last_is_removed()
     ]
 
 
+@pytest.mark.parametrize("last", ["a", "map"])
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_of_two_edges_of_others_the_one_that_came_last_is_removed(last: str, elsewhere: bool) -> None:
+    bus = Bus(SimulatedClock())
+    if elsewhere:
+        bus.publish([moving("x", "a", 0, authority="one"), moving("x", "map", 0, authority="two")])
+    edges = {"a": moving("base", "a", 0, authority="one"), "map": moving("a", "map", 0, authority="two")}
+    for child in sorted(edges, key=last.__eq__):
+        bus.publish(edges[child])
+    with bus.reserve("base", "owner"):
+        TransformBroadcaster(bus, "owner").send("map", "base", Transform())
+    assert {event.frame for event in bus._topology.known()} == {"base", "a", "map"} - {last}
+
+
 def test_a_loop_of_the_owners_own_edges_or_those_of_other_owners_is_refused() -> None:
     bus = Bus(SimulatedClock())
     one, two = TransformBroadcaster(bus, "one"), TransformBroadcaster(bus, "two")

@@ -166,6 +166,7 @@ def test_publishing_after_the_end_of_the_loop_raises(run: Run) -> None:
     for _ in range(2):
         (error,) = in_thread(lambda: publishers[0](moving("map", "a", 1)))
         assert isinstance(error, BusClosedError)
+        assert len(publishers[0].queue) == 1, "after the first error it takes no more"
 
 
 async def test_publishing_before_the_with_raises() -> None:

@@ -48,6 +48,21 @@ def test_coordinates_side_by_side_anywhere_in_a_point_are_a_view(first: int, pla
     assert np.shares_memory(points, np.frombuffer(data, np.uint8)) == is_view
 
 
+def test_a_field_may_have_several_numbers_for_each_point_in_one_row() -> None:
+    pairs = np.arange(4, dtype=">u2").reshape(2, 2)
+    message = new_layout(PointCloud("a", 5, np.zeros((2, 3), np.float32), fields={"pair": pairs}))
+    assert message["fields"][-1] == {"name": "pair", "offset": 12, "datatype": 4, "count": 2}
+    assert (message["point_step"], message["row_step"], message["is_bigendian"], message["is_dense"]) == (
+        16,
+        32,
+        False,
+        False,
+    )
+    assert read_cloud(message, "a", 5).fields["pair"].tolist() == [[0, 1], [2, 3]]
+    with pytest.raises(ValueError, match=r"field 'grid' of dtype uint8, shape \(2, 1, 1\)"):
+        new_layout(PointCloud("a", 5, np.zeros((2, 3)), fields={"grid": np.zeros((2, 1, 1), np.uint8)}))
+
+
 def test_a_coordinate_is_one_number() -> None:
     message = new_layout(PointCloud("a", 5, np.ones((1, 3))))
     message["fields"][0]["count"] = 3
