@@ -264,6 +264,38 @@ async def test_sleep_until_ends_when_a_jump_passes_its_stamp() -> None:
         assert later.ended
 
 
+async def test_sleep_until_ends_at_its_stamp_on_a_clock_that_has_run_and_jumped() -> None:
+    clock = SimulatedClock(start=100 * SECOND)
+    await clock.advance(1.0)
+    async with anyio.create_task_group() as tasks:
+        before = Asked(tasks, partial(clock.sleep_until, 103 * SECOND))
+        after = Asked(tasks, partial(clock.sleep_until, 106 * SECOND))
+        await clock.advance(1.999)
+        assert not before.ended
+        await clock.advance(0.001)
+        assert before.ended
+        clock.set(104 * SECOND)
+        await clock.advance(1.999)
+        assert not after.ended
+        await clock.advance(0.001)
+        assert after.ended
+        assert clock.now() == 106 * SECOND
+
+
+async def test_listeners_get_each_new_stamp_until_they_are_closed() -> None:
+    clock = SimulatedClock(start=SECOND)
+    stamps: list[int] = []
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(clock.sleep, 0.5)
+        with clock.on_move(stamps.append):
+            await clock.advance(0.0)
+            assert stamps == []
+            await clock.advance(1.0)
+            clock.set(SECOND)
+        clock.set(2 * SECOND)
+    assert stamps == [3 * SECOND // 2, 2 * SECOND, SECOND]
+
+
 async def test_sleep_until_raises_after_a_jump_back() -> None:
     clock = SimulatedClock()
     async with anyio.create_task_group() as tasks:

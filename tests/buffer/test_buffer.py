@@ -249,7 +249,7 @@ async def test_an_infinite_timeout_never_expires() -> None:
         assert asked.answer.stamp == 7
 
 
-@pytest.mark.parametrize("phase", ["before the report", "after the report"])
+@pytest.mark.parametrize("phase", ["before the report", "after the report", "at the timeout"])
 @pytest.mark.parametrize("data_first", [True, False])
 @pytest.mark.parametrize("timeout", [None, 2.0, 7.0])
 async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
@@ -266,7 +266,9 @@ async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
             clock.scopes[-1].cancel()
             await settle()
             assert len(buffer.pending()) == 1
-        steps: list[Callable[[], object]] = [clock.scopes[-1].cancel, lambda: bus.publish(moving("map", "a", 9))]
+        # The first scope is that of the timeout, and the last one that of the report.
+        scope = clock.scopes[0 if phase == "at the timeout" else -1]
+        steps: list[Callable[[], object]] = [scope.cancel, lambda: bus.publish(moving("map", "a", 9))]
         for step in reversed(steps) if data_first else steps:
             step()
         await settle()

@@ -101,6 +101,16 @@ async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics() 
     assert bus.statistics().queues == ()
 
 
+def test_only_the_removal_of_a_frame_that_has_a_parent_is_an_event() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(static("map", "table"))
+    with bus.events() as events:
+        for frame in ("map", "table"):
+            bus.remove_frame(frame)
+        found = list(iter(events.queue.get, None))
+    assert [event for event in found if isinstance(event, FrameRemoved)] == [FrameRemoved(0, "table")]
+
+
 # Stale and live
 
 

@@ -55,7 +55,9 @@ def test_a_message_that_ends_before_its_last_position_is_truncated(ros1: bool) -
         assert caught.value.reason == "truncated"
 
 
-def test_a_count_that_no_message_can_hold_is_refused_at_once() -> None:
-    payload = b"\0\1\0\0" + struct.pack("<iII", 1, 2, 1) + b"\0" * 4 + struct.pack("<I", 2**31)
-    with pytest.raises(MalformedMessageError, match="cannot hold 2147483648 names"):
+@pytest.mark.parametrize("count", [6, 2**31])
+def test_a_count_that_no_message_can_hold_is_refused_at_once(count: int) -> None:
+    # The header is followed by 20 bytes, and each name has at least 4 for its length.
+    payload = b"\0\1\0\0" + struct.pack("<iII", 1, 2, 1) + b"\0" * 4 + struct.pack("<I", count)
+    with pytest.raises(MalformedMessageError, match=f"cannot hold {count} names"):
         decode_joint_state(payload, ros1=False)
