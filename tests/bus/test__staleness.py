@@ -155,6 +155,13 @@ def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
     assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
 
 
+def test_a_frame_that_is_removed_before_anybody_looks_leaves_no_entry() -> None:
+    world = World()
+    world.send("a", 100)
+    world.remove("a")
+    assert size_of(world.staleness) == 0
+
+
 def test_a_sample_of_a_live_frame_adds_no_entry() -> None:
     world = World()
     world.send("a", 0)
