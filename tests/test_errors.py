@@ -217,6 +217,14 @@ def test_a_message_has_the_question_the_facts_and_the_difference(error: Transfor
             "frame 'base_link': asked for 12.500 s, it has no samples",
         ),
         (
+            PastExtrapolationError(child="base_link", stamp=from_seconds(12.5), oldest=None, newest=None),
+            "frame 'base_link': asked for 12.500 s, it has no samples",
+        ),
+        (
+            AheadError(child="base_link", stamp=from_seconds(12.5), oldest=None, newest=None),
+            "frame 'base_link': asked for the latest up to 12.500 s, it has no samples",
+        ),
+        (
             FutureExtrapolationError(child="base_link", stamp=LATEST, oldest=None, newest=None, authority="odometry"),
             "frame 'base_link': asked for the latest, it has no samples, from 'odometry'",
         ),
@@ -340,6 +348,15 @@ def test_of_thousands_of_names_only_the_likely_ones_are_compared_in_full(frame: 
     CountedName.compared = 0
     assert UnknownFrameError(frame=frame, known=frames_of_many_robots()).close_matches[0] == "robot77/joint_4_link"
     assert CountedName.compared <= errors.LOOKED_AT
+
+
+def test_a_name_of_the_same_length_is_likelier_than_a_thousand_short_or_long_ones() -> None:
+    for others in (
+        [f"x{number}" for number in range(1_000)],
+        [f"robot1/base_link/{'x' * 30}/{n}" for n in range(1_000)],
+    ):
+        error = UnknownFrameError(frame="robot1/base_lnik", known=[*others, "robot1/base_link"])
+        assert error.close_matches[0] == "robot1/base_link"
 
 
 def test_many_errors_about_one_frame_compute_similar_names_once() -> None:

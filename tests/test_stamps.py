@@ -14,10 +14,22 @@ from hypothesis import strategies as st
 from support.strategies import TODAY, stamps
 
 from tfbus import LATEST, SECOND, from_seconds, to_seconds
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, as_stamp, as_stamps, format_duration, format_stamp
+from tfbus.stamps import (
+    STAMP_MAX,
+    STAMP_MIN,
+    as_at,
+    as_duration,
+    as_stamp,
+    as_stamps,
+    format_age,
+    format_duration,
+    format_stamp,
+)
 
 HUGE = pytest.param(10**400, id="huge")
 UNITS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": SECOND}
+DAY = 86_400 * SECOND
+LONG_UNITS = {"m": 60 * SECOND, "h": 3_600 * SECOND, "D": DAY, "W": 7 * DAY}
 
 
 def test_seconds_become_whole_nanoseconds() -> None:
@@ -77,16 +89,30 @@ def test_seconds_that_are_no_number_are_a_type_error(arguments: tuple[Any, ...])
         from_seconds(*arguments)
 
 
-def test_nanoseconds_may_not_leave_64_bits() -> None:
+@pytest.mark.parametrize(
+    ("seconds", "nanoseconds", "beyond"), [(9_223_372_036, 854_775_807, 1), (-9_223_372_036, -854_775_808, -1)]
+)
+def test_nanoseconds_may_not_leave_64_bits(seconds: int, nanoseconds: int, beyond: int) -> None:
+    assert from_seconds(seconds, nanoseconds) in (STAMP_MIN, STAMP_MAX)
     with pytest.raises(ValueError, match="64-bit"):
-        from_seconds(9_223_372_036, 854_775_808)
+        from_seconds(seconds, nanoseconds + beyond)
 
 
-@pytest.mark.parametrize("value", [0, -1, -(2**63), 2**63 - 1, np.int64(7), np.uint8(7), np.array(7)])
+@pytest.mark.parametrize(
+    "value",
+    [0, -1, STAMP_MIN, STAMP_MAX, np.int64(7), np.uint8(7), np.array(7), np.int64(STAMP_MIN), np.uint64(STAMP_MAX)],
+)
 def test_any_integer_is_a_stamp_and_becomes_a_plain_int(value: Any) -> None:
     stamp = as_stamp(value)
     assert type(stamp) is int
     assert stamp == int(value)
+
+
+def test_an_instant_that_is_asked_for_may_be_latest_or_none() -> None:
+    assert (as_at(LATEST), as_at(None), as_at(7)) == (LATEST, None, 7)
+    assert (type(as_at(np.int64(7))), as_at(np.datetime64(7, "s"))) == (int, 7 * SECOND)
+    with pytest.raises(TypeError, match="from_seconds"):
+        as_at(1.5)  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize("value", [1.5, math.nan, np.float64(1.5)])
@@ -125,6 +151,10 @@ DATES = [
     pytest.param(np.datetime64(1_999_999, "fs"), 1, id="fs"),
     pytest.param(np.datetime64(2 * SECOND, "as"), 2, id="as"),
     pytest.param(np.datetime64("2262-04"), 9_222_422_400 * SECOND, id="last month"),
+    pytest.param(np.datetime64("1677-10"), -106_742 * DAY, id="first month"),
+    # 1972 to 2260 are 73 leap years but for 2100 and 2200; 1680 to 1968 but for 1700, 1800 and 1900.
+    pytest.param(np.datetime64("2262"), (292 * 365 + 71) * DAY, id="last year"),
+    pytest.param(np.datetime64("1678"), -(292 * 365 + 70) * DAY, id="first year"),
     pytest.param(datetime(2020, 2, 29, 12, microsecond=1, tzinfo=UTC), NOON + 1_000, id="datetime"),
     pytest.param(datetime(2020, 2, 29, 13, tzinfo=timezone(timedelta(hours=1))), NOON, id="east of UTC"),
 ]
@@ -138,6 +168,16 @@ def test_a_date_is_a_stamp_and_becomes_a_plain_int(date: datetime | np.datetime6
         stamps = as_stamps(dates)
         assert stamps.dtype == np.int64
         assert stamps.tolist() == [stamp, stamp]
+
+
+@pytest.mark.parametrize(("unit", "size"), [*UNITS.items(), *LONG_UNITS.items()])
+def test_the_last_date_of_each_unit_is_a_stamp_and_the_next_is_beyond_64_bits(unit: Any, size: int) -> None:
+    last = STAMP_MAX // size
+    for ticks in (-last, last):
+        assert as_stamp(np.datetime64(ticks, unit)) == ticks * size
+    for ticks in (-last - 1, last + 1) if size > 1 else ():
+        with pytest.raises(ValueError, match="64-bit"):
+            as_stamp(np.datetime64(ticks, unit))
 
 
 @pytest.mark.parametrize("unit", ["Y", "M", "W", "D", "h", "m", "s", "ms", "us", "ns"])
@@ -230,8 +270,12 @@ def test_the_text_of_a_stamp_is_exact(stamp: int) -> None:
         (0, "0 ns"),
         (1, "1 ns"),
         (999, "999 ns"),
+        (1_000, "1 us"),
         (1_500, "1.5 us"),
+        (999_999, "1000 us"),
+        (1_000_000, "1 ms"),
         (410_000_000, "410 ms"),
+        (SECOND, "1 s"),
         (2_500_000_000, "2.5 s"),
         (3_600 * SECOND, "3600 s"),
         (-410_000_000, "-410 ms"),
@@ -245,6 +289,13 @@ def test_the_text_of_a_duration_has_the_fitting_unit(nanoseconds: int, text: str
 def test_the_text_of_a_duration_has_three_correct_digits(nanoseconds: int) -> None:
     number, unit = format_duration(nanoseconds).split(" ")
     assert abs(Fraction(number) * UNITS[unit] - nanoseconds) <= abs(Fraction(nanoseconds)) * Fraction(5, 1000)
+
+
+@pytest.mark.parametrize(
+    ("nanoseconds", "text"), [(-2_500_000_000, "2.5 s ahead"), (-1, "1 ns ahead"), (0, "age 0 ns"), (1, "age 1 ns")]
+)
+def test_the_text_of_an_age_says_when_it_is_ahead(nanoseconds: int, text: str) -> None:
+    assert format_age(nanoseconds) == text
 
 
 def test_latest_pickles_and_copies_as_itself() -> None:

@@ -36,6 +36,7 @@ def test_statistics_are_frozen_and_serializable_as_json(statistics: Any) -> None
 def test_the_json_of_a_bus_has_its_buffers_and_queues_by_name() -> None:
     described = json.loads(json.dumps(asdict(ONE_OF_EACH[2])))
     assert described["rejected"] == {"cycle": 2}
+    assert described["ahead"] == 0
     assert described["buffers"] == [
         {
             "offered": 9,
@@ -48,6 +49,7 @@ def test_the_json_of_a_bus_has_its_buffers_and_queues_by_name() -> None:
             "looped": 0,
         }
     ]
+    assert BufferStatistics(1, 1, 0, 0, 0) == BufferStatistics(1, 1, 0, 0, 0, expired_ahead=0, superseded=0, looped=0)
     assert described["queues"] == [
         {"kind": "stream", "overflow": "conflate", "capacity": 5, "pending": 4, "dropped": 3, "conflated": 0}
     ]

@@ -1,5 +1,6 @@
 """Alarms on a loop whose time stands still until the test moves it, and on the loops that there are."""
 
+import random
 from functools import partial
 from typing import Any
 
@@ -84,12 +85,28 @@ def test_one_timer_serves_all_alarms_that_follow_each_other() -> None:
     heap = _AlarmHeap(loop)
     for _ in range(10_000):
         heap.add(60.0, list)()
+        heap.add(60.0, list)()
         loop.move(0.001)
     assert loop.set == 1
     assert len(heap._alarms) < 200
 
 
-def test_an_alarm_that_raises_keeps_the_later_ones() -> None:
+def test_alarms_ring_in_order_when_most_others_were_cancelled() -> None:
+    loop = HandLoop()
+    heap = _AlarmHeap(loop)
+    rung: list[int] = []
+    times = random.Random(1).sample(range(1_000), 500)
+    cancels = {time: heap.add(time, partial(rung.append, time)) for time in times}
+    kept = times[::10]
+    for time in cancels.keys() - set(kept):
+        cancels[time]()
+    heap.add(1_000.0, list)
+    assert len(heap._alarms) < 100
+    loop.move(1_000.0)
+    assert rung == sorted(kept)
+
+
+def test_an_alarm_that_raises_is_logged_and_keeps_the_later_ones(caplog: pytest.LogCaptureFixture) -> None:
     loop = HandLoop()
     heap = _AlarmHeap(loop)
     rung: list[str] = []
@@ -103,6 +120,7 @@ def test_an_alarm_that_raises_keeps_the_later_ones() -> None:
     assert rung == []
     loop.move(1.0)
     assert rung == ["later"]
+    assert caplog.messages == ["a timer raised"]
 
 
 @pytest.mark.parametrize(
@@ -129,7 +147,11 @@ def test_alarms_on_one_loop_ring_although_another_one_ran_meanwhile() -> None:
         await done.wait()
 
     async def on_the_other() -> None:
+        there = anyio.Event()
         alarms.call_after(60.0, partial(rung.append, "never"))()
+        alarms.call_after(0.001, there.set)
+        with anyio.fail_after(10.0):
+            await there.wait()
 
     anyio.run(on_the_first)
     assert rung == ["first"]

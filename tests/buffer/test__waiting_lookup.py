@@ -153,6 +153,44 @@ async def test_a_wrong_policy_raises_at_once() -> None:
             buffer.lookup_nowait("map", "base", max_gap=-1.0)
 
 
+async def test_a_long_wait_has_one_timer_for_the_next_log_line_however_often_its_cause_changes(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    bus.publish(driving("map", "base", 0.0))
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "arm", timeout=60.0))
+        await clock.advance(5.0)
+        for parent, child in (("b", "arm"), ("c", "b"), ("d", "c")):
+            bus.publish(driving(parent, child, 0.0))
+            await clock.advance(1.0)
+            assert len(clock._timers) == 2
+        assert len(caplog.messages) == 1
+        await clock.advance(3.0)
+        assert len(caplog.messages) == 2
+        asked.cancel()
+
+
+@pytest.mark.parametrize("ends", ["answered", "cancelled", "closed"])
+async def test_a_lookup_that_has_waited_leaves_no_timer(ends: str) -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    buffer = Buffer(bus)
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "base", timeout=60.0))
+        await settle()
+        assert len(clock._timers) == 2, "one for the end, and one for the log line before it"
+        if ends == "answered":
+            bus.publish(driving("map", "base", 0.0))
+        elif ends == "cancelled":
+            asked.cancel()
+        else:
+            buffer.close()
+    assert clock._timers == []
+
+
 @pytest.mark.parametrize("source", ["base", "arm"])
 @pytest.mark.thorough
 async def test_a_lookup_that_has_waited_leaves_no_reference_cycles(source: str) -> None:

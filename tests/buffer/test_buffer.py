@@ -32,6 +32,7 @@ from tfbus import (
     Vector3Stamped,
     do_transform,
 )
+from tfbus.buffer.buffer import _DESCRIBED
 
 pytestmark = pytest.mark.anyio
 
@@ -248,7 +249,7 @@ async def test_an_infinite_timeout_never_expires() -> None:
         assert asked.answer.stamp == 7
 
 
-@pytest.mark.parametrize("phase", ["before the report", "after the report"])
+@pytest.mark.parametrize("phase", ["before the report", "after the report", "at the timeout"])
 @pytest.mark.parametrize("data_first", [True, False])
 @pytest.mark.parametrize("timeout", [None, 2.0, 7.0])
 async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
@@ -265,7 +266,9 @@ async def test_a_sample_in_the_turn_in_which_the_timeout_expires_still_answers(
             clock.scopes[-1].cancel()
             await settle()
             assert len(buffer.pending()) == 1
-        steps: list[Callable[[], object]] = [clock.scopes[-1].cancel, lambda: bus.publish(moving("map", "a", 9))]
+        # The first scope is that of the timeout, and the last one that of the report.
+        scope = clock.scopes[0 if phase == "at the timeout" else -1]
+        steps: list[Callable[[], object]] = [scope.cancel, lambda: bus.publish(moving("map", "a", 9))]
         for step in reversed(steps) if data_first else steps:
             step()
         await settle()
@@ -465,6 +468,19 @@ async def test_samples_of_other_edges_wake_none_of_ten_thousand_waiters() -> Non
         tasks.cancel_scope.cancel()
     assert waiting(bus) == 0
     assert buffer.pending() == ()
+
+
+@pytest.mark.parametrize("more", range(3))
+async def test_a_description_has_ten_waiting_lookups_and_the_number_of_all_others(more: int) -> None:
+    _, _, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        for number in range(_DESCRIBED + more):
+            tasks.start_soon(buffer.lookup, "map", f"frame{number}")
+        await settle()
+        waiting = [line for line in buffer.describe().splitlines() if line.startswith("waiting: ")]
+        tasks.cancel_scope.cancel()
+    assert ["see pending()" in line for line in waiting] == [False] * _DESCRIBED + [True] * (more > 0)
+    assert not more or waiting[-1] == f"waiting: {more} more lookups, see pending()"
 
 
 @pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])

@@ -103,6 +103,15 @@ def test_a_prefilled_frame_with_another_newest_parent_than_on_the_bus_is_left_ou
     assert late.tree.parent("y") == "a"
 
 
+@pytest.mark.parametrize(("held", "superseded"), [(49, 1), (50, 0), (51, 0)])
+def test_a_prefill_with_the_newest_sample_of_the_bus_has_missed_nothing(held: int, superseded: int) -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus, prefill=tree_of(moving("a", "x", held)))
+    bus.publish(moving("old", "x", 45))
+    assert late.tree.frames() == (["a", "x"] if superseded else ["a", "old", "x"])
+    assert bus.statistics().buffers[0].superseded == superseded
+
+
 def test_a_prefilled_static_frame_gives_way_to_a_moving_one_of_the_bus() -> None:
     bus = bus_with([moving("a", "x", 50)])
     assert Buffer(bus, prefill=tree_of(static("a", "x"))).tree.frames() == []
@@ -133,6 +142,17 @@ def test_samples_of_a_prefill_that_are_ahead_of_the_bus_give_way_when_the_bus_re
     assert late.tree.edges()[0].newest == 90
     bus.publish(moving("b", "x", 70))
     assert [(edge.parent, edge.newest) for edge in late.tree.edges()] == [("b", 70)]
+
+
+@pytest.mark.parametrize("heard", [89, 90, 91])
+def test_samples_of_a_prefill_stay_when_the_bus_reparents_later_than_them(heard: int) -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus, prefill=tree_of(*over("a", "x", (50, 90)), keep=None))
+    bus.publish(moving("a", "x", heard))
+    assert len(bus._late) == (heard < 90)
+    bus.publish(moving("b", "x", 95))
+    assert [late.tree.parent("x", stamp) for stamp in (50, 94, 95)] == ["a", "a", "b"]
+    assert late.tree.edges()[0].samples == len({50, 90, 95, heard})
 
 
 # Any history

@@ -34,6 +34,17 @@ def test_the_thread_of_the_first_loop_becomes_and_stays_the_owner(run: Run) -> N
         claim.check()
 
 
+def test_a_loop_in_the_thread_that_made_the_bus_leaves_it_to_no_other_loop(run: Run) -> None:
+    claim = OwnerThread()
+
+    async def use() -> None:
+        claim.check()
+
+    run(use)
+    assert isinstance(in_thread(lambda: run(use)), RuntimeError)
+    claim.check()
+
+
 def test_made_on_a_loop_the_owner_is_the_thread_of_that_loop(run: Run) -> None:
     claims: list[OwnerThread] = []
 

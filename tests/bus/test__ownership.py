@@ -209,6 +209,20 @@ def test_of_several_edges_of_others_the_one_that_was_published_last_is_removed()
     ]
 
 
+@pytest.mark.parametrize("last", ["a", "map"])
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_of_two_edges_of_others_the_one_that_came_last_is_removed(last: str, elsewhere: bool) -> None:
+    bus = Bus(SimulatedClock())
+    if elsewhere:
+        bus.publish([moving("x", "a", 0, authority="one"), moving("x", "map", 0, authority="two")])
+    edges = {"a": moving("base", "a", 0, authority="one"), "map": moving("a", "map", 0, authority="two")}
+    for child in sorted(edges, key=last.__eq__):
+        bus.publish(edges[child])
+    with bus.reserve("base", "owner"):
+        TransformBroadcaster(bus, "owner").send("map", "base", Transform())
+    assert {event.frame for event in bus._topology.known()} == {"base", "a", "map"} - {last}
+
+
 def test_a_loop_of_the_owners_own_edges_or_those_of_other_owners_is_refused() -> None:
     bus = Bus(SimulatedClock())
     one, two = TransformBroadcaster(bus, "one"), TransformBroadcaster(bus, "two")
@@ -257,7 +271,7 @@ def test_a_batch_that_is_refused_for_another_reason_removes_nothing() -> None:
             with pytest.raises(InvalidTransformError):
                 bus.publish([good, bad])
         assert [event.frame for event in bus._topology.known()] == ["map", "q"]
-        bus.publish([good, moving("q", "p", 1)], invalid="drop")
+        bus.publish([good, moving("q", "p", 1), moving("map", "w", 1, 1e13)], invalid="drop")
     assert [event.frame for event in bus._topology.known()] == ["q", "base"]
 
 

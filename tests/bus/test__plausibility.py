@@ -122,6 +122,29 @@ def test_a_stamp_ahead_of_the_clock_is_announced_logged_once_and_counted(caplog:
     assert StampAhead(NOW, "base", NOW + HOUR + 2, "peer") in found
 
 
+@pytest.mark.parametrize("beyond", [0, 1])
+def test_a_stamp_is_ahead_only_beyond_the_bound(beyond: int) -> None:
+    bus = bus_at(max_ahead=2.0)
+    Buffer(bus)
+    bus.publish(moving("map", "base", NOW + 2 * SECOND + beyond))
+    bus.publish(moving("map", "base", NOW - HOUR))
+    with bus.events() as events:
+        found = [events.queue.get() for _ in range(len(events.queue))]
+    counted = bus.statistics()
+    assert (counted.ahead, counted.buffers[0].expired, counted.buffers[0].expired_ahead) == (beyond, 1, beyond)
+    assert [event for event in found if isinstance(event, StampAhead)] == (
+        [StampAhead(NOW, "base", NOW + 2 * SECOND + 1, "")] if beyond else []
+    )
+
+
+def test_with_a_bound_beyond_the_last_stamp_none_is_ahead() -> None:
+    bus = bus_at(max_ahead=9_223_372_000.0)
+    buffer = Buffer(bus)
+    for stamp in (NOW, NOW + 1, STAMP_MAX):
+        bus.publish(moving("map", "base", stamp))
+    assert (bus.statistics().ahead, buffer.lookup_nowait("map", "base").stamp) == (0, STAMP_MAX)
+
+
 def test_a_bus_that_rejects_them_keeps_the_frame_alive() -> None:
     bus = bus_at(reject_ahead=True)
     buffer = Buffer(bus)
@@ -183,8 +206,8 @@ def test_a_clock_of_the_machine_that_was_set_back_is_noticed_when_samples_expire
     bus = Bus(clock)
     Buffer(bus)
     bus.publish(moving("map", "base", NOW, authority="odometry"))
-    clock.step = -HOUR
     with bus.events() as events:
+        clock.step = -HOUR
         bus.publish(moving("map", "base", NOW - HOUR, authority="odometry"))
         found = [events.queue.get() for _ in range(len(events.queue))]
     assert StampAhead(NOW - HOUR, "base", NOW, "odometry") in found

@@ -136,6 +136,7 @@ def test_clear_forgets_every_frame() -> None:
     world = World()
     world.send("a", 100)
     world.send("b", 100)
+    world.send("c", 150)
     world.staleness.changes(111)
     world.send("a", 111)
     world.edges.clear()
@@ -152,6 +153,13 @@ def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
         world.remove(f"object {number}")
     assert size_of(world.staleness) < 200
     assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
+
+
+def test_a_frame_that_is_removed_before_anybody_looks_leaves_no_entry() -> None:
+    world = World()
+    world.send("a", 100)
+    world.remove("a")
+    assert size_of(world.staleness) == 0
 
 
 def test_a_sample_of_a_live_frame_adds_no_entry() -> None:

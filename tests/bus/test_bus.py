@@ -437,12 +437,13 @@ def test_each_jump_back_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     assert caplog.messages == ["the clock jumped back: moving samples are dropped"] * 2
 
 
-def test_a_jump_forward_drops_nothing() -> None:
+@pytest.mark.parametrize("stamp", [100, 10**15])
+def test_a_jump_forward_or_to_the_same_stamp_drops_nothing(stamp: int) -> None:
     clock = SimulatedClock(start=100)
     bus = Bus(clock)
     buffer = Buffer(bus)
     bus.publish(moving("map", "base", 90))
-    clock.set(10**15)
+    clock.set(stamp)
     assert buffer.can_transform("map", "base", 90)
     assert bus.statistics().clock_resets == 0
 

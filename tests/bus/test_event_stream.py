@@ -101,6 +101,16 @@ async def test_events_that_a_slow_reader_misses_are_counted_in_the_statistics() 
     assert bus.statistics().queues == ()
 
 
+def test_only_the_removal_of_a_frame_that_has_a_parent_is_an_event() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(static("map", "table"))
+    with bus.events() as events:
+        for frame in ("map", "table"):
+            bus.remove_frame(frame)
+        found = list(iter(events.queue.get, None))
+    assert [event for event in found if isinstance(event, FrameRemoved)] == [FrameRemoved(0, "table")]
+
+
 # Stale and live
 
 
@@ -244,6 +254,21 @@ async def test_a_jump_back_is_an_event_and_pending_events_stay() -> None:
             ClockReset(2 * SECOND, 10 * SECOND),
             FrameAdded(2 * SECOND, "base", "map", "", static=False),
         ], "a moving frame is forgotten by a jump back, so it is new"
+
+
+async def test_a_frame_that_was_stale_before_a_jump_back_is_new_and_not_live_again() -> None:
+    clock = SimulatedClock(start=10 * SECOND)
+    bus = Bus(clock)
+    got: Events = []
+    async with anyio.create_task_group() as tasks:
+        with bus.events(stale_after=1.0) as events:
+            tasks.start_soon(read, events, got)
+            bus.publish(driving("map", "base", 5.0))
+            await settle()
+            clock.set(2 * SECOND)
+            bus.publish(driving("map", "base", 2.0))
+            await settle()
+    assert [type(event) for event in got] == [FrameAdded, FrameStale, ClockReset, FrameAdded]
 
 
 # The end

@@ -166,6 +166,7 @@ def test_publishing_after_the_end_of_the_loop_raises(run: Run) -> None:
     for _ in range(2):
         (error,) = in_thread(lambda: publishers[0](moving("map", "a", 1)))
         assert isinstance(error, BusClosedError)
+        assert len(publishers[0].queue) == 1, "after the first error it takes no more"
 
 
 async def test_publishing_before_the_with_raises() -> None:
@@ -174,6 +175,16 @@ async def test_publishing_before_the_with_raises() -> None:
     (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
     assert isinstance(error, RuntimeError)
     assert "with" in str(error)
+
+
+async def test_after_a_with_that_failed_to_begin_publishing_raises() -> None:
+    bus = Bus()
+    publish = bus.threadsafe()
+    bus.close()
+    with pytest.raises(BusClosedError):
+        publish.__enter__()
+    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
+    assert isinstance(error, BusClosedError)
 
 
 def test_the_with_is_entered_on_an_event_loop_only() -> None:

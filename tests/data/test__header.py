@@ -1,5 +1,5 @@
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,16 @@ def test_any_frame_and_stamp_are_kept(frame: str, stamp: int | Latest) -> None:
         kept = replace(data, frame=frame, stamp=stamp)
         assert kept.frame == frame
         assert kept.stamp == stamp
+
+
+@dataclass(init=False, frozen=True)
+class Landmark(PointStamped):
+    name: str = "lamp"
+
+
+def test_a_subclass_may_have_a_further_field() -> None:
+    lamp = Landmark("map", 5, (1, 2, 3))
+    assert (lamp.frame, lamp.stamp, lamp.point, lamp.name) == ("map", 5, (1.0, 2.0, 3.0), "lamp")
 
 
 @pytest.mark.parametrize("data", ONE_OF_EACH, ids=name_of)

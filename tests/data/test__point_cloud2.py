@@ -33,6 +33,36 @@ def test_every_datatype_of_a_field_is_read() -> None:
         assert (found.dtype, found.tolist()) == (value.dtype, [100])
 
 
+@pytest.mark.parametrize(("first", "places", "is_view"), [(4, "xyz", True), (0, "xyz", True), (4, "zyx", False)])
+def test_coordinates_side_by_side_anywhere_in_a_point_are_a_view(first: int, places: str, is_view: bool) -> None:
+    message = new_layout(PointCloud("a", 5, np.array([(1.0, 2.0, 3.0), (4.0, 5.0, 6.0)], np.float32)))
+    for field in message["fields"]:
+        field["offset"] = first + 4 * places.index(field["name"])
+    rows = np.zeros((2, 5), np.float32)
+    for number, axis in enumerate("xyz"):
+        rows[:, first // 4 + places.index(axis)] = (number + 1, number + 4)
+    data = rows.tobytes()
+    message.update(point_step=20, row_step=40, data=data)
+    points = read_cloud(message, "a", 5).points
+    assert points.tolist() == [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    assert np.shares_memory(points, np.frombuffer(data, np.uint8)) == is_view
+
+
+def test_a_field_may_have_several_numbers_for_each_point_in_one_row() -> None:
+    pairs = np.arange(4, dtype=">u2").reshape(2, 2)
+    message = new_layout(PointCloud("a", 5, np.zeros((2, 3), np.float32), fields={"pair": pairs}))
+    assert message["fields"][-1] == {"name": "pair", "offset": 12, "datatype": 4, "count": 2}
+    assert (message["point_step"], message["row_step"], message["is_bigendian"], message["is_dense"]) == (
+        16,
+        32,
+        False,
+        False,
+    )
+    assert read_cloud(message, "a", 5).fields["pair"].tolist() == [[0, 1], [2, 3]]
+    with pytest.raises(ValueError, match=r"field 'grid' of dtype uint8, shape \(2, 1, 1\)"):
+        new_layout(PointCloud("a", 5, np.zeros((2, 3)), fields={"grid": np.zeros((2, 1, 1), np.uint8)}))
+
+
 def test_a_coordinate_is_one_number() -> None:
     message = new_layout(PointCloud("a", 5, np.ones((1, 3))))
     message["fields"][0]["count"] = 3

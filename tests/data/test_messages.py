@@ -285,6 +285,16 @@ def test_what_is_no_message_is_a_type_error(message: Any) -> None:
         from_message(message)
 
 
+def test_the_error_of_what_is_no_message_names_its_fields() -> None:
+    fields = {name: 0 for name in "lkjihgfedcba"}
+    for message, kind in ((fields, "dict"), (as_object(fields), "SimpleNamespace")):
+        with pytest.raises(TypeError) as caught:
+            from_message(message)
+        assert str(caught.value) == (
+            f"a {kind} is no message that can be transformed; its fields are a, b, c, d, e, f, g, h, i, j"
+        )
+
+
 def test_data_that_have_no_message_are_refused() -> None:
     with pytest.raises(TypeError, match="int has no message"):
         to_message(5)  # type: ignore[arg-type]

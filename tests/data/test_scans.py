@@ -57,6 +57,11 @@ def test_ranges_that_are_not_finite_or_outside_the_limits_give_no_points() -> No
     np.testing.assert_allclose(np.linalg.norm(cloud.points, axis=1), [0.1, 5.0, 30.0])
 
 
+def test_both_limits_may_be_one_range() -> None:
+    scan = scan_of([4.0, 5.0, 6.0], range_min=5.0, range_max=5.0)
+    assert scan.to_points().fields["index"].tolist() == [1]
+
+
 def test_without_limits_every_finite_range_from_zero_is_valid() -> None:
     assert scan_of([-1.0, 0.0, 1e9, math.inf, math.nan]).to_points().fields["index"].tolist() == [1, 2]
 

@@ -261,7 +261,8 @@ def test_ten_megabytes_of_nesting_are_refused_at_the_limit() -> None:
 def test_elements_may_be_nested_as_deep_as_the_limit() -> None:
     deep = MAX_DEPTH - 1
     assert read_urdf(robot('<link name="a"/>', "<x>" * deep, "</x>" * deep)).links == ("a",)
-    assert "nested" in problem(robot("<x>" * MAX_DEPTH, "</x>" * MAX_DEPTH))
+    for before in ("", "<x/>" * MAX_DEPTH):
+        assert "nested" in problem(robot(before, "<x>" * MAX_DEPTH, "</x>" * MAX_DEPTH))
 
 
 def test_a_name_of_several_lines_makes_an_error_of_one() -> None:

@@ -224,5 +224,7 @@ def test_a_joint_is_a_value() -> None:
         assert (twin, hash(twin)) == (made, hash(made))
         assert twin.transform(0.3) == made.transform(0.3)
     assert joint("revolute") != made
+    assert eval(repr(made)) == made
+    assert repr(made).endswith("lower=-1.0, upper=1.0, mimic=Mimic(joint='shoulder', multiplier=2.0, offset=0.0))")
     with pytest.raises(FrozenInstanceError):
         made.name = "wrist"  # type: ignore[misc]

@@ -353,6 +353,6 @@ def test_a_pr2_makes_one_tree_of_its_83_frames() -> None:
 
 
 def test_the_repr_is_one_line_with_links_and_moving_joints() -> None:
-    joints = (Joint("wrist", "revolute", "base", "hand"), Joint("glue", "fixed", "hand", "led"))
-    model = RobotModel("arm", ("base", "hand", "led"), joints)
-    assert repr(model) == "<RobotModel 'arm': 3 links below 'base', 1 moving joints>"
+    joints = (slide("rail", "base", "hand"), fixed("glue", "hand", "led"), slide("gripper", "hand", "finger"))
+    model = RobotModel("arm", ("base", "hand", "led", "finger"), joints)
+    assert repr(model) == "<RobotModel 'arm': 4 links below 'base', 2 moving joints>"

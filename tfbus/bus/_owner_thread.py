@@ -31,7 +31,7 @@ class OwnerThread:
             if self._on_a_loop or not on_a_loop:
                 raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
             self.thread = thread
-        self._on_a_loop = self._on_a_loop or on_a_loop
+        self._on_a_loop = on_a_loop
 
 
 def _runs_a_loop() -> bool:

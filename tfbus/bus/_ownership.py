@@ -70,8 +70,8 @@ class Ownership:
 
     def reserved_for(self, frame: str) -> str | None:
         """The authority that has reserved a frame, if any."""
-        authority, _ = self._reserved.get(frame, (None, 0))
-        return authority
+        reserved = self._reserved.get(frame)
+        return None if reserved is None else reserved[0]
 
     def reserve(self, frame: str, authority: str) -> Registration:
         """Let only this authority publish a frame, until every registration of it is closed.

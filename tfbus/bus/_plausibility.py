@@ -57,9 +57,9 @@ class Plausibility:
 
     def newest_plausible(self) -> int:
         """The greatest stamp, in ns, that is not ahead of the clock now; `STAMP_MAX` if none is."""
-        if self._max_ahead is None or self._recorded:
+        if self._max_ahead is None or self._recorded or not self.clock_is_set:
             return STAMP_MAX
-        return self._clock.now() + self._max_ahead if self.clock_is_set else STAMP_MAX
+        return min(self._clock.now() + self._max_ahead, STAMP_MAX)
 
     @contextmanager
     def recorded_time(self) -> Iterator[None]:

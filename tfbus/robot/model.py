@@ -65,9 +65,9 @@ class RobotModel:
     links: Sequence[str]
     joints: Sequence[Joint]
     root: str = field(init=False)
-    _fixed: tuple[Joint, ...] = field(init=False, repr=False, compare=False)
-    _resolved: tuple[tuple[Joint, Joint | None], ...] = field(init=False, repr=False, compare=False)
-    _names: frozenset[str] = field(init=False, repr=False, compare=False)
+    _fixed: tuple[Joint, ...] = field(init=False, compare=False)
+    _resolved: tuple[tuple[Joint, Joint | None], ...] = field(init=False, compare=False)
+    _names: frozenset[str] = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
         def set_field(name: str, value: object) -> None:
