@@ -103,7 +103,8 @@ def test_an_attachment_is_laid_out_as_its_module_says() -> None:
     assert pack(5, [], StateStep(6, 7, 0, final=False)) == header(number=5, claim=(1, 6, 7, 0, 0))
     # The fourth byte says that there is a time.
     assert pack(5, [], time=-7) == header(number=5)[:3] + b"\1" + header(number=5)[4:] + struct.pack("<q", -7)
-    assert reason_of(header()[:3] + b"\2" + header()[4:] + bytes(16)) == "attachment"
+    for times in (1, 2):
+        assert reason_of(header()[:3] + b"\2" + header()[4:] + bytes(8 * times)) == "attachment"
     assert reason_of(header()[:3] + b"\1" + header()[4:] + bytes(7)) == "attachment"
     assert pack(5, entries) == (
         header(2, 2, 3, number=5)

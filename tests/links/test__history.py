@@ -11,6 +11,7 @@ from tfbus.links._history import (
     LONGEST_HISTORY,
     MOST_HELD,
     MOST_OF_FRAME,
+    MOST_REMEMBERED,
     PATIENCE,
     HistoryAsker,
     HistoryTeller,
@@ -130,6 +131,18 @@ def test_a_peer_is_asked_once_even_if_it_comes_back() -> None:
         s.domain.meet(s.teller, s.asker)
         s.deliver()
         assert stamps_of(s.heard, "base") == [1]
+
+
+def test_so_many_peers_are_remembered_as_asked() -> None:
+    asked: list[str] = []
+    asker = HistoryAsker(5.0, lambda peer, _seconds, _after: asked.append(peer), lambda: 0.0)
+    for number in range(MOST_REMEMBERED):
+        asker.joined(f"{number}")
+    asker.joined("0")
+    assert len(asked) == MOST_REMEMBERED
+    for peer in ("one more", "1", "0"):
+        asker.joined(peer)
+    assert asked[MOST_REMEMBERED:] == ["one more", "0"], "the first one was forgotten"
 
 
 def test_without_an_answer_what_is_live_is_late_and_not_lost() -> None:

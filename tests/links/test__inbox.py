@@ -14,7 +14,17 @@ from support import strategies as some
 from support.samples import moving, static
 from support.wires import Domain, End, size_of
 
-from tfbus import Buffer, Bus, BusClosedError, FrameAdded, PeerLost, PeerRejected, SimulatedClock, TransformStamped
+from tfbus import (
+    Buffer,
+    Bus,
+    BusClosedError,
+    FrameAdded,
+    PeerLost,
+    PeerRejected,
+    SimulatedClock,
+    Transform,
+    TransformStamped,
+)
 from tfbus.bus._ownership import OnConflict
 from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
 from tfbus.links._entries import MovingFrame, RemovedFrame
@@ -221,8 +231,8 @@ def test_gaps_in_the_numbers_of_a_peer_are_messages_that_were_lost(given: tuple[
 
 @pytest.mark.parametrize(
     ("second", "told"),
-    [(1, 1), (2, 1), (3, 0)],
-    ids=["of the same message", "without a gap", "after one lost message"],
+    [(1, 1), (2, 1), (3, 0), (2**33, 0)],
+    ids=["of the same message", "without a gap", "after one lost message", "after a number that is made up"],
 )
 def test_a_claim_after_a_lost_message_is_not_believed(second: int, told: int) -> None:
     with receiver() as here:
@@ -251,6 +261,20 @@ def test_a_live_message_that_an_answer_has_overtaken_does_not_change_what_is_kno
         now = StateStep(3, 4, digest_moving("a") ^ digest_moving("b"), message=2)
         here.inbox.receive("peer", ReceivedMessage([MovingFrame("a")], 2, step=now))
         assert (mirror.agrees, mirror.number, "a" in mirror) == (True, 4, True)
+
+
+def test_when_a_peer_has_told_its_whole_state_the_frames_go_that_it_brings_no_more() -> None:
+    with receiver() as here:
+        here.end.receive("peer", Presence.JOINED)
+        for name in "abc":
+            here.receive(moving("map", name, 1), sequence=1)
+        here.receive(moving("map", "d", 1), sequence=1, sender="other")
+        first, last = StateStep(0, 1, 0, final=False), StateStep(1, 2, digest_moving("a") ^ digest_moving("c"))
+        assert here.inbox.receive_answer("peer", ReceivedMessage([MovingFrame("a")], step=first))
+        assert set(here.frames) == set("abcd"), "the rest may follow"
+        assert here.inbox.receive_answer("peer", ReceivedMessage([MovingFrame("c")], step=last))
+        assert set(here.frames) == set("acd")
+        assert here.counts == (6, 4, 0, 0)
 
 
 def test_a_claim_that_is_near_a_large_number_is_believed() -> None:
@@ -330,6 +354,13 @@ def test_an_older_removal_spares_newer_samples() -> None:
         assert here.bus.statistics().frames == 1
         here.remove("a", sequence=6)
         assert here.bus.statistics().frames == 0
+        # The frame may be another's by now, whose numbers are lower.
+        here.receive(moving("map", "b", 5), sequence=8)
+        here.receive(moving("map", "b", 6), origin=OTHER, sequence=3)
+        here.remove("b", sequence=7)
+        assert here.frames == ["b"]
+        here.remove("b", sequence=9)
+        assert here.frames == []
 
 
 def test_a_removed_frame_comes_back_only_with_a_higher_number() -> None:
@@ -388,7 +419,11 @@ def test_of_very_many_removals_the_highest_number_is_remembered_for_live_message
         here.receive(moving("map", "new", 1), origin=OTHER, sequence=8, number=20_002)
         here.receive(static("map", "old"), sequence=1, number=0)
         here.receive(moving("map", "10", 1), sequence=20_000, number=20_003)
-        assert [[sample.child for sample in heard] for heard in here.heard] == [["new"], ["old"], ["10"]]
+        # So does what is told of the last seconds.
+        past = ReceivedTransform("map", "past", 1, Transform())
+        here.inbox.receive_history("peer", ReceivedMessage([ReceivedBatch([past], [], ORIGIN, 2)]))
+        assert [[sample.child for sample in heard] for heard in here.heard] == [["new"], ["old"], ["10"], ["past"]]
+        assert here.counts[:3] == (8, 4, 2)
 
 
 @pytest.mark.thorough
@@ -416,6 +451,21 @@ def test_the_loss_of_a_frame_removes_only_what_that_peer_has_brought() -> None:
         here.remove("d", origin=OTHER, sequence=9, sender="bridge", lost=True)
         here.receive(moving("map", "d", 1), sequence=1, sender="new")
         assert set(here.frames) == {"b", "c", "d"}, "and so has who has come since then"
+
+
+@pytest.mark.parametrize(("kind", "lost", "told"), [("static", True, 1), ("static", False, 0), ("moving", True, 0)])
+def test_of_a_loss_only_those_are_told_again_who_bring_a_late_static_sample(kind: str, lost: bool, told: int) -> None:
+    sample = static("map", "a") if kind == "static" else moving("map", "a", 1)
+    with receiver() as here:
+        here.receive(sample, sequence=1, sender="bridge")
+        here.receive(moving("map", "b", 1), sequence=1)
+        here.remove("a", origin=OTHER, sequence=9, sender="bridge", lost=lost)
+        here.turn()
+        here.receive(sample, sequence=1)
+        assert here.frames == ["b"]
+        entries = [entry for sent in here.turn() for entry in read_message(sent.payload, sent.attachment).entries]
+        losses = [(entry.frame, entry.lost) for entry in entries if isinstance(entry, RemovedFrame)]
+        assert losses == [("a", True)] * told
 
 
 def test_after_a_loss_a_removal_counts_as_ever() -> None:
