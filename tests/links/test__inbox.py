@@ -19,6 +19,7 @@ from tfbus import (
     Bus,
     BusClosedError,
     FrameAdded,
+    InvalidTransformError,
     PeerLost,
     PeerRejected,
     SimulatedClock,
@@ -738,11 +739,28 @@ def test_removals_of_unknown_frames_do_not_reach_the_bus() -> None:
 def test_a_closed_bus_takes_nothing_in() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1))
+        here.end.receive("peer", Presence.JOINED)
         here.bus.close()
         here.receive(moving("map", "a", 2), sequence=2)
         here.remove("a", sequence=3)
+        told = ReceivedMessage([ReceivedBatch([], [], ORIGIN, 4)], step=StateStep(0, 1, 0))
+        assert not here.inbox.receive_answer("peer", told)
+        here.inbox.receive_history("peer", told)
         assert here.heard == [(moving("map", "a", 1),)]
         assert here.counts == (1, 1, 0, 0)
+
+
+def test_what_a_peer_tells_that_has_gone_is_not_taken() -> None:
+    with receiver() as here:
+        bad = InvalidTransformError("bad", reason="bad", parent="map", child="a", authority="")
+        told = ReceivedMessage([ReceivedBatch([], [], ORIGIN, 1)], errors=[bad], step=StateStep(0, 1, 0))
+        assert not here.inbox.receive_answer("peer", told)
+        here.inbox.receive_history("peer", told)
+        assert (here.counts, here.peers.rejected) == ((0, 0, 0, 0), {})
+        # While it is there, what of that is invalid is counted.
+        here.peers.find("peer")
+        here.inbox.receive_history("peer", told)
+        assert (here.counts, here.peers.rejected) == ((1, 0, 0, 0), {"bad": 1})
 
 
 def test_a_subscriber_that_closes_the_bus_in_the_middle_of_a_message_ends_it() -> None:
