@@ -151,6 +151,7 @@ def test_an_echo_does_not_go_out_and_replaces_what_is_kept() -> None:
     sender.remove("u", origin=OTHER, echo=True)
     assert (sender.notified, sender.outbox.pending) == (2, 0)
     assert sender.turn() == ([], {"s": (theirs,), "t": None, "u": RemovedFrame(OTHER, 3, "u")})
+    assert not any(map(sender.outbox.state.brings, ("s", "t", "u", "new", "a"))), "another link brings them"
     sender.add(static("map", "s", 8.0), origin=OTHER, echo=True)
     assert sender.notified == 3
 

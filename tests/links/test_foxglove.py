@@ -188,6 +188,15 @@ async def test_after_its_end_a_server_has_no_address_and_its_port_is_free(bus: B
         socket.create_connection(("127.0.0.1", port))
 
 
+async def test_a_server_whose_task_is_cancelled_ends_too(bus: Bus) -> None:
+    with anyio.CancelScope() as scope:
+        async with FoxgloveServer(bus, 0) as server:
+            port = int(server.address.rpartition(":")[2])
+            scope.cancel()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port))
+
+
 async def test_a_server_is_entered_once_and_not_on_a_closed_bus(bus: Bus) -> None:
     server = FoxgloveServer(bus, 0)
     async with server:

@@ -13,15 +13,26 @@ from cyclonedds.topic import Topic
 from support.processes import until
 from support.samples import moving, static
 
+from tfbus import SimulatedClock
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds._carrier import _MOVING, _STATIC, DdsCarrier, _nodes_of
 from tfbus.links.dds._domains import configuration, domain
-from tfbus.links.dds._types import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo, RawTFMessage
+from tfbus.links.dds._types import (
+    Gid,
+    Header,
+    NodeEntitiesInfo,
+    ParticipantEntitiesInfo,
+    RawClock,
+    RawJointState,
+    RawString,
+    RawTFMessage,
+    Time,
+)
 from tfbus.links.ros._carrier import RosMessage
-from tfbus.links.ros.settings import settings_of
+from tfbus.links.ros.settings import RosOptions, settings_of
 from tfbus.tf_message import encode
 
 AS_A_CARRIER: type[Carrier] = DdsCarrier
@@ -121,6 +132,44 @@ async def test_who_has_sent_a_message_is_known_to_be_of_ros_or_not(
     assert carrier._is_of_ros(items[0].sender) is of_ros
     node.end()
     await carrier.close()
+
+
+def _kind(item: Received) -> tuple[bool, bool, bool]:
+    return item.content.joints, item.content.clock, item.content.description
+
+
+async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(domain_number: int) -> None:
+    items: list[Received] = []
+    takers: RosOptions = {"joint_states": print, "clock": SimulatedClock(), "robot_description": print, "send": False}
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of(takers))
+    await carrier.open(items.append, SendReport(print))
+    node = Node(domain_number)
+    make: Any = SimpleNamespace(joints=RawJointState, clock=RawClock)
+    stamp: Any = Time(100, 5)
+    said: list[tuple[str, Any, Any]] = [
+        ("joint_states", RawJointState, make.joints(Header(stamp, ""), ["a"], [0.5], [], [])),
+        ("clock", RawClock, make.clock(stamp)),
+        ("robot_description", RawString, RawString("<robot/>")),
+    ]
+    writers: list[tuple[Any, Any]] = [
+        (DataWriter(node.participant, Topic(node.participant, f"rt/{name}", kind), _STATIC), message)
+        for name, kind, message in said
+    ]
+    with anyio.fail_after(20):
+        while len(kinds := {_kind(item): item for item in items if isinstance(item.content, RosMessage)}) < 3:
+            # The two that are not latched may be lost while the two meet.
+            for writer, message in writers:
+                writer.write(message)
+            await anyio.sleep(0.01)
+    for writer, _ in writers:
+        writer.__del__()
+    node.end()
+    await carrier.close()
+    assert {kind: (item.sender, item.moving) for kind, item in kinds.items()} == {
+        (True, False, False): ("other topics", True),
+        (False, True, False): ("other topics", True),
+        (False, False, True): ("other topics", False),
+    }
 
 
 async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:

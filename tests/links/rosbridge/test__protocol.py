@@ -89,6 +89,7 @@ def test_bytes_of_ros_1_are_told_from_those_of_ros_2() -> None:
         (json.loads(publish("/tf", [moving("map", "base", 5)]))["msg"], False),
         (ros1(ros1_of(moving("map", "base", 5))), False),
         (ros1(), False),
+        (b"\0\1\0\0", False),
         ({"transforms": []}, False),
         ({"transforms": [5]}, False),
         (5, False),
@@ -101,6 +102,8 @@ def test_the_content_of_a_message_tells_whether_it_is_of_ros_2(content: Any, ros
 def test_the_status_of_a_server_has_no_topic() -> None:
     incoming = read('{"op": "status", "level": "error", "msg": "no such type"}')
     assert (incoming.topic, incoming.content) == ("", "status: no such type")
+    for other in ('{"op": "status", "topic": "/tf", "msg": {}}', '{"op": "publish", "topic": 5, "msg": {}}'):
+        assert read(other).topic == ""
 
 
 @pytest.mark.parametrize("message", ["", "[1]", "nonsense", "5", b"\xff", b"\x05", "[" * 100_000, b"\x81" * 100_000])
