@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from support import wires
 from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.samples import moving, static
 from support.wires import Domain
@@ -191,6 +192,22 @@ def test_an_answer_does_not_overtake_the_batch_that_it_tells_of() -> None:
     end.receive(asking.id, Question(0, asking.id))
     domain.settle()
     assert heard == [["lidar", "base"]]
+    for made in (end, asking):
+        made.leave()
+
+
+def test_a_question_whose_answer_no_message_can_hold_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    domain = Domain()
+    end, asking = domain.join(Bus(SimulatedClock())), domain.join(Bus(SimulatedClock()))
+
+    def fail(*_: object) -> Message:
+        raise ValueError("too much")
+
+    monkeypatch.setattr(wires, "write_answer", fail)
+    wire = domain.wires[end, asking]
+    wire.packets.clear()
+    end.receive(asking.id, Question(0, asking.id))
+    assert (list(wire.packets), end.endpoint.peers.rejected) == ([], {})
     for made in (end, asking):
         made.leave()
 

@@ -194,6 +194,23 @@ async def test_the_error_of_the_body_comes_out_as_it_is_and_the_last_turn_goes_o
     assert carrier.calls == ["open", "run", "send 1", "close"]
 
 
+@pytest.mark.every_loop
+async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -> None:
+    class EndingCarrier(LoggedCarrier):
+        async def run(self) -> None:
+            try:
+                await super().run()
+            finally:
+                self.calls.append("end")
+
+    carrier = EndingCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier):
+            await until(lambda: "run" in carrier.calls)
+            bus.publish(moving("map", "a", 1))
+    assert carrier.calls == ["open", "run", "send 1", "end", "close"]
+
+
 async def test_an_error_of_the_running_carrier_ends_the_body_and_comes_out_as_it_is() -> None:
     carrier = LoggedCarrier(fails="run")
     with Bus() as bus, pytest.raises(MineError):

@@ -146,6 +146,17 @@ def test_whoever_asks_tells_where_it_listens() -> None:
     assert b"tcp/10.0.0.3:7447" in other.told_by(third)
 
 
+def test_nobody_is_named_whom_the_asker_has_or_who_asks() -> None:
+    here, third = End(), End()
+    third.knows(id=here.id)
+    common = [here.knows(id=third.knows("tcp/10.0.0.1:1")) for _ in range(3)]
+    lacked = {third.knows("tcp/10.0.0.1:1") for _ in range(3)}
+    for known in (common, common[:1], []):
+        here.others = dict.fromkeys(known, NO_ROBOT)
+        named = {line.split("/")[4] for line in here.told_by(third).decode().split("\n")}
+        assert named == lacked | set(common) - set(known)
+
+
 def test_only_those_are_named_that_the_asker_wants_and_dialled_of_its_domain() -> None:
     third = End()
     wanted = [third.knows("tcp/10.0.0.1:1", robot="r1"), third.knows("tcp/10.0.0.1:1", robot="s")]

@@ -157,6 +157,8 @@ async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: st
                 await client.lookup("map", "base")
             with pytest.raises(RuntimeError, match="entered once"):
                 await client.__aenter__()
+    with pytest.raises(ValueError, match="capacity"):
+        BufferClient(domain, capacity=0)
     with Bus() as bus, pytest.raises(RuntimeError, match="not entered"):
         async with BufferClient(link=ZenohLink(bus, domain)):
             raise AssertionError("it has no session")
