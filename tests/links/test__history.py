@@ -6,6 +6,7 @@ from support.samples import moving, static
 from support.wires import Domain, End
 
 from tfbus import SECOND, Buffer, Bus, TransformStamped
+from tfbus.links import _history
 from tfbus.links._history import (
     CHUNK,
     LONGEST_HISTORY,
@@ -97,19 +98,25 @@ def test_without_it_nothing_of_the_past_comes() -> None:
         assert s.heard == []
 
 
-@pytest.mark.thorough
-def test_the_past_comes_in_chunks_of_whole_frames_and_is_bounded() -> None:
+@pytest.mark.parametrize(
+    ("chunk", "most"), [(20, 20), (20, 30), pytest.param(CHUNK, MOST_OF_FRAME, marks=pytest.mark.thorough)]
+)
+def test_the_past_comes_in_chunks_of_whole_frames_and_is_bounded(
+    chunk: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_history, "CHUNK", chunk)
+    monkeypatch.setattr(_history, "MOST_OF_FRAME", most)
     with scene(LONGEST_HISTORY) as s:
         names = [f"f{number}" for number in range(5)]
-        for stamp in range(CHUNK // 2):
+        for stamp in range(chunk // 2):
             s.publish(*(moving("map", name, stamp) for name in names))
-        for stamp in range(MOST_OF_FRAME + 10):
+        for stamp in range(most + 10):
             s.publish(moving("map", "much", stamp))
         s.join()
         s.deliver()
         assert {name: len(stamps_of(s.heard, name)) for name in [*names, "much"]} == {
-            **dict.fromkeys(names, CHUNK // 2),
-            "much": MOST_OF_FRAME,
+            **dict.fromkeys(names, chunk // 2),
+            "much": most,
         }
         assert stamps_of(s.heard, "much")[0] == 10 / SECOND
         teller = s.teller.endpoint._history_teller

@@ -207,6 +207,16 @@ async def test_a_server_is_entered_once_and_not_on_a_closed_bus(bus: Bus) -> Non
         await FoxgloveServer(bus, 0).__aenter__()
 
 
+async def test_the_bus_of_another_thread_is_not_served(bus: Bus) -> None:
+    async def enter() -> None:
+        with pytest.raises(RuntimeError, match="thread"):
+            await FoxgloveServer(bus, 0).__aenter__()
+
+    with bus.threadsafe():
+        # This event loop has a claim on the bus now.
+        await anyio.to_thread.run_sync(anyio.run, enter)
+
+
 @pytest.mark.parametrize(
     ("port", "error"), [(-1, ValueError), (65_536, ValueError), (1.0, TypeError), (True, TypeError)]
 )

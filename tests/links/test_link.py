@@ -117,6 +117,23 @@ async def test_samples_of_one_turn_go_out_together_and_a_full_turn_at_once() -> 
         assert carrier.calls == ["send 5000", "send 1", "close"]
 
 
+async def test_a_link_tells_its_name_and_how_many_peers_it_has() -> None:
+    carrier, told = LoggedCarrier(), list[str]()
+    with Bus() as bus:
+        link = Link(bus, "world", carrier)
+        told.append(repr(link))
+        async with link:
+            for count, name in enumerate(("a", "b")):
+                told.append(repr(link))
+                carrier.receive(Received(name, Presence.JOINED))
+                await until(lambda count=count: len(link.peers) == count + 1)  # type: ignore[misc]
+            told.append(repr(link))
+    told.append(repr(link))
+    assert told == [
+        f"<Link 'world': {state}>" for state in ("not joined", "0 peers", "1 peer", "2 peers", "not joined")
+    ]
+
+
 async def test_a_link_is_entered_once() -> None:
     with Bus() as bus:
         link = Link(bus, "world", LoggedCarrier())

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.joint_messages import KIND, TYPES, joint_state
-from support.ros import ros1, ros1_of
+from support.ros import named, ros1, ros1_of
 from support.samples import moving, static
 from support.strategies import CHARACTERS
 
@@ -71,6 +71,17 @@ def test_messages_are_read_in_every_encoding() -> None:
         incoming = read(message)
         assert (incoming.topic, incoming.encoding) == ("/tf", encoding)
         assert decode_content(incoming.content).samples == samples
+
+
+def test_leading_slashes_of_names_are_left_out_in_every_encoding() -> None:
+    other = moving("-map", "--base", 5, 1.5)
+
+    def slashed(message: bytes) -> bytes:
+        return named(named(message, "-map", "/map"), "--base", "//base")
+
+    fields = json.loads(slashed(publish("/tf", [other]).encode()))["msg"]
+    for content in (fields, slashed(encode([other])), slashed(ros1(ros1_of(other)))):
+        assert decode_content(content).samples == [moving("map", "base", 5, 1.5)]
 
 
 def test_bytes_of_ros_1_are_told_from_those_of_ros_2() -> None:

@@ -92,7 +92,7 @@ async def test_what_waits_to_be_sent_is_sent_before_the_session_ends(address: st
     session.soon(lambda: ending.wait(10))
     session.soon(lambda: sent.append(opened.is_closed()))
     await session.close()
-    assert sent == [False]
+    assert (sent, opened.is_closed()) == ([False], True)
 
 
 @pytest.mark.thorough

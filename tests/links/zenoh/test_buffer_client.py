@@ -138,6 +138,7 @@ async def test_a_server_that_goes_ends_the_lookups_and_one_that_never_was_is_tol
                 tasks.start_soon(ask)
                 await until(lambda: server.statistics().waiting == 1)
             assert reasons == ["lost"]
+            assert not link._zenoh_session().is_closed(), "it is the link's"
 
 
 async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: str) -> None:
