@@ -186,6 +186,20 @@ def test_too_much_for_one_attachment_is_refused(entries: list[Entry]) -> None:
         pack(1, entries)
 
 
+def test_an_attachment_may_have_all_the_bytes_and_not_one_more() -> None:
+    names = [f"{number:x}" * len(LONGEST) for number in range(15)]
+
+    def entries(last: int) -> list[Entry]:
+        return [PublishedBatch(ONE, 1, tuple((name, False, 1) for name in (*names, "x" * last)))]
+
+    length = MAX_BYTES - len(pack(1, entries(0)))
+    packed = pack(1, entries(length))
+    assert (len(packed), unpack(packed)) == (MAX_BYTES, Attachment(1, tuple(entries(length))))
+    with pytest.raises(ValueError, match=f"{MAX_BYTES + 1} bytes, more than {MAX_BYTES}"):
+        pack(1, entries(length + 1))
+    assert reason_of(packed + b"x") == "oversized"
+
+
 def test_the_error_names_the_size() -> None:
     with pytest.raises(ValueError) as raised:
         pack(1, [RemovedFrame(ONE, n, "x" * 1_000) for n in range(2_000)])

@@ -32,6 +32,7 @@ from tfbus.links._entries import MovingFrame, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._message import Message, read_message
 from tfbus.links._mirror import Mirror
+from tfbus.links._outbox import Outbox
 from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence
@@ -499,6 +500,18 @@ def test_after_the_loss_of_a_peer_only_later_peers_may_repeat_its_last_samples(d
         assert here.counts[1:3] == (3, 2)
         here.receive(moving("map", "a", 5), sequence=5, sender="new")
         assert here.counts[1:3] == (3, 3)
+
+
+def test_beside_a_world_without_origins_a_moving_sample_that_passed_is_no_news_and_a_static_one_is_ranked() -> None:
+    with receiver() as here:
+        world = Outbox(None, lambda: None)
+        here.end.relay.attach(world, foreign=True)
+        here.bus.publish([moving("map", "a", 1), static("map", "s")])
+        # They have gone round through that world and another bus.
+        here.receive(moving("map", "a", 1), static("map", "s"), sequence=500)
+        assert here.heard[1:] == [(static("map", "s"),)]
+        assert here.counts == (1, 1, 1, 0)
+        here.end.relay.detach(world)
 
 
 def test_a_number_that_no_bus_can_have_given_is_refused_and_later_ones_are_news() -> None:

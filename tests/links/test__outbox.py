@@ -184,6 +184,14 @@ def test_an_echo_of_frames_that_are_not_kept_notifies_nobody() -> None:
     sender.remove("t", echo=True)
     sender.remove("a", echo=True)
     assert (sender.notified, sender.outbox.pending, sender.turn()) == (0, 0, ([], {}))
+    assert sender.outbox.state.entry("t") is None
+
+
+def test_a_removal_of_a_frame_that_the_link_never_brought_is_told_to_late_joiners_too() -> None:
+    sender = Sender()
+    sender.remove("unknown")
+    assert sender.outbox.state.entry("unknown") == RemovedFrame(ORIGIN, 1, "unknown")
+    assert sender.notified == 1
 
 
 @given(
