@@ -43,6 +43,19 @@ def test_a_link_hears_the_robots_of_its_patterns(pattern: str, robots: list[str]
     assert [hears(Keys("yard", B, robot), mine, "live") for robot in others] == [False] * len(others)
 
 
+def test_of_slow_robots_a_link_hears_the_presence_and_the_slow_key_at_a_rate() -> None:
+    mine = Keys("yard", A, robots=("r1", "s1"), slow_robots=(("s1", 2.0), ("s2", 0.5)))
+    others = [Keys("yard", B, robot) for robot in ("r1", "s1", "s2", "x1")]
+    assert [hears(other, mine, "live") for other in others] == [True, True, False, False]
+    assert [hears(other, mine, "@alive") for other in others] == [True, True, True, False]
+    assert len(mine.heard("@alive")) == 3, "each is heard once"
+    rates = [
+        [rate for key, rate in mine.slow() if zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(other.own("slow")))]
+        for other in others
+    ]
+    assert rates == [[], [2.0], [0.5], []]
+
+
 @pytest.mark.parametrize("robot", [NO_ROBOT, "r1", "r-1.x_"])
 def test_the_sender_is_in_a_key(robot: str) -> None:
     keys, other = Keys("yard/arm", A), Keys("yard/arm", B, robot)
