@@ -1,5 +1,5 @@
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Unpack
 
 import anyio
 import pytest
@@ -7,6 +7,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
 from cyclonedds.domain import DomainParticipant
+from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
@@ -33,7 +34,7 @@ from tfbus.links.dds._types import (
 )
 from tfbus.links.ros._carrier import RosMessage
 from tfbus.links.ros.settings import RosOptions, settings_of
-from tfbus.tf_message import encode
+from tfbus.tf_message import MalformedMessageError, encode
 
 AS_A_CARRIER: type[Carrier] = DdsCarrier
 """That it fits the protocol, mypy says."""
@@ -170,6 +171,111 @@ async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(d
         (False, True, False): ("other topics", True),
         (False, False, True): ("other topics", False),
     }
+
+
+class Reader:
+    """A reader as the thread of the readers has it: its messages, and the writers that it knows."""
+
+    def __init__(self, *messages: Any) -> None:
+        self.messages = list(messages)
+        self.writers: dict[int, tuple[str, str]] = {}
+        self.asked: list[int] = []
+
+    def take(self, N: int) -> list[Any]:  # noqa: N803 - the library calls it so
+        taken, self.messages = self.messages[:N], self.messages[N:]
+        return taken
+
+    def get_matched_publications(self) -> list[int]:
+        return list(self.writers)
+
+    def get_matched_publication_data(self, handle: int) -> Any:
+        self.asked.append(handle)
+        if handle not in self.writers:
+            return None
+        key, participant = (SimpleNamespace(hex=name) for name in self.writers[handle])
+        return SimpleNamespace(key=key, participant_key=participant)
+
+
+GONE = InvalidSample.__new__(InvalidSample)
+"""What the library gives in place of a message when a writer has gone."""
+
+
+def said(payload: bytes, writer: int = 1) -> Any:
+    return SimpleNamespace(payload=payload, sample_info=SimpleNamespace(publication_handle=writer))
+
+
+def unopened(**options: Unpack[RosOptions]) -> tuple[Any, list[Received]]:
+    """A carrier that has not joined, and what it has received."""
+    items: list[Received] = []
+    carrier = DdsCarrier(0, CONFIG, settings_of(options))
+    carrier._receive, carrier._report = items.append, SendReport(print)
+    return carrier, items
+
+
+def test_all_messages_that_wait_are_taken_and_the_library_is_asked_once_for_each_writer() -> None:
+    carrier, items = unopened(authority="ros")
+    payloads = [b"%d" % number for number in range(250)]
+    reader = Reader(*(each for payload in payloads for each in (GONE, said(payload))))
+    reader.writers[1] = ("writer", "driver")
+    carrier._take(False, reader)
+    assert [item.content.payload for item in items] == payloads
+    assert {(item.sender, item.moving) for item in items} == {("driver", True)}
+    assert reader.asked == [1]
+    # One that has gone since then, and is not remembered.
+    reader.messages = [said(b"last", 2), said(b"last", 2)]
+    carrier._take(True, reader)
+    assert [(item.sender, item.moving, item.content.authority) for item in items[250:]] == [("", False, "")] * 2
+    assert reader.asked == [1, 2, 2]
+
+
+def test_without_an_authority_messages_wait_for_the_names_of_their_nodes() -> None:
+    carrier, items = unopened()
+    reader = Reader(said(b"first"))
+    reader.writers[1] = ("1" * 32, "0" * 32)
+    carrier._take(False, reader)
+    assert items == []
+    one, two = (SimpleNamespace(data=[17 * number] * 16) for number in (0, 1))
+    node = SimpleNamespace(node_namespace="/robot/", node_name="a", writer_gid_seq=[two])
+    carrier._take_nodes(Reader(GONE, SimpleNamespace(gid=one, node_entities_info_seq=[node])))
+    assert items[0].content == RosMessage(b"first", static=False, authority="/robot/a")
+
+
+def test_a_participant_is_there_while_it_publishes_on_any_topic() -> None:
+    carrier, items = unopened()
+    static_frames, moving_frames = Reader(), Reader()
+
+    def told(*participants: str, reader: Reader) -> list[tuple[str, object]]:
+        items.clear()
+        reader.writers = {number: (f"{number}", name) for number, name in enumerate(participants)}
+        carrier._match(0 if reader is static_frames else 1, reader)
+        return [(item.sender, item.content) for item in items]
+
+    assert told("b", "a", reader=static_frames) == [("a", Presence.JOINED), ("b", Presence.JOINED)]
+    assert told("b", "b", "c", reader=moving_frames) == [("c", Presence.JOINED)]
+    assert told("c", reader=static_frames) == [("a", Presence.LEFT)]
+    assert told(reader=moving_frames) == [("b", Presence.LEFT)]
+    assert told(reader=static_frames) == [("c", Presence.LEFT)]
+
+
+def test_a_writer_is_asked_for_anew_when_the_writers_have_changed() -> None:
+    carrier, items = unopened(authority="ros")
+    reader = Reader(said(b"first"))
+    reader.writers[1] = ("writer", "driver")
+    carrier._take(False, reader)
+    reader.writers[1] = ("writer", "another")
+    carrier._match(0, reader)
+    reader.messages = [said(b"second")]
+    carrier._take(False, reader)
+    assert [item.sender for item in items if isinstance(item.content, RosMessage)] == ["driver", "another"]
+
+
+def test_what_the_library_cannot_read_is_a_malformed_message_with_the_begin_of_its_error() -> None:
+    carrier, items = unopened()
+    carrier._misread(ValueError("x" * 1_000))
+    (item,) = items
+    assert isinstance(item.content, MalformedMessageError)
+    assert item.content.reason == "encoding"
+    assert 100 < str(item.content).count("x") < 200
 
 
 async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:

@@ -38,6 +38,10 @@ async def test_without_a_domain_it_is_tf_and_without_a_robot_a_tilde() -> None:
     assert LookupSession(None, None, None, None, None, None, 2.0).key("@lookup", "a") == "tfbus/tf/~/@lookup/a"
 
 
+async def test_a_session_that_never_opened_closes() -> None:
+    await LookupSession("yard", None, None, None, None, None, 2.0).close()
+
+
 class Network:
     """Notes the questions that are asked, and fails where the session has ended."""
 
