@@ -43,6 +43,13 @@ def test_a_participant_of_ros_is_known_by_its_user_data(
         assert not found[participant.guid.hex]
 
 
+def test_an_entity_is_deleted_now() -> None:
+    deleted: list[bool] = []
+    entity: Any = SimpleNamespace(__del__=lambda: deleted.append(True))
+    delete(entity)
+    assert deleted == [True]
+
+
 class Times:
     """A time that passes only while somebody sleeps, and what a reader finds at which."""
 
