@@ -90,6 +90,18 @@ def test_who_joins_late_has_the_last_seconds_with_stamps_parents_and_authorities
         assert [sample.child for sample in s.heard if sample.static] == ["lidar"]
 
 
+@pytest.mark.parametrize("keeps", [(2.0, 8.0), (8.0, 2.0)])
+def test_the_past_is_that_of_the_buffer_which_holds_most_of_it(keeps: tuple[float, float]) -> None:
+    with scene(60.0, keeps[0]) as s, Buffer(s.source, keeps[1]), Buffer(s.source, 4.0):
+        for second in range(20):
+            s.publish(moving("map", "base", second * SECOND))
+        s.join()
+        s.deliver()
+        held = stamps_of(s.heard, "base")
+        assert held == list(range(20))[-len(held) :]
+        assert 8 <= len(held) <= 10
+
+
 def test_without_it_nothing_of_the_past_comes() -> None:
     with scene() as s:
         s.publish(moving("map", "base", SECOND))

@@ -10,6 +10,7 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from support.processes import until
 from support.samples import moving, static
@@ -19,8 +20,9 @@ from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.dds._carrier import _MOVING, _STATIC, DdsCarrier, _nodes_of
+from tfbus.links.dds._carrier import _MOVING, _STATIC, _STATICS, DdsCarrier, _nodes_of
 from tfbus.links.dds._domains import configuration, domain
+from tfbus.links.dds._publishers import PATIENCE, Publishers
 from tfbus.links.dds._types import (
     Gid,
     Header,
@@ -252,7 +254,13 @@ def test_a_participant_is_there_while_it_publishes_on_any_topic() -> None:
 
     assert told("b", "a", reader=static_frames) == [("a", Presence.JOINED), ("b", Presence.JOINED)]
     assert told("b", "b", "c", reader=moving_frames) == [("c", Presence.JOINED)]
-    assert told("c", reader=static_frames) == [("a", Presence.LEFT)]
+    # What still waits for the name of its node comes before the end of its participant.
+    static_frames.messages = [said(b"waits", 1)]
+    carrier._take(True, static_frames)
+    assert told("c", reader=static_frames) == [
+        ("a", RosMessage(b"waits", static=True, authority="a")),
+        ("a", Presence.LEFT),
+    ]
     assert told(reader=moving_frames) == [("b", Presence.LEFT)]
     assert told(reader=static_frames) == [("c", Presence.LEFT)]
 
@@ -276,6 +284,54 @@ def test_what_the_library_cannot_read_is_a_malformed_message_with_the_begin_of_i
     assert isinstance(item.content, MalformedMessageError)
     assert item.content.reason == "encoding"
     assert 100 < str(item.content).count("x") < 200
+
+
+async def test_while_it_runs_messages_are_delivered_whose_nodes_told_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    carrier, items = unopened()
+    now, pauses = 100.0, list[float]()
+    carrier._publishers = Publishers(carrier._deliver, lambda _: False, lambda: now)
+    reader = Reader(said(b"waits"))
+    reader.writers[1] = ("writer", "driver")
+    carrier._take(False, reader)
+
+    async def sleep(seconds: float) -> None:
+        nonlocal now
+        if items:
+            raise EOFError
+        pauses.append(seconds)
+        now += seconds
+
+    monkeypatch.setattr(anyio, "sleep", sleep)
+    with pytest.raises(EOFError):
+        await carrier.run()
+    assert sum(pauses) == PATIENCE
+    assert items[0].content == RosMessage(b"waits", static=False, authority="driver")
+
+
+async def test_what_is_sent_is_counted_and_of_the_static_frames_the_last_message_is_latched(domain_number: int) -> None:
+    report = SendReport(print)
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of({}))
+    await carrier.open(print, report)
+    for stamp in (1, 2):
+        moved = OutgoingBatch(bytes(16), stamp, [moving("map", "base", stamp)])
+        carrier.send(Turn([moved], {"lidar": OutgoingBatch(bytes(16), stamp, [static("map", "lidar", stamp=stamp)])}))
+    assert (report.messages, report.samples) == (4, 4)
+    node = Node(domain_number)
+    reader: DataReader[Any] = DataReader(
+        node.participant, Topic(node.participant, "rt/tf_static", RawTFMessage), _STATICS
+    )
+    latched: list[bytes] = []
+
+    def received() -> bool:
+        messages: list[Any] = reader.take(N=10)
+        latched.extend(message.payload for message in messages)
+        return bool(latched)
+
+    await until(received)
+    reader.__del__()
+    node.end()
+    await carrier.close()
+    assert latched == [encode([static("map", "lidar", stamp=2)])]
 
 
 async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:
