@@ -17,6 +17,7 @@ from tfbus.links._history import (
     HistoryAsker,
     HistoryTeller,
 )
+from tfbus.links._message import Message
 from tfbus.links._receive_queue import HistoryAnswer, HistoryQuestion
 from tfbus.links.zenoh import ZenohLink
 
@@ -180,7 +181,7 @@ def test_without_an_answer_what_is_live_is_late_and_not_lost() -> None:
         assert stamps_of(s.heard, "base") == [1]
 
 
-@pytest.mark.parametrize("end", ["answer", "loss", "many"])
+@pytest.mark.parametrize("end", ["answer", "garbage", "loss", "many"])
 def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too_much(end: str) -> None:
     with scene() as s:
         s.join()
@@ -195,6 +196,10 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
         if end == "answer":
             assert s.heard == []
             s.asker.receive(s.teller.id, HistoryAnswer(None))
+        elif end == "garbage":
+            assert s.heard == []
+            s.asker.receive(s.teller.id, HistoryAnswer(Message(b"", b"no attachment", 0)))
+            assert s.asker.endpoint.peers.rejected == {"version": 1}
         elif end == "loss":
             assert s.heard == []
             s.domain.part(s.teller, s.asker)
@@ -224,6 +229,7 @@ def test_a_peer_whose_answers_lead_nowhere_is_asked_no_more() -> None:
             full.joined("peer")
             assert all(full.holds("peer", message) for _ in range(held))
             assert full.goes_on("peer", message) is goes_on
+            assert full.holds("peer", message) is goes_on
 
 
 def test_it_has_to_be_a_time_that_passes() -> None:

@@ -544,6 +544,21 @@ def test_a_number_of_this_bus_that_somebody_has_made_up_does_not_hide_what_it_sa
         assert [len(heard) for heard in here.heard] == [3, 1]
 
 
+def test_what_this_bus_has_said_itself_last_comes_back_without_being_said_again() -> None:
+    with receiver() as here:
+        here.bus.publish(static("map", "s"))
+        origin, number = here.end.relay.origin, here.said().sequence
+        here.receive(static("map", "s"), origin=origin, sequence=number)
+        here.remove("s", origin=origin, sequence=number)
+        assert here.turn() == []
+        # The next number is made up.
+        here.receive(static("map", "s"), origin=origin, sequence=number + 1)
+        number = here.said().sequence
+        here.remove("s", origin=origin, sequence=number + 1)
+        assert here.said().sequence > number + 1
+        assert here.frames == ["s"]
+
+
 def test_samples_of_this_bus_itself_are_no_news() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), origin=here.end.relay.origin, sequence=100)

@@ -156,7 +156,17 @@ def test_whoever_comes_late_gets_the_last_message_of_static_frames_and_no_moving
 
 def test_what_cannot_be_sent_is_not_counted_as_sent() -> None:
     made, _ = carrier()
+    errors: list[Exception] = []
+    made._report = SendReport(errors.append)
     assert made._publish([static("map", "lidar")], static=True) is False
+
+    def put(*_: object, **__: object) -> None:
+        raise zenoh.ZError("the session is closed")
+
+    closed: Any = SimpleNamespace(put=put)
+    made._publishers[True] = closed
+    assert made._publish([static("map", "lidar")], static=True) is False
+    assert ["the session is closed" in str(error) for error in errors] == [True]
 
 
 def test_a_carrier_that_never_opened_closes() -> None:

@@ -125,6 +125,33 @@ def test_a_peer_that_is_named_twice_and_has_not_come_is_dialled() -> None:
     assert here.dialled()[:1] == [(lost, "tcp/10.0.0.2:3")]
 
 
+@pytest.mark.parametrize(
+    ("waits", "dialled"), [((MISSING_TIME / 2, MISSING_TIME / 2), True), ((LONGEST_PAUSE, 0.0), False)]
+)
+def test_a_missing_peer_is_remembered_for_a_while_though_others_do_not_name_it(
+    waits: tuple[float, float], dialled: bool
+) -> None:
+    here, third = End(), End()
+    lost = third.knows("tcp/10.0.0.2:1")
+    answer = here.told_by(third)
+    here.introductions.take(answer, ())
+    here.time += waits[0]
+    here.introductions.take(b"", ())
+    here.time += waits[1]
+    here.introductions.take(answer, ())
+    assert [peer for peer, _ in here.dialled()] == [lost] * dialled
+
+
+def test_a_missing_peer_that_is_named_again_after_a_long_time_is_dialled() -> None:
+    here, third = End(), End()
+    lost = third.knows("tcp/10.0.0.2:1")
+    answer = here.told_by(third)
+    here.introductions.take(answer, ())
+    here.time += LONGEST_PAUSE
+    here.introductions.take(answer, ())
+    assert [peer for peer, _ in here.dialled()] == [lost]
+
+
 def test_a_peer_that_has_come_in_between_is_no_more_missing_than_a_new_one() -> None:
     here, third = End(), End()
     lost = third.knows("tcp/10.0.0.2:1")
