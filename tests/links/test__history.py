@@ -19,6 +19,7 @@ from tfbus.links._history import (
 )
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import HistoryAnswer, HistoryQuestion
+from tfbus.links._state import StateStep
 from tfbus.links.zenoh import ZenohLink
 
 
@@ -101,6 +102,14 @@ def test_the_past_is_that_of_the_buffer_which_holds_most_of_it(keeps: tuple[floa
         held = stamps_of(s.heard, "base")
         assert held == list(range(20))[-len(held) :]
         assert 8 <= len(held) <= 10
+
+
+def test_without_a_buffer_there_is_nothing_to_tell() -> None:
+    with Bus(max_ahead=None) as bus:
+        end = Domain().join(bus)
+        bus.publish(moving("map", "base", SECOND))
+        assert end.endpoint._history_teller.chunk(5.0, "") == ([], StateStep(0, 0, 0))
+        end.leave()
 
 
 def test_without_it_nothing_of_the_past_comes() -> None:

@@ -188,6 +188,15 @@ async def test_after_its_end_a_server_has_no_address_and_its_port_is_free(bus: B
         socket.create_connection(("127.0.0.1", port))
 
 
+async def test_a_server_that_ends_before_its_applications_leaves_the_bus(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0) as server:
+        app = await anyio.to_thread.run_sync(Application, server.address)
+        app.subscribe()
+        await until(lambda: bool(bus._subscribers.callbacks))
+    assert not bus._subscribers.callbacks
+    await anyio.to_thread.run_sync(app.close)
+
+
 async def test_a_server_whose_task_is_cancelled_ends_too(bus: Bus) -> None:
     with anyio.CancelScope() as scope:
         async with FoxgloveServer(bus, 0) as server:

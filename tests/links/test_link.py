@@ -366,6 +366,18 @@ def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
         assert link.statistics().queue.pending == 3
 
 
+async def test_a_link_tells_no_time_that_it_is_not_to_tell() -> None:
+    clock, carrier = SimulatedClock(), LoggedCarrier()
+    told: list[int | None] = []
+    carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier):
+            clock.set(1_000)
+            bus.publish(moving("map", "a", 1))
+            await until(lambda: bool(told))
+    assert told == [None]
+
+
 async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own() -> None:
     clock = SimulatedClock()
     followers: list[int] = []

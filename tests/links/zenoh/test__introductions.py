@@ -132,6 +132,7 @@ def test_a_missing_peer_is_remembered_for_a_while_though_others_do_not_name_it(
     waits: tuple[float, float], dialled: bool
 ) -> None:
     here, third = End(), End()
+    here.time = 2 * LONGEST_PAUSE
     lost = third.knows("tcp/10.0.0.2:1")
     answer = here.told_by(third)
     here.introductions.take(answer, ())

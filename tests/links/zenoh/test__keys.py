@@ -2,7 +2,7 @@ import pytest
 import zenoh
 
 from tfbus.links.zenoh._filters import name_of, write_filter
-from tfbus.links.zenoh._keys import NO_ROBOT, Keys, check_domain, check_robot, robots_expression
+from tfbus.links.zenoh._keys import LONGEST_NAME, NO_ROBOT, Keys, check_domain, check_robot, robots_expression
 
 A, B = "a" * 32, "b" * 32
 
@@ -85,6 +85,11 @@ def test_a_domain_that_can_be_no_part_of_a_key_is_named(domain: str) -> None:
 def test_domains_and_robots_have_letters_digits_and_some_signs() -> None:
     assert check_domain("yard-1/arm_2.x") == "yard-1/arm_2.x"
     assert check_robot("r-1_2.x") == "r-1_2.x"
+    longest = "x" * LONGEST_NAME
+    assert {check(longest) for check in (check_domain, check_robot, robots_expression)} == {longest}
+    for check in (check_domain, check_robot, robots_expression):
+        with pytest.raises(ValueError, match=r"domain|robot"):
+            check(longest + "x")
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "~", "a b", "@r", "x" * 201])
