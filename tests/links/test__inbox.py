@@ -470,6 +470,20 @@ def test_of_a_loss_only_those_are_told_again_who_bring_a_late_static_sample(kind
         assert losses == [("a", True)] * told
 
 
+def test_a_loss_is_passed_on_towards_the_owner_once_though_several_peers_tell_of_it() -> None:
+    with receiver() as here:
+        towards = Domain().join(here.bus)
+        towards.receive("owner", Message(encode([static("map", "s")]), pack(1, [batch([static("map", "s")])]), 1))
+        passed_on = []
+        for sequence, sender in ((1, "a"), (9, "a"), (9, "b"), (10, "b"), (9, "c")):
+            here.remove("s", origin=OTHER, sequence=sequence, sender=sender, lost=True)
+            passed_on.append(towards.endpoint.outbox.flush().entries)
+        assert here.frames == ["s"]
+        losses = {number: [RemovedFrame(OTHER, number, "s", lost=True)] for number in (9, 10)}
+        assert passed_on == [[], losses[9], [], losses[10], []]
+        towards.leave()
+
+
 def test_after_a_loss_a_removal_counts_as_ever() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=18)
