@@ -365,6 +365,20 @@ def test_an_older_removal_spares_newer_samples() -> None:
         assert here.frames == []
 
 
+def test_of_what_two_buses_say_of_a_frame_a_removal_below_the_other_word_changes_nothing() -> None:
+    with receiver() as here:
+        here.receive(static("map", "s"), moving("map", "a", 1), origin=OTHER, sequence=9)
+        here.remove("s", sequence=5)
+        here.remove("a", sequence=5)
+        assert set(here.frames) == {"s", "a"}
+        here.remove("s", sequence=12)
+        here.remove("s", origin=OTHER, sequence=10)
+        here.receive(static("map", "s"), sequence=11)
+        assert here.frames == ["a"], "the removal of the higher number is the one that holds"
+        here.receive(static("map", "s"), origin=OTHER, sequence=13)
+        assert set(here.frames) == {"s", "a"}
+
+
 def test_a_removed_frame_comes_back_only_with_a_higher_number() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=1)

@@ -190,6 +190,16 @@ async def test_a_link_that_is_cancelled_while_it_opens_closes_its_carrier() -> N
     assert carrier.calls == ["open", "close"]
 
 
+async def test_what_comes_while_the_carrier_opens_is_published_when_the_link_has_joined() -> None:
+    carrier = LoggedCarrier()
+    message = Received("driver", ForeignMessage(False, [ARM]))
+    carrier.while_opening = lambda: carrier.receive(message)
+    with Bus() as bus:
+        async with Link(bus, "world", carrier) as link:
+            await receive_samples(link, 1)
+            assert bus.statistics().frames == 1
+
+
 async def test_a_bus_that_closes_while_the_carrier_opens_is_not_linked() -> None:
     carrier = LoggedCarrier()
     bus = Bus()
