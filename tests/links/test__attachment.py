@@ -103,7 +103,8 @@ def test_an_attachment_is_laid_out_as_its_module_says() -> None:
     assert pack(5, [], StateStep(6, 7, 0, final=False)) == header(number=5, claim=(1, 6, 7, 0, 0))
     # The fourth byte says that there is a time.
     assert pack(5, [], time=-7) == header(number=5)[:3] + b"\1" + header(number=5)[4:] + struct.pack("<q", -7)
-    assert reason_of(header()[:3] + b"\2" + header()[4:] + bytes(16)) == "attachment"
+    for times in (1, 2):
+        assert reason_of(header()[:3] + b"\2" + header()[4:] + bytes(8 * times)) == "attachment"
     assert reason_of(header()[:3] + b"\1" + header()[4:] + bytes(7)) == "attachment"
     assert pack(5, entries) == (
         header(2, 2, 3, number=5)
@@ -183,6 +184,20 @@ LONGEST = "x" * 65_535
 def test_too_much_for_one_attachment_is_refused(entries: list[Entry]) -> None:
     with pytest.raises(ValueError, match=r"too much for one attachment|surrogates not allowed"):
         pack(1, entries)
+
+
+def test_an_attachment_may_have_all_the_bytes_and_not_one_more() -> None:
+    names = [f"{number:x}" * len(LONGEST) for number in range(15)]
+
+    def entries(last: int) -> list[Entry]:
+        return [PublishedBatch(ONE, 1, tuple((name, False, 1) for name in (*names, "x" * last)))]
+
+    length = MAX_BYTES - len(pack(1, entries(0)))
+    packed = pack(1, entries(length))
+    assert (len(packed), unpack(packed)) == (MAX_BYTES, Attachment(1, tuple(entries(length))))
+    with pytest.raises(ValueError, match=f"{MAX_BYTES + 1} bytes, more than {MAX_BYTES}"):
+        pack(1, entries(length + 1))
+    assert reason_of(packed + b"x") == "oversized"
 
 
 def test_the_error_names_the_size() -> None:

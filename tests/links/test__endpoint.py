@@ -6,17 +6,19 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from support import wires
 from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.samples import moving, static
 from support.wires import Domain
 
 from tfbus import Bus, Event, SimulatedClock
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
+from tfbus.links._asker import FIRST_PAUSE, PATIENCE, SETTLING
 from tfbus.links._endpoint import CLAIM_PERIOD, Endpoint
 from tfbus.links._message import Message
 from tfbus.links._outbox import Turn
 from tfbus.links._peers import MAX_PEERS
-from tfbus.links._receive_queue import Presence, Question, Received
+from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.tf_message import MalformedMessageError
 
 
@@ -195,6 +197,63 @@ def test_an_answer_does_not_overtake_the_batch_that_it_tells_of() -> None:
         made.leave()
 
 
+@pytest.mark.parametrize(
+    ("answer", "rejected"), [(None, {}), (Message(b"", b"no attachment", 0), {"version": 1})], ids=["none", "malformed"]
+)
+def test_a_peer_without_an_answer_of_use_is_asked_again_after_a_pause(
+    answer: Message | None, rejected: dict[str, int]
+) -> None:
+    domain = Domain()
+    end, peer = domain.join(Bus(SimulatedClock())), domain.join(Bus(SimulatedClock()))
+    end.receive(peer.id, Presence.JOINED)
+    assert end.endpoint.next_question() == domain.time
+    end.endpoint.reconcile()
+    assert end.endpoint.next_question() == domain.time + PATIENCE
+    end.receive(peer.id, Answer(answer))
+    due = end.endpoint.next_question()
+    assert due is not None
+    assert 0.5 * FIRST_PAUSE <= due - domain.time <= 1.5 * FIRST_PAUSE
+    assert end.endpoint.peers.rejected == rejected
+    for made in (end, peer):
+        made.leave()
+
+
+def test_a_message_with_a_gap_before_it_makes_a_link_ask_soon() -> None:
+    domain = Domain()
+    bus = Bus(SimulatedClock())
+    end, asking = domain.join(bus), domain.join(Bus(SimulatedClock()))
+    domain.settle()
+    domain.pass_time()
+    domain.settle()
+    assert asking.endpoint.next_question() is None
+    for name in ("lost", "heard"):
+        domain.wires[end, asking].packets.clear()
+        bus.publish(static("map", name))
+        end.endpoint.send()
+    domain.settle()
+    due = asking.endpoint.next_question()
+    assert due is not None
+    assert due - domain.time <= 1.5 * SETTLING
+    for made in (end, asking):
+        made.leave()
+
+
+def test_a_question_whose_answer_no_message_can_hold_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    domain = Domain()
+    end, asking = domain.join(Bus(SimulatedClock())), domain.join(Bus(SimulatedClock()))
+
+    def fail(*_: object) -> Message:
+        raise ValueError("too much")
+
+    monkeypatch.setattr(wires, "write_answer", fail)
+    wire = domain.wires[end, asking]
+    wire.packets.clear()
+    end.receive(asking.id, Question(0, asking.id))
+    assert (list(wire.packets), end.endpoint.peers.rejected) == ([], {})
+    for made in (end, asking):
+        made.leave()
+
+
 def test_a_peer_that_has_gone_is_asked_no_more() -> None:
     domain = Domain()
     end = domain.join(Bus(SimulatedClock()))
@@ -222,6 +281,7 @@ def test_the_time_of_a_clock_goes_before_what_is_published_at_it_and_a_jump_behi
     heard = Heard(other)
     end = domain.join(bus)
     hearing = domain.join(other, follower=heard)
+    plain = domain.join(Bus(SimulatedClock()))
     domain.settle()
     end.endpoint.tell_time(5)
     bus.publish(moving("map", "a", 1))
@@ -233,6 +293,7 @@ def test_the_time_of_a_clock_goes_before_what_is_published_at_it_and_a_jump_behi
     end.endpoint.send()
     domain.settle()
     assert heard.found == [6, "a", 6, "b", 2, "c"]
+    assert (plain.bus.statistics().frames, plain.endpoint.peers.rejected) == (3, {}), "it follows no clock"
     heard.found.clear()
     # Nothing but a time; and whoever comes later is told.
     end.endpoint.tell_time(9)
@@ -245,7 +306,7 @@ def test_the_time_of_a_clock_goes_before_what_is_published_at_it_and_a_jump_behi
     domain.settle()
     assert set(heard.found) == {9}
     assert set(late.found) == {9}
-    for made in (end, hearing, last):
+    for made in (end, hearing, plain, last):
         made.leave()
 
 

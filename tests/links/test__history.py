@@ -6,16 +6,20 @@ from support.samples import moving, static
 from support.wires import Domain, End
 
 from tfbus import SECOND, Buffer, Bus, TransformStamped
+from tfbus.links import _history
 from tfbus.links._history import (
     CHUNK,
     LONGEST_HISTORY,
     MOST_HELD,
     MOST_OF_FRAME,
+    MOST_REMEMBERED,
     PATIENCE,
     HistoryAsker,
     HistoryTeller,
 )
+from tfbus.links._message import Message
 from tfbus.links._receive_queue import HistoryAnswer, HistoryQuestion
+from tfbus.links._state import StateStep
 from tfbus.links.zenoh import ZenohLink
 
 
@@ -88,6 +92,26 @@ def test_who_joins_late_has_the_last_seconds_with_stamps_parents_and_authorities
         assert [sample.child for sample in s.heard if sample.static] == ["lidar"]
 
 
+@pytest.mark.parametrize("keeps", [(2.0, 8.0), (8.0, 2.0)])
+def test_the_past_is_that_of_the_buffer_which_holds_most_of_it(keeps: tuple[float, float]) -> None:
+    with scene(60.0, keeps[0]) as s, Buffer(s.source, keeps[1]), Buffer(s.source, 4.0):
+        for second in range(20):
+            s.publish(moving("map", "base", second * SECOND))
+        s.join()
+        s.deliver()
+        held = stamps_of(s.heard, "base")
+        assert held == list(range(20))[-len(held) :]
+        assert 8 <= len(held) <= 10
+
+
+def test_without_a_buffer_there_is_nothing_to_tell() -> None:
+    with Bus(max_ahead=None) as bus:
+        end = Domain().join(bus)
+        bus.publish(moving("map", "base", SECOND))
+        assert end.endpoint._history_teller.chunk(5.0, "") == ([], StateStep(0, 0, 0))
+        end.leave()
+
+
 def test_without_it_nothing_of_the_past_comes() -> None:
     with scene() as s:
         s.publish(moving("map", "base", SECOND))
@@ -96,19 +120,25 @@ def test_without_it_nothing_of_the_past_comes() -> None:
         assert s.heard == []
 
 
-@pytest.mark.thorough
-def test_the_past_comes_in_chunks_of_whole_frames_and_is_bounded() -> None:
+@pytest.mark.parametrize(
+    ("chunk", "most"), [(20, 20), (20, 30), pytest.param(CHUNK, MOST_OF_FRAME, marks=pytest.mark.thorough)]
+)
+def test_the_past_comes_in_chunks_of_whole_frames_and_is_bounded(
+    chunk: int, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_history, "CHUNK", chunk)
+    monkeypatch.setattr(_history, "MOST_OF_FRAME", most)
     with scene(LONGEST_HISTORY) as s:
         names = [f"f{number}" for number in range(5)]
-        for stamp in range(CHUNK // 2):
+        for stamp in range(chunk // 2):
             s.publish(*(moving("map", name, stamp) for name in names))
-        for stamp in range(MOST_OF_FRAME + 10):
+        for stamp in range(most + 10):
             s.publish(moving("map", "much", stamp))
         s.join()
         s.deliver()
         assert {name: len(stamps_of(s.heard, name)) for name in [*names, "much"]} == {
-            **dict.fromkeys(names, CHUNK // 2),
-            "much": MOST_OF_FRAME,
+            **dict.fromkeys(names, chunk // 2),
+            "much": most,
         }
         assert stamps_of(s.heard, "much")[0] == 10 / SECOND
         teller = s.teller.endpoint._history_teller
@@ -132,6 +162,18 @@ def test_a_peer_is_asked_once_even_if_it_comes_back() -> None:
         assert stamps_of(s.heard, "base") == [1]
 
 
+def test_so_many_peers_are_remembered_as_asked() -> None:
+    asked: list[str] = []
+    asker = HistoryAsker(5.0, lambda peer, _seconds, _after: asked.append(peer), lambda: 0.0)
+    for number in range(MOST_REMEMBERED):
+        asker.joined(f"{number}")
+    asker.joined("0")
+    assert len(asked) == MOST_REMEMBERED
+    for peer in ("one more", "1", "0"):
+        asker.joined(peer)
+    assert asked[MOST_REMEMBERED:] == ["one more", "0"], "the first one was forgotten"
+
+
 def test_without_an_answer_what_is_live_is_late_and_not_lost() -> None:
     with scene() as s:
         s.join()
@@ -148,7 +190,7 @@ def test_without_an_answer_what_is_live_is_late_and_not_lost() -> None:
         assert stamps_of(s.heard, "base") == [1]
 
 
-@pytest.mark.parametrize("end", ["answer", "loss", "many"])
+@pytest.mark.parametrize("end", ["answer", "garbage", "loss", "many"])
 def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too_much(end: str) -> None:
     with scene() as s:
         s.join()
@@ -163,6 +205,10 @@ def test_what_was_held_back_comes_when_the_peer_says_nothing_leaves_or_sends_too
         if end == "answer":
             assert s.heard == []
             s.asker.receive(s.teller.id, HistoryAnswer(None))
+        elif end == "garbage":
+            assert s.heard == []
+            s.asker.receive(s.teller.id, HistoryAnswer(Message(b"", b"no attachment", 0)))
+            assert s.asker.endpoint.peers.rejected == {"version": 1}
         elif end == "loss":
             assert s.heard == []
             s.domain.part(s.teller, s.asker)
@@ -192,6 +238,7 @@ def test_a_peer_whose_answers_lead_nowhere_is_asked_no_more() -> None:
             full.joined("peer")
             assert all(full.holds("peer", message) for _ in range(held))
             assert full.goes_on("peer", message) is goes_on
+            assert full.holds("peer", message) is goes_on
 
 
 def test_it_has_to_be_a_time_that_passes() -> None:

@@ -14,13 +14,25 @@ from support import strategies as some
 from support.samples import moving, static
 from support.wires import Domain, End, size_of
 
-from tfbus import Buffer, Bus, BusClosedError, FrameAdded, PeerLost, PeerRejected, SimulatedClock, TransformStamped
+from tfbus import (
+    Buffer,
+    Bus,
+    BusClosedError,
+    FrameAdded,
+    InvalidTransformError,
+    PeerLost,
+    PeerRejected,
+    SimulatedClock,
+    Transform,
+    TransformStamped,
+)
 from tfbus.bus._ownership import OnConflict
 from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
 from tfbus.links._entries import MovingFrame, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
 from tfbus.links._message import Message, read_message
 from tfbus.links._mirror import Mirror
+from tfbus.links._outbox import Outbox
 from tfbus.links._peers import MAX_AUTHORITIES, MAX_PEERS
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence
@@ -221,8 +233,8 @@ def test_gaps_in_the_numbers_of_a_peer_are_messages_that_were_lost(given: tuple[
 
 @pytest.mark.parametrize(
     ("second", "told"),
-    [(1, 1), (2, 1), (3, 0)],
-    ids=["of the same message", "without a gap", "after one lost message"],
+    [(1, 1), (2, 1), (3, 0), (2**33, 0)],
+    ids=["of the same message", "without a gap", "after one lost message", "after a number that is made up"],
 )
 def test_a_claim_after_a_lost_message_is_not_believed(second: int, told: int) -> None:
     with receiver() as here:
@@ -251,6 +263,20 @@ def test_a_live_message_that_an_answer_has_overtaken_does_not_change_what_is_kno
         now = StateStep(3, 4, digest_moving("a") ^ digest_moving("b"), message=2)
         here.inbox.receive("peer", ReceivedMessage([MovingFrame("a")], 2, step=now))
         assert (mirror.agrees, mirror.number, "a" in mirror) == (True, 4, True)
+
+
+def test_when_a_peer_has_told_its_whole_state_the_frames_go_that_it_brings_no_more() -> None:
+    with receiver() as here:
+        here.end.receive("peer", Presence.JOINED)
+        for name in "abc":
+            here.receive(moving("map", name, 1), sequence=1)
+        here.receive(moving("map", "d", 1), sequence=1, sender="other")
+        first, last = StateStep(0, 1, 0, final=False), StateStep(1, 2, digest_moving("a") ^ digest_moving("c"))
+        assert here.inbox.receive_answer("peer", ReceivedMessage([MovingFrame("a")], step=first))
+        assert set(here.frames) == set("abcd"), "the rest may follow"
+        assert here.inbox.receive_answer("peer", ReceivedMessage([MovingFrame("c")], step=last))
+        assert set(here.frames) == set("acd")
+        assert here.counts == (6, 4, 0, 0)
 
 
 def test_a_claim_that_is_near_a_large_number_is_believed() -> None:
@@ -330,6 +356,27 @@ def test_an_older_removal_spares_newer_samples() -> None:
         assert here.bus.statistics().frames == 1
         here.remove("a", sequence=6)
         assert here.bus.statistics().frames == 0
+        # The frame may be another's by now, whose numbers are lower.
+        here.receive(moving("map", "b", 5), sequence=8)
+        here.receive(moving("map", "b", 6), origin=OTHER, sequence=3)
+        here.remove("b", sequence=7)
+        assert here.frames == ["b"]
+        here.remove("b", sequence=9)
+        assert here.frames == []
+
+
+def test_of_what_two_buses_say_of_a_frame_a_removal_below_the_other_word_changes_nothing() -> None:
+    with receiver() as here:
+        here.receive(static("map", "s"), moving("map", "a", 1), origin=OTHER, sequence=9)
+        here.remove("s", sequence=5)
+        here.remove("a", sequence=5)
+        assert set(here.frames) == {"s", "a"}
+        here.remove("s", sequence=12)
+        here.remove("s", origin=OTHER, sequence=10)
+        here.receive(static("map", "s"), sequence=11)
+        assert here.frames == ["a"], "the removal of the higher number is the one that holds"
+        here.receive(static("map", "s"), origin=OTHER, sequence=13)
+        assert set(here.frames) == {"s", "a"}
 
 
 def test_a_removed_frame_comes_back_only_with_a_higher_number() -> None:
@@ -388,7 +435,11 @@ def test_of_very_many_removals_the_highest_number_is_remembered_for_live_message
         here.receive(moving("map", "new", 1), origin=OTHER, sequence=8, number=20_002)
         here.receive(static("map", "old"), sequence=1, number=0)
         here.receive(moving("map", "10", 1), sequence=20_000, number=20_003)
-        assert [[sample.child for sample in heard] for heard in here.heard] == [["new"], ["old"], ["10"]]
+        # So does what is told of the last seconds.
+        past = ReceivedTransform("map", "past", 1, Transform())
+        here.inbox.receive_history("peer", ReceivedMessage([ReceivedBatch([past], [], ORIGIN, 2)]))
+        assert [[sample.child for sample in heard] for heard in here.heard] == [["new"], ["old"], ["10"], ["past"]]
+        assert here.counts[:3] == (8, 4, 2)
 
 
 @pytest.mark.thorough
@@ -416,6 +467,35 @@ def test_the_loss_of_a_frame_removes_only_what_that_peer_has_brought() -> None:
         here.remove("d", origin=OTHER, sequence=9, sender="bridge", lost=True)
         here.receive(moving("map", "d", 1), sequence=1, sender="new")
         assert set(here.frames) == {"b", "c", "d"}, "and so has who has come since then"
+
+
+@pytest.mark.parametrize(("kind", "lost", "told"), [("static", True, 1), ("static", False, 0), ("moving", True, 0)])
+def test_of_a_loss_only_those_are_told_again_who_bring_a_late_static_sample(kind: str, lost: bool, told: int) -> None:
+    sample = static("map", "a") if kind == "static" else moving("map", "a", 1)
+    with receiver() as here:
+        here.receive(sample, sequence=1, sender="bridge")
+        here.receive(moving("map", "b", 1), sequence=1)
+        here.remove("a", origin=OTHER, sequence=9, sender="bridge", lost=lost)
+        here.turn()
+        here.receive(sample, sequence=1)
+        assert here.frames == ["b"]
+        entries = [entry for sent in here.turn() for entry in read_message(sent.payload, sent.attachment).entries]
+        losses = [(entry.frame, entry.lost) for entry in entries if isinstance(entry, RemovedFrame)]
+        assert losses == [("a", True)] * told
+
+
+def test_a_loss_is_passed_on_towards_the_owner_once_though_several_peers_tell_of_it() -> None:
+    with receiver() as here:
+        towards = Domain().join(here.bus)
+        towards.receive("owner", Message(encode([static("map", "s")]), pack(1, [batch([static("map", "s")])]), 1))
+        passed_on = []
+        for sequence, sender in ((1, "a"), (9, "a"), (9, "b"), (10, "b"), (9, "c")):
+            here.remove("s", origin=OTHER, sequence=sequence, sender=sender, lost=True)
+            passed_on.append(towards.endpoint.outbox.flush().entries)
+        assert here.frames == ["s"]
+        losses = {number: [RemovedFrame(OTHER, number, "s", lost=True)] for number in (9, 10)}
+        assert passed_on == [[], losses[9], [], losses[10], []]
+        towards.leave()
 
 
 def test_after_a_loss_a_removal_counts_as_ever() -> None:
@@ -450,6 +530,18 @@ def test_after_the_loss_of_a_peer_only_later_peers_may_repeat_its_last_samples(d
         assert here.counts[1:3] == (3, 3)
 
 
+def test_beside_a_world_without_origins_a_moving_sample_that_passed_is_no_news_and_a_static_one_is_ranked() -> None:
+    with receiver() as here:
+        world = Outbox(None, lambda: None)
+        here.end.relay.attach(world, foreign=True)
+        here.bus.publish([moving("map", "a", 1), static("map", "s")])
+        # They have gone round through that world and another bus.
+        here.receive(moving("map", "a", 1), static("map", "s"), sequence=500)
+        assert here.heard[1:] == [(static("map", "s"),)]
+        assert here.counts == (1, 1, 1, 0)
+        here.end.relay.detach(world)
+
+
 def test_a_number_that_no_bus_can_have_given_is_refused_and_later_ones_are_news() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1), sequence=7)
@@ -478,6 +570,21 @@ def test_a_number_of_this_bus_that_somebody_has_made_up_does_not_hide_what_it_sa
         here.bus.publish(moving("map", "m", 3))
         assert here.said().sequence > said_again.sequence
         assert [len(heard) for heard in here.heard] == [3, 1]
+
+
+def test_what_this_bus_has_said_itself_last_comes_back_without_being_said_again() -> None:
+    with receiver() as here:
+        here.bus.publish(static("map", "s"))
+        origin, number = here.end.relay.origin, here.said().sequence
+        here.receive(static("map", "s"), origin=origin, sequence=number)
+        here.remove("s", origin=origin, sequence=number)
+        assert here.turn() == []
+        # The next number is made up.
+        here.receive(static("map", "s"), origin=origin, sequence=number + 1)
+        number = here.said().sequence
+        here.remove("s", origin=origin, sequence=number + 1)
+        assert here.said().sequence > number + 1
+        assert here.frames == ["s"]
 
 
 def test_samples_of_this_bus_itself_are_no_news() -> None:
@@ -688,11 +795,28 @@ def test_removals_of_unknown_frames_do_not_reach_the_bus() -> None:
 def test_a_closed_bus_takes_nothing_in() -> None:
     with receiver() as here:
         here.receive(moving("map", "a", 1))
+        here.end.receive("peer", Presence.JOINED)
         here.bus.close()
         here.receive(moving("map", "a", 2), sequence=2)
         here.remove("a", sequence=3)
+        told = ReceivedMessage([ReceivedBatch([], [], ORIGIN, 4)], step=StateStep(0, 1, 0))
+        assert not here.inbox.receive_answer("peer", told)
+        here.inbox.receive_history("peer", told)
         assert here.heard == [(moving("map", "a", 1),)]
         assert here.counts == (1, 1, 0, 0)
+
+
+def test_what_a_peer_tells_that_has_gone_is_not_taken() -> None:
+    with receiver() as here:
+        bad = InvalidTransformError("bad", reason="bad", parent="map", child="a", authority="")
+        told = ReceivedMessage([ReceivedBatch([], [], ORIGIN, 1)], errors=[bad], step=StateStep(0, 1, 0))
+        assert not here.inbox.receive_answer("peer", told)
+        here.inbox.receive_history("peer", told)
+        assert (here.counts, here.peers.rejected) == ((0, 0, 0, 0), {})
+        # While it is there, what of that is invalid is counted.
+        here.peers.find("peer")
+        here.inbox.receive_history("peer", told)
+        assert (here.counts, here.peers.rejected) == ((1, 0, 0, 0), {"bad": 1})
 
 
 def test_a_subscriber_that_closes_the_bus_in_the_middle_of_a_message_ends_it() -> None:

@@ -7,11 +7,21 @@ from support import strategies as some
 from support.samples import moving, static
 
 from tfbus import SECOND, InvalidTransformError, TransformStamped
+from tfbus.links import _message
 from tfbus.links._attachment import MAX_ENTRIES, PublishedBatch, pack, unpack
 from tfbus.links._carrier import SendReport
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch
-from tfbus.links._message import FULL_MESSAGE, MAX_BYTES, Message, MessageWriter, can_hold, read_message, write_answer
+from tfbus.links._message import (
+    _LONGEST_AUTHORITY,
+    FULL_MESSAGE,
+    MAX_BYTES,
+    Message,
+    MessageWriter,
+    can_hold,
+    read_message,
+    write_answer,
+)
 from tfbus.links._state import StateStep
 from tfbus.tf_message import MAX_NAME, MalformedMessageError, encode
 
@@ -168,6 +178,30 @@ def test_no_message_is_larger_than_what_others_accept() -> None:
     messages = writer.write()
     assert shapes(messages) == [[1_500], [1_500, 1]]
     assert all(len(message.payload) + len(message.attachment) <= MAX_BYTES for message in messages)
+
+
+@pytest.mark.parametrize(("spare", "messages"), [(0, 1), (-1, 2)])
+def test_payload_and_attachment_together_may_fill_a_message(
+    spare: int, messages: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = Writer()
+
+    def written() -> list[Message]:
+        for name in "ab":
+            writer.add(moving("map", name, 1, authority="slam"))
+        return writer.write()
+
+    (whole,) = written()
+    monkeypatch.setattr(_message, "MAX_BYTES", len(whole.payload) + len(whole.attachment) + spare)
+    assert len(written()) == messages
+
+
+def test_the_longest_authority_is_sent() -> None:
+    longest = moving("map", "a", 1, authority="x" * _LONGEST_AUTHORITY)
+    assert can_hold(longest)
+    writer = Writer()
+    writer.add(longest)
+    assert writer.sent() == [[longest]]
 
 
 def test_a_batch_too_large_for_a_message_is_counted_and_its_neighbours_go_out() -> None:

@@ -134,5 +134,7 @@ def test_a_peer_with_too_many_frames_overfills_it_until_it_tells_all_anew() -> N
     assert not mirror.overfull
     mirror.moving("c")
     assert (mirror.overfull, "c" in mirror) == (True, False)
+    assert mirror.has_moving("b")
     mirror.begins_anew()
     assert not mirror.overfull
+    assert not mirror.has_moving("b"), "what it brings is all to be told again"

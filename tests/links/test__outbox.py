@@ -151,6 +151,7 @@ def test_an_echo_does_not_go_out_and_replaces_what_is_kept() -> None:
     sender.remove("u", origin=OTHER, echo=True)
     assert (sender.notified, sender.outbox.pending) == (2, 0)
     assert sender.turn() == ([], {"s": (theirs,), "t": None, "u": RemovedFrame(OTHER, 3, "u")})
+    assert not any(map(sender.outbox.state.brings, ("s", "t", "u", "new", "a"))), "another link brings them"
     sender.add(static("map", "s", 8.0), origin=OTHER, echo=True)
     assert sender.notified == 3
 
@@ -183,6 +184,14 @@ def test_an_echo_of_frames_that_are_not_kept_notifies_nobody() -> None:
     sender.remove("t", echo=True)
     sender.remove("a", echo=True)
     assert (sender.notified, sender.outbox.pending, sender.turn()) == (0, 0, ([], {}))
+    assert sender.outbox.state.entry("t") is None
+
+
+def test_a_removal_of_a_frame_that_the_link_never_brought_is_told_to_late_joiners_too() -> None:
+    sender = Sender()
+    sender.remove("unknown")
+    assert sender.outbox.state.entry("unknown") == RemovedFrame(ORIGIN, 1, "unknown")
+    assert sender.notified == 1
 
 
 @given(

@@ -6,7 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.links._receive_queue import MANY, MAX_BYTES, Answer, Presence, Question, Received, ReceiveQueue
+from tfbus.links._receive_queue import (
+    _OVERHEAD,
+    MANY,
+    MAX_BYTES,
+    Answer,
+    Presence,
+    Question,
+    Received,
+    ReceiveQueue,
+)
 from tfbus.statistics import QueueStatistics
 
 MIB = 2**20
@@ -147,6 +156,25 @@ def test_beyond_the_bytes_moving_items_are_dropped_first_and_then_the_oldest_of_
     queue.put(kept("kept 4", 15 * MIB))
     assert queue.statistics().dropped == 5
     assert drained(queue) == ["kept 1", "kept 2", "kept 3", "kept 4"]
+
+
+@pytest.mark.parametrize("before", [[], [moving(1, MIB)], [moving(1, MIB), kept("b", MIB)]], ids=len)
+@pytest.mark.parametrize("end", ["read", "discarded"])
+def test_an_item_may_fill_all_the_room_that_is_left(before: list[Received], end: str) -> None:
+    queue = ReceiveQueue(10)
+    for item in before:
+        queue.put(item)
+    if end == "read":
+        drained(queue)
+    else:
+        queue.discard_moving()
+    room = MAX_BYTES - sum(item.size + _OVERHEAD for item in before if end == "discarded" and not item.moving)
+    dropped = queue.statistics().dropped
+    queue.put(kept("all of it", room - _OVERHEAD))
+    assert queue.statistics().dropped == dropped
+    assert drained(queue)[-1] == "all of it"
+    queue.put(kept("more", MAX_BYTES - _OVERHEAD + 1))
+    assert queue.statistics().dropped == dropped + 1
 
 
 def test_reading_frees_room() -> None:

@@ -54,7 +54,7 @@ class Scene:
         self.reconciler.answered("peer", ReceivedMessage([MovingFrame(name) for name in names], step=step))
 
 
-A, B = digest_moving("a"), digest_moving("b")
+A, B, C = map(digest_moving, "abc")
 
 
 def test_a_peer_that_joins_is_asked_at_once_and_not_again_when_all_was_told() -> None:
@@ -78,6 +78,10 @@ def test_a_second_answer_to_what_all_was_told_already_changes_nothing() -> None:
         assert (peer.mirror.agrees, peer.mirror.number, "b" in peer.mirror) == (True, 2, True)
         assert not peer.mirror.take_whole()
         assert scene.reconciler.next_due() is None
+    # One that was written since then has more.
+    scene.answer(StateStep(2, 3, A ^ B ^ C), "c")
+    assert peer.mirror is not None
+    assert (peer.mirror.number, "c" in peer.mirror) == (3, True)
 
 
 def test_what_a_peer_claims_and_has_not_told_is_asked_for_in_parts() -> None:
@@ -91,6 +95,17 @@ def test_what_a_peer_claims_and_has_not_told_is_asked_for_in_parts() -> None:
     assert scene.run() == [("peer", 2)]
     scene.answer(StateStep(2, 3, A ^ B), "b")
     assert scene.reconciler.next_due() is None
+
+
+def test_a_peer_may_begin_anew_with_less_than_it_had_told() -> None:
+    scene = Scene()
+    scene.join()
+    scene.run()
+    scene.answer(StateStep(0, 2, A ^ B), "a", "b")
+    scene.hear(StateStep(4, 4, C))
+    assert scene.run() == [("peer", 2)]
+    scene.answer(StateStep(0, 1, 0, final=False), "a")
+    assert scene.run() == [("peer", 1)]
 
 
 def test_a_live_message_that_tells_the_rest_makes_the_question_needless() -> None:
@@ -111,8 +126,9 @@ def test_without_an_answer_and_after_one_that_does_not_help_it_asks_again_after_
     scene.reconciler.unanswered("peer")
     assert scene.run() == [("peer", 0)]
     assert 0.5 * FIRST_PAUSE <= scene.time <= 1.5 * FIRST_PAUSE
-    scene.answer(StateStep(7, 9, A))
-    assert scene.reconciler.next_due() != scene.time
+    for step in (StateStep(7, 9, A), StateStep(0, 0, A)):
+        scene.answer(step)
+        assert scene.reconciler.next_due() != scene.time
     assert scene.run() == [("peer", 0)]
 
 

@@ -188,6 +188,24 @@ async def test_after_its_end_a_server_has_no_address_and_its_port_is_free(bus: B
         socket.create_connection(("127.0.0.1", port))
 
 
+async def test_a_server_that_ends_before_its_applications_leaves_the_bus(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0) as server:
+        app = await anyio.to_thread.run_sync(Application, server.address)
+        app.subscribe()
+        await until(lambda: bool(bus._subscribers.callbacks))
+    assert not bus._subscribers.callbacks
+    await anyio.to_thread.run_sync(app.close)
+
+
+async def test_a_server_whose_task_is_cancelled_ends_too(bus: Bus) -> None:
+    with anyio.CancelScope() as scope:
+        async with FoxgloveServer(bus, 0) as server:
+            port = int(server.address.rpartition(":")[2])
+            scope.cancel()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port))
+
+
 async def test_a_server_is_entered_once_and_not_on_a_closed_bus(bus: Bus) -> None:
     server = FoxgloveServer(bus, 0)
     async with server:
@@ -196,6 +214,16 @@ async def test_a_server_is_entered_once_and_not_on_a_closed_bus(bus: Bus) -> Non
         await server.__aenter__()
     with pytest.raises(BusClosedError):
         await FoxgloveServer(bus, 0).__aenter__()
+
+
+async def test_the_bus_of_another_thread_is_not_served(bus: Bus) -> None:
+    async def enter() -> None:
+        with pytest.raises(RuntimeError, match="thread"):
+            await FoxgloveServer(bus, 0).__aenter__()
+
+    with bus.threadsafe():
+        # This event loop has a claim on the bus now.
+        await anyio.to_thread.run_sync(anyio.run, enter)
 
 
 @pytest.mark.parametrize(

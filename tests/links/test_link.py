@@ -117,6 +117,23 @@ async def test_samples_of_one_turn_go_out_together_and_a_full_turn_at_once() -> 
         assert carrier.calls == ["send 5000", "send 1", "close"]
 
 
+async def test_a_link_tells_its_name_and_how_many_peers_it_has() -> None:
+    carrier, told = LoggedCarrier(), list[str]()
+    with Bus() as bus:
+        link = Link(bus, "world", carrier)
+        told.append(repr(link))
+        async with link:
+            for count, name in enumerate(("a", "b")):
+                told.append(repr(link))
+                carrier.receive(Received(name, Presence.JOINED))
+                await until(lambda count=count: len(link.peers) == count + 1)  # type: ignore[misc]
+            told.append(repr(link))
+    told.append(repr(link))
+    assert told == [
+        f"<Link 'world': {state}>" for state in ("not joined", "0 peers", "1 peer", "2 peers", "not joined")
+    ]
+
+
 async def test_a_link_is_entered_once() -> None:
     with Bus() as bus:
         link = Link(bus, "world", LoggedCarrier())
@@ -173,6 +190,16 @@ async def test_a_link_that_is_cancelled_while_it_opens_closes_its_carrier() -> N
     assert carrier.calls == ["open", "close"]
 
 
+async def test_what_comes_while_the_carrier_opens_is_published_when_the_link_has_joined() -> None:
+    carrier = LoggedCarrier()
+    message = Received("driver", ForeignMessage(False, [ARM]))
+    carrier.while_opening = lambda: carrier.receive(message)
+    with Bus() as bus:
+        async with Link(bus, "world", carrier) as link:
+            await receive_samples(link, 1)
+            assert bus.statistics().frames == 1
+
+
 async def test_a_bus_that_closes_while_the_carrier_opens_is_not_linked() -> None:
     carrier = LoggedCarrier()
     bus = Bus()
@@ -192,6 +219,23 @@ async def test_the_error_of_the_body_comes_out_as_it_is_and_the_last_turn_goes_o
     assert caught.value.__cause__ is None
     assert caught.value.__context__ is None
     assert carrier.calls == ["open", "run", "send 1", "close"]
+
+
+@pytest.mark.every_loop
+async def test_what_was_published_last_goes_out_while_the_carrier_still_runs() -> None:
+    class EndingCarrier(LoggedCarrier):
+        async def run(self) -> None:
+            try:
+                await super().run()
+            finally:
+                self.calls.append("end")
+
+    carrier = EndingCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier):
+            await until(lambda: "run" in carrier.calls)
+            bus.publish(moving("map", "a", 1))
+    assert carrier.calls == ["open", "run", "send 1", "end", "close"]
 
 
 async def test_an_error_of_the_running_carrier_ends_the_body_and_comes_out_as_it_is() -> None:
@@ -330,6 +374,18 @@ def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
         for _ in range(3):
             carrier.receive(message)
         assert link.statistics().queue.pending == 3
+
+
+async def test_a_link_tells_no_time_that_it_is_not_to_tell() -> None:
+    clock, carrier = SimulatedClock(), LoggedCarrier()
+    told: list[int | None] = []
+    carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier):
+            clock.set(1_000)
+            bus.publish(moving("map", "a", 1))
+            await until(lambda: bool(told))
+    assert told == [None]
 
 
 async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own() -> None:

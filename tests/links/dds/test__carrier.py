@@ -1,5 +1,5 @@
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Unpack
 
 import anyio
 import pytest
@@ -7,22 +7,36 @@ import pytest
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
 from cyclonedds.domain import DomainParticipant
+from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from support.processes import until
 from support.samples import moving, static
 
+from tfbus import SimulatedClock
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.dds._carrier import _MOVING, _STATIC, DdsCarrier, _nodes_of
+from tfbus.links.dds._carrier import _MOVING, _STATIC, _STATICS, DdsCarrier, _nodes_of
 from tfbus.links.dds._domains import configuration, domain
-from tfbus.links.dds._types import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo, RawTFMessage
+from tfbus.links.dds._publishers import PATIENCE, Publishers
+from tfbus.links.dds._types import (
+    Gid,
+    Header,
+    NodeEntitiesInfo,
+    ParticipantEntitiesInfo,
+    RawClock,
+    RawJointState,
+    RawString,
+    RawTFMessage,
+    Time,
+)
 from tfbus.links.ros._carrier import RosMessage
-from tfbus.links.ros.settings import settings_of
-from tfbus.tf_message import encode
+from tfbus.links.ros.settings import RosOptions, settings_of
+from tfbus.tf_message import MalformedMessageError, encode
 
 AS_A_CARRIER: type[Carrier] = DdsCarrier
 """That it fits the protocol, mypy says."""
@@ -121,6 +135,203 @@ async def test_who_has_sent_a_message_is_known_to_be_of_ros_or_not(
     assert carrier._is_of_ros(items[0].sender) is of_ros
     node.end()
     await carrier.close()
+
+
+def _kind(item: Received) -> tuple[bool, bool, bool]:
+    return item.content.joints, item.content.clock, item.content.description
+
+
+async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(domain_number: int) -> None:
+    items: list[Received] = []
+    takers: RosOptions = {"joint_states": print, "clock": SimulatedClock(), "robot_description": print, "send": False}
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of(takers))
+    await carrier.open(items.append, SendReport(print))
+    node = Node(domain_number)
+    make: Any = SimpleNamespace(joints=RawJointState, clock=RawClock)
+    stamp: Any = Time(100, 5)
+    said: list[tuple[str, Any, Any]] = [
+        ("joint_states", RawJointState, make.joints(Header(stamp, ""), ["a"], [0.5], [], [])),
+        ("clock", RawClock, make.clock(stamp)),
+        ("robot_description", RawString, RawString("<robot/>")),
+    ]
+    writers: list[tuple[Any, Any]] = [
+        (DataWriter(node.participant, Topic(node.participant, f"rt/{name}", kind), _STATIC), message)
+        for name, kind, message in said
+    ]
+    with anyio.fail_after(20):
+        while len(kinds := {_kind(item): item for item in items if isinstance(item.content, RosMessage)}) < 3:
+            # The two that are not latched may be lost while the two meet.
+            for writer, message in writers:
+                writer.write(message)
+            await anyio.sleep(0.01)
+    for writer, _ in writers:
+        writer.__del__()
+    node.end()
+    await carrier.close()
+    assert {kind: (item.sender, item.moving) for kind, item in kinds.items()} == {
+        (True, False, False): ("other topics", True),
+        (False, True, False): ("other topics", True),
+        (False, False, True): ("other topics", False),
+    }
+
+
+class Reader:
+    """A reader as the thread of the readers has it: its messages, and the writers that it knows."""
+
+    def __init__(self, *messages: Any) -> None:
+        self.messages = list(messages)
+        self.writers: dict[int, tuple[str, str]] = {}
+        self.asked: list[int] = []
+
+    def take(self, N: int) -> list[Any]:  # noqa: N803 - the library calls it so
+        taken, self.messages = self.messages[:N], self.messages[N:]
+        return taken
+
+    def get_matched_publications(self) -> list[int]:
+        return list(self.writers)
+
+    def get_matched_publication_data(self, handle: int) -> Any:
+        self.asked.append(handle)
+        if handle not in self.writers:
+            return None
+        key, participant = (SimpleNamespace(hex=name) for name in self.writers[handle])
+        return SimpleNamespace(key=key, participant_key=participant)
+
+
+GONE = InvalidSample.__new__(InvalidSample)
+"""What the library gives in place of a message when a writer has gone."""
+
+
+def said(payload: bytes, writer: int = 1) -> Any:
+    return SimpleNamespace(payload=payload, sample_info=SimpleNamespace(publication_handle=writer))
+
+
+def unopened(**options: Unpack[RosOptions]) -> tuple[Any, list[Received]]:
+    """A carrier that has not joined, and what it has received."""
+    items: list[Received] = []
+    carrier = DdsCarrier(0, CONFIG, settings_of(options))
+    carrier._receive, carrier._report = items.append, SendReport(print)
+    return carrier, items
+
+
+def test_all_messages_that_wait_are_taken_and_the_library_is_asked_once_for_each_writer() -> None:
+    carrier, items = unopened(authority="ros")
+    payloads = [b"%d" % number for number in range(250)]
+    reader = Reader(*(each for payload in payloads for each in (GONE, said(payload))))
+    reader.writers[1] = ("writer", "driver")
+    carrier._take(False, reader)
+    assert [item.content.payload for item in items] == payloads
+    assert {(item.sender, item.moving) for item in items} == {("driver", True)}
+    assert reader.asked == [1]
+    # One that has gone since then, and is not remembered.
+    reader.messages = [said(b"last", 2), said(b"last", 2)]
+    carrier._take(True, reader)
+    assert [(item.sender, item.moving, item.content.authority) for item in items[250:]] == [("", False, "")] * 2
+    assert reader.asked == [1, 2, 2]
+
+
+def test_without_an_authority_messages_wait_for_the_names_of_their_nodes() -> None:
+    carrier, items = unopened()
+    reader = Reader(said(b"first"))
+    reader.writers[1] = ("1" * 32, "0" * 32)
+    carrier._take(False, reader)
+    assert items == []
+    one, two = (SimpleNamespace(data=[17 * number] * 16) for number in (0, 1))
+    node = SimpleNamespace(node_namespace="/robot/", node_name="a", writer_gid_seq=[two])
+    carrier._take_nodes(Reader(GONE, SimpleNamespace(gid=one, node_entities_info_seq=[node])))
+    assert items[0].content == RosMessage(b"first", static=False, authority="/robot/a")
+
+
+def test_a_participant_is_there_while_it_publishes_on_any_topic() -> None:
+    carrier, items = unopened()
+    static_frames, moving_frames = Reader(), Reader()
+
+    def told(*participants: str, reader: Reader) -> list[tuple[str, object]]:
+        items.clear()
+        reader.writers = {number: (f"{number}", name) for number, name in enumerate(participants)}
+        carrier._match(0 if reader is static_frames else 1, reader)
+        return [(item.sender, item.content) for item in items]
+
+    assert told("b", "a", reader=static_frames) == [("a", Presence.JOINED), ("b", Presence.JOINED)]
+    assert told("b", "b", "c", reader=moving_frames) == [("c", Presence.JOINED)]
+    # What still waits for the name of its node comes before the end of its participant.
+    static_frames.messages = [said(b"waits", 1)]
+    carrier._take(True, static_frames)
+    assert told("c", reader=static_frames) == [
+        ("a", RosMessage(b"waits", static=True, authority="a")),
+        ("a", Presence.LEFT),
+    ]
+    assert told(reader=moving_frames) == [("b", Presence.LEFT)]
+    assert told(reader=static_frames) == [("c", Presence.LEFT)]
+
+
+def test_a_writer_is_asked_for_anew_when_the_writers_have_changed() -> None:
+    carrier, items = unopened(authority="ros")
+    reader = Reader(said(b"first"))
+    reader.writers[1] = ("writer", "driver")
+    carrier._take(False, reader)
+    reader.writers[1] = ("writer", "another")
+    carrier._match(0, reader)
+    reader.messages = [said(b"second")]
+    carrier._take(False, reader)
+    assert [item.sender for item in items if isinstance(item.content, RosMessage)] == ["driver", "another"]
+
+
+def test_what_the_library_cannot_read_is_a_malformed_message_with_the_begin_of_its_error() -> None:
+    carrier, items = unopened()
+    carrier._misread(ValueError("x" * 1_000))
+    (item,) = items
+    assert isinstance(item.content, MalformedMessageError)
+    assert item.content.reason == "encoding"
+    assert 100 < str(item.content).count("x") < 200
+
+
+async def test_while_it_runs_messages_are_delivered_whose_nodes_told_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    carrier, items = unopened()
+    now, pauses = 100.0, list[float]()
+    carrier._publishers = Publishers(carrier._deliver, lambda _: False, lambda: now)
+    reader = Reader(said(b"waits"))
+    reader.writers[1] = ("writer", "driver")
+    carrier._take(False, reader)
+
+    async def sleep(seconds: float) -> None:
+        nonlocal now
+        if items:
+            raise EOFError
+        pauses.append(seconds)
+        now += seconds
+
+    monkeypatch.setattr(anyio, "sleep", sleep)
+    with pytest.raises(EOFError):
+        await carrier.run()
+    assert sum(pauses) == PATIENCE
+    assert items[0].content == RosMessage(b"waits", static=False, authority="driver")
+
+
+async def test_what_is_sent_is_counted_and_of_the_static_frames_the_last_message_is_latched(domain_number: int) -> None:
+    report = SendReport(print)
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of({}))
+    await carrier.open(print, report)
+    for stamp in (1, 2):
+        moved = OutgoingBatch(bytes(16), stamp, [moving("map", "base", stamp)])
+        carrier.send(Turn([moved], {"lidar": OutgoingBatch(bytes(16), stamp, [static("map", "lidar", stamp=stamp)])}))
+    assert (report.messages, report.samples) == (4, 4)
+    node = Node(domain_number)
+    reader: DataReader[Any] = DataReader(
+        node.participant, Topic(node.participant, "rt/tf_static", RawTFMessage), _STATICS
+    )
+    latched: list[bytes] = []
+
+    def received() -> bool:
+        messages: list[Any] = reader.take(N=10)
+        latched.extend(message.payload for message in messages)
+        return bool(latched)
+
+    await until(received)
+    reader.__del__()
+    node.end()
+    await carrier.close()
+    assert latched == [encode([static("map", "lidar", stamp=2)])]
 
 
 async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:

@@ -1,6 +1,8 @@
 import sys
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -17,7 +19,7 @@ from support.both_sides import node
 from tfbus.links.dds import _joining
 from tfbus.links.dds._carrier import _STATICS
 from tfbus.links.dds._domains import configuration, domain
-from tfbus.links.dds._joining import delete, is_of_ros, join, read
+from tfbus.links.dds._joining import ANSWER_TIME, QUIET_TIME, WRITERS_TIME, delete, is_of_ros, join, read
 from tfbus.links.dds._types import RawTFMessage
 
 CONFIG = configuration("localhost", (), None)
@@ -39,6 +41,65 @@ def test_a_participant_of_ros_is_known_by_its_user_data(
         found = {each.key.hex: is_of_ros(each) for each in read(reader)}
         assert found[other.guid.hex] is of_ros
         assert not found[participant.guid.hex]
+
+
+def test_an_entity_is_deleted_now() -> None:
+    deleted: list[bool] = []
+    entity: Any = SimpleNamespace(__del__=lambda: deleted.append(True))
+    delete(entity)
+    assert deleted == [True]
+
+
+class Times:
+    """A time that passes only while somebody sleeps, and what a reader finds at which."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, found: list[tuple[float, Any]]) -> None:
+        self.now = 0.0
+        self.deleted: list[Any] = []
+        self.found = found
+        monkeypatch.setattr(_joining, "monotonic", lambda: self.now)
+        monkeypatch.setattr(_joining, "sleep", self._sleep)
+        monkeypatch.setattr(_joining, "BuiltinDataReader", lambda *_: "reader")
+        monkeypatch.setattr(_joining, "read", lambda _: [each for when, each in self.found if when <= self.now])
+        monkeypatch.setattr(_joining, "delete", self.deleted.append)
+
+    def _sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+def program(name: str, of_ros: bool = True) -> Any:
+    data = SimpleNamespace(data=b"enclave=/;" if of_ros else b"")
+    return SimpleNamespace(key=SimpleNamespace(hex=name), guid=SimpleNamespace(hex=name), qos={Policy.Userdata: data})
+
+
+def test_programs_of_ros_are_waited_for_until_no_more_of_them_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    own, first, second = program("own"), ANSWER_TIME - 0.005, ANSWER_TIME + 0.01
+    others = [(first, program("other", of_ros=False)), (first, program("a")), (second, program("b"))]
+    times = Times(monkeypatch, [(0.0, own), *others, (second + QUIET_TIME + 0.01, program("late"))])
+    assert _joining._answering(own) == {"a", "b"}
+    assert second + QUIET_TIME <= times.now <= second + QUIET_TIME + 0.005
+    assert times.deleted == ["reader"]
+    times.now, times.found = 0.0, [(0.0, own)]
+    assert _joining._answering(own) == set()
+    assert ANSWER_TIME <= times.now <= ANSWER_TIME + 0.005, "nobody is there"
+
+
+@pytest.mark.parametrize(("known_at", "until"), [(0.3, 0.3), (99.0, WRITERS_TIME)])
+def test_who_joins_waits_until_a_writer_of_each_program_is_known(
+    known_at: float, until: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writers = [(when, SimpleNamespace(participant_key=SimpleNamespace(hex=name))) for when, name in [(0.1, "a")] * 2]
+    writers.append((known_at, SimpleNamespace(participant_key=SimpleNamespace(hex="b"))))
+    times = Times(monkeypatch, writers)
+    made: Iterator[Any] = iter(["first", "second"])
+    monkeypatch.setattr(_joining, "DomainParticipant", lambda _: next(made))
+    monkeypatch.setattr(_joining, "_answering", lambda _: {"a", "b"})
+    with ExitStack() as stack:
+        joined: Any = join(5, stack)
+        assert joined == "second"
+        assert until <= times.now <= until + 0.005
+        assert times.deleted == ["reader"]
+    assert times.deleted == ["reader", "second", "first"], "the first one stays as long as the other"
 
 
 @pytest.mark.thorough

@@ -133,9 +133,40 @@ def test_a_node_announces_its_topics_and_passes_messages_on_both_ways() -> None:
     assert made._publish([moving("map", "base", 3)], static=False) is False
 
 
+def test_whoever_comes_late_gets_the_last_message_of_static_frames_and_no_moving_ones() -> None:
+    address = free_address()
+    early = RmwZenohCarrier(7, "early", settings(address, None, None, 2.0), settings_of({}))
+    late = RmwZenohCarrier(7, "late", settings(None, address, None, 2.0), settings_of({"send": False}))
+    items = Queue[Received]()
+    late._receive = items.put
+    for made in (early, late):
+        made._report = SendReport(print)
+    early._join()
+    for stamp in (1, 2):
+        assert early._publish([static("map", "lidar", stamp=stamp)], static=True)
+        assert early._publish([moving("map", "base", stamp)], static=False)
+    late._join()
+    assert items.get(timeout=20.0).content == RosMessage(
+        encode([static("map", "lidar", stamp=2)]), static=True, authority="rmw_zenoh"
+    )
+    assert items.empty()
+    for made in (late, early):
+        anyio.run(made.close)
+
+
 def test_what_cannot_be_sent_is_not_counted_as_sent() -> None:
     made, _ = carrier()
+    errors: list[Exception] = []
+    made._report = SendReport(errors.append)
     assert made._publish([static("map", "lidar")], static=True) is False
+
+    def put(*_: object, **__: object) -> None:
+        raise zenoh.ZError("the session is closed")
+
+    closed: Any = SimpleNamespace(put=put)
+    made._publishers[True] = closed
+    assert made._publish([static("map", "lidar")], static=True) is False
+    assert ["the session is closed" in str(error) for error in errors] == [True]
 
 
 def test_a_carrier_that_never_opened_closes() -> None:

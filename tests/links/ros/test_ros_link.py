@@ -6,7 +6,7 @@ from support.ros import ListCarrier
 from support.samples import moving, static
 
 from tfbus import Bus, SimulatedClock, from_seconds
-from tfbus.links._receive_queue import Received
+from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros import RosLink, RosOptions
 from tfbus.links.ros._carrier import RosMessage
 from tfbus.tf_message import encode
@@ -31,6 +31,19 @@ async def test_a_link_to_ros_passes_on_both_ways_what_its_options_let_through() 
     assert heard[1:] == [(moving("map", "base", 9, authority="/n"),)]
     assert link.statistics().rejected == {"too many frames": 1}
     assert carrier.closed
+
+
+@pytest.mark.parametrize(("options", "frames"), [({}, 1), ({"drop_lost": False}, 1), ({"drop_lost": True}, 0)])
+async def test_the_frames_of_a_lost_peer_stay_unless_they_are_to_be_dropped(options: RosOptions, frames: int) -> None:
+    carrier, payload = ListCarrier(options), encode([moving("map", "base", 9)])
+    with Bus() as bus:
+        async with RosLink(bus, "ros", carrier, **options) as link:
+            for content in (Presence.JOINED, RosMessage(payload, static=False, authority="/n")):
+                carrier._receive(Received("peer", content))
+            await until(lambda: bus.statistics().frames == 1)
+            carrier._receive(Received("peer", Presence.LEFT))
+            await until(lambda: link.peers == ())
+            assert bus.statistics().frames == frames
 
 
 async def test_a_simulated_clock_follows_the_time_of_ros_and_one_jump_back_is_one_reset() -> None:

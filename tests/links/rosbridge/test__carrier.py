@@ -1,5 +1,6 @@
 import json
 import math
+from types import SimpleNamespace
 from typing import Any
 
 import anyio
@@ -11,11 +12,15 @@ from support.processes import until
 from support.rosbridge import rosbridge_server
 from support.samples import moving
 
+from tfbus import SimulatedClock
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.ros._carrier import RosMessage
 from tfbus.links.ros.settings import settings_of
 from tfbus.links.rosbridge import _carrier
-from tfbus.links.rosbridge._carrier import RosbridgeCarrier
+from tfbus.links.rosbridge._carrier import Encoding, RosbridgeCarrier
+from tfbus.links.rosbridge._protocol import Incoming
+from tfbus.tf_message import MalformedMessageError
 
 AS_A_CARRIER: type[Carrier] = RosbridgeCarrier
 """That it fits the protocol, mypy says."""
@@ -76,12 +81,17 @@ async def test_attempts_to_come_back_are_ever_further_apart_up_to_a_limit(monkey
 class Alone:
     """A carrier that was not opened, what it could not send, and what it asks its server for."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, waits: list[bool] | None = None) -> None:
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, waits: list[bool] | None = None, encoding: Encoding = "cbor"
+    ) -> None:
         self.errors: list[Exception] = []
         self.pauses: list[float] = []
+        self.items: list[Received] = []
         self._waits = iter([] if waits is None else waits)
-        self.carrier = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({}), lookup_waits=lambda: next(self._waits))
+        settings = settings_of({"joint_states": print, "clock": SimulatedClock(), "robot_description": print})
+        self.carrier = RosbridgeCarrier("ws://127.0.0.1:1", settings, encoding, lambda: next(self._waits))
         self.carrier._report = self.report = SendReport(self.errors.append)
+        self.carrier._receive = self.items.append
         self._left = None if waits is None else len(waits)
         monkeypatch.setattr(anyio, "sleep", self._sleep)
 
@@ -90,11 +100,126 @@ class Alone:
             raise EOFError
         self.pauses.append(seconds)
 
+    async def connect(self, monkeypatch: pytest.MonkeyPatch, now: float) -> None:
+        """Find a server at a time."""
+
+        async def found(*_: object) -> object:
+            return object()
+
+        monkeypatch.setattr(_carrier, "monotonic", lambda: now)
+        monkeypatch.setattr(_carrier, "WebSocket", SimpleNamespace(connect=found))
+        await self.carrier._connect()
+
+    def encodings(self) -> dict[str, str]:
+        """The encoding that is asked for of each topic."""
+        taken = [json.loads(text) for text in self.carrier._requests]
+        return {request["topic"]: request["compression"] for request in taken if request["op"] == "subscribe"}
+
     def requests(self) -> list[tuple[str, str]]:
         """Operation and topic of each request since the last call."""
         taken = [json.loads(text) for text in self.carrier._requests]
         self.carrier._requests.clear()
         return [(request["op"], request["topic"]) for request in taken]
+
+
+MOVING, STATIC = (Incoming(topic, {"transforms": []}, "cbor") for topic in ("/tf", "/tf_static"))
+OF_ROS_2 = Incoming("/tf_static", {"transforms": [{"header": {"stamp": {"sec": 5, "nanosec": 0}}}]}, "cbor")
+
+
+async def test_each_topic_has_its_kind_and_only_what_comes_again_may_be_dropped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alone = Alone(monkeypatch)
+    for topic in ("/tf", "/tf_static", "/joint_states", "/clock", "/robot_description"):
+        alone.carrier._take(Incoming(topic, "content", "cbor"), 7)
+    with pytest.raises(MalformedMessageError, match="'/other', which nobody asked for"):
+        alone.carrier._take(Incoming("/other", "content", "cbor"), 7)
+    url = "ws://127.0.0.1:1"
+    assert alone.items == [
+        Received(url, RosMessage("content", static=False, authority="rosbridge"), 7, moving=True),
+        Received(url, RosMessage("content", static=True, authority="rosbridge"), 7),
+        Received(url, RosMessage("content", static=False, authority="", joints=True), 7, moving=True),
+        Received(url, RosMessage("content", static=False, authority="", clock=True), 7, moving=True),
+        Received(url, RosMessage("content", static=False, authority="", description=True), 7),
+    ]
+    assert alone.carrier._heard_moving
+
+
+@pytest.mark.parametrize(("encoding", "joints"), [("cbor", "none"), ("cbor-raw", "cbor-raw")])
+async def test_what_is_latched_is_asked_for_first_and_joints_never_in_decoded_cbor(
+    encoding: Encoding, joints: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = Alone(monkeypatch, encoding=encoding)
+    await alone.connect(monkeypatch, 100.0)
+    others = {"/tf": encoding, "/clock": encoding, "/robot_description": encoding}
+    assert alone.encodings() == {"/tf_static": encoding, "/joint_states": joints, **others}
+    requests = alone.requests()
+    assert requests[:2] == [("subscribe", "/tf_static"), ("subscribe", "/tf")]
+    assert requests[5:] == [("advertise", "/tf_static")]
+    assert [item.content for item in alone.items] == [Presence.JOINED]
+    # In JSON, from a server that has not the bytes.
+    alone.carrier._take(MOVING._replace(encoding="none"), 7)
+    assert alone.requests() == (again("/tf_static") + again("/tf")) * (encoding == "cbor-raw")
+
+
+@pytest.mark.parametrize(
+    ("of_ros2", "published", "held"), [(True, True, True), (False, True, False), (True, False, False)]
+)
+async def test_after_a_break_moving_frames_are_held_back_while_ros_2_has_the_former_publisher(
+    of_ros2: bool, published: bool, held: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = Alone(monkeypatch)
+    await alone.connect(monkeypatch, 100.0)
+    if of_ros2:
+        alone.carrier._take(OF_ROS_2, 7)
+    # That the server is of ROS 2 is not forgotten.
+    alone.carrier._take(STATIC, 7)
+    sample = [moving("map", "a", 1)]
+    if published:
+        assert alone.carrier._publish(sample, static=False)
+    alone.carrier._broken_at = 150.0
+    await alone.connect(monkeypatch, 155.0)
+    assert alone.carrier._publish(sample, static=False) is not held
+    # What a server of ROS 2 gives at first may be of this link itself.
+    for later, still in ((_carrier.ECHO_TIME, held), (_carrier.ECHO_TIME + 0.1, False)):
+        monkeypatch.setattr(_carrier, "monotonic", lambda now=155.0 + later: now)
+        alone.carrier._take(STATIC, 7)
+        alone.carrier._take(MOVING, 7)
+        assert alone.carrier._publish(sample, static=False) is not still
+
+
+@pytest.mark.parametrize("waits", [_carrier.LINGER_TIME - 0.1, _carrier.LINGER_TIME])
+async def test_moving_frames_are_held_back_for_so_long_after_the_break(
+    waits: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = Alone(monkeypatch)
+    await alone.connect(monkeypatch, 100.0)
+    alone.carrier._take(OF_ROS_2, 7)
+    assert alone.carrier._publish([moving("map", "a", 1)], static=False)
+    alone.carrier._broken_at = 150.0
+    await alone.connect(monkeypatch, 150.0 + waits)
+    taken = alone.carrier._publish([moving("map", "a", 1)], static=False)
+    assert taken is (waits >= _carrier.LINGER_TIME)
+
+
+async def test_a_server_is_pinged_until_it_has_been_silent_for_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone, pings, now = Alone(monkeypatch, []), list[float](), 1_000.0
+    alone._left = None
+
+    async def ping() -> None:
+        pings.append(now)
+
+    def pass_time() -> float:
+        nonlocal now
+        now += _carrier.SILENCE / 4
+        return now
+
+    monkeypatch.setattr(_carrier, "monotonic", pass_time)
+    socket: Any = SimpleNamespace(heard=1_000.0, ping=ping)
+    with pytest.raises(ConnectionResetError, match="nothing has come for 10 s"):
+        await alone.carrier._keep_alive(socket)
+    assert alone.pauses == [_carrier.SILENCE / 4] * 5
+    assert len(pings) == 4
 
 
 def again(topic: str) -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.joint_messages import KIND, TYPES, joint_state
-from support.ros import ros1, ros1_of
+from support.ros import named, ros1, ros1_of
 from support.samples import moving, static
 from support.strategies import CHARACTERS
 
@@ -73,6 +73,17 @@ def test_messages_are_read_in_every_encoding() -> None:
         assert decode_content(incoming.content).samples == samples
 
 
+def test_leading_slashes_of_names_are_left_out_in_every_encoding() -> None:
+    other = moving("-map", "--base", 5, 1.5)
+
+    def slashed(message: bytes) -> bytes:
+        return named(named(message, "-map", "/map"), "--base", "//base")
+
+    fields = json.loads(slashed(publish("/tf", [other]).encode()))["msg"]
+    for content in (fields, slashed(encode([other])), slashed(ros1(ros1_of(other)))):
+        assert decode_content(content).samples == [moving("map", "base", 5, 1.5)]
+
+
 def test_bytes_of_ros_1_are_told_from_those_of_ros_2() -> None:
     many = [static("map", f"f{number}") for number in range(256)]
     for samples in (many[:1], many, []):
@@ -89,6 +100,7 @@ def test_bytes_of_ros_1_are_told_from_those_of_ros_2() -> None:
         (json.loads(publish("/tf", [moving("map", "base", 5)]))["msg"], False),
         (ros1(ros1_of(moving("map", "base", 5))), False),
         (ros1(), False),
+        (b"\0\1\0\0", False),
         ({"transforms": []}, False),
         ({"transforms": [5]}, False),
         (5, False),
@@ -101,6 +113,8 @@ def test_the_content_of_a_message_tells_whether_it_is_of_ros_2(content: Any, ros
 def test_the_status_of_a_server_has_no_topic() -> None:
     incoming = read('{"op": "status", "level": "error", "msg": "no such type"}')
     assert (incoming.topic, incoming.content) == ("", "status: no such type")
+    for other in ('{"op": "status", "topic": "/tf", "msg": {}}', '{"op": "publish", "topic": 5, "msg": {}}'):
+        assert read(other).topic == ""
 
 
 @pytest.mark.parametrize("message", ["", "[1]", "nonsense", "5", b"\xff", b"\x05", "[" * 100_000, b"\x81" * 100_000])

@@ -58,7 +58,9 @@ async def test_transforms_pass_both_ways_in_an_encoding_that_the_server_has(
         said = [request["msg"]["transforms"] for request in server.requests if request["op"] == "publish"]
         # Static frames go before moving ones, as they are fewer and latched.
         assert [[row["child_frame_id"] for row in rows] for rows in said] == [["camera"], ["camera", "imu"], ["arm"]]
-        assert sorted(server.operations("advertise")) == ["/tf", "/tf_static"]
+        advertised = [request for request in server.requests if request["op"] == "advertise"]
+        assert {request["topic"]: request["latch"] for request in advertised} == {"/tf": False, "/tf_static": True}
+        assert len(advertised) == 2
 
 
 @pytest.mark.parametrize("first", [True, False])

@@ -43,13 +43,16 @@ def test_a_peer_that_was_reached_and_is_lost_is_dialled_until_it_is_back() -> No
     assert round(scene.next()[0], 6) == FIRST_PAUSE
 
 
-def test_after_a_while_the_pauses_are_long() -> None:
+@pytest.mark.parametrize(("waited", "pause"), [(SHORT_TIME - 1, 2 * FIRST_PAUSE), (SHORT_TIME, LONG_PAUSE)])
+def test_after_a_while_the_pauses_are_long(waited: float, pause: float) -> None:
     scene = Scene()
+    scene.time = 10 * SHORT_TIME
     scene.dialing.reached("a", "tcp/here:1")
     scene.dialing.left("a")
-    scene.time += SHORT_TIME + 1
+    scene.time += waited
     assert scene.dialing.take_due() == [("a", "tcp/here:1")]
-    assert scene.next() == (LONG_PAUSE, [("a", "tcp/here:1")])
+    until_next, who = scene.next()
+    assert (round(until_next, 6), who) == (pause, [("a", "tcp/here:1")])
 
 
 def test_a_peer_that_was_never_reached_is_not_dialled() -> None:

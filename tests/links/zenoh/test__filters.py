@@ -28,6 +28,13 @@ def test_a_filter_that_is_too_long_for_a_key_is_none() -> None:
     names = [f"frame {number:013}" for number in range(1_000)]
     assert write_filter(["*"], names) == ""
     assert 0 < len(write_filter(["*"], names[:500])) <= LONGEST_FILTER
+    # Four characters hold three bytes, and a filter of one empty name has some.
+    length = LONGEST_FILTER * 3 // 4 - len(json.dumps([["*"], [""]], separators=(",", ":")))
+    longest = write_filter(["*"], ["x" * length])
+    assert (len(longest), read_filter(longest)[1]) == (LONGEST_FILTER, frozenset(["x" * length]))
+    assert write_filter(["*"], ["x" * (length + 1)]) == ""
+    with pytest.raises(ValueError, match=f"more than {LONGEST_FILTER}"):
+        read_filter(encoded(json.dumps([["*"], ["x" * (length + 1)]], separators=(",", ":"))))
 
 
 @pytest.mark.parametrize(

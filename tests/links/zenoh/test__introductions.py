@@ -125,6 +125,34 @@ def test_a_peer_that_is_named_twice_and_has_not_come_is_dialled() -> None:
     assert here.dialled()[:1] == [(lost, "tcp/10.0.0.2:3")]
 
 
+@pytest.mark.parametrize(
+    ("waits", "dialled"), [((MISSING_TIME / 2, MISSING_TIME / 2), True), ((LONGEST_PAUSE, 0.0), False)]
+)
+def test_a_missing_peer_is_remembered_for_a_while_though_others_do_not_name_it(
+    waits: tuple[float, float], dialled: bool
+) -> None:
+    here, third = End(), End()
+    here.time = 2 * LONGEST_PAUSE
+    lost = third.knows("tcp/10.0.0.2:1")
+    answer = here.told_by(third)
+    here.introductions.take(answer, ())
+    here.time += waits[0]
+    here.introductions.take(b"", ())
+    here.time += waits[1]
+    here.introductions.take(answer, ())
+    assert [peer for peer, _ in here.dialled()] == [lost] * dialled
+
+
+def test_a_missing_peer_that_is_named_again_after_a_long_time_is_dialled() -> None:
+    here, third = End(), End()
+    lost = third.knows("tcp/10.0.0.2:1")
+    answer = here.told_by(third)
+    here.introductions.take(answer, ())
+    here.time += LONGEST_PAUSE
+    here.introductions.take(answer, ())
+    assert [peer for peer, _ in here.dialled()] == [lost]
+
+
 def test_a_peer_that_has_come_in_between_is_no_more_missing_than_a_new_one() -> None:
     here, third = End(), End()
     lost = third.knows("tcp/10.0.0.2:1")
@@ -144,6 +172,17 @@ def test_whoever_asks_tells_where_it_listens() -> None:
     other = End()
     assert here.id.encode() in other.told_by(third)
     assert b"tcp/10.0.0.3:7447" in other.told_by(third)
+
+
+def test_nobody_is_named_whom_the_asker_has_or_who_asks() -> None:
+    here, third = End(), End()
+    third.knows(id=here.id)
+    common = [here.knows(id=third.knows("tcp/10.0.0.1:1")) for _ in range(3)]
+    lacked = {third.knows("tcp/10.0.0.1:1") for _ in range(3)}
+    for known in (common, common[:1], []):
+        here.others = dict.fromkeys(known, NO_ROBOT)
+        named = {line.split("/")[4] for line in here.told_by(third).decode().split("\n")}
+        assert named == lacked | set(common) - set(known)
 
 
 def test_only_those_are_named_that_the_asker_wants_and_dialled_of_its_domain() -> None:

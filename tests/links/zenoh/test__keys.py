@@ -2,7 +2,15 @@ import pytest
 import zenoh
 
 from tfbus.links.zenoh._filters import name_of, write_filter
-from tfbus.links.zenoh._keys import ANY_ROBOT, NO_ROBOT, Keys, check_domain, check_robot, robots_expression
+from tfbus.links.zenoh._keys import (
+    ANY_ROBOT,
+    LONGEST_NAME,
+    NO_ROBOT,
+    Keys,
+    check_domain,
+    check_robot,
+    robots_expression,
+)
 
 A, B = "a" * 32, "b" * 32
 
@@ -43,6 +51,19 @@ def test_a_link_hears_the_robots_of_its_patterns(pattern: str, robots: list[str]
     assert [hears(Keys("yard", B, robot), mine, "live") for robot in others] == [False] * len(others)
 
 
+def test_of_slow_robots_a_link_hears_the_presence_and_the_slow_key_at_a_rate() -> None:
+    mine = Keys("yard", A, robots=("r1", "s1"), slow_robots=(("s1", 2.0), ("s2", 0.5)))
+    others = [Keys("yard", B, robot) for robot in ("r1", "s1", "s2", "x1")]
+    assert [hears(other, mine, "live") for other in others] == [True, True, False, False]
+    assert [hears(other, mine, "@alive") for other in others] == [True, True, True, False]
+    assert len(mine.heard("@alive")) == 3, "each is heard once"
+    rates = [
+        [rate for key, rate in mine.slow() if zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(other.own("slow")))]
+        for other in others
+    ]
+    assert rates == [[], [2.0], [0.5], []]
+
+
 @pytest.mark.parametrize("robot", [NO_ROBOT, "r1", "r-1.x_"])
 def test_the_sender_is_in_a_key(robot: str) -> None:
     keys, other = Keys("yard/arm", A), Keys("yard/arm", B, robot)
@@ -73,6 +94,11 @@ def test_a_domain_that_can_be_no_part_of_a_key_is_named(domain: str) -> None:
 def test_domains_and_robots_have_letters_digits_and_some_signs() -> None:
     assert check_domain("yard-1/arm_2.x") == "yard-1/arm_2.x"
     assert check_robot("r-1_2.x") == "r-1_2.x"
+    longest = "x" * LONGEST_NAME
+    assert {check(longest) for check in (check_domain, check_robot, robots_expression)} == {longest}
+    for check in (check_domain, check_robot, robots_expression):
+        with pytest.raises(ValueError, match=r"domain|robot"):
+            check(longest + "x")
 
 
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "~", "a b", "@r", "x" * 201])

@@ -38,6 +38,10 @@ async def test_without_a_domain_it_is_tf_and_without_a_robot_a_tilde() -> None:
     assert LookupSession(None, None, None, None, None, None, 2.0).key("@lookup", "a") == "tfbus/tf/~/@lookup/a"
 
 
+async def test_a_session_that_never_opened_closes() -> None:
+    await LookupSession("yard", None, None, None, None, None, 2.0).close()
+
+
 class Network:
     """Notes the questions that are asked, and fails where the session has ended."""
 
@@ -92,7 +96,7 @@ async def test_what_waits_to_be_sent_is_sent_before_the_session_ends(address: st
     session.soon(lambda: ending.wait(10))
     session.soon(lambda: sent.append(opened.is_closed()))
     await session.close()
-    assert sent == [False]
+    assert (sent, opened.is_closed()) == ([False], True)
 
 
 @pytest.mark.thorough

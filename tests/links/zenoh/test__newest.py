@@ -7,7 +7,7 @@ from tfbus.links._message import Message, read_message
 from tfbus.links._outbox import Turn
 from tfbus.links._peers import MAX_PEERS
 from tfbus.links._state import StateStep
-from tfbus.links.zenoh._newest import NewestSamples, Thinning
+from tfbus.links.zenoh._newest import _TOGETHER, NewestSamples, Thinning
 
 ORIGIN = b"0123456789abcdef"
 STEP = StateStep(3, 5, 99, message=7)
@@ -83,6 +83,15 @@ def test_of_each_sender_as_much_is_taken_as_the_rate_allows_and_what_comes_toget
     assert thinning.takes("b"), "each sender has its own time"
     now[0] = 100.8
     assert thinning.takes("a") is (time < 0.45), "the time counts from the last message that was taken"
+
+
+def test_what_comes_together_does_not_put_off_the_next_time() -> None:
+    now = [0.0]
+    thinning = Thinning(1.0, lambda: now[0])
+    taken = []
+    for now[0] in (0.0, 0.01, _TOGETHER, 0.5, 0.91):
+        taken.append(thinning.takes("a"))
+    assert taken == [True, True, True, False, True]
 
 
 def test_the_memory_of_senders_is_bounded() -> None:

@@ -365,6 +365,19 @@ def test_a_link_hears_presence_of_others_only() -> None:
     assert end.items.empty()
 
 
+def test_of_the_slow_keys_of_others_messages_are_received_at_their_rate_and_no_deletions() -> None:
+    end = closed_end()
+    receive = end.session._receive_slow(0.001)
+    for link in (A, B, B):
+        key = Keys("yard", link).own("slow")
+        for kind, payload in ((zenoh.SampleKind.DELETE, b""), (zenoh.SampleKind.PUT, b"put")):
+            sample: Any = SimpleNamespace(key_expr=key, kind=kind, payload=Payload(payload), attachment=None)
+            receive(sample)
+    # What comes together is one.
+    assert [end.next() for _ in range(2)] == [Received(B, (b"put", b""), 3, moving=True)] * 2
+    assert end.items.empty()
+
+
 def test_a_peer_without_the_filter_is_heard_by_its_live_key_alone() -> None:
     end = closed_end()
     end.session._keys = keys = Keys("yard", A, filter=write_filter(["*"], ["base"]))

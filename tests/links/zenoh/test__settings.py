@@ -37,6 +37,8 @@ def test_without_an_address_links_meet_on_the_loopback_only() -> None:
     assert MEETING_POINT.startswith("tcp/127.0.0.1:")
     assert read("scouting/multicast/enabled") is False
     assert read("mode") == "peer"
+    # It would leave a file open for each link that has ended.
+    assert read("transport/shared_memory/enabled") is False
 
 
 @pytest.mark.parametrize("addresses", ["tcp/192.168.1.5:7447", ["tcp/192.168.1.5:7447"], ("tcp/192.168.1.5:7447",)])

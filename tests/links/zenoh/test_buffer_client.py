@@ -1,10 +1,12 @@
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from itertools import islice
 from typing import Any
 
 import anyio
 import pytest
 import zenoh
+from support.asking import settle
 from support.processes import until
 from support.samples import moving, static
 
@@ -24,6 +26,8 @@ from tfbus import (
 from tfbus.links._remote_lookup import Cancellation, read_question, write_answer
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, buffer_client
 from tfbus.links.zenoh._lookup_session import LookupSession
+from tfbus.links.zenoh.buffer_client import PATIENCE
+from tfbus.links.zenoh.buffer_server import LONGEST_WAIT
 
 pytestmark = pytest.mark.anyio
 
@@ -134,6 +138,7 @@ async def test_a_server_that_goes_ends_the_lookups_and_one_that_never_was_is_tol
                 tasks.start_soon(ask)
                 await until(lambda: server.statistics().waiting == 1)
             assert reasons == ["lost"]
+            assert not link._zenoh_session().is_closed(), "it is the link's"
 
 
 async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: str) -> None:
@@ -153,9 +158,166 @@ async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: st
                 await client.lookup("map", "base")
             with pytest.raises(RuntimeError, match="entered once"):
                 await client.__aenter__()
+    with pytest.raises(ValueError, match="capacity"):
+        BufferClient(domain, capacity=0)
     with Bus() as bus, pytest.raises(RuntimeError, match="not entered"):
         async with BufferClient(link=ZenohLink(bus, domain)):
             raise AssertionError("it has no session")
+
+
+class Session:
+    """Answers the questions of a client by what a test gives, in a time that passes only while they wait.
+
+    None is the end of a question without an answer. The questions behind the last answer stay open.
+    """
+
+    domain, robot, is_closed = "yard", None, False
+
+    def __init__(self, answers: list[TransformStamped | Exception | None]) -> None:
+        self.now = 100.0
+        self.unsent = 0
+        self.asked: list[float] = []
+        self.cancelled: list[int] = []
+        self._answers = iter(answers)
+
+    def ask(self, payload: bytes, take: Callable[[bytes | None], object], timeout: float, to_all: bool = False) -> None:
+        question = read_question(payload)
+        assert to_all is isinstance(question, Cancellation), "nobody knows who of them has the question"
+        if isinstance(question, Cancellation):
+            self.cancelled.append(question.number)
+            return
+        assert question.timeout is not None
+        assert timeout > question.timeout + PATIENCE, "zenoh must not give up before the client does"
+        self.asked.append(question.timeout)
+        for answer in islice(self._answers, 1):
+            if isinstance(answer, LookupTimeoutError):
+                self.now += question.timeout
+            take(None if answer is None else write_answer(answer))
+
+
+def met(session: Session, monkeypatch: pytest.MonkeyPatch, **options: Any) -> BufferClient:
+    """A client of a session that has met a server."""
+    monkeypatch.setattr(buffer_client, "monotonic", lambda: session.now)
+    monkeypatch.setattr(buffer_client, "_SETTLING", 0.001)
+    client = BufferClient(**options)
+    client._session = session  # type: ignore[assignment]
+    client._waker.bind()
+    client._is_open = True
+    client._note_server("server", True)
+    return client
+
+
+FOUND = moving("map", "base", 7)
+MISSING = UnknownFrameError(frame="base", known=("map",))
+LATE = LookupTimeoutError(target="map", source="base", timeout=LONGEST_WAIT, missing=MISSING)
+LATE.__cause__ = MISSING
+
+
+@pytest.mark.parametrize(
+    ("timeout", "answers", "asked"),
+    [
+        (0.0, [LATE], [0.0]),
+        (LONGEST_WAIT, [LATE], [LONGEST_WAIT]),
+        (LONGEST_WAIT + 2.0, [LATE, LATE], [LONGEST_WAIT, 2.0]),
+        (2 * LONGEST_WAIT + 2.0, [LATE, LATE, FOUND], [LONGEST_WAIT, LONGEST_WAIT, 2.0]),
+        (None, [LATE, LATE, LATE, FOUND], [LONGEST_WAIT] * 4),
+    ],
+)
+async def test_a_long_wait_is_asked_for_in_parts(
+    timeout: float | None,
+    answers: list[TransformStamped | Exception | None],
+    asked: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    session = Session(answers)
+    client = met(session, monkeypatch)
+    if answers[-1] is FOUND:
+        assert await client.lookup("map", "base", timeout=timeout) == FOUND
+    else:
+        with pytest.raises(LookupTimeoutError) as late:
+            await client.lookup("map", "base", timeout=timeout)
+        assert late.value.timeout == timeout, "it is that of the lookup, not of its last part"
+        assert isinstance(late.value.__cause__, UnknownFrameError)
+    assert (session.asked, session.cancelled) == (asked, [])
+
+
+async def test_the_clock_of_the_other_bus_may_end_a_wait_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Session([LATE])
+    client = met(session, monkeypatch)
+    monkeypatch.setattr(buffer_client, "monotonic", lambda: 100.0)
+    with pytest.raises(LookupTimeoutError):
+        await client.lookup("map", "base", timeout=5.0)
+    assert session.asked == [5.0]
+
+
+async def test_a_server_that_is_not_there_is_waited_for_no_longer_than_the_lookup_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    session = Session([FOUND])
+    client = met(session, monkeypatch)
+    client._note_server("server", False)
+    await settle()
+    with anyio.fail_after(PATIENCE / 2), pytest.raises(RemoteLookupError) as absent:
+        await client.lookup("map", "base", timeout=0.0)
+    assert (absent.value.reason, session.asked) == ("absent", [])
+    answers = []
+
+    async def ask() -> None:
+        answers.append(await client.lookup("map", "base"))
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(ask)
+        await settle()
+        client._note_server("server", True)
+    assert answers == [FOUND]
+
+
+@pytest.mark.parametrize("losses", [0, 1, 3, 4])
+async def test_a_question_that_was_dropped_is_asked_three_times_more(
+    losses: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session([*[None] * losses, FOUND])
+    client = met(session, monkeypatch)
+    if losses > 3:
+        with pytest.raises(RemoteLookupError) as silent:
+            await client.lookup("map", "base")
+        assert (silent.value.reason, silent.value.domain, silent.value.robot) == ("silent", "yard", None)
+    else:
+        assert await client.lookup("map", "base") == FOUND
+    assert len(session.asked) == min(losses + 1, 4)
+    assert (client._pending, session.cancelled) == ({}, [])
+
+
+async def test_a_question_that_was_dropped_is_not_asked_again_when_its_time_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    session = Session([None, FOUND])
+    client = met(session, monkeypatch)
+    with pytest.raises(RemoteLookupError) as silent:
+        await client.lookup("map", "base", timeout=0.0)
+    assert (silent.value.reason, session.asked) == ("silent", [0.0])
+
+
+@pytest.mark.parametrize(("unsent", "cancelled"), [(1, [1, 2]), (2, [])])
+async def test_so_many_lookups_may_wait_and_those_given_up_are_cancelled_where_there_is_room(
+    unsent: int, cancelled: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = Session([])
+    client = met(session, monkeypatch, capacity=2)
+    async with anyio.create_task_group() as tasks:
+        for _ in range(2):
+            tasks.start_soon(client.lookup, "map", "base")
+        await settle()
+        assert list(client._pending) == [1, 2]
+        with pytest.raises(RuntimeError, match="2 lookups wait"):
+            await client.lookup("map", "base")
+        session.unsent = unsent
+        tasks.cancel_scope.cancel()
+    assert (sorted(session.cancelled), client._pending) == (cancelled, {})
+    # Those that were given up wait to be sent.
+    session.unsent = 2
+    with pytest.raises(RuntimeError, match="2 lookups wait"):
+        await client.lookup("map", "base")
 
 
 @pytest.mark.thorough

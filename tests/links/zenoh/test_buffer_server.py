@@ -1,17 +1,21 @@
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import anyio
 import anyio.to_thread
 import pytest
 import zenoh
+from support.asking import settle
 from support.processes import PATIENCE, until
 from support.samples import static
 
 from tfbus import LATEST, Buffer, Bus, RemoteLookupError, TransformStamped
-from tfbus.links._remote_lookup import RemoteQuestion, read_answer, write_question
-from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
+from tfbus.links._remote_lookup import Cancellation, RemoteQuestion, read_answer, write_question
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, buffer_server
 from tfbus.links.zenoh._settings import settings
 
 pytestmark = pytest.mark.anyio
@@ -118,6 +122,110 @@ async def test_what_is_known_is_answered_while_the_event_loop_is_busy(address: s
                 await anyio.to_thread.run_sync(session.close)
             counts = server.statistics()
             assert (counts.answered, counts.failed, counts.waiting, counts.queue.dropped) == (1, 1, 0, 0)
+
+
+class Session:
+    """Notes what a server has its session's thread do; so many things wait for that thread."""
+
+    domain, robot = "yard", None
+
+    def __init__(self) -> None:
+        self.unsent = 0
+        self.waiting: list[Callable[[], object]] = []
+        self.replies: list[tuple[object, bytes]] = []
+
+    def soon(self, do: Callable[[], object]) -> None:
+        self.waiting.append(do)
+
+    def reply(self, query: object, answer: bytes) -> None:
+        self.replies.append((query, answer))
+
+
+class Query:
+    """A question as zenoh hands it over."""
+
+    def __init__(self, question: RemoteQuestion | Cancellation | None = None) -> None:
+        text = b"" if question is None else write_question(question)
+        self.payload = SimpleNamespace(to_bytes=lambda: text)
+        self.dropped = 0
+
+    def drop(self) -> None:
+        self.dropped += 1
+
+
+def unopened(buffer: Buffer, **options: Any) -> tuple[Any, Session]:
+    """A server that is not entered, and its session."""
+    server, session = BufferServer(buffer, **options), Session()
+    server._session = session  # type: ignore[assignment]
+    return server, session
+
+
+async def test_beyond_the_capacity_questions_and_answers_are_dropped_and_counted() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        server, session = unopened(buffer, capacity=3)
+        for session.unsent, dropped in ((2, 0), (3, 1)):
+            asked, answered = Query(), Query()
+            server._receive(asked)
+            server._answer(answered, static("map", "base"))
+            assert (asked.dropped, answered.dropped) == (dropped, dropped)
+            assert (len(session.waiting), len(session.replies)) == (1, 1)
+        assert server.statistics().queue.dropped == 2
+        session.unsent = 0
+        server._received.extend(["gone"] * 3)
+        server._receive(asked := Query())
+        assert (asked.dropped, server.statistics().queue.dropped) == (1, 3), "what waits for the event loop counts too"
+
+
+async def test_an_asker_ends_behind_its_questions_and_only_when_it_goes() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        server, session = unopened(buffer)
+        server._note_asker("me", True)
+        assert session.waiting == []
+        server._receive(query := Query(RemoteQuestion("me", 1, "map", "base", LATEST)))
+        server._note_asker("me", False)
+        for do in session.waiting:
+            do()
+        assert list(server._received) == [(query, RemoteQuestion("me", 1, "map", "base", LATEST)), "me"]
+
+
+async def test_a_cancellation_needs_no_answer_and_a_question_that_is_cancelled_has_none() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        server, session = unopened(buffer)
+        server._take(cancelling := Query(Cancellation("me", 1)))
+        assert (cancelling.dropped, list(server._received)) == (1, [Cancellation("me", 1)])
+        question = RemoteQuestion("me", 1, "map", "base", LATEST, timeout=PATIENCE)
+        waiting, key = Query(question), ("me", 1)
+        async with anyio.create_task_group() as tasks:
+            server._begin_to_wait(waiting, question, tasks)
+            await settle()
+            assert server.statistics().waiting == 1
+            server._cancel(key)
+            server._cancel(key)
+        assert (waiting.dropped, session.replies) == (1, [])
+        counts = server.statistics()
+        assert (counts.waiting, counts.cancelled, counts.answered, counts.failed) == (0, 1, 0, 0)
+
+
+@pytest.mark.parametrize(("rate", "taken"), [(4.0, [4, 1, 0, 1, 3, 4]), (0.5, [1, 0, 0, 0, 0, 1])])
+async def test_so_many_lookups_are_taken_in_a_second_and_at_once(
+    rate: float, taken: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(buffer_server, "monotonic", lambda: now[0])
+    with Bus() as bus, Buffer(bus) as buffer:
+        bus.publish(static("map", "base"))
+        server, session = unopened(buffer, rate=rate)
+        monkeypatch.setattr(buffer_server, "reply_now", lambda *_: None)
+        counts = [0]
+        for now[0] in (100.0, 100.25, 100.375, 100.5, 101.25, 200.0):
+            for number in range(10):
+                server._take(Query(RemoteQuestion("me", number, "map", "base", LATEST)))
+            counts.append(server.statistics().answered)
+        assert [after - before for before, after in pairwise(counts)] == taken
+        assert server.statistics().refused == {"busy": 60 - sum(taken)}
+        error = read_answer(session.replies[0][1], "yard", None)
+        assert isinstance(error, RemoteLookupError)
+        assert error.reason == "busy"
 
 
 async def test_what_makes_no_sense_is_refused_at_once(domain: str) -> None:

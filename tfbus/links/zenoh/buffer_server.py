@@ -59,7 +59,7 @@ class BufferServer:
     capacity : int
         How many lookups may wait at once; beyond that they are refused.
     rate : float
-        How many lookups are taken in a second, and at once; beyond that they are refused.
+        How many lookups are taken in a second, and at once (one at least); beyond that they are refused.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class BufferServer:
         self._session = LookupSession(domain, robot, link, listen, connect, config, lease)
         self._capacity = capacity
         self._rate = rate
-        self._allowance = rate
+        self._allowance = self._most_at_once = max(rate, 1.0)
         self._refilled = monotonic()
         self._entered = False
         self._received: deque[_Item] = deque()
@@ -217,9 +217,9 @@ class BufferServer:
 
     def _admit(self) -> bool:
         now = monotonic()
-        self._allowance = min(self._rate, self._allowance + (now - self._refilled) * self._rate)
+        self._allowance = min(self._most_at_once, self._allowance + (now - self._refilled) * self._rate)
         self._refilled = now
-        if self._allowance < 1 and self._rate >= 1:
+        if self._allowance < 1:
             return False
         self._allowance -= 1
         return True
