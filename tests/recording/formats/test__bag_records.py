@@ -53,7 +53,13 @@ def test_messages_are_split_whatever_the_order_of_the_fields() -> None:
         (4_000_000_005, 1, b""),
         (5_000_000_005, 1, b"z"),
     ]
-    assert content.damage == ""
+    assert (content.connections, content.damage) == ([], "")
+
+
+def test_connections_are_split_from_the_messages_and_other_records_are_passed_over() -> None:
+    described = field(b"conn", bytes(4)) + field(b"op", b"\7")
+    content = split_chunk(record(described, b"type=a") + record(field(b"op", b"\4"), b"index") + message(0, 2, b"x"))
+    assert content == ([(2_000_000_005, 0, b"x")], [({b"conn": bytes(4), b"op": b"\7"}, b"type=a")], "")
 
 
 @pytest.mark.parametrize("order", ["".join(order) for order in permutations("cot")])
@@ -110,6 +116,8 @@ def test_a_record_of_another_kind_with_the_mark_of_a_chunk_in_a_field_is_no_chun
     other = record(field(b"op", b"\2") + field(b"size", bytes(4)) + field(b"note", mark))
     assert read_record(io.BytesIO(other), 0).kind == 2
     assert find_chunk(io.BytesIO(other), 0) is None
+    # A chunk has the field "size".
+    assert find_chunk(io.BytesIO(record(field(b"op", b"\5"), b"abc")), 0) is None
     # The mark is in the data of the chunk behind it, or before it begins.
     chunk = record(field(b"size", bytes(4)) + field(b"op", b"\5"), mark)
     assert find_chunk(io.BytesIO(mark + chunk), 0) == len(mark)
@@ -181,5 +189,8 @@ def test_damage_is_an_error() -> None:
 
 
 def test_the_counts_of_an_index_are_read_as_far_as_they_go() -> None:
-    assert counts_in(struct.pack("<IIII", 3, 10, 4, 20) + b"rest") == {3: 10, 4: 20}
-    assert list(index_entries(struct.pack("<IIIIII", 1, 2, 0, 3, 4, 0) + b"rest")) == [1_000_000_002, 3_000_000_004]
+    for rest in range(8):
+        assert counts_in(struct.pack("<6I", 3, 10, 4, 20, 5, 30) + bytes(rest)) == {3: 10, 4: 20, 5: 30}
+    for rest in range(12):
+        entries = struct.pack("<6I", 1, 2, 0, 3, 4, 0) + bytes(rest)
+        assert list(index_entries(entries)) == [1_000_000_002, 3_000_000_004]
