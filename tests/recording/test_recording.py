@@ -204,9 +204,25 @@ def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -
     with open_recording(write_channels(tmp_path / "run.mcap", ("/tf", "/tf_static"), [(1, 0)])) as recording:
         assert recording.count == 1
         assert [topic.name for topic in recording.topics] == ["/tf", "/tf_static"]
+        assert [(message.received, message.errors) for message in recording.messages()] == [(1, ())]
 
 
 def test_two_channels_of_one_topic_and_type_are_one_topic_with_the_messages_of_both(tmp_path: Path) -> None:
     path = write_channels(tmp_path / "run.mcap", ("/tf", "/tf"), [(1, 0), (2, 1), (3, 1)])
     with open_recording(path) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 3)]
+
+
+@pytest.mark.parametrize("names", [("a.mcap", "b.mcap"), ("b.mcap", "a.mcap")])
+def test_the_number_of_messages_of_a_topic_is_not_known_if_one_of_its_files_does_not_tell(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    for name, finish in zip(names, (True, False), strict=True):
+        write_mcap(tmp_path / name, LINES[1:2], finish=finish)
+    with open_recording(tmp_path) as recording:
+        messages = recording.messages()
+        next(messages)
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", None)]
+        assert len(list(messages)) == 1
+        # Now both have been read.
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 2)]

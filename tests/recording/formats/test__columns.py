@@ -12,8 +12,9 @@ from tfbus import TransformStamped
 from tfbus.recording.formats._columns import ColumnDecoder, Columns
 from tfbus.recording.formats._decoder import ChannelDecoder
 from tfbus.recording.formats._packed import Packed, pack
+from tfbus.recording.formats._raw_transforms import RawTransform, write_cdr, write_ros1
 from tfbus.recording.formats._storage import Channel, StoredMessage
-from tfbus.tf_message import encode
+from tfbus.tf_message import MAX_NAME, encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
@@ -168,6 +169,68 @@ def test_samples_of_several_authorities_are_told_apart() -> None:
     }
 
 
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def stamped(
+    channel: Channel, seconds: int, nanoseconds: int, row: Sequence[float] = IDENTITY, child: bytes = b"odom"
+) -> bytes:
+    """A message of one transform, of which nothing is checked."""
+    write = write_ros1 if channel is ROS1 else write_cdr
+    return write([RawTransform(seconds, nanoseconds, b"map", child, struct.pack("<7d", *row))])
+
+
+@pytest.mark.parametrize(
+    ("channel", "seconds", "nanoseconds", "valid"),
+    [
+        (CDR, 2**31 - 1, 999_999_999, True),
+        (CDR, -(2**31), 0, True),
+        (CDR, 1, 1_000_000_000, False),
+        (ROS1, 2**31 - 1, 999_999_999, True),
+        (ROS1, 2**31, 0, False),
+        (ROS1, 2**32 - 1, 0, False),
+        (ROS1, 1, 1_000_000_000, False),
+    ],
+)
+def test_stamps_are_decoded_at_once_up_to_their_bounds(
+    channel: Channel, seconds: int, nanoseconds: int, valid: bool
+) -> None:
+    decoder = ColumnDecoder({channel: ChannelDecoder(channel, static=False)})
+    columns = decoder.decode(packed([(1, channel, stamped(channel, seconds, nanoseconds))]))
+    if valid:
+        assert columns is not None
+        assert columns[0].stamps.tolist() == [seconds * 10**9 + nanoseconds]
+    else:
+        assert columns is None
+
+
+@pytest.mark.parametrize(
+    ("norm", "valid"), [(0.99 - 1e-9, False), (0.99 + 1e-9, True), (1.01 - 1e-9, True), (1.01 + 1e-9, False)]
+)
+def test_a_quaternion_is_normalised_at_once_if_its_norm_is_off_by_no_more_than_a_hundredth(
+    norm: float, valid: bool
+) -> None:
+    columns, one_by_one = both([(1, CDR, stamped(CDR, 0, 5, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -norm)))])
+    assert (columns is not None) == valid == bool(one_by_one)
+    if columns is not None:
+        assert columns[0].rows.tolist() == [[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -1.0]]
+
+
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+def test_names_are_decoded_at_once_up_to_the_longest(channel: Channel) -> None:
+    for size, valid in ((MAX_NAME - 1, True), (MAX_NAME + 1, False)):
+        data = stamped(channel, 0, 1, child=b"n" * size)
+        decoders = {channel: ChannelDecoder(channel, static=False)}
+        assert (ColumnDecoder(decoders).decode(packed([(1, channel, data)])) is not None) == valid
+
+
+def test_messages_are_decoded_at_once_up_to_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = len(GOOD[2])
+    for bound, valid in ((size, True), (size - 1, False)):
+        monkeypatch.setattr("tfbus.recording.formats._columns.MAX_MESSAGE", bound)
+        assert (both([GOOD])[0] is not None) == valid
+
+
 @pytest.mark.parametrize("names", [[f"f{k:03}" for k in range(200)], ["f" * k for k in range(1, 64)]])
 def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> None:
     stored: list[StoredMessage] = [(k, CDR, encode([moving("map", name, k)])) for k, name in enumerate(2 * names)]
@@ -179,5 +242,19 @@ def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> No
 def test_a_channel_with_more_layouts_than_are_kept_is_left_to_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
     stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k}", k)])) for k in range(4)]
     monkeypatch.setattr("tfbus.recording.formats._columns._MAX_LAYOUTS", 3)
+    assert both(stored[:3])[0] is not None
+    assert both(stored)[0] is None
+
+
+def test_messages_of_one_size_with_more_structures_than_are_kept_are_left_to_the_slow_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The longer one name is, the shorter is the other.
+    stored: list[StoredMessage] = [
+        (k, CDR, encode([moving("map", "a" * (8 * k + 3), k), moving("map", "b" * (8 * (4 - k) + 3), k)]))
+        for k in range(4)
+    ]
+    assert len({len(payload) for _, _, payload in stored}) == 1
+    monkeypatch.setattr("tfbus.recording.formats._columns._MAX_STRUCTURES", 3)
     assert both(stored[:3])[0] is not None
     assert both(stored)[0] is None

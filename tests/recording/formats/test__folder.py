@@ -169,21 +169,52 @@ def test_what_is_missing_of_several_files_is_told_behind_their_last_message(tmp_
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "why"),
     [
-        pytest.param("[" * 100_000, marks=pytest.mark.thorough, id="deep"),
-        "a: &a [*a]",
-        "\0",
-        "rosbag2_bagfile_information: {}",
-        "- 1",
+        pytest.param("[" * 100_000, "maximum recursion depth", marks=pytest.mark.thorough, id="deep"),
+        ("a: &a [*a]", "'rosbag2_bagfile_information'"),
+        ("\0", "unacceptable character"),
+        ("rosbag2_bagfile_information: {}", "'relative_file_paths'"),
+        ("rosbag2_bagfile_information: {relative_file_paths: []}", "it names no file"),
+        ("- 1", "list indices must be integers"),
     ],
 )
-def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, text: str) -> None:
+def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, text: str, why: str) -> None:
     write_mcap(tmp_path / "run_0.mcap", LINES)
     (tmp_path / "metadata.yaml").write_text(text)
     assert batches_in(tmp_path) == EXPECTED
     with open_recording(tmp_path) as recording:
-        assert recording.remarks[0].startswith("metadata.yaml is ignored, as it cannot be read: ")
+        assert recording.remarks[0].startswith(f"metadata.yaml is ignored, as it cannot be read: {why}")
+
+
+def test_metadata_are_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    write_mcap(tmp_path / "stray.mcap", LINES)
+    metadata(tmp_path, "run_0.mcap", count=30)
+    size = (tmp_path / "metadata.yaml").stat().st_size
+    why = f"it has more than {size - 1} bytes, which is the bound"
+    for bound, remark in (
+        (size, "stray.mcap is ignored: metadata.yaml does not name it"),
+        (size - 1, f"metadata.yaml is ignored, as it cannot be read: {why}"),
+    ):
+        monkeypatch.setattr("tfbus.recording.formats._folder.MAX_METADATA", bound)
+        with open_recording(tmp_path) as recording:
+            assert recording.remarks == (remark,)
+
+
+def test_an_error_without_words_is_told_by_its_name_and_a_long_one_is_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    metadata(tmp_path, "run_0.mcap", count=30)
+    for error, told in ((MemoryError(), "MemoryError"), (ValueError("one\n two " + "x" * 300), "one two " + "x" * 192)):
+
+        def fail(_: bytes, error: Exception = error) -> None:
+            raise error
+
+        monkeypatch.setattr("tfbus.recording.formats._folder._as_yaml", fail)
+        with open_recording(tmp_path) as recording:
+            assert recording.remarks == (f"metadata.yaml is ignored, as it cannot be read: {told}",)
 
 
 def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(tmp_path: Path) -> None:

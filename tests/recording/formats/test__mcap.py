@@ -100,6 +100,29 @@ def test_an_index_is_used_up_to_its_bound(write: Write, monkeypatch: pytest.Monk
             assert recording.count == count
 
 
+def test_the_shortest_finished_file_is_an_empty_recording_and_with_a_byte_less_it_is_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    magic = b"\x89MCAP0\r\n"
+    footer = b"\x02" + (20).to_bytes(8, "little") + bytes(20)
+    path.write_bytes(magic + footer + magic)
+    with open_recording(path) as recording:
+        assert (recording.start, recording.end, recording.finished) == (None, None, True)
+        assert list(recording.messages()) == []
+    path.write_bytes((magic + footer + magic)[:-1])
+    with pytest.raises(RecordingError, match="ends before its first message"):
+        open_recording(path)
+
+
+def test_an_index_without_statistics_does_not_contradict_the_chunks(write: Write) -> None:
+    path = write(LINES, use_statistics=False, enable_crcs=False)
+    whole = path.read_bytes()
+    for part in (b"geometry_msgs/TransformStamped", b"/tf_static"):
+        data = bytearray(whole)
+        data[data.rindex(part)] ^= 1
+        path.write_bytes(data)
+        assert batches_in(path) == EXPECTED
+
+
 def test_a_message_at_log_time_zero_counts(write: Write) -> None:
     for finish in (True, False):
         path = write([(0, "/tf", [moving("a", "b", 0)])], finish=finish)
