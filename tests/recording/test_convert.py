@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -18,6 +19,7 @@ from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
 from tfbus.recording.formats._raw_transforms import RawTransform, parser_of, write_cdr, write_ros1
 from tfbus.recording.formats._storage import Channel
+from tfbus.recording.load import MAX_DETAILS
 from tfbus.recording.recording import open_storage
 from tfbus.tf_message import encode
 
@@ -124,6 +126,47 @@ def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path) -> No
     unknown = write_mcap(tmp_path / "unknown.mcap", [(1, "/a", b"\0\1\0\0")], schema="my_msgs/msg/Thing")
     done = convert([unknown], tmp_path / "unknown.bag")
     assert (done.messages, done.problems) == (0, {"type": 1})
+
+
+def test_what_the_recorder_has_compressed_is_unfolded_and_what_only_looks_like_it_is_not(tmp_path: Path) -> None:
+    text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
+    folded = zstandard.compress(text)
+    torn = folded[:4] + b"\xff" * 30
+    lines: list[Line] = [(1, "/said", folded), (2, "/said", torn), (3, "/said", text)]
+    source = write_mcap(tmp_path / "run.mcap", lines, schema="std_msgs/msg/String")
+    path = tmp_path / "copy.mcap"
+    done = convert([source], path)
+    assert lines_of_others(path) == [("/said", 1, text), ("/said", 3, text)]
+    assert (done.messages, done.problems) == (2, {"damaged": 1})
+    assert "cannot be decompressed" in done.details[0]
+    # In another encoding, these may be the first bytes of anything.
+    source = write_mcap(tmp_path / "other.mcap", lines, schema="my.Thing", encoding="protobuf")
+    assert convert([source], path, overwrite=True).problems == {}
+    assert [payload for _, _, payload in lines_of_others(path)] == [folded, torn, text]
+
+
+def test_details_are_kept_once_each_and_up_to_a_number() -> None:
+    done = Conversion()
+    for number in range(MAX_DETAILS + 1):
+        for _ in range(2):
+            done.note("type", f"number {number}")
+    assert done.problems == {"type": 2 * MAX_DETAILS + 2}
+    assert done.details == [f"number {number}" for number in range(MAX_DETAILS)]
+
+
+def test_runs_of_authorities_keep_their_lengths_and_a_single_one_stands_for_any_number(tmp_path: Path) -> None:
+    frames = [moving("map", name, 1) for name in "abc"]
+    metadata = {"tfbus.authorities": '[["x", 2], ["y", 1]]'}
+    source = write_mcap(tmp_path / "source.mcap", [(1, "/tf", frames), (2, "/tf", frames)], metadata=metadata)
+    for keep, runs in (("abc", '[["x", 2], ["y", 1]]'), ("ac", '[["x", 1], ["y", 1]]'), ("ab", '[["x", 1]]')):
+        _, found = edited(tmp_path, source, frames=list(keep), prefix="r/")
+        names = {"a": "x", "b": "x", "c": "y"}
+        assert [[(each.child, each.authority) for each in batch] for _, batch in found] == [
+            [(f"r/{name}", names[name]) for name in keep]
+        ] * 2
+        with (tmp_path / "edited.mcap").open("rb") as file:
+            ((written, *_),) = {tuple(channel.metadata.values()) for _, channel, _ in make_reader(file).iter_messages()}
+        assert written == runs
 
 
 def edited(tmp_path: Path, *inputs: Path, **arguments: Any) -> tuple[Conversion, list[Any]]:

@@ -459,6 +459,45 @@ def test_a_pause_and_a_new_rate_count_from_their_moment(tmp_path: Path, simulate
 
 
 @pytest.mark.parametrize("simulated", [True, False])
+def test_a_seek_is_followed_at_once_and_a_pause_lasts_beyond_it(tmp_path: Path, simulated: bool) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1_000.0, 2_000.0)))
+    times: list[float] = []
+
+    async def until(heard: Listener, count: int) -> None:
+        # Without a limit: this clock jumps to it while a thread reads.
+        while len(heard.entries) < count:
+            heard.arrived = anyio.Event()
+            await heard.arrived.wait()
+
+    async def play() -> None:
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            heard = Listener(bus)
+            bus.subscribe(lambda _: times.append(anyio.current_time()))
+            player = Player(bus, path)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                await until(heard, 1)
+                await anyio.sleep(3.0)
+                player.seek(START + 1_000 * SECOND)
+                await until(heard, 2)
+                player.pause()
+                await anyio.sleep(100.0)
+                player.seek(START + 1_000 * SECOND)
+                await anyio.sleep(100.0)
+                player.step()
+                await until(heard, 3)
+                player.seek(START + 1_999 * SECOND)
+                player.resume()
+            assert [batch[0].stamp for batch in heard.batches] == [
+                START + seconds * SECOND for seconds in (0, 1_000, 1_000, 2_000)
+            ]
+
+    in_virtual_time(play)
+    # The second at once, the third when the step is taken; of the last, a second is left.
+    assert [time - times[0] for time in times] == pytest.approx([0.0, 3.0, 203.0, 204.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
 async def test_the_highest_rates_wait_for_nothing(tmp_path: Path, simulated: bool) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
     for rate in (1e12, 1e300):

@@ -132,6 +132,18 @@ def test_a_summary_is_frozen_data() -> None:
         summary.messages = 0  # type: ignore[misc]
     with pytest.raises(dataclasses.FrozenInstanceError):
         summary.frames[0].moving = 0  # type: ignore[misc]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        summary.senders[0].moving = 0  # type: ignore[misc]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        summary.topics[0].count = 0  # type: ignore[misc]
+
+
+def test_a_duration_or_a_span_needs_both_ends() -> None:
+    frame = FrameSummary("b", ("a",), 0, 0, None, None, None, None, ())
+    whole = RecordingSummary(Path("run"), True, None, None, 0, 0, (frame,), ("a",), {})
+    for first, last, expected in ((None, None, None), (SECOND, None, None), (None, SECOND, None), (0, SECOND, 1.0)):
+        assert dataclasses.replace(whole, start=first, end=last).duration == expected
+        assert dataclasses.replace(frame, oldest=first, newest=last).span == expected
 
 
 def test_the_summary_of_a_real_robot() -> None:
@@ -145,12 +157,12 @@ def test_the_summary_of_a_real_robot() -> None:
 
 
 def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path: Path) -> None:
-    # 2,000 samples at 100 Hz, each received 3 ms after its stamp, but for the last: 5 ms, from another sender.
-    lines = [(10 * MS * k + 3 * MS, moving("a", "b", 10 * MS * k, float(k), "one")) for k in range(1_999)]
-    lines.append((19_990 * MS + 5 * MS, moving("a", "b", 19_990 * MS, 0.0, "two")))
+    # 4,000 samples at 100 Hz, each received 3 ms after its stamp, but for the last: 5 ms, from another sender.
+    lines = [(10 * MS * k + 3 * MS, moving("a", "b", 10 * MS * k, float(k), "one")) for k in range(3_999)]
+    lines.append((39_990 * MS + 5 * MS, moving("a", "b", 39_990 * MS, 0.0, "two")))
     # A late sample of another parent leaves the newest edge as it is, so the next one closes no loop.
-    lines.append((20_000 * MS, moving("c", "b", 19_985 * MS, 0.0, "one")))
-    lines.append((20_001 * MS, moving("b", "c", 20_001 * MS, 0.0, "three")))
+    lines.append((40_000 * MS, moving("c", "b", 39_985 * MS, 0.0, "one")))
+    lines.append((40_001 * MS, moving("b", "c", 40_001 * MS, 0.0, "three")))
     with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
@@ -158,16 +170,17 @@ def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path
     with open_recording(tmp_path / "run.mcap") as recording:
         summary = summarise(recording, progress=counted.append)
         one_by_one = summarise(recording, recording.messages())
-    assert len(counted) > 1
-    assert sum(counted) == summary.messages == summary.transforms == 2_002
+    # The first one names the frame, the last one has to be judged.
+    assert len(counted) > 2
+    assert sum(counted) == summary.messages == summary.transforms == 4_002
     assert summary.problems == {}
     assert summary.frames == one_by_one.frames
     frames = {frame.frame: frame for frame in summary.frames}
     b = frames["b"]
-    assert (b.moving, b.oldest, b.newest, b.authorities) == (2_001, 0, 19_990 * MS, ("one", "two"))
+    assert (b.moving, b.oldest, b.newest, b.authorities) == (4_001, 0, 39_990 * MS, ("one", "two"))
     assert b.delay is not None
-    # 1,999 of 3 ms, one of 5 ms and one of 15 ms.
-    assert b.delay.mean == pytest.approx((1_999 * 0.003 + 0.005 + 0.015) / 2_001)
+    # 3,999 of 3 ms, one of 5 ms and one of 15 ms.
+    assert b.delay.mean == pytest.approx((3_999 * 0.003 + 0.005 + 0.015) / 4_001)
     assert b.delay.max == 0.015
     senders = {sender.authority: (sender.frames, sender.moving) for sender in summary.senders}
-    assert senders == {"one": (("b",), 2_000), "two": (("b",), 1), "three": (("c",), 1)}
+    assert senders == {"one": (("b",), 4_000), "two": (("b",), 1), "three": (("c",), 1)}
