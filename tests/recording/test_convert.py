@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import SMALL, Line, batches_in, messages_in, sender_of, write_mcap
 from support.samples import moving, static
@@ -102,6 +103,20 @@ def test_the_readers_of_others_find_the_same_messages(tmp_path: Path, ending: st
     if ending == ".bag":
         payloads = [(topic, time, bytes(TYPES.cdr_to_ros1(payload, TF))) for topic, time, payload in payloads]
     assert lines_of_others(path) == payloads
+
+
+def test_a_bag_made_of_cdr_describes_its_types_as_ros_1_does(tmp_path: Path) -> None:
+    convert([write_mcap(tmp_path / "source.mcap", LINES)], tmp_path / "run.bag")
+    with rosbag1.Reader(tmp_path / "run.bag") as bag, rosbag1.Reader(SMALL) as recorded:
+        assert {(each.msgtype, each.digest) for each in bag.connections} == {
+            (each.msgtype, each.digest) for each in recorded.connections if each.topic in ("/tf", "/tf_static")
+        }
+    # By the definition in the bag, each message is as long as it is.
+    with AnyReader([tmp_path / "run.bag"]) as reader:
+        found: list[Any] = [reader.deserialize(data, each.msgtype) for each, _, data in reader.messages()]
+    assert [[each.child_frame_id for each in message.transforms] for message in found] == [
+        [each.child for each in samples] for _, _, samples in LINES if not isinstance(samples, bytes)
+    ]
 
 
 def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(tmp_path: Path) -> None:

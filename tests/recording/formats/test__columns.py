@@ -149,6 +149,22 @@ def test_what_may_be_invalid_or_needs_a_judgement_is_left_to_the_slow_path(other
     assert ColumnDecoder(decoders).decode(packed([GOOD, other])) is None
 
 
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+def test_a_message_with_a_wrong_bit_is_left_to_the_slow_path_or_decoded_to_the_same(channel: Channel) -> None:
+    payload = payload_of(channel, [moving("map", "odom", 1), moving("odom", "base", 1)])
+    decoders = {channel: ChannelDecoder(channel, static=False)}
+    for place in range(len(payload)):
+        damaged = bytearray(payload)
+        damaged[place] ^= 1 << place % 8
+        columns = ColumnDecoder(decoders).decode(packed([(1, channel, payload), (2, channel, bytes(damaged))]))
+        if columns is None:
+            continue
+        found = decoders[channel].decode(bytes(damaged))
+        assert found.errors == []
+        whole = decoders[channel].decode(payload).samples + found.samples
+        assert sorted((s for each in columns for s in samples_in(each)), key=str) == sorted(whole, key=str)
+
+
 def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
     payload = encode([moving("mmap", "bbase", 5)]).replace(b"mmap", b"/map").replace(b"bbase", b"/base")
     decoder = ColumnDecoder({CDR: ChannelDecoder(CDR, static=True)})

@@ -21,7 +21,8 @@ from tfbus.tf_message import MalformedMessageError
 
 NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
 ONE = RawTransform(5, 6, b"map", b"base", NUMBERS)
-OTHER = RawTransform(7, 8, b"base", b"cam", struct.pack("<7d", 4, 5, 6, 0, 0, 1, 0))
+OTHER = RawTransform(7, 8, b"base", b"camera1", struct.pack("<7d", 4, 5, 6, 0, 0, 1, 0))
+THIRD = RawTransform(9, 10, b"base", b"cam", struct.pack("<7d", 7, 8, 9, 0, 1, 0, 0))
 CDR, ROS1 = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), Channel("/tf", "tf2_msgs/TFMessage", "ros1")
 AS_JSON = {
     "timestamp": {"sec": 5, "nsec": 6},
@@ -84,15 +85,16 @@ def in_ros1(transform: RawTransform) -> bytes:
 
 
 def test_several_transforms_are_one_message_in_either_encoding() -> None:
-    ros1 = write_ros1([ONE, OTHER])
-    assert ros1 == b"\2\0\0\0" + in_ros1(ONE) + in_ros1(OTHER)
-    assert parser_of(ROS1)(ros1) == [ONE, OTHER]
-    cdr = write_cdr([ONE, OTHER])
-    # The first names end at 32, the second ones at 116: only these are filled up to a multiple of 8.
+    ros1 = write_ros1([ONE, OTHER, THIRD])
+    assert ros1 == b"\3\0\0\0" + in_ros1(ONE) + in_ros1(OTHER) + in_ros1(THIRD)
+    assert parser_of(ROS1)(ros1) == [ONE, OTHER, THIRD]
+    cdr = write_cdr([ONE, OTHER, THIRD])
+    # Each string ends at a multiple of 4: the names at 32, 120 and 204, of which only the last is no multiple of 8.
     first = struct.pack("<iI", 5, 6) + b"\4\0\0\0map\0" + b"\5\0\0\0base\0\0\0\0" + NUMBERS
-    second = struct.pack("<iI", 7, 8) + b"\5\0\0\0base\0\0\0\0" + b"\4\0\0\0cam\0" + bytes(4) + OTHER.numbers
-    assert cdr == b"\0\1\0\0\2\0\0\0" + first + second
-    assert parser_of(CDR)(cdr) == [ONE, OTHER]
+    second = struct.pack("<iI", 7, 8) + b"\5\0\0\0base\0\0\0\0" + b"\x08\0\0\0camera1\0" + OTHER.numbers
+    third = struct.pack("<iI", 9, 10) + b"\5\0\0\0base\0\0\0\0" + b"\4\0\0\0cam\0" + bytes(4) + THIRD.numbers
+    assert cdr == b"\0\1\0\0\3\0\0\0" + first + second + third
+    assert parser_of(CDR)(cdr) == [ONE, OTHER, THIRD]
 
 
 @pytest.mark.parametrize(("channel", "payload"), [(CDR, write_cdr([ONE, OTHER])), (ROS1, write_ros1([ONE, OTHER]))])

@@ -56,6 +56,23 @@ def test_a_definition_of_ros_1_is_passed_on_with_its_digest() -> None:
     assert MessageTypes().ros1_definition(other) == ("uint8 a\n", md5(b"uint8 a").hexdigest())
 
 
+@pytest.mark.parametrize(
+    ("kind", "digest"),
+    [
+        ("std_msgs/msg/String", "992ce8a1687cec8c8bd883ec73ca41d1"),
+        ("std_msgs/msg/Header", "2176decaecbce78abc3b96ef049fabed"),
+        ("geometry_msgs/msg/PointStamped", "c63aecb41bfdfd6b7e1fac37c7cbe7bf"),
+        ("nav_msgs/msg/Odometry", "cd5e73d190d741a2f92e81eda573aca7"),
+        ("tf2_msgs/msg/TFMessage", "94810edda583a504dfda3829e70d7eec"),
+    ],
+)
+def test_the_definition_of_a_type_of_ros_2_has_the_digest_of_ros_1(kind: str, digest: str) -> None:
+    definition, found = MessageTypes().ros1_definition(Channel("/a", kind, "cdr"))
+    assert found == digest
+    # A header counts the messages there, which ROS 2 has given up.
+    assert ("uint32 seq\ntime stamp\nstring frame_id\n" in definition) == (kind != "std_msgs/msg/String")
+
+
 def test_types_with_a_header_are_known() -> None:
     assert "sensor_msgs/msg/LaserScan" in types_with_header()
     assert "geometry_msgs/msg/Twist" not in types_with_header()
