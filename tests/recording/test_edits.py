@@ -14,6 +14,7 @@ def test_edits_are_frozen() -> None:
 
 
 def test_without_edits_nothing_changes_not_even_a_leading_slash() -> None:
+    assert Edits() == Edits(frames=None, rename={}, prefix="", drop_static=False)
     assert Edits().apply(SLASHED) == SLASHED
     assert not Edits().changes_messages
     assert not Edits(drop_static=True).changes_messages

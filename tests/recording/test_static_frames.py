@@ -1,5 +1,7 @@
+import errno
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -98,8 +100,10 @@ def test_a_file_that_is_no_text_or_not_there_is_named(tmp_path: Path) -> None:
     file.write_bytes(b"\xff\xfe")
     with pytest.raises(RecordingError, match="it is neither YAML nor JSON"):
         load_static(file)
-    with pytest.raises(RecordingError, match="it cannot be read"):
+    with pytest.raises(RecordingError) as unreadable:
         load_static(tmp_path)
+    assert str(unreadable.value) == f"recording {str(tmp_path)!r}: it cannot be read: {os.strerror(errno.EISDIR)}"
+    assert unreadable.value.reason == "unreadable"
 
 
 def test_what_convert_writes_is_read(tmp_path: Path) -> None:
