@@ -3,6 +3,7 @@ import struct
 from itertools import permutations
 
 import pytest
+from support.bag_bytes import chunk, field, message, record
 
 from tfbus.recording.formats import _bag_records
 from tfbus.recording.formats._bag_records import (
@@ -21,27 +22,7 @@ from tfbus.recording.formats._bag_records import (
     time_in,
 )
 
-
-def field(name: bytes, value: bytes) -> bytes:
-    return struct.pack("<I", len(name) + 1 + len(value)) + name + b"=" + value
-
-
-def record(header: bytes, data: bytes = b"") -> bytes:
-    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
-
-
-def message(connection: int, seconds: int, data: bytes, order: str = "cot") -> bytes:
-    fields = {
-        "c": field(b"conn", struct.pack("<I", connection)),
-        "o": field(b"op", b"\2"),
-        "t": field(b"time", struct.pack("<II", seconds, 5)),
-    }
-    return record(b"".join(fields[letter] for letter in order), data)
-
-
-CHUNK_RECORD = record(
-    field(b"compression", b"none") + field(b"op", b"\5") + field(b"size", struct.pack("<I", 3)), b"abc"
-)
+CHUNK_RECORD = chunk(b"abc")
 
 
 def test_messages_are_split_whatever_the_order_of_the_fields() -> None:
@@ -119,9 +100,9 @@ def test_a_record_of_another_kind_with_the_mark_of_a_chunk_in_a_field_is_no_chun
     # A chunk has the field "size".
     assert find_chunk(io.BytesIO(record(field(b"op", b"\5"), b"abc")), 0) is None
     # The mark is in the data of the chunk behind it, or before it begins.
-    chunk = record(field(b"size", bytes(4)) + field(b"op", b"\5"), mark)
-    assert find_chunk(io.BytesIO(mark + chunk), 0) == len(mark)
-    assert find_chunk(io.BytesIO(chunk), 1) is None
+    real = record(field(b"size", bytes(4)) + field(b"op", b"\5"), mark)
+    assert find_chunk(io.BytesIO(mark + real), 0) == len(mark)
+    assert find_chunk(io.BytesIO(real), 1) is None
 
 
 def test_a_record_that_claims_more_than_its_bound_is_not_read() -> None:
@@ -151,8 +132,7 @@ def test_a_chunk_is_unfolded_up_to_its_bound_and_has_the_size_that_it_claims(mon
     monkeypatch.setattr(_bag_records, "MAX_CHUNK", 3)
 
     def content(size: int, data: bytes, torn: bool = False) -> bytes:
-        header = field(b"compression", b"none") + field(b"op", b"\5") + field(b"size", struct.pack("<I", size))
-        file = io.BytesIO(record(header, data))
+        file = io.BytesIO(chunk(data, size))
         return read_chunk(file, read_record(file, 0), torn)
 
     assert content(3, b"abc") == b"abc"

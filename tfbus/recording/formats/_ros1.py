@@ -175,6 +175,11 @@ class Ros1Storage:
             numbers = ", ".join(map(str, sorted(self._contradictions)))
             yield lost_message(now, f"the descriptions of connection {numbers} contradict each other")
         if since is None and until is None:
+            known = {chunk.offset for chunk in chunks.values()}
+            for chunk in self._chunks:
+                # What was not read is in an index.
+                if chunk.offset not in known:
+                    counts.update(chunk.counts or {})
             self._counted = counts
             promised = self._promised
             if promised is not None:
