@@ -240,6 +240,21 @@ def test_a_part_begins_with_the_static_transforms_from_before(tmp_path: Path, so
     assert [received for received, _ in found] == [100 + k for k in range(20)]
 
 
+def test_static_transforms_from_before_a_part_come_once_each_in_the_order_in_which_they_came_last(
+    tmp_path: Path,
+) -> None:
+    sent = [(k, static("base", name, x)) for k, name, x in ((1, "a", 1.0), (2, "b", 1.0), (3, "a", 1.0), (4, "b", 2.0))]
+    source = write_mcap(tmp_path / "run.mcap", [(k, "/tf_static", [sample]) for k, sample in sent])
+    b, a, other = sent[1][1], sent[2][1], sent[3][1]
+    for since, expected in (
+        (1, [(k, (sample,)) for k, sample in sent]),
+        (4, [(4, (b,)), (4, (a,)), (4, (other,))]),
+        (5, [(5, (b,)), (5, (a,)), (5, (other,))]),
+    ):
+        _, found = edited(tmp_path, source, since=since)
+        assert found == expected
+
+
 def test_several_recordings_are_merged_by_their_log_times(tmp_path: Path) -> None:
     even = write_mcap(tmp_path / "even.mcap", LINES[::2])
     odd = write_mcap(tmp_path / "odd.mcap", LINES[1::2])
