@@ -140,6 +140,8 @@ GOOD = (1, CDR, encode([moving("map", "odom", 1), moving("odom", "base", 1)]))
         ),
         (2, CDR, encode([moving("earth", "odom", 2), moving("x", "y", 2)])),
         (2, Channel("/tf", "foxglove.FrameTransform", "json"), b"{}"),
+        # Nobody has decided how a channel of that kind is read.
+        (2, Channel("/tf", TF, "cdr"), encode([moving("map", "odom", 1)])),
     ],
 )
 def test_what_may_be_invalid_or_needs_a_judgement_is_left_to_the_slow_path(other: StoredMessage) -> None:

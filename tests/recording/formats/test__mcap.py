@@ -370,6 +370,7 @@ THREE = [moving("a", name, 1) for name in "bcd"]
         ("3", [""] * 3),
         ('[["odometry", "x"]]', [""] * 3),
         ('[["odometry", 3], ["slam", -1]]', [""] * 3),
+        ('[["odometry", 3], ["slam", 0]]', [""] * 3),
         ('[["odometry", 1000000000000]]', ["odometry"] * 3),
         ('[["odometry", 1000000000000], ["slam", 1]]', [""] * 3),
     ],
