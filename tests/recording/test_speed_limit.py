@@ -8,7 +8,7 @@ from support.samples import moving, static
 
 from tfbus import SECOND, TransformStamped
 from tfbus.recording import load
-from tfbus.recording.speed_limit import SpeedLimit
+from tfbus.recording.speed_limit import _MAX_CANDIDATES, SpeedLimit
 
 
 def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]:
@@ -45,6 +45,11 @@ def test_candidates_are_bounded() -> None:
     # The oldest one is forgotten, so what comes back to its place confirms nothing.
     found, dropped = kept(*places, places[0])
     assert (len(found), dropped) == (1, {"speed": 40})
+    # As long as it is remembered, it is confirmed, and the others go; of one more, two are forgotten in turn.
+    most = places[:_MAX_CANDIDATES]
+    assert kept(*most, places[0]) == ([places[0], places[0]], {"speed": _MAX_CANDIDATES - 1})
+    most = places[: _MAX_CANDIDATES + 1]
+    assert kept(*most, places[0]) == ([places[2]], {"speed": _MAX_CANDIDATES + 1})
 
 
 def test_frames_parents_and_kinds_are_apart() -> None:
