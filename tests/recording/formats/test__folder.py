@@ -88,6 +88,20 @@ def test_a_file_that_cannot_be_read_is_told_and_the_others_are_read(tmp_path: Pa
     assert sum(bool(message.errors) for message in messages_in(tmp_path, since=5)) == 1
 
 
+def test_what_cannot_be_read_is_told_at_the_start_of_the_recording_or_of_the_range(tmp_path: Path) -> None:
+    # A file without messages has no start.
+    write_mcap(tmp_path / "run_0.mcap", [])
+    write_mcap(tmp_path / "run_1.mcap", LINES[10:20])
+    (tmp_path / "run_2.mcap").write_bytes(b"nonsense")
+    for since, told in ((None, 10), (12, 12), (40, 40)):
+        lost = [message for message in messages_in(tmp_path, since) if message.errors]
+        assert [message.received for message in lost] == [told]
+    with open_recording(tmp_path) as recording:
+        assert (recording.start, recording.end, recording.count) == (10, 19, 10)
+        (block,) = (block for block in recording.blocks() if len(block))
+        assert [message.received for message in block.messages()] == [10, *range(10, 20)]
+
+
 def test_a_folder_of_nothing_but_bad_files_is_refused_for_what_is_wrong_with_the_first(tmp_path: Path) -> None:
     (tmp_path / "run_0.mcap").write_bytes(b"")
     (tmp_path / "run_1.db3").write_bytes(b"nonsense")
@@ -157,6 +171,12 @@ def test_what_the_metadata_promise_and_the_files_do_not_have_is_told(
     *_, lost = messages_in(tmp_path)
     assert says in str(lost.errors[0])
     assert lost.received == 29
+
+
+def test_what_the_metadata_promise_of_topics_that_are_not_read_is_not_told(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "run_0.mcap", [*LINES, (40, "/camera", b"picture")])
+    metadata(tmp_path, "run_0.mcap", topic="/camera", count=7)
+    assert batches_in(tmp_path) == EXPECTED
 
 
 def test_what_is_missing_of_several_files_is_told_behind_their_last_message(tmp_path: Path) -> None:

@@ -139,6 +139,15 @@ def test_all_messages_are_read_with_an_index_and_without(
         assert facts(recording) == (10, 159, 61, False)
 
 
+def test_a_damaged_description_in_an_index_that_is_cut_does_not_count(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(write_bag(path))
+    place = data.rindex(b"type=tf2_msgs") + 5
+    data[place] ^= 1
+    path.write_bytes(data[:-1])
+    assert read(path) == (EXPECTED, [])
+
+
 def test_an_index_behind_the_end_that_counts_nothing_hides_no_message(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     data = bytearray(write_bag(path))
@@ -340,6 +349,10 @@ def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(tmp_path
         with open_recording(path) as recording:
             assert facts(recording) == (SECOND + 5, last * SECOND + 5, None, False)
             assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", None), ("/tf", None)]
+            # Of a part, nothing is known of the whole.
+            for part in ((0, None), (None, 99 * SECOND)):
+                assert len(list(recording.messages(*part))) == count
+                assert recording.count is None
             assert len(list(recording.messages())) == recording.count == count
             assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 1), ("/tf", count)]
 
