@@ -13,6 +13,7 @@ from support.samples import any_samples, moving, static
 
 from tfbus import TransformStamped
 from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
+from tfbus.recording.formats import _mcap_reading
 from tfbus.recording.formats._mcap_output import McapOutput
 
 SECOND = 1_000_000_000
@@ -110,6 +111,39 @@ def test_the_samples_left_out_are_those_left_out_of_a_loaded_tree(
     assert {frame.frame for frame in summary.frames} == {edge.child for edge in tree.edges()}
     for frame, edge in zip(summary.frames, tree.edges(), strict=True):
         assert edge.parent in frame.parents
+
+
+@pytest.mark.parametrize(
+    ("lines", "loops"),
+    [
+        # Of one stamp, the parent that comes later holds.
+        ([moving("a", "b", 5), moving("c", "b", 5), moving("b", "c", 6)], 1),
+        ([moving("c", "b", 5), moving("a", "b", 5), moving("b", "c", 6)], 0),
+        ([moving("a", "b", 5), moving("c", "b", 4), moving("b", "c", 6)], 0),
+        # Also where the stamps before are counted in columns.
+        ([moving("a", "b", 5), moving("a", "b", 7), moving("c", "b", 6), moving("b", "c", 8)], 0),
+        ([moving("a", "b", 5), moving("a", "b", 7), moving("a", "b", 3), moving("c", "b", 6), moving("b", "c", 8)], 0),
+        ([moving("a", "b", 5), moving("a", "b", 7), moving("c", "b", 7), moving("b", "c", 8)], 1),
+        ([static("a", "b"), moving("c", "b", 1), moving("b", "c", 2)], 1),
+        ([moving("a", "b", 9), static("c", "b"), moving("b", "c", 2)], 1),
+    ],
+)
+def test_the_newest_parent_of_a_frame_decides_what_closes_a_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: list[TransformStamped], loops: int
+) -> None:
+    # Each message is a block of its own.
+    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", 1)
+    monkeypatch.setattr(_mcap_reading, "_BLOCK", 1)
+    sent = [(k, "/tf_static" if sample.static else "/tf", [sample]) for k, sample in enumerate(lines)]
+    path = write_mcap(tmp_path / "run.mcap", sent, chunk_size=1)
+    counted: list[int] = []
+    with open_recording(path) as recording:
+        summary = summarise(recording, progress=counted.append)
+    problems: Counter[str] = Counter()
+    load(path, problems=problems)
+    assert summary.problems == problems == ({"cycle": loops} if loops else {})
+    assert counted == [1] * len(lines)
+    assert summary.messages == len(lines)
 
 
 def test_summarise_reads_the_messages_that_are_given() -> None:

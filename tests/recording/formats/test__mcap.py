@@ -405,6 +405,43 @@ def errors_in(path: Path) -> list[str]:
     return [str(error) for message in messages_in(path) for error in message.errors]
 
 
+def errors_in_blocks(path: Path) -> list[str]:
+    with open_recording(path) as recording:
+        return [str(error) for block in recording.blocks() for message in block.messages() for error in message.errors]
+
+
+def test_a_description_that_contradicts_that_of_the_index_is_told_and_that_of_the_index_holds(write: Write) -> None:
+    path = write(LINES, enable_crcs=False)
+    # The first one is in the first chunk.
+    damage(path, b"/tf_static")
+    for found in (errors_in(path), errors_in_blocks(path)):
+        assert found == ["no message of transforms (damaged): the descriptions of channel 1 contradict each other"]
+    assert [(message.received, message.batch) for message in messages_in(path) if message.batch] == EXPECTED
+
+
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_messages_on_channels_that_are_not_described_are_counted(write: Write, use_chunking: bool) -> None:
+    path = write(LINES, finish=False, enable_crcs=False, use_chunking=use_chunking)
+    data = bytearray(path.read_bytes())
+    for place in (3, 4, 30):
+        # The number of the channel is the first of the message, 22 bytes before the payload.
+        at = data.index(encode(EXPECTED[place][1])) - 22
+        assert int.from_bytes(data[at : at + 2], "little") == 2
+        data[at] = 9
+    path.write_bytes(data)
+    reason = "no message of transforms (damaged): 3 messages are on channels that the file does not describe"
+    assert errors_in(path) == errors_in_blocks(path) == [reason]
+    assert [message.received for message in messages_in(path) if message.batch] == [
+        received for place, (received, _) in enumerate(EXPECTED) if place not in (3, 4, 30)
+    ]
+    with open_recording(path) as recording:
+        assert recording.count is None
+        for part in ((0, None), (None, 10**9)):
+            assert len(list(recording.messages(*part))) > 0
+        assert len(list(recording.messages())) == len(EXPECTED) - 3 + 1
+        assert recording.count == len(EXPECTED) - 3
+
+
 def test_many_channels_that_claim_a_million_authorities_cost_nothing(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with path.open("wb") as file:
