@@ -198,6 +198,16 @@ def test_without_a_counter_the_problems_are_logged_in_one_line(caplog: pytest.Lo
     assert caplog.records == []
 
 
+def test_what_is_not_read_although_it_may_hold_transforms_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, f"/{name}/tf", [moving("a", "b", 1)]) for name in ("r1", "r2")])
+    load(path)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{path}: not read: 1 messages on topic /{name}/tf of type tf2_msgs/msg/TFMessage" for name in ("r1", "r2")
+    ]
+
+
 def test_nothing_is_logged_for_a_good_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     load(write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])]))
     assert caplog.records == []
