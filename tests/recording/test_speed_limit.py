@@ -69,6 +69,14 @@ def test_a_speed_is_a_number_greater_than_zero(speed: Any, error: type[Exception
         SpeedLimit(speed)
 
 
+def test_a_speed_limit_holds_in_a_long_recording_that_would_be_stored_at_once(tmp_path: Path) -> None:
+    lines = [(k, "/tf", [moving("map", "base", k * SECOND, 1e6 if k == 1_900 else float(k))]) for k in range(2_000)]
+    problems: Counter[str] = Counter()
+    tree = load(write_mcap(tmp_path / "run.mcap", lines), max_speed=3.0, problems=problems)
+    assert [edge.samples for edge in tree.edges()] == [1_999]
+    assert problems == {"speed": 1}
+
+
 def test_load_leaves_out_what_nothing_can_have_reached(tmp_path: Path) -> None:
     places = [5e9, 0, 1, 2, 77, 3]
     lines = [(at, "/tf", [moving("map", "base", at * SECOND, x)]) for at, x in enumerate(places)]
