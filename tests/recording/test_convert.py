@@ -223,6 +223,22 @@ def test_a_single_authority_is_the_node_that_a_bag_names(tmp_path: Path, source:
     assert {each.authority for _, batch in batches_in(tmp_path / "run.bag") for each in batch} == {"b"}
 
 
+def test_a_message_without_transforms_stays_and_one_that_loses_all_of_them_goes(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "run.mcap", [(1, "/tf", []), (2, "/tf", [moving("a", "b", 2)])])
+    told: list[int] = []
+    done = convert([source], tmp_path / "some.mcap", edits=Edits(frames=["c"]), progress=told.append)
+    assert batches_in(tmp_path / "some.mcap") == [(1, ())]
+    assert (done.messages, done.transforms, told) == (1, 0, [1, 1])
+
+
+def test_of_the_metadata_of_a_channel_the_quality_of_service_stays(tmp_path: Path) -> None:
+    profiles = {"offered_qos_profiles": "- history: 1"}
+    source = write_mcap(tmp_path / "run.mcap", LINES, metadata={**profiles, "other": "x"})
+    edited(tmp_path, source, prefix="r/")
+    with (tmp_path / "edited.mcap").open("rb") as file:
+        assert [channel.metadata for _, channel, _ in make_reader(file).iter_messages()] == [profiles] * len(LINES)
+
+
 def test_static_transforms_are_left_out_and_told(tmp_path: Path, source: Path) -> None:
     done, found = edited(tmp_path, source, drop_static=True, rename={"laser": "lidar"})
     assert not any(each.static for _, batch in found for each in batch)
