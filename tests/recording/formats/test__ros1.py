@@ -332,6 +332,20 @@ def test_a_range_of_a_bag_without_an_index_includes_both_ends(tmp_path: Path) ->
         assert lost == []
 
 
+def test_damage_between_the_chunks_is_told_at_the_start_of_the_recording_or_of_the_range(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    one = chunk(connection(0, b"/tf", **TF) + message(0, 7, b""))
+    path.write_bytes(unfinished(b"\xff" * 40, one))
+    for since, told in ((None, 7 * SECOND + 5), (0, 7 * SECOND + 5), (9 * SECOND, 9 * SECOND)):
+        lost = [
+            message.received for message in messages_in(path, since) if "nothing can be read" in str(message.errors)
+        ]
+        assert lost == [told]
+    # Nothing is behind the whole, and a byte more is a record that is cut.
+    for rest in (b"", b"x"):
+        assert stored_in(path, one, rest) == ([(7, "/tf", b"")], [])
+
+
 def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     described = connection(0, b"/tf", **TF) + connection(1, b"/other", type=b"a/B")
