@@ -16,6 +16,7 @@ from support.samples import moving, static
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
 from tfbus.recording.formats._bag_records import find_chunk, read_record
+from tfbus.recording.formats._raw_transforms import write_ros1
 from tfbus.recording.formats._ros1 import Ros1Storage
 from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import encode
@@ -371,12 +372,21 @@ def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(tmp_path
             assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 1), ("/tf", count)]
 
 
+def test_a_chunk_of_which_its_index_has_an_unknown_connection_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    first = chunk(connection(0, b"/tf", **TF) + message(0, 1, write_ros1([])))
+    path.write_bytes(unfinished(first, index(0, 1), chunk(message(9, 2, b"y")), index(9, 2)))
+    whole, lost = messages_in(path)
+    assert (whole.received, whole.errors) == (SECOND + 5, ())
+    assert "1 messages are on connections that the file does not describe" in str(lost.errors[0])
+
+
 def test_a_topic_that_is_not_read_has_all_its_messages_counted(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     described = connection(0, b"/tf", **TF) + connection(1, b"/other", type=b"a/B")
-    # The second chunk is not read, as its index tells that nothing in it is wanted.
-    chunks = described + message(1, 1, b"x"), message(1, 2, b"y") + message(1, 3, b"z"), message(0, 4, b"x")
-    path.write_bytes(unfinished(chunk(chunks[0]), chunk(chunks[1]), index(1, 2, 3), chunk(chunks[2])))
+    # The second chunk is not read, as its index tells that nothing in it is wanted, so its damage is not met.
+    first, second = described + message(1, 1, b"x"), message(1, 2, b"y") + message(1, 3, b"z") + b"\xff" * 9
+    path.write_bytes(unfinished(chunk(first), chunk(second), index(1, 2, 3), chunk(message(0, 4, b"x"))))
     with open_recording(path) as recording:
         assert [message.received for message in recording.messages()] == [4 * SECOND + 5]
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 3), ("/tf", 1)]
