@@ -347,6 +347,29 @@ def test_damage_between_the_chunks_is_told_at_the_start_of_the_recording_or_of_t
         assert stored_in(path, one, rest) == ([(7, "/tf", b"")], [])
 
 
+def test_a_chunk_of_which_nothing_can_be_read_changes_neither_start_nor_end(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    damaged = chunk(b"\xff" * 50)
+    described = connection(0, b"/tf", **TF)
+    first, second = (chunk(described + message(0, seconds, write_ros1([]))) for seconds in (7, 9))
+    for parts in ((damaged, first, second), (first, damaged, second), (first, second, damaged)):
+        path.write_bytes(unfinished(*parts))
+        with open_recording(path) as recording:
+            assert (recording.start, recording.end) == (7 * SECOND + 5, 9 * SECOND + 5)
+            lost, *whole = recording.messages()
+        place = len(unfinished(*parts[: parts.index(damaged)]))
+        assert (lost.received, len(lost.errors)) == (7 * SECOND + 5, 1)
+        assert f"the chunk at byte {place}: " in str(lost.errors[0])
+        assert [(each.received, each.errors) for each in whole] == [(7 * SECOND + 5, ()), (9 * SECOND + 5, ())]
+    # With its index, its time is known.
+    path.write_bytes(unfinished(first, damaged, index(0, 8), second))
+    assert [(each.received // SECOND, len(each.errors)) for each in messages_in(path)] == [(7, 0), (8, 1), (9, 0)]
+    path.write_bytes(unfinished(damaged))
+    with pytest.raises(RecordingError, match=r"as a bag of ROS 1: the chunk at byte \d+: ") as raised:
+        open_recording(path)
+    assert raised.value.reason == "damaged"
+
+
 def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     described = connection(0, b"/tf", **TF) + connection(1, b"/other", type=b"a/B")
