@@ -1,3 +1,4 @@
+import errno
 import gzip
 import math
 import os
@@ -15,7 +16,7 @@ from support.recorded import SMALL, as_ros2, messages_in, write_mcap
 from support.samples import moving, static
 
 from tfbus import InvalidTransformError, RecordingError
-from tfbus.recording import open_recording
+from tfbus.recording import RecordedTopic, open_recording
 from tfbus.tf_message import encode
 
 OPEN_FILES = Path("/proc/self/fd")
@@ -165,8 +166,9 @@ def test_a_file_that_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
-        with pytest.raises(RecordingError, match="it cannot be read: ") as raised:
+        with pytest.raises(RecordingError) as raised:
             open_recording(path)
+    assert str(raised.value) == f"recording {str(path)!r}: it cannot be read: {os.strerror(errno.ENXIO)}"
     assert raised.value.reason == "unreadable"
 
 
@@ -198,6 +200,61 @@ def write_channels(path: Path, topics: Sequence[str], lines: Iterable[tuple[int,
             writer.add_message(channels[channel], stamp, encode([moving("map", "base", stamp)]), stamp)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
+
+
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_all_topics_are_told_and_those_that_may_hold_transforms_and_are_not_read_are_remarked(
+    tmp_path: Path, finish: bool
+) -> None:
+    one = [moving("map", "base", 1)]
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", one), (2, "/r/tf", one), (3, "/r/tf", one)], finish=finish)
+    with open_recording(path) as recording:
+        assert len(list(recording.messages())) == 1
+        assert recording.topics == (
+            RecordedTopic("/r/tf", TF_TYPE, 2, read=False, ignored=True),
+            RecordedTopic("/tf", TF_TYPE, 1, read=True, ignored=False),
+        )
+        assert recording.remarks == (f"not read: 2 messages on topic /r/tf of type {TF_TYPE}",)
+    with open_recording(path) as recording:
+        next(recording.messages())
+        count = "2 messages on " if finish else ""
+        assert recording.remarks == (f"not read: {count}topic /r/tf of type {TF_TYPE}",)
+    with open_recording(write_mcap(path, [(1, "/camera/tf", one), (2, "/camera", b"")], schema="")) as recording:
+        assert [(topic.name, topic.ignored) for topic in recording.topics] == [("/camera", False), ("/camera/tf", True)]
+        assert recording.remarks == ("not read: 1 messages on topic /camera/tf of type unknown",)
+
+
+def test_positions_of_joints_are_remarked_where_there_are_no_transforms(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    hint = "/joint_states has the positions of joints: load_joint_states reads them with a URDF"
+    for kind in ("sensor_msgs/msg/JointState", "sensor_msgs/JointState"):
+        write_mcap(path, [(1, "/joint_states", b"")], schema=kind)
+        with open_recording(path) as recording:
+            assert recording.remarks == (f"no transforms, but {hint}",)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    path.rename(folder / "joints.mcap")
+    write_mcap(folder / "more.mcap", LINES)
+    with open_recording(folder) as recording:
+        assert recording.remarks == ()
+
+
+def test_a_topic_that_was_asked_for_is_there_with_transforms(tmp_path: Path) -> None:
+    path = write_channels(tmp_path / "run.mcap", ("/tf", "/r/tf", "/r/tf_static"), [(1, 0), (2, 1)])
+    with open_recording(path, topics=["r/tf", "/r/tf_static"]) as recording:
+        assert [message.received for message in recording.messages()] == [2]
+    path = write_mcap(tmp_path / "other.mcap", [(1, "/camera", b"")], schema="sensor_msgs/msg/Image")
+    with pytest.raises(RecordingError) as raised:
+        open_recording(path, topics="/camera")
+    assert str(raised.value).endswith("topic 'camera' has type sensor_msgs/msg/Image, which holds no transforms")
+    assert raised.value.reason == "no such topic"
+    # What an unfinished file has, only reading it tells.
+    path = write_mcap(path, [(1, "/camera", b"")], schema="sensor_msgs/msg/Image", finish=False)
+    with open_recording(path, topics="/camera") as recording:
+        assert list(recording.messages()) == []
 
 
 def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -> None:

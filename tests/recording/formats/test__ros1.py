@@ -140,6 +140,23 @@ def test_all_messages_are_read_with_an_index_and_without(
         assert facts(recording) == (10, 159, 61, False)
 
 
+def test_a_finished_bag_without_messages_is_an_empty_recording(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(unfinished())
+    place = data.index(b"index_pos=") + 10
+    # Its index is behind the header at the earliest.
+    for begin in (len(data), len(data) - 1):
+        data[place : place + 8] = begin.to_bytes(8, "little")
+        path.write_bytes(data)
+        if begin == len(data):
+            with open_recording(path) as recording:
+                assert facts(recording) == (None, None, 0, True)
+                assert list(recording.messages()) == []
+        else:
+            with pytest.raises(RecordingError, match="ends before its first message"):
+                open_recording(path)
+
+
 def test_a_damaged_description_in_an_index_that_is_cut_does_not_count(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     data = bytearray(write_bag(path))
