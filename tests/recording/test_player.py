@@ -122,7 +122,7 @@ async def test_samples_are_published_as_they_were_recorded(tmp_path: Path) -> No
         await player.play()
     assert heard.batches == batches
     assert (player.start, player.end, player.position) == (START, START + 2, START + 2)
-    assert (player.played, player.passes, player.bad) == (4, 1, {})
+    assert (player.played, player.messages, player.passes, player.bad) == (4, 3, 1, {})
 
 
 async def test_a_simulated_clock_goes_from_message_to_message(tmp_path: Path) -> None:
@@ -793,9 +793,9 @@ async def test_a_paused_player_steps_from_message_to_message(tmp_path: Path, sim
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(player.play)
             assert await steered.until(1) == [0]
-            player.pause()
-            assert player.paused
+            assert not player.paused
             player.step()
+            assert player.paused
             assert await steered.until(2) == [0, 100]
             player.step()
             player.step()

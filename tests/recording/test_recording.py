@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from support.recorded import SMALL, as_ros2, messages_in, write_mcap
 from support.samples import moving, static
 
@@ -102,10 +103,23 @@ def test_a_closed_recording_cannot_be_read(recording: Path) -> None:
 @pytest.mark.skipif(not OPEN_FILES.is_dir(), reason="this system does not show the open files of a process")
 def test_the_files_are_closed(recording: Path, tmp_path: Path) -> None:
     folder = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3)
+    compressed = as_ros2(
+        SMALL, tmp_path / "zstd", StoragePlugin.MCAP, mode=CompressionMode.FILE, fmt=CompressionFormat.ZSTD
+    )
+    # Of one whose second file cannot be opened, the first one is closed too.
+    unreadable = tmp_path / "unreadable"
+    unreadable.mkdir()
+    write_mcap(unreadable / "run_0.mcap", LINES)
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(unreadable / "run_1.mcap"))
     before = len(list(OPEN_FILES.iterdir()))
-    for path in (SMALL, recording, folder):
+    for path in (SMALL, recording, folder, compressed):
         with open_recording(path) as opened:
             next(opened.messages())
+    with pytest.raises(RecordingError, match="it cannot be read") as raised:
+        open_recording(unreadable)
+    # Its traceback still refers to all that was opened.
+    assert raised.tb is not None
     assert len(list(OPEN_FILES.iterdir())) == before
 
 

@@ -10,7 +10,7 @@ from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in, wri
 from support.samples import moving, static
 
 from tfbus import RecordingError
-from tfbus.recording import open_recording
+from tfbus.recording import RecordedMessage, open_recording
 
 ZSTD = {"fmt": CompressionFormat.ZSTD}
 LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
@@ -42,6 +42,12 @@ def test_what_ros_2_records_is_read_compressed_or_not(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def in_blocks(path: Path) -> list[RecordedMessage]:
+    """All messages of a recording, as they are in its blocks."""
+    with open_recording(path) as recording:
+        return [message for block in recording.blocks() for message in block.messages()]
+
+
 def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: Path) -> None:
     # By name, 10 is before 2.
     for number, part in ((2, LINES[:10]), (10, LINES[10:25]), (11, LINES[25:])):
@@ -50,6 +56,7 @@ def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: P
     assert batches_in(tmp_path) == EXPECTED
     with open_recording(tmp_path) as recording:
         assert facts(recording) == (0, 29, 30, True)
+    assert [message.received for message in in_blocks(tmp_path)] == list(range(30))
     assert [message.received for message in messages_in(tmp_path, 9, 11)] == [9, 10, 11]
 
 
@@ -79,7 +86,7 @@ def test_a_file_that_cannot_be_read_is_told_and_the_others_are_read(tmp_path: Pa
     write_mcap(tmp_path / "run_0.mcap", LINES)
     (tmp_path / "run_1.mcap").write_bytes(content)
     lost, *rest = messages_in(tmp_path)
-    assert [error.reason for error in lost.errors] == ["damaged"]
+    assert (lost.received, [error.reason for error in lost.errors]) == (0, ["damaged"])
     assert "run_1.mcap" in str(lost.errors[0])
     assert [(message.received, message.batch) for message in rest] == EXPECTED
     with open_recording(tmp_path) as recording:
@@ -280,9 +287,21 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
         assert sum(bool(message.batch) for message in recording.messages()) > 700
 
 
-def test_what_the_metadata_promise_of_a_long_file_is_held_to_what_is_read_in_blocks(tmp_path: Path) -> None:
+@pytest.mark.parametrize("received", [0, 7])
+def test_what_is_missing_of_a_file_of_which_nothing_is_read_is_told_at_its_start(tmp_path: Path, received: int) -> None:
+    write_mcap(tmp_path / "run_0.mcap", [(received, "/camera", b"picture")])
+    metadata(tmp_path, "run_0.mcap", topic="/gone", count=3)
+    for messages in (messages_in(tmp_path), in_blocks(tmp_path)):
+        assert [(message.received, len(message.errors)) for message in messages] == [(received, 1)]
+
+
+# One that is not finished is not packed.
+@pytest.mark.parametrize("finish", [True, False])
+def test_what_the_metadata_promise_of_a_long_file_is_held_to_what_is_read_in_blocks(
+    tmp_path: Path, finish: bool
+) -> None:
     lines = [(5 + k, "/tf", [moving("odom", "base", k)]) for k in range(2_000)]
-    write_mcap(tmp_path / "run_0.mcap", lines)
+    write_mcap(tmp_path / "run_0.mcap", lines, finish=finish)
     for promised, lost in ((2_000, 0), (2_003, 1)):
         metadata(tmp_path, "run_0.mcap", count=promised)
         with open_recording(tmp_path) as recording:
