@@ -2,7 +2,7 @@ from array import array
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tfbus import SECOND
@@ -13,6 +13,11 @@ columns = st.lists(st.lists(st.integers(0, 10**4), max_size=60), max_size=4)
 
 
 @given(columns=columns, at_once=st.sampled_from([1, 7, 10**6]))
+@example(columns=[], at_once=1)
+@example(columns=[[5], [], [5, 5]], at_once=1)
+@example(columns=[[5], [7, 7]], at_once=1)
+@example(columns=[[9, 3, 6], [0, 3, 1]], at_once=1)
+@example(columns=[[3, 0], [9, 12, 10]], at_once=10**6)
 def test_the_periods_are_those_of_all_different_stamps(columns: list[list[int]], at_once: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_periods, "_AT_ONCE", at_once)

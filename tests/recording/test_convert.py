@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import SMALL, Line, batches_in, messages_in, sender_of, write_mcap
 from support.samples import moving, static
@@ -18,6 +20,7 @@ from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
 from tfbus.recording.formats._raw_transforms import RawTransform, parser_of, write_cdr, write_ros1
 from tfbus.recording.formats._storage import Channel
+from tfbus.recording.load import MAX_DETAILS
 from tfbus.recording.recording import open_storage
 from tfbus.tf_message import encode
 
@@ -102,6 +105,20 @@ def test_the_readers_of_others_find_the_same_messages(tmp_path: Path, ending: st
     assert lines_of_others(path) == payloads
 
 
+def test_a_bag_made_of_cdr_describes_its_types_as_ros_1_does(tmp_path: Path) -> None:
+    convert([write_mcap(tmp_path / "source.mcap", LINES)], tmp_path / "run.bag")
+    with rosbag1.Reader(tmp_path / "run.bag") as bag, rosbag1.Reader(SMALL) as recorded:
+        assert {(each.msgtype, each.digest) for each in bag.connections} == {
+            (each.msgtype, each.digest) for each in recorded.connections if each.topic in ("/tf", "/tf_static")
+        }
+    # By the definition in the bag, each message is as long as it is.
+    with AnyReader([tmp_path / "run.bag"]) as reader:
+        found: list[Any] = [reader.deserialize(data, each.msgtype) for each, _, data in reader.messages()]
+    assert [[each.child_frame_id for each in message.transforms] for message in found] == [
+        [each.child for each in samples] for _, _, samples in LINES if not isinstance(samples, bytes)
+    ]
+
+
 def test_other_topics_pass_through_untouched_or_are_converted_where_the_format_needs_it(tmp_path: Path) -> None:
     text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
     source = write_mcap(tmp_path / "run.mcap", [(5, "/said", text)], schema="std_msgs/msg/String")
@@ -124,6 +141,47 @@ def test_what_a_format_cannot_hold_is_left_out_and_counted(tmp_path: Path) -> No
     unknown = write_mcap(tmp_path / "unknown.mcap", [(1, "/a", b"\0\1\0\0")], schema="my_msgs/msg/Thing")
     done = convert([unknown], tmp_path / "unknown.bag")
     assert (done.messages, done.problems) == (0, {"type": 1})
+
+
+def test_what_the_recorder_has_compressed_is_unfolded_and_what_only_looks_like_it_is_not(tmp_path: Path) -> None:
+    text = bytes(TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"]("hello"), "std_msgs/msg/String"))
+    folded = zstandard.compress(text)
+    torn = folded[:4] + b"\xff" * 30
+    lines: list[Line] = [(1, "/said", folded), (2, "/said", torn), (3, "/said", text)]
+    source = write_mcap(tmp_path / "run.mcap", lines, schema="std_msgs/msg/String")
+    path = tmp_path / "copy.mcap"
+    done = convert([source], path)
+    assert lines_of_others(path) == [("/said", 1, text), ("/said", 3, text)]
+    assert (done.messages, done.problems) == (2, {"damaged": 1})
+    assert "cannot be decompressed" in done.details[0]
+    # In another encoding, these may be the first bytes of anything.
+    source = write_mcap(tmp_path / "other.mcap", lines, schema="my.Thing", encoding="protobuf")
+    assert convert([source], path, overwrite=True).problems == {}
+    assert [payload for _, _, payload in lines_of_others(path)] == [folded, torn, text]
+
+
+def test_details_are_kept_once_each_and_up_to_a_number() -> None:
+    done = Conversion()
+    for number in range(MAX_DETAILS + 1):
+        for _ in range(2):
+            done.note("type", f"number {number}")
+    assert done.problems == {"type": 2 * MAX_DETAILS + 2}
+    assert done.details == [f"number {number}" for number in range(MAX_DETAILS)]
+
+
+def test_runs_of_authorities_keep_their_lengths_and_a_single_one_stands_for_any_number(tmp_path: Path) -> None:
+    frames = [moving("map", name, 1) for name in "abc"]
+    metadata = {"tfbus.authorities": '[["x", 2], ["y", 1]]'}
+    source = write_mcap(tmp_path / "source.mcap", [(1, "/tf", frames), (2, "/tf", frames)], metadata=metadata)
+    for keep, runs in (("abc", '[["x", 2], ["y", 1]]'), ("ac", '[["x", 1], ["y", 1]]'), ("ab", '[["x", 1]]')):
+        _, found = edited(tmp_path, source, frames=list(keep), prefix="r/")
+        names = {"a": "x", "b": "x", "c": "y"}
+        assert [[(each.child, each.authority) for each in batch] for _, batch in found] == [
+            [(f"r/{name}", names[name]) for name in keep]
+        ] * 2
+        with (tmp_path / "edited.mcap").open("rb") as file:
+            ((written, *_),) = {tuple(channel.metadata.values()) for _, channel, _ in make_reader(file).iter_messages()}
+        assert written == runs
 
 
 def edited(tmp_path: Path, *inputs: Path, **arguments: Any) -> tuple[Conversion, list[Any]]:
@@ -165,6 +223,22 @@ def test_a_single_authority_is_the_node_that_a_bag_names(tmp_path: Path, source:
     assert {each.authority for _, batch in batches_in(tmp_path / "run.bag") for each in batch} == {"b"}
 
 
+def test_a_message_without_transforms_stays_and_one_that_loses_all_of_them_goes(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "run.mcap", [(1, "/tf", []), (2, "/tf", [moving("a", "b", 2)])])
+    told: list[int] = []
+    done = convert([source], tmp_path / "some.mcap", edits=Edits(frames=["c"]), progress=told.append)
+    assert batches_in(tmp_path / "some.mcap") == [(1, ())]
+    assert (done.messages, done.transforms, told) == (1, 0, [1, 1])
+
+
+def test_of_the_metadata_of_a_channel_the_quality_of_service_stays(tmp_path: Path) -> None:
+    profiles = {"offered_qos_profiles": "- history: 1"}
+    source = write_mcap(tmp_path / "run.mcap", LINES, metadata={**profiles, "other": "x"})
+    edited(tmp_path, source, prefix="r/")
+    with (tmp_path / "edited.mcap").open("rb") as file:
+        assert [channel.metadata for _, channel, _ in make_reader(file).iter_messages()] == [profiles] * len(LINES)
+
+
 def test_static_transforms_are_left_out_and_told(tmp_path: Path, source: Path) -> None:
     done, found = edited(tmp_path, source, drop_static=True, rename={"laser": "lidar"})
     assert not any(each.static for _, batch in found for each in batch)
@@ -180,6 +254,21 @@ def test_a_part_begins_with_the_static_transforms_from_before(tmp_path: Path, so
     assert [each.child for each in found[0][1]] == ["laser", "camera"]
     _, found = edited(tmp_path, source, topics=["tf"])
     assert [received for received, _ in found] == [100 + k for k in range(20)]
+
+
+def test_static_transforms_from_before_a_part_come_once_each_in_the_order_in_which_they_came_last(
+    tmp_path: Path,
+) -> None:
+    sent = [(k, static("base", name, x)) for k, name, x in ((1, "a", 1.0), (2, "b", 1.0), (3, "a", 1.0), (4, "b", 2.0))]
+    source = write_mcap(tmp_path / "run.mcap", [(k, "/tf_static", [sample]) for k, sample in sent])
+    b, a, other = sent[1][1], sent[2][1], sent[3][1]
+    for since, expected in (
+        (1, [(k, (sample,)) for k, sample in sent]),
+        (4, [(4, (b,)), (4, (a,)), (4, (other,))]),
+        (5, [(5, (b,)), (5, (a,)), (5, (other,))]),
+    ):
+        _, found = edited(tmp_path, source, since=since)
+        assert found == expected
 
 
 def test_several_recordings_are_merged_by_their_log_times(tmp_path: Path) -> None:

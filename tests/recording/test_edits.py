@@ -1,10 +1,20 @@
+from dataclasses import FrozenInstanceError
+
+import pytest
+
 from tfbus.recording import Edits
 from tfbus.recording.formats._raw_transforms import RawTransform
 
 SLASHED = RawTransform(1, 2, b"/odom", b"/base", bytes(56))
 
 
+def test_edits_are_frozen() -> None:
+    with pytest.raises(FrozenInstanceError):
+        Edits().prefix = "r/"  # type: ignore[misc]
+
+
 def test_without_edits_nothing_changes_not_even_a_leading_slash() -> None:
+    assert Edits() == Edits(frames=None, rename={}, prefix="", drop_static=False)
     assert Edits().apply(SLASHED) == SLASHED
     assert not Edits().changes_messages
     assert not Edits(drop_static=True).changes_messages

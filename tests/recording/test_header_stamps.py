@@ -1,6 +1,7 @@
 from pathlib import Path
 
 import pytest
+import zstandard
 from rosbags.typesys import Stores, get_typestore
 from support.recorded import Line, real, write_mcap
 
@@ -32,6 +33,44 @@ def test_the_stamps_are_those_of_the_headers(tmp_path: Path, text: bytes) -> Non
     assert (found.stamps.tolist(), found.from_headers, found.unreadable) == ([0, 1_500_000_000, 3_000_000_000], True, 1)
 
 
+@pytest.mark.parametrize("seconds", [0, 2**31 - 1])
+@pytest.mark.parametrize(
+    ("encoding", "payload"),
+    [
+        ("cdr", "00 01 00 00 {little} 05 00 00 00"),
+        ("cdr", "00 00 00 00 {big} 00 00 00 05"),
+        # The number that counts the messages comes first.
+        ("ros1", "09 09 09 09 {little} 05 00 00 00"),
+    ],
+)
+def test_the_stamp_is_found_in_either_encoding_and_byte_order(
+    tmp_path: Path, encoding: str, payload: str, seconds: int
+) -> None:
+    data = bytes.fromhex(payload.format(little=seconds.to_bytes(4, "little").hex(), big=seconds.to_bytes(4).hex()))
+    lines: list[Line] = [(7, "/points", data), (8, "/points", data[:-1])]
+    found = header_stamps(write(tmp_path / "run.mcap", POINT, b"", lines, encoding), "/points")
+    assert (found.stamps.tolist(), found.unreadable) == ([seconds * 10**9 + 5], 1)
+
+
+def test_messages_that_the_recorder_has_compressed_are_unfolded_and_what_cannot_be_is_unreadable(
+    tmp_path: Path,
+) -> None:
+    folded = zstandard.compress(point(1_500_000_000))
+    lines: list[Line] = [(7, "/points", folded), (8, "/points", folded[:4] + b"\xff" * 30)]
+    found = header_stamps(write(tmp_path / "run.mcap", POINT, b"", lines), "/points")
+    assert (found.stamps.tolist(), found.unreadable) == ([1_500_000_000], 1)
+
+
+def test_a_damaged_chunk_is_one_that_is_unreadable(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    write_mcap(path, LINES, schema=POINT, definition=b"", finish=False, chunk_size=1)
+    data = bytearray(path.read_bytes())
+    data[data.index(point(1_500_000_000))] ^= 1
+    path.write_bytes(data)
+    found = header_stamps(path, "/points")
+    assert (found.stamps.tolist(), found.from_headers, found.unreadable) == ([0, 3_000_000_000], True, 1)
+
+
 def test_without_headers_the_log_times_are_taken(tmp_path: Path) -> None:
     found = header_stamps(write(tmp_path / "run.mcap", "std_msgs/msg/String", b"string data\n"), "/points")
     assert (found.stamps.tolist(), found.from_headers) == ([0, 1, 2], False)
@@ -48,6 +87,9 @@ def test_a_topic_without_messages_is_an_error_that_names_the_others(tmp_path: Pa
         (Channel("/a", "my/msg/A", "cdr", "ros2msg", b"int8 X=1\nstd_msgs/msg/Header header"), True),
         (Channel("/a", "my/A", "ros1", "ros1msg", b"Header header"), True),
         (Channel("/a", "my/A", "ros1", "ros1msg", b"int32 x\nHeader header"), False),
+        (Channel("/a", "my/msg/A", "cdr", "ros2msg", b"int8 X=1\n# Header header\n"), False),
+        (Channel("/a", "std_msgs/msg/Header", "cdr", "jsonschema", b"Header header"), False),
+        (Channel("/a", "my/A", "ros1", "ros1msg", b"Header header # not = a constant"), True),
         (Channel("/a", "my/A", "ros1", "ros1msg", b"\n=====\nMSG: my/B\nHeader header"), False),
         (Channel("/a", "sensor_msgs/LaserScan", "ros1"), True),
         (Channel("/a", "sensor_msgs/msg/LaserScan", "cdr"), True),

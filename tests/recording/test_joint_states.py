@@ -46,6 +46,22 @@ def test_what_cannot_be_used_is_counted_and_the_rest_is_read(tmp_path: Path) -> 
     assert tree.inserted == 3
 
 
+def test_a_part_includes_both_ends_and_damage_is_counted(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    payloads = [joint_state(k, {"shoulder": 0.1 * k, "tail": 1.0, "ear": 1.0}) for k in range(5)]
+    write_mcap(path, [(k, "/joint_states", each) for k, each in enumerate(payloads)], schema=KIND, chunk_size=1)
+    data = bytearray(path.read_bytes())
+    data[data.index(payloads[2])] ^= 1
+    path.write_bytes(data)
+    problems = Counter({"damaged": 10})
+    tree = load_joint_states(path, ARM, "joint_states", 1, 3, problems=problems)
+    # The third message is lost, and two have two unknown joints each; one joint is fixed.
+    assert problems == {"damaged": 11, "unknown joint": 4}
+    assert tree.inserted == 3
+    (edge,) = (edge for edge in tree.edges() if edge.child == "upper")
+    assert (edge.samples, edge.oldest, edge.newest) == (2, 1, 3)
+
+
 def test_a_recording_without_positions_is_refused_and_says_where_there_are_some(tmp_path: Path) -> None:
     path = write(tmp_path / "run.mcap", joint_state(1, {}), topic="/arm/joint_states")
     with pytest.raises(RecordingError, match="topics with them: /arm/joint_states") as raised:

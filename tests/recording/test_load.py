@@ -26,8 +26,10 @@ from tfbus import (
     TransformTree,
     UnknownFrameError,
 )
-from tfbus.recording import load
+from tfbus.recording import load, open_recording
 from tfbus.recording.formats._mcap_output import McapOutput
+from tfbus.recording.load import MAX_DETAILS, Problems, fill
+from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.tree import forest_of
 
 SECOND = 1_000_000_000
@@ -196,6 +198,16 @@ def test_without_a_counter_the_problems_are_logged_in_one_line(caplog: pytest.Lo
     assert caplog.records == []
 
 
+def test_what_is_not_read_although_it_may_hold_transforms_is_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_mcap(tmp_path / "run.mcap", [(1, f"/{name}/tf", [moving("a", "b", 1)]) for name in ("r1", "r2")])
+    load(path)
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{path}: not read: 1 messages on topic /{name}/tf of type tf2_msgs/msg/TFMessage" for name in ("r1", "r2")
+    ]
+
+
 def test_nothing_is_logged_for_a_good_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     load(write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])]))
     assert caplog.records == []
@@ -205,6 +217,23 @@ def test_problems_are_added_to_a_given_counter() -> None:
     problems = Counter({"cycle": 10})
     load(SMALL, problems=problems)
     assert problems["cycle"] == 11
+
+
+def test_the_progress_of_filling_a_tree_is_told_in_messages_read() -> None:
+    told: list[int] = []
+    tree = TransformTree(keep=None)
+    with open_recording(SMALL) as recording:
+        fill(tree, recording, Problems(), progress=told.append)
+        assert sum(told) == recording.count
+    assert tree.edges() == load(SMALL, problems=Counter()).edges()
+
+
+def test_the_details_of_damaged_messages_are_kept_up_to_a_number() -> None:
+    problems = Problems()
+    for number in range(MAX_DETAILS + 1):
+        problems.note((MalformedMessageError("damaged", f"number {number}"),))
+    assert problems["damaged"] == MAX_DETAILS + 1
+    assert problems.details == [f"number {number}" for number in range(MAX_DETAILS)]
 
 
 def test_a_missing_recording_raises(tmp_path: Path) -> None:

@@ -122,7 +122,7 @@ async def test_samples_are_published_as_they_were_recorded(tmp_path: Path) -> No
         await player.play()
     assert heard.batches == batches
     assert (player.start, player.end, player.position) == (START, START + 2, START + 2)
-    assert (player.played, player.passes, player.bad) == (4, 1, {})
+    assert (player.played, player.messages, player.passes, player.bad) == (4, 3, 1, {})
 
 
 async def test_a_simulated_clock_goes_from_message_to_message(tmp_path: Path) -> None:
@@ -459,6 +459,45 @@ def test_a_pause_and_a_new_rate_count_from_their_moment(tmp_path: Path, simulate
 
 
 @pytest.mark.parametrize("simulated", [True, False])
+def test_a_seek_is_followed_at_once_and_a_pause_lasts_beyond_it(tmp_path: Path, simulated: bool) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1_000.0, 2_000.0)))
+    times: list[float] = []
+
+    async def until(heard: Listener, count: int) -> None:
+        # Without a limit: this clock jumps to it while a thread reads.
+        while len(heard.entries) < count:
+            heard.arrived = anyio.Event()
+            await heard.arrived.wait()
+
+    async def play() -> None:
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            heard = Listener(bus)
+            bus.subscribe(lambda _: times.append(anyio.current_time()))
+            player = Player(bus, path)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                await until(heard, 1)
+                await anyio.sleep(3.0)
+                player.seek(START + 1_000 * SECOND)
+                await until(heard, 2)
+                player.pause()
+                await anyio.sleep(100.0)
+                player.seek(START + 1_000 * SECOND)
+                await anyio.sleep(100.0)
+                player.step()
+                await until(heard, 3)
+                player.seek(START + 1_999 * SECOND)
+                player.resume()
+            assert [batch[0].stamp for batch in heard.batches] == [
+                START + seconds * SECOND for seconds in (0, 1_000, 1_000, 2_000)
+            ]
+
+    in_virtual_time(play)
+    # The second at once, the third when the step is taken; of the last, a second is left.
+    assert [time - times[0] for time in times] == pytest.approx([0.0, 3.0, 203.0, 204.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
 async def test_the_highest_rates_wait_for_nothing(tmp_path: Path, simulated: bool) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0, 1_000_000.0)))
     for rate in (1e12, 1e300):
@@ -754,9 +793,9 @@ async def test_a_paused_player_steps_from_message_to_message(tmp_path: Path, sim
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(player.play)
             assert await steered.until(1) == [0]
-            player.pause()
-            assert player.paused
+            assert not player.paused
             player.step()
+            assert player.paused
             assert await steered.until(2) == [0, 100]
             player.step()
             player.step()

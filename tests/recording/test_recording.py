@@ -1,3 +1,4 @@
+import errno
 import gzip
 import math
 import os
@@ -11,11 +12,12 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from support.recorded import SMALL, as_ros2, messages_in, write_mcap
 from support.samples import moving, static
 
 from tfbus import InvalidTransformError, RecordingError
-from tfbus.recording import open_recording
+from tfbus.recording import RecordedTopic, open_recording
 from tfbus.tf_message import encode
 
 OPEN_FILES = Path("/proc/self/fd")
@@ -101,10 +103,23 @@ def test_a_closed_recording_cannot_be_read(recording: Path) -> None:
 @pytest.mark.skipif(not OPEN_FILES.is_dir(), reason="this system does not show the open files of a process")
 def test_the_files_are_closed(recording: Path, tmp_path: Path) -> None:
     folder = as_ros2(SMALL, tmp_path / "bag", StoragePlugin.SQLITE3)
+    compressed = as_ros2(
+        SMALL, tmp_path / "zstd", StoragePlugin.MCAP, mode=CompressionMode.FILE, fmt=CompressionFormat.ZSTD
+    )
+    # Of one whose second file cannot be opened, the first one is closed too.
+    unreadable = tmp_path / "unreadable"
+    unreadable.mkdir()
+    write_mcap(unreadable / "run_0.mcap", LINES)
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(unreadable / "run_1.mcap"))
     before = len(list(OPEN_FILES.iterdir()))
-    for path in (SMALL, recording, folder):
+    for path in (SMALL, recording, folder, compressed):
         with open_recording(path) as opened:
             next(opened.messages())
+    with pytest.raises(RecordingError, match="it cannot be read") as raised:
+        open_recording(unreadable)
+    # Its traceback still refers to all that was opened.
+    assert raised.tb is not None
     assert len(list(OPEN_FILES.iterdir())) == before
 
 
@@ -165,8 +180,9 @@ def test_a_file_that_cannot_be_opened_is_unreadable(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(path))
-        with pytest.raises(RecordingError, match="it cannot be read: ") as raised:
+        with pytest.raises(RecordingError) as raised:
             open_recording(path)
+    assert str(raised.value) == f"recording {str(path)!r}: it cannot be read: {os.strerror(errno.ENXIO)}"
     assert raised.value.reason == "unreadable"
 
 
@@ -200,13 +216,84 @@ def write_channels(path: Path, topics: Sequence[str], lines: Iterable[tuple[int,
     return path
 
 
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_all_topics_are_told_and_those_that_may_hold_transforms_and_are_not_read_are_remarked(
+    tmp_path: Path, finish: bool
+) -> None:
+    one = [moving("map", "base", 1)]
+    path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", one), (2, "/r/tf", one), (3, "/r/tf", one)], finish=finish)
+    with open_recording(path) as recording:
+        assert len(list(recording.messages())) == 1
+        assert recording.topics == (
+            RecordedTopic("/r/tf", TF_TYPE, 2, read=False, ignored=True),
+            RecordedTopic("/tf", TF_TYPE, 1, read=True, ignored=False),
+        )
+        assert recording.remarks == (f"not read: 2 messages on topic /r/tf of type {TF_TYPE}",)
+    with open_recording(path) as recording:
+        next(recording.messages())
+        count = "2 messages on " if finish else ""
+        assert recording.remarks == (f"not read: {count}topic /r/tf of type {TF_TYPE}",)
+    with open_recording(write_mcap(path, [(1, "/camera/tf", one), (2, "/camera", b"")], schema="")) as recording:
+        assert [(topic.name, topic.ignored) for topic in recording.topics] == [("/camera", False), ("/camera/tf", True)]
+        assert recording.remarks == ("not read: 1 messages on topic /camera/tf of type unknown",)
+
+
+def test_positions_of_joints_are_remarked_where_there_are_no_transforms(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    hint = "/joint_states has the positions of joints: load_joint_states reads them with a URDF"
+    for kind in ("sensor_msgs/msg/JointState", "sensor_msgs/JointState"):
+        write_mcap(path, [(1, "/joint_states", b"")], schema=kind)
+        with open_recording(path) as recording:
+            assert recording.remarks == (f"no transforms, but {hint}",)
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    path.rename(folder / "joints.mcap")
+    write_mcap(folder / "more.mcap", LINES)
+    with open_recording(folder) as recording:
+        assert recording.remarks == ()
+
+
+def test_a_topic_that_was_asked_for_is_there_with_transforms(tmp_path: Path) -> None:
+    path = write_channels(tmp_path / "run.mcap", ("/tf", "/r/tf", "/r/tf_static"), [(1, 0), (2, 1)])
+    with open_recording(path, topics=["r/tf", "/r/tf_static"]) as recording:
+        assert [message.received for message in recording.messages()] == [2]
+    path = write_mcap(tmp_path / "other.mcap", [(1, "/camera", b"")], schema="sensor_msgs/msg/Image")
+    with pytest.raises(RecordingError) as raised:
+        open_recording(path, topics="/camera")
+    assert str(raised.value).endswith("topic 'camera' has type sensor_msgs/msg/Image, which holds no transforms")
+    assert raised.value.reason == "no such topic"
+    # What an unfinished file has, only reading it tells.
+    path = write_mcap(path, [(1, "/camera", b"")], schema="sensor_msgs/msg/Image", finish=False)
+    with open_recording(path, topics="/camera") as recording:
+        assert list(recording.messages()) == []
+
+
 def test_a_topic_without_messages_adds_nothing_to_their_number(tmp_path: Path) -> None:
     with open_recording(write_channels(tmp_path / "run.mcap", ("/tf", "/tf_static"), [(1, 0)])) as recording:
         assert recording.count == 1
         assert [topic.name for topic in recording.topics] == ["/tf", "/tf_static"]
+        assert [(message.received, message.errors) for message in recording.messages()] == [(1, ())]
 
 
 def test_two_channels_of_one_topic_and_type_are_one_topic_with_the_messages_of_both(tmp_path: Path) -> None:
     path = write_channels(tmp_path / "run.mcap", ("/tf", "/tf"), [(1, 0), (2, 1), (3, 1)])
     with open_recording(path) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 3)]
+
+
+@pytest.mark.parametrize("names", [("a.mcap", "b.mcap"), ("b.mcap", "a.mcap")])
+def test_the_number_of_messages_of_a_topic_is_not_known_if_one_of_its_files_does_not_tell(
+    tmp_path: Path, names: tuple[str, str]
+) -> None:
+    for name, finish in zip(names, (True, False), strict=True):
+        write_mcap(tmp_path / name, LINES[1:2], finish=finish)
+    with open_recording(tmp_path) as recording:
+        messages = recording.messages()
+        next(messages)
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", None)]
+        assert len(list(messages)) == 1
+        # Now both have been read.
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/tf", 2)]

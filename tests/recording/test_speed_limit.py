@@ -8,7 +8,7 @@ from support.samples import moving, static
 
 from tfbus import SECOND, TransformStamped
 from tfbus.recording import load
-from tfbus.recording.speed_limit import SpeedLimit
+from tfbus.recording.speed_limit import _MAX_CANDIDATES, SpeedLimit
 
 
 def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]:
@@ -45,6 +45,11 @@ def test_candidates_are_bounded() -> None:
     # The oldest one is forgotten, so what comes back to its place confirms nothing.
     found, dropped = kept(*places, places[0])
     assert (len(found), dropped) == (1, {"speed": 40})
+    # As long as it is remembered, it is confirmed, and the others go; of one more, two are forgotten in turn.
+    most = places[:_MAX_CANDIDATES]
+    assert kept(*most, places[0]) == ([places[0], places[0]], {"speed": _MAX_CANDIDATES - 1})
+    most = places[: _MAX_CANDIDATES + 1]
+    assert kept(*most, places[0]) == ([places[2]], {"speed": _MAX_CANDIDATES + 1})
 
 
 def test_frames_parents_and_kinds_are_apart() -> None:
@@ -62,6 +67,14 @@ def test_frames_parents_and_kinds_are_apart() -> None:
 def test_a_speed_is_a_number_greater_than_zero(speed: Any, error: type[Exception]) -> None:
     with pytest.raises(error, match="max_speed"):
         SpeedLimit(speed)
+
+
+def test_a_speed_limit_holds_in_a_long_recording_that_would_be_stored_at_once(tmp_path: Path) -> None:
+    lines = [(k, "/tf", [moving("map", "base", k * SECOND, 1e6 if k == 1_900 else float(k))]) for k in range(2_000)]
+    problems: Counter[str] = Counter()
+    tree = load(write_mcap(tmp_path / "run.mcap", lines), max_speed=3.0, problems=problems)
+    assert [edge.samples for edge in tree.edges()] == [1_999]
+    assert problems == {"speed": 1}
 
 
 def test_load_leaves_out_what_nothing_can_have_reached(tmp_path: Path) -> None:

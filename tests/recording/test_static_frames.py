@@ -1,5 +1,7 @@
+import errno
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +33,12 @@ def test_a_moving_sample_becomes_static_with_the_stamp_0(tmp_path: Path) -> None
 
 def test_plain_data_of_samples_are_entries_and_a_tree_is_filled_by_them(tmp_path: Path) -> None:
     file = tmp_path / "a.json"
-    file.write_text(json.dumps([static("base", "lidar", 2.0, 5).to_dict()]))
+    entries = [static("base", "lidar", 2.0, 5, "survey"), moving("base", "camera", 7, 3.0)]
+    file.write_text(json.dumps([entry.to_dict() for entry in entries]))
+    found = load_static(file, authority="me")
+    assert found == [static("base", "lidar", 2.0, 0, "survey"), static("base", "camera", 3.0, 0, "me")]
     tree = TransformTree()
-    tree.insert_many(load_static(file))
+    tree.insert_many(found)
     assert tree.lookup("base", "lidar").transform.translation == (2.0, 0.0, 0.0)
 
 
@@ -95,8 +100,10 @@ def test_a_file_that_is_no_text_or_not_there_is_named(tmp_path: Path) -> None:
     file.write_bytes(b"\xff\xfe")
     with pytest.raises(RecordingError, match="it is neither YAML nor JSON"):
         load_static(file)
-    with pytest.raises(RecordingError, match="it cannot be read"):
+    with pytest.raises(RecordingError) as unreadable:
         load_static(tmp_path)
+    assert str(unreadable.value) == f"recording {str(tmp_path)!r}: it cannot be read: {os.strerror(errno.EISDIR)}"
+    assert unreadable.value.reason == "unreadable"
 
 
 def test_what_convert_writes_is_read(tmp_path: Path) -> None:

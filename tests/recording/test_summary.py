@@ -13,6 +13,7 @@ from support.samples import any_samples, moving, static
 
 from tfbus import TransformStamped
 from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
+from tfbus.recording.formats import _mcap_reading
 from tfbus.recording.formats._mcap_output import McapOutput
 
 SECOND = 1_000_000_000
@@ -112,6 +113,39 @@ def test_the_samples_left_out_are_those_left_out_of_a_loaded_tree(
         assert edge.parent in frame.parents
 
 
+@pytest.mark.parametrize(
+    ("lines", "loops"),
+    [
+        # Of one stamp, the parent that comes later holds.
+        ([moving("a", "b", 5), moving("c", "b", 5), moving("b", "c", 6)], 1),
+        ([moving("c", "b", 5), moving("a", "b", 5), moving("b", "c", 6)], 0),
+        ([moving("a", "b", 5), moving("c", "b", 4), moving("b", "c", 6)], 0),
+        # Also where the stamps before are counted in columns.
+        ([moving("a", "b", 5), moving("a", "b", 7), moving("c", "b", 6), moving("b", "c", 8)], 0),
+        ([moving("a", "b", 5), moving("a", "b", 7), moving("a", "b", 3), moving("c", "b", 6), moving("b", "c", 8)], 0),
+        ([moving("a", "b", 5), moving("a", "b", 7), moving("c", "b", 7), moving("b", "c", 8)], 1),
+        ([static("a", "b"), moving("c", "b", 1), moving("b", "c", 2)], 1),
+        ([moving("a", "b", 9), static("c", "b"), moving("b", "c", 2)], 1),
+    ],
+)
+def test_the_newest_parent_of_a_frame_decides_what_closes_a_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: list[TransformStamped], loops: int
+) -> None:
+    # Each message is a block of its own.
+    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", 1)
+    monkeypatch.setattr(_mcap_reading, "_BLOCK", 1)
+    sent = [(k, "/tf_static" if sample.static else "/tf", [sample]) for k, sample in enumerate(lines)]
+    path = write_mcap(tmp_path / "run.mcap", sent, chunk_size=1)
+    counted: list[int] = []
+    with open_recording(path) as recording:
+        summary = summarise(recording, progress=counted.append)
+    problems: Counter[str] = Counter()
+    load(path, problems=problems)
+    assert summary.problems == problems == ({"cycle": loops} if loops else {})
+    assert counted == [1] * len(lines)
+    assert summary.messages == len(lines)
+
+
 def test_summarise_reads_the_messages_that_are_given() -> None:
     with open_recording(SMALL) as recording:
         seen = []
@@ -132,6 +166,18 @@ def test_a_summary_is_frozen_data() -> None:
         summary.messages = 0  # type: ignore[misc]
     with pytest.raises(dataclasses.FrozenInstanceError):
         summary.frames[0].moving = 0  # type: ignore[misc]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        summary.senders[0].moving = 0  # type: ignore[misc]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        summary.topics[0].count = 0  # type: ignore[misc]
+
+
+def test_a_duration_or_a_span_needs_both_ends() -> None:
+    frame = FrameSummary("b", ("a",), 0, 0, None, None, None, None, ())
+    whole = RecordingSummary(Path("run"), True, None, None, 0, 0, (frame,), ("a",), {})
+    for first, last, expected in ((None, None, None), (SECOND, None, None), (None, SECOND, None), (0, SECOND, 1.0)):
+        assert dataclasses.replace(whole, start=first, end=last).duration == expected
+        assert dataclasses.replace(frame, oldest=first, newest=last).span == expected
 
 
 def test_the_summary_of_a_real_robot() -> None:
@@ -145,12 +191,12 @@ def test_the_summary_of_a_real_robot() -> None:
 
 
 def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path: Path) -> None:
-    # 2,000 samples at 100 Hz, each received 3 ms after its stamp, but for the last: 5 ms, from another sender.
-    lines = [(10 * MS * k + 3 * MS, moving("a", "b", 10 * MS * k, float(k), "one")) for k in range(1_999)]
-    lines.append((19_990 * MS + 5 * MS, moving("a", "b", 19_990 * MS, 0.0, "two")))
+    # 4,000 samples at 100 Hz, each received 3 ms after its stamp, but for the last: 5 ms, from another sender.
+    lines = [(10 * MS * k + 3 * MS, moving("a", "b", 10 * MS * k, float(k), "one")) for k in range(3_999)]
+    lines.append((39_990 * MS + 5 * MS, moving("a", "b", 39_990 * MS, 0.0, "two")))
     # A late sample of another parent leaves the newest edge as it is, so the next one closes no loop.
-    lines.append((20_000 * MS, moving("c", "b", 19_985 * MS, 0.0, "one")))
-    lines.append((20_001 * MS, moving("b", "c", 20_001 * MS, 0.0, "three")))
+    lines.append((40_000 * MS, moving("c", "b", 39_985 * MS, 0.0, "one")))
+    lines.append((40_001 * MS, moving("b", "c", 40_001 * MS, 0.0, "three")))
     with closing(McapOutput(str(tmp_path / "run.mcap"), overwrite=True)) as output:
         output.write([(received, (sample,)) for received, sample in lines])
         output.finish()
@@ -158,16 +204,17 @@ def test_a_long_recording_is_summarised_in_blocks_as_message_by_message(tmp_path
     with open_recording(tmp_path / "run.mcap") as recording:
         summary = summarise(recording, progress=counted.append)
         one_by_one = summarise(recording, recording.messages())
-    assert len(counted) > 1
-    assert sum(counted) == summary.messages == summary.transforms == 2_002
+    # The first one names the frame, the last one has to be judged.
+    assert len(counted) > 2
+    assert sum(counted) == summary.messages == summary.transforms == 4_002
     assert summary.problems == {}
     assert summary.frames == one_by_one.frames
     frames = {frame.frame: frame for frame in summary.frames}
     b = frames["b"]
-    assert (b.moving, b.oldest, b.newest, b.authorities) == (2_001, 0, 19_990 * MS, ("one", "two"))
+    assert (b.moving, b.oldest, b.newest, b.authorities) == (4_001, 0, 39_990 * MS, ("one", "two"))
     assert b.delay is not None
-    # 1,999 of 3 ms, one of 5 ms and one of 15 ms.
-    assert b.delay.mean == pytest.approx((1_999 * 0.003 + 0.005 + 0.015) / 2_001)
+    # 3,999 of 3 ms, one of 5 ms and one of 15 ms.
+    assert b.delay.mean == pytest.approx((3_999 * 0.003 + 0.005 + 0.015) / 4_001)
     assert b.delay.max == 0.015
     senders = {sender.authority: (sender.frames, sender.moving) for sender in summary.senders}
-    assert senders == {"one": (("b",), 2_000), "two": (("b",), 1), "three": (("c",), 1)}
+    assert senders == {"one": (("b",), 4_000), "two": (("b",), 1), "three": (("c",), 1)}

@@ -5,7 +5,7 @@ import pytest
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 from rosbags.rosbag2.metadata import parse_qos
 
-from tfbus.recording.formats._channels import MAX_CHANNELS, MAX_SHARED_CHANNELS, Channels, Runs
+from tfbus.recording.formats._channels import _MAX_RUNS, MAX_CHANNELS, MAX_SHARED_CHANNELS, Channels, Runs
 
 
 @dataclass
@@ -84,5 +84,6 @@ def test_ways_to_share_a_message_leave_half_of_the_room_to_single_authorities() 
 
 
 def test_a_message_of_very_many_authorities_has_no_channel_of_its_own() -> None:
-    (number,), _ = registered(("/tf", [(f"a{number}", 1) for number in range(100)]))
-    assert number is None
+    for count, has_one in ((_MAX_RUNS, True), (_MAX_RUNS + 1, False)):
+        (number,), _ = registered(("/tf", [(f"a{number}", 1) for number in range(count)]))
+        assert (number is not None) == has_one

@@ -12,8 +12,9 @@ from tfbus import TransformStamped
 from tfbus.recording.formats._columns import ColumnDecoder, Columns
 from tfbus.recording.formats._decoder import ChannelDecoder
 from tfbus.recording.formats._packed import Packed, pack
+from tfbus.recording.formats._raw_transforms import RawTransform, write_cdr, write_ros1
 from tfbus.recording.formats._storage import Channel, StoredMessage
-from tfbus.tf_message import encode
+from tfbus.tf_message import MAX_NAME, encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
 TF = "tf2_msgs/msg/TFMessage"
@@ -139,6 +140,8 @@ GOOD = (1, CDR, encode([moving("map", "odom", 1), moving("odom", "base", 1)]))
         ),
         (2, CDR, encode([moving("earth", "odom", 2), moving("x", "y", 2)])),
         (2, Channel("/tf", "foxglove.FrameTransform", "json"), b"{}"),
+        # Nobody has decided how a channel of that kind is read.
+        (2, Channel("/tf", TF, "cdr"), encode([moving("map", "odom", 1)])),
     ],
 )
 def test_what_may_be_invalid_or_needs_a_judgement_is_left_to_the_slow_path(other: StoredMessage) -> None:
@@ -146,6 +149,22 @@ def test_what_may_be_invalid_or_needs_a_judgement_is_left_to_the_slow_path(other
     assert columns is not None
     decoders = {channel: ChannelDecoder(channel, static=False) for channel in (CDR, ROS1, OTHER)}
     assert ColumnDecoder(decoders).decode(packed([GOOD, other])) is None
+
+
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+def test_a_message_with_a_wrong_bit_is_left_to_the_slow_path_or_decoded_to_the_same(channel: Channel) -> None:
+    payload = payload_of(channel, [moving("map", "odom", 1), moving("odom", "base", 1)])
+    decoders = {channel: ChannelDecoder(channel, static=False)}
+    for place in range(len(payload)):
+        damaged = bytearray(payload)
+        damaged[place] ^= 1 << place % 8
+        columns = ColumnDecoder(decoders).decode(packed([(1, channel, payload), (2, channel, bytes(damaged))]))
+        if columns is None:
+            continue
+        found = decoders[channel].decode(bytes(damaged))
+        assert found.errors == []
+        whole = decoders[channel].decode(payload).samples + found.samples
+        assert sorted((s for each in columns for s in samples_in(each)), key=str) == sorted(whole, key=str)
 
 
 def test_leading_slashes_and_static_flags_are_those_of_the_channel() -> None:
@@ -168,6 +187,68 @@ def test_samples_of_several_authorities_are_told_apart() -> None:
     }
 
 
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def stamped(
+    channel: Channel, seconds: int, nanoseconds: int, row: Sequence[float] = IDENTITY, child: bytes = b"odom"
+) -> bytes:
+    """A message of one transform, of which nothing is checked."""
+    write = write_ros1 if channel is ROS1 else write_cdr
+    return write([RawTransform(seconds, nanoseconds, b"map", child, struct.pack("<7d", *row))])
+
+
+@pytest.mark.parametrize(
+    ("channel", "seconds", "nanoseconds", "valid"),
+    [
+        (CDR, 2**31 - 1, 999_999_999, True),
+        (CDR, -(2**31), 0, True),
+        (CDR, 1, 1_000_000_000, False),
+        (ROS1, 2**31 - 1, 999_999_999, True),
+        (ROS1, 2**31, 0, False),
+        (ROS1, 2**32 - 1, 0, False),
+        (ROS1, 1, 1_000_000_000, False),
+    ],
+)
+def test_stamps_are_decoded_at_once_up_to_their_bounds(
+    channel: Channel, seconds: int, nanoseconds: int, valid: bool
+) -> None:
+    decoder = ColumnDecoder({channel: ChannelDecoder(channel, static=False)})
+    columns = decoder.decode(packed([(1, channel, stamped(channel, seconds, nanoseconds))]))
+    if valid:
+        assert columns is not None
+        assert columns[0].stamps.tolist() == [seconds * 10**9 + nanoseconds]
+    else:
+        assert columns is None
+
+
+@pytest.mark.parametrize(
+    ("norm", "valid"), [(0.99 - 1e-9, False), (0.99 + 1e-9, True), (1.01 - 1e-9, True), (1.01 + 1e-9, False)]
+)
+def test_a_quaternion_is_normalised_at_once_if_its_norm_is_off_by_no_more_than_a_hundredth(
+    norm: float, valid: bool
+) -> None:
+    columns, one_by_one = both([(1, CDR, stamped(CDR, 0, 5, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -norm)))])
+    assert (columns is not None) == valid == bool(one_by_one)
+    if columns is not None:
+        assert columns[0].rows.tolist() == [[1.0, 2.0, 3.0, 0.0, 0.0, 0.0, -1.0]]
+
+
+@pytest.mark.parametrize("channel", [CDR, ROS1])
+def test_names_are_decoded_at_once_up_to_the_longest(channel: Channel) -> None:
+    for size, valid in ((MAX_NAME - 1, True), (MAX_NAME + 1, False)):
+        data = stamped(channel, 0, 1, child=b"n" * size)
+        decoders = {channel: ChannelDecoder(channel, static=False)}
+        assert (ColumnDecoder(decoders).decode(packed([(1, channel, data)])) is not None) == valid
+
+
+def test_messages_are_decoded_at_once_up_to_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    size = len(GOOD[2])
+    for bound, valid in ((size, True), (size - 1, False)):
+        monkeypatch.setattr("tfbus.recording.formats._columns.MAX_MESSAGE", bound)
+        assert (both([GOOD])[0] is not None) == valid
+
+
 @pytest.mark.parametrize("names", [[f"f{k:03}" for k in range(200)], ["f" * k for k in range(1, 64)]])
 def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> None:
     stored: list[StoredMessage] = [(k, CDR, encode([moving("map", name, k)])) for k, name in enumerate(2 * names)]
@@ -179,5 +260,19 @@ def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> No
 def test_a_channel_with_more_layouts_than_are_kept_is_left_to_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
     stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k}", k)])) for k in range(4)]
     monkeypatch.setattr("tfbus.recording.formats._columns._MAX_LAYOUTS", 3)
+    assert both(stored[:3])[0] is not None
+    assert both(stored)[0] is None
+
+
+def test_messages_of_one_size_with_more_structures_than_are_kept_are_left_to_the_slow_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The longer one name is, the shorter is the other.
+    stored: list[StoredMessage] = [
+        (k, CDR, encode([moving("map", "a" * (8 * k + 3), k), moving("map", "b" * (8 * (4 - k) + 3), k)]))
+        for k in range(4)
+    ]
+    assert len({len(payload) for _, _, payload in stored}) == 1
+    monkeypatch.setattr("tfbus.recording.formats._columns._MAX_STRUCTURES", 3)
     assert both(stored[:3])[0] is not None
     assert both(stored)[0] is None

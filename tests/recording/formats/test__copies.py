@@ -56,6 +56,7 @@ def test_the_metadata_have_the_hash_of_a_type_where_it_is_known(tmp_path: Path) 
     with closing(sqlite3.connect(path)) as file:
         (metadata,) = file.execute("SELECT metadata FROM metadata").fetchone()
         columns = dict(file.execute("SELECT name, type_description_hash FROM topics"))
+        assert [number for (number,) in file.execute("SELECT id FROM topics ORDER BY id")] == [1, 2]
     topics = json.loads(metadata)["rosbag2_bagfile_information"]["topics_with_message_count"]
     told = {topic["topic_metadata"]["name"]: topic["topic_metadata"]["type_description_hash"] for topic in topics}
     assert told == columns == {"/tf": TYPE_HASH, "/talk": ""}

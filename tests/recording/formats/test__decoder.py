@@ -5,7 +5,7 @@ import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
-from support.samples import moving
+from support.samples import moving, static
 
 from tfbus.recording.formats._decoder import ChannelDecoder
 from tfbus.recording.formats._storage import Channel
@@ -25,6 +25,37 @@ BY_ROS_1 = bytes(get_typestore(Stores.ROS2_HUMBLE).cdr_to_ros1(PAYLOAD, "tf2_msg
 def test_the_samples_are_those_that_were_sent_in_whatever_they_are_wrapped(channel: Channel, payload: bytes) -> None:
     found = ChannelDecoder(channel, static=False).decode(payload)
     assert (found.samples, found.errors) == (SAMPLES, [])
+
+
+@pytest.mark.parametrize(
+    ("metadata", "authorities"),
+    [
+        ('[["x", 1]]', ["x", "x", "x"]),
+        ('[["x", 2], ["y", 1]]', ["x", "x", "y"]),
+        ('[["x", 1], ["y", 2]]', ["x", "y", "y"]),
+        ('[["x", 2], ["y", 2]]', ["", "", ""]),
+        ('[["x", 1], ["y", 1]]', ["", "", ""]),
+        ('[["x", 3], ["y", 0]]', ["", "", ""]),
+        ("[]", ["", "", ""]),
+    ],
+)
+def test_each_transform_has_the_authority_of_its_run_if_there_are_as_many_as_the_runs_have(
+    metadata: str, authorities: list[str]
+) -> None:
+    channel = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr", metadata={"tfbus.authorities": metadata})
+    decoder = ChannelDecoder(channel, static=True, prefix="r/")
+    samples = [static("map", name) for name in "abc"]
+    found = decoder.decode(encode(samples)).samples
+    assert found == [static("r/map", f"r/{name}", authority=who) for name, who in zip("abc", authorities, strict=True)]
+    assert [decoder.authority_of(place, 3) for place in range(3)] == authorities
+
+
+def test_a_refused_transform_stays_refused_under_a_prefix() -> None:
+    payload = encode([moving("map", "a", 1), moving("map", "b", 1, 12_345.0)])
+    payload = payload.replace(struct.pack("<d", 12_345.0), struct.pack("<d", float("nan")))
+    found = ChannelDecoder(CDR, static=False, prefix="r/").decode(payload)
+    assert found.samples == [moving("r/map", "r/a", 1, authority="odometry"), None]
+    assert [error.reason for error in found.errors] == ["not finite"]
 
 
 def test_in_the_other_byte_order_every_transform_has_its_authority_too() -> None:

@@ -10,7 +10,7 @@ from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in, wri
 from support.samples import moving, static
 
 from tfbus import RecordingError
-from tfbus.recording import open_recording
+from tfbus.recording import RecordedMessage, open_recording
 
 ZSTD = {"fmt": CompressionFormat.ZSTD}
 LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
@@ -42,6 +42,12 @@ def test_what_ros_2_records_is_read_compressed_or_not(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def in_blocks(path: Path) -> list[RecordedMessage]:
+    """All messages of a recording, as they are in its blocks."""
+    with open_recording(path) as recording:
+        return [message for block in recording.blocks() for message in block.messages()]
+
+
 def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: Path) -> None:
     # By name, 10 is before 2.
     for number, part in ((2, LINES[:10]), (10, LINES[10:25]), (11, LINES[25:])):
@@ -50,6 +56,7 @@ def test_several_files_are_one_recording_in_the_order_of_their_times(tmp_path: P
     assert batches_in(tmp_path) == EXPECTED
     with open_recording(tmp_path) as recording:
         assert facts(recording) == (0, 29, 30, True)
+    assert [message.received for message in in_blocks(tmp_path)] == list(range(30))
     assert [message.received for message in messages_in(tmp_path, 9, 11)] == [9, 10, 11]
 
 
@@ -79,13 +86,27 @@ def test_a_file_that_cannot_be_read_is_told_and_the_others_are_read(tmp_path: Pa
     write_mcap(tmp_path / "run_0.mcap", LINES)
     (tmp_path / "run_1.mcap").write_bytes(content)
     lost, *rest = messages_in(tmp_path)
-    assert [error.reason for error in lost.errors] == ["damaged"]
+    assert (lost.received, [error.reason for error in lost.errors]) == (0, ["damaged"])
     assert "run_1.mcap" in str(lost.errors[0])
     assert [(message.received, message.batch) for message in rest] == EXPECTED
     with open_recording(tmp_path) as recording:
         assert not recording.finished
     # Told once, also where what was static before is looked for.
     assert sum(bool(message.errors) for message in messages_in(tmp_path, since=5)) == 1
+
+
+def test_what_cannot_be_read_is_told_at_the_start_of_the_recording_or_of_the_range(tmp_path: Path) -> None:
+    # A file without messages has no start.
+    write_mcap(tmp_path / "run_0.mcap", [])
+    write_mcap(tmp_path / "run_1.mcap", LINES[10:20])
+    (tmp_path / "run_2.mcap").write_bytes(b"nonsense")
+    for since, told in ((None, 10), (12, 12), (40, 40)):
+        lost = [message for message in messages_in(tmp_path, since) if message.errors]
+        assert [message.received for message in lost] == [told]
+    with open_recording(tmp_path) as recording:
+        assert (recording.start, recording.end, recording.count) == (10, 19, 10)
+        (block,) = (block for block in recording.blocks() if len(block))
+        assert [message.received for message in block.messages()] == [10, *range(10, 20)]
 
 
 def test_a_folder_of_nothing_but_bad_files_is_refused_for_what_is_wrong_with_the_first(tmp_path: Path) -> None:
@@ -159,6 +180,12 @@ def test_what_the_metadata_promise_and_the_files_do_not_have_is_told(
     assert lost.received == 29
 
 
+def test_what_the_metadata_promise_of_topics_that_are_not_read_is_not_told(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "run_0.mcap", [*LINES, (40, "/camera", b"picture")])
+    metadata(tmp_path, "run_0.mcap", topic="/camera", count=7)
+    assert batches_in(tmp_path) == EXPECTED
+
+
 def test_what_is_missing_of_several_files_is_told_behind_their_last_message(tmp_path: Path) -> None:
     for part in range(2):
         write_mcap(tmp_path / f"run_{part}.mcap", LINES[15 * part : 15 * part + 15])
@@ -169,21 +196,52 @@ def test_what_is_missing_of_several_files_is_told_behind_their_last_message(tmp_
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("text", "why"),
     [
-        pytest.param("[" * 100_000, marks=pytest.mark.thorough, id="deep"),
-        "a: &a [*a]",
-        "\0",
-        "rosbag2_bagfile_information: {}",
-        "- 1",
+        pytest.param("[" * 100_000, "maximum recursion depth", marks=pytest.mark.thorough, id="deep"),
+        ("a: &a [*a]", "'rosbag2_bagfile_information'"),
+        ("\0", "unacceptable character"),
+        ("rosbag2_bagfile_information: {}", "'relative_file_paths'"),
+        ("rosbag2_bagfile_information: {relative_file_paths: []}", "it names no file"),
+        ("- 1", "list indices must be integers"),
     ],
 )
-def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, text: str) -> None:
+def test_metadata_that_cannot_be_read_are_ignored_with_a_remark(tmp_path: Path, text: str, why: str) -> None:
     write_mcap(tmp_path / "run_0.mcap", LINES)
     (tmp_path / "metadata.yaml").write_text(text)
     assert batches_in(tmp_path) == EXPECTED
     with open_recording(tmp_path) as recording:
-        assert recording.remarks[0].startswith("metadata.yaml is ignored, as it cannot be read: ")
+        assert recording.remarks[0].startswith(f"metadata.yaml is ignored, as it cannot be read: {why}")
+
+
+def test_metadata_are_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    write_mcap(tmp_path / "stray.mcap", LINES)
+    metadata(tmp_path, "run_0.mcap", count=30)
+    size = (tmp_path / "metadata.yaml").stat().st_size
+    why = f"it has more than {size - 1} bytes, which is the bound"
+    for bound, remark in (
+        (size, "stray.mcap is ignored: metadata.yaml does not name it"),
+        (size - 1, f"metadata.yaml is ignored, as it cannot be read: {why}"),
+    ):
+        monkeypatch.setattr("tfbus.recording.formats._folder.MAX_METADATA", bound)
+        with open_recording(tmp_path) as recording:
+            assert recording.remarks == (remark,)
+
+
+def test_an_error_without_words_is_told_by_its_name_and_a_long_one_is_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_mcap(tmp_path / "run_0.mcap", LINES)
+    metadata(tmp_path, "run_0.mcap", count=30)
+    for error, told in ((MemoryError(), "MemoryError"), (ValueError("one\n two " + "x" * 300), "one two " + "x" * 192)):
+
+        def fail(_: bytes, error: Exception = error) -> None:
+            raise error
+
+        monkeypatch.setattr("tfbus.recording.formats._folder._as_yaml", fail)
+        with open_recording(tmp_path) as recording:
+            assert recording.remarks == (f"metadata.yaml is ignored, as it cannot be read: {told}",)
 
 
 def test_metadata_that_promise_nothing_on_a_topic_that_no_file_has_are_kept(tmp_path: Path) -> None:
@@ -229,9 +287,21 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
         assert sum(bool(message.batch) for message in recording.messages()) > 700
 
 
-def test_what_the_metadata_promise_of_a_long_file_is_held_to_what_is_read_in_blocks(tmp_path: Path) -> None:
+@pytest.mark.parametrize("received", [0, 7])
+def test_what_is_missing_of_a_file_of_which_nothing_is_read_is_told_at_its_start(tmp_path: Path, received: int) -> None:
+    write_mcap(tmp_path / "run_0.mcap", [(received, "/camera", b"picture")])
+    metadata(tmp_path, "run_0.mcap", topic="/gone", count=3)
+    for messages in (messages_in(tmp_path), in_blocks(tmp_path)):
+        assert [(message.received, len(message.errors)) for message in messages] == [(received, 1)]
+
+
+# One that is not finished is not packed.
+@pytest.mark.parametrize("finish", [True, False])
+def test_what_the_metadata_promise_of_a_long_file_is_held_to_what_is_read_in_blocks(
+    tmp_path: Path, finish: bool
+) -> None:
     lines = [(5 + k, "/tf", [moving("odom", "base", k)]) for k in range(2_000)]
-    write_mcap(tmp_path / "run_0.mcap", lines)
+    write_mcap(tmp_path / "run_0.mcap", lines, finish=finish)
     for promised, lost in ((2_000, 0), (2_003, 1)):
         metadata(tmp_path, "run_0.mcap", count=promised)
         with open_recording(tmp_path) as recording:

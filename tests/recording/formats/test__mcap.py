@@ -18,7 +18,8 @@ from support.recorded import batches_in, facts, messages_in, write_mcap
 from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
-from tfbus.recording import open_recording
+from tfbus.recording import RecordedMessage, open_recording
+from tfbus.recording.formats import _mcap_records
 from tfbus.tf_message import encode
 
 COUNT = 40
@@ -41,6 +42,16 @@ def damage(path: Path, part: bytes) -> None:
     data = bytearray(path.read_bytes())
     data[data.index(part)] ^= 1
     path.write_bytes(data)
+
+
+def in_blocks(path: Path, since: int | None = None, until: int | None = None) -> list[RecordedMessage]:
+    """All messages of a recording, as they are in its blocks."""
+    with open_recording(path) as recording:
+        return [message for block in recording.blocks(since, until) for message in block.messages()]
+
+
+def errors_in(messages: list[RecordedMessage]) -> list[str]:
+    return [str(error) for message in messages for error in message.errors]
 
 
 def records_in(data: bytes | bytearray) -> Iterator[tuple[int, int]]:
@@ -98,6 +109,29 @@ def test_an_index_is_used_up_to_its_bound(write: Write, monkeypatch: pytest.Monk
         monkeypatch.setattr("tfbus.recording.formats._mcap.MAX_INDEX", bound)
         with open_recording(path) as recording:
             assert recording.count == count
+
+
+def test_the_shortest_finished_file_is_an_empty_recording_and_with_a_byte_less_it_is_cut_off(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    magic = b"\x89MCAP0\r\n"
+    footer = b"\x02" + (20).to_bytes(8, "little") + bytes(20)
+    path.write_bytes(magic + footer + magic)
+    with open_recording(path) as recording:
+        assert (recording.start, recording.end, recording.finished) == (None, None, True)
+        assert list(recording.messages()) == []
+    path.write_bytes((magic + footer + magic)[:-1])
+    with pytest.raises(RecordingError, match="ends before its first message"):
+        open_recording(path)
+
+
+def test_an_index_without_statistics_does_not_contradict_the_chunks(write: Write) -> None:
+    path = write(LINES, use_statistics=False, enable_crcs=False)
+    whole = path.read_bytes()
+    for part in (b"geometry_msgs/TransformStamped", b"/tf_static"):
+        data = bytearray(whole)
+        data[data.rindex(part)] ^= 1
+        path.write_bytes(data)
+        assert batches_in(path) == EXPECTED
 
 
 def test_a_message_at_log_time_zero_counts(write: Write) -> None:
@@ -170,6 +204,7 @@ def test_only_the_chunks_of_the_range_are_read(write: Write) -> None:
     # One for the static transform, which is in the first chunk.
     assert [message.received for message in middle if message.batch] == [115, 116, 117, 118, 119, 120]
     assert not any(message.errors for message in middle)
+    assert in_blocks(path, 115, 120) == middle
 
 
 @pytest.mark.parametrize("finish", [True, False])
@@ -191,6 +226,8 @@ def test_a_damaged_chunk_is_reported_and_the_others_are_read(write: Write, finis
     assert [error.detail for message in promised for error in message.errors] == [expected] * finish  # type: ignore[union-attr]
     # It comes in the place of what is lost.
     assert messages.index(lost) == missing[0]
+    # Several chunks at once give the same.
+    assert list(map(str, in_blocks(path))) == list(map(str, messages))
 
 
 def test_damage_before_a_range_is_reported_at_the_start_of_the_range(write: Write) -> None:
@@ -212,6 +249,7 @@ def test_a_chunk_without_transforms_is_not_read(write: Write) -> None:
     path = write([(1, "/tf", first), (2, "/camera", b"picture" * 1_000), (3, "/tf", second)], chunk_size=1)
     damage(path, b"picturepicture")
     assert [received for received, _ in batches_in(path)] == [1, 3]
+    assert [(message.received, message.errors) for message in in_blocks(path)] == [(1, ()), (3, ())]
 
 
 def test_a_record_beyond_the_end_of_a_finished_file_is_reported(write: Write) -> None:
@@ -264,6 +302,22 @@ def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Writ
     assert [(message.received, message.batch) for message in messages] == EXPECTED * 2
     assert [error.reason for error in lost.errors] == ["damaged"]
     assert f"the channel at byte {len(data)}" in str(lost.errors[0])
+
+
+def test_a_record_of_an_unknown_kind_or_beyond_its_bound_is_told_with_its_place(
+    write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(LINES, finish=False)
+    data = path.read_bytes()
+    path.write_bytes(data + b"\x7f" + (3).to_bytes(8, "little") + b"abc" + data[8:])
+    (lost,) = errors_in(messages_in(path))
+    assert lost.endswith(f"the record at byte {len(data)}: its kind, 127, is unknown")
+    path = write(LINES[:1], finish=False)
+    chunk = next(place for place, opcode in records_in(path.read_bytes()) if opcode == Opcode.CHUNK)
+    path.write_bytes(path.read_bytes() + write(LINES[1:2], finish=False, use_chunking=False).read_bytes()[8:])
+    monkeypatch.setitem(_mcap_records._BOUND, Opcode.CHUNK, 50)
+    (lost,) = errors_in(messages_in(path))
+    assert lost.endswith(f"the chunk at byte {chunk}: it exceeds its bound")
 
 
 @pytest.mark.parametrize(
@@ -347,6 +401,7 @@ THREE = [moving("a", name, 1) for name in "bcd"]
         ("3", [""] * 3),
         ('[["odometry", "x"]]', [""] * 3),
         ('[["odometry", 3], ["slam", -1]]', [""] * 3),
+        ('[["odometry", 3], ["slam", 0]]', [""] * 3),
         ('[["odometry", 1000000000000]]', ["odometry"] * 3),
         ('[["odometry", 1000000000000], ["slam", 1]]', [""] * 3),
     ],
@@ -377,8 +432,36 @@ def test_several_iterations_are_independent(write: Write) -> None:
         assert rest == EXPECTED[1:]
 
 
-def errors_in(path: Path) -> list[str]:
-    return [str(error) for message in messages_in(path) for error in message.errors]
+def test_a_description_that_contradicts_that_of_the_index_is_told_and_that_of_the_index_holds(write: Write) -> None:
+    path = write(LINES, enable_crcs=False)
+    # The first one is in the first chunk.
+    damage(path, b"/tf_static")
+    for found in (errors_in(messages_in(path)), errors_in(in_blocks(path))):
+        assert found == ["no message of transforms (damaged): the descriptions of channel 1 contradict each other"]
+    assert [(message.received, message.batch) for message in messages_in(path) if message.batch] == EXPECTED
+
+
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_messages_on_channels_that_are_not_described_are_counted(write: Write, use_chunking: bool) -> None:
+    path = write(LINES, finish=False, enable_crcs=False, use_chunking=use_chunking)
+    data = bytearray(path.read_bytes())
+    for place in (3, 4, 30):
+        # The number of the channel is the first of the message, 22 bytes before the payload.
+        at = data.index(encode(EXPECTED[place][1])) - 22
+        assert int.from_bytes(data[at : at + 2], "little") == 2
+        data[at] = 9
+    path.write_bytes(data)
+    reason = "no message of transforms (damaged): 3 messages are on channels that the file does not describe"
+    assert errors_in(messages_in(path)) == errors_in(in_blocks(path)) == [reason]
+    assert [message.received for message in messages_in(path) if message.batch] == [
+        received for place, (received, _) in enumerate(EXPECTED) if place not in (3, 4, 30)
+    ]
+    with open_recording(path) as recording:
+        assert recording.count is None
+        for part in ((0, None), (None, 10**9)):
+            assert len(list(recording.messages(*part))) > 0
+        assert len(list(recording.messages())) == len(EXPECTED) - 3 + 1
+        assert recording.count == len(EXPECTED) - 3
 
 
 def test_many_channels_that_claim_a_million_authorities_cost_nothing(tmp_path: Path) -> None:
@@ -418,7 +501,7 @@ def test_a_chunk_that_claims_another_size_than_it_has_is_not_inflated(write: Wri
     data[second + 25 : second + 33] = claim.to_bytes(8, "little")
     path.write_bytes(data)
     tracemalloc.start()
-    lost, *_ = errors_in(path)
+    lost, *_ = errors_in(messages_in(path))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert f"the chunk at byte {second}: it claims {claim:,} bytes" in lost
@@ -469,8 +552,9 @@ def test_an_index_that_no_longer_leads_to_a_chunk_with_transforms_is_told(write:
     # The length of the chunk.
     data[entry + 33 : entry + 41] = (2**40).to_bytes(8, "little")
     path.write_bytes(data)
-    assert any("it is behind the end of the file" in text for text in errors_in(path))
-    assert any("promises" in text for text in errors_in(path))
+    for errors in (errors_in(messages_in(path)), errors_in(in_blocks(path))):
+        assert any("it is behind the end of the file" in text for text in errors)
+        assert any("promises" in text for text in errors)
 
 
 @given(data=st.data())

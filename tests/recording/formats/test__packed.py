@@ -56,6 +56,9 @@ def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPa
         [30],
         [1],
     ]
+    # Nine bytes do not fill one of ten.
+    stored = [(k, A, bytes(size)) for k, size in enumerate((9, 1, 1))]
+    assert [len(block) for block in batches(iter(stored))] == [2, 1]
 
 
 @pytest.mark.parametrize("together", [1, 2**16])

@@ -1,16 +1,29 @@
 import json
 import struct
+from collections.abc import Callable
 
 import pytest
+import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.recording.formats._raw_transforms import RawTransform, bounded, holds_transforms, parser_of, write_cdr
+from tfbus.recording.formats import _raw_transforms
+from tfbus.recording.formats._raw_transforms import (
+    RawTransform,
+    bounded,
+    holds_transforms,
+    parser_of,
+    write_cdr,
+    write_ros1,
+)
 from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import MalformedMessageError
 
 NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
 ONE = RawTransform(5, 6, b"map", b"base", NUMBERS)
+OTHER = RawTransform(7, 8, b"base", b"camera1", struct.pack("<7d", 4, 5, 6, 0, 0, 1, 0))
+THIRD = RawTransform(9, 10, b"base", b"cam", struct.pack("<7d", 7, 8, 9, 0, 1, 0, 0))
+CDR, ROS1 = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), Channel("/tf", "tf2_msgs/TFMessage", "ros1")
 AS_JSON = {
     "timestamp": {"sec": 5, "nsec": 6},
     "parent_frame_id": "map",
@@ -63,6 +76,56 @@ def test_foxglove_messages_of_ros_have_the_layout_of_ros() -> None:
         parser_of(many)(write_cdr([ONE]) + bytes(4))
     ros1 = struct.pack("<II", 5, 6) + b"\3\0\0\0map\4\0\0\0base" + NUMBERS
     assert parser_of(foxglove("ros1", "foxglove_msgs/FrameTransform"))(ros1) == [ONE]
+
+
+def in_ros1(transform: RawTransform) -> bytes:
+    seconds, nanoseconds, parent, child, numbers = transform
+    names = b"".join(struct.pack("<I", len(name)) + name for name in (parent, child))
+    return bytes(4) + struct.pack("<II", seconds, nanoseconds) + names + numbers
+
+
+def test_several_transforms_are_one_message_in_either_encoding() -> None:
+    ros1 = write_ros1([ONE, OTHER, THIRD])
+    assert ros1 == b"\3\0\0\0" + in_ros1(ONE) + in_ros1(OTHER) + in_ros1(THIRD)
+    assert parser_of(ROS1)(ros1) == [ONE, OTHER, THIRD]
+    cdr = write_cdr([ONE, OTHER, THIRD])
+    # Each string ends at a multiple of 4: the names at 32, 120 and 204, of which only the last is no multiple of 8.
+    first = struct.pack("<iI", 5, 6) + b"\4\0\0\0map\0" + b"\5\0\0\0base\0\0\0\0" + NUMBERS
+    second = struct.pack("<iI", 7, 8) + b"\5\0\0\0base\0\0\0\0" + b"\x08\0\0\0camera1\0" + OTHER.numbers
+    third = struct.pack("<iI", 9, 10) + b"\5\0\0\0base\0\0\0\0" + b"\4\0\0\0cam\0" + bytes(4) + THIRD.numbers
+    assert cdr == b"\0\1\0\0\3\0\0\0" + first + second + third
+    assert parser_of(CDR)(cdr) == [ONE, OTHER, THIRD]
+
+
+@pytest.mark.parametrize(("channel", "payload"), [(CDR, write_cdr([ONE, OTHER])), (ROS1, write_ros1([ONE, OTHER]))])
+def test_a_message_that_is_cut_anywhere_is_malformed(channel: Channel, payload: bytes) -> None:
+    reasons = set()
+    for size in range(len(payload)):
+        with pytest.raises(MalformedMessageError) as raised:
+            parser_of(channel)(payload[:size])
+        reasons.add(raised.value.reason)
+    # Of CDR, the header may be cut, or a string may be without its NUL.
+    assert reasons == ({"truncated"} if channel is ROS1 else {"truncated", "encoding", "text"})
+
+
+def test_what_is_behind_a_message_of_ros_1_is_told() -> None:
+    with pytest.raises(MalformedMessageError, match=r"\(oversized\): 1 bytes behind the last transform"):
+        parser_of(ROS1)(write_ros1([ONE]) + bytes(1))
+
+
+@pytest.mark.parametrize(
+    ("write", "channel", "low", "high"), [(write_cdr, CDR, -(2**31), 2**31), (write_ros1, ROS1, 0, 2**32)]
+)
+def test_the_seconds_that_the_stamp_of_an_encoding_holds_are_written(
+    write: Callable[[list[RawTransform]], bytes], channel: Channel, low: int, high: int
+) -> None:
+    for seconds in (low, high - 1):
+        edge = ONE._replace(seconds=seconds)
+        assert parser_of(channel)(write([edge])) == [edge]
+    for seconds in (low - 1, high):
+        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
+            write([ONE._replace(seconds=seconds)])
+        assert raised.value.reason == "stamp"
 
 
 def protobuf_schema() -> tuple[bytes, bytes]:
@@ -127,11 +190,27 @@ def test_a_message_in_another_encoding_is_told_by_its_header() -> None:
         parse(b"\0\7\0\0\1\2\3\4")
 
 
-def test_a_message_is_bounded_compressed_or_not() -> None:
-    assert bounded(b"abc") == b"abc"
+def test_of_a_long_text_the_error_shows_the_beginning() -> None:
+    body = struct.pack("<I", 1) + bytes(8) + struct.pack("<I", 50) + b"x" * 50 + bytes(80)
+    with pytest.raises(MalformedMessageError, match=f"the string b'{'x' * 40}' does not end with NUL"):
+        parser_of(CDR)(b"\0\1\0\0" + body)
     with pytest.raises(MalformedMessageError) as raised:
-        bounded(bytes(8 * 2**20 + 1))
-    assert raised.value.reason == "oversized"
+        parser_of(foxglove("json"))(b"\xff" * 300)
+    assert len(raised.value.detail) == 200
+
+
+def test_a_message_is_bounded_compressed_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_raw_transforms, "MAX_MESSAGE", 300)
+    compress = zstandard.compress
+    assert bounded(bytes(300)) == bounded(compress(bytes(300))) == bytes(300)
+    for payload, reason in (
+        (bytes(301), "oversized"),
+        (compress(bytes(301)), "oversized"),
+        (compress(b"")[:4] + b"\xff" * 30, "encoding"),
+    ):
+        with pytest.raises(MalformedMessageError) as raised:
+            bounded(payload)
+        assert raised.value.reason == reason
 
 
 def test_only_known_types_in_known_encodings_hold_transforms() -> None:

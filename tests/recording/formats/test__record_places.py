@@ -6,7 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tfbus.recording.formats import _record_places
-from tfbus.recording.formats._record_places import record_places
+from tfbus.recording.formats._record_places import _FIRST_STEPS, record_places
 
 
 def written(sizes: list[int]) -> bytes:
@@ -21,6 +21,33 @@ def written(sizes: list[int]) -> bytes:
 def test_all_records_are_found_whether_their_lengths_repeat_or_not(parts: list[tuple[list[int], int]]) -> None:
     sizes = [size for lengths, count in parts for size in islice(cycle(lengths), count)]
     assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+def test_all_records_are_found_wherever_their_lengths_change() -> None:
+    for count in range(70):
+        sizes = [3] * count + [4, 4, 5, 4, 4, 5] + [3, 1] * 20
+        assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "most"),
+    # To see the last one twice, 62 records have to be read at once.
+    [([3], _FIRST_STEPS), ([1, 2, 3, 1, 4], _FIRST_STEPS), ([*range(30), 7], 4 * 62)],
+)
+def test_few_of_many_records_whose_lengths_repeat_are_read_one_by_one(
+    monkeypatch: pytest.MonkeyPatch, lengths: list[int], most: int
+) -> None:
+    read = []
+
+    class Length:
+        def unpack_from(self, data: bytes, at: int) -> tuple[int]:
+            read.append(at)
+            return struct.unpack_from("<Q", data, at)
+
+    monkeypatch.setattr(_record_places, "_LENGTH", Length())
+    sizes = list(islice(cycle(lengths), 10_000))
+    assert record_places(written(sizes)).tolist() == list(accumulate((9 + size for size in sizes), initial=0))
+    assert len(read) <= most
 
 
 def test_long_cycles_and_more_records_than_are_guessed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

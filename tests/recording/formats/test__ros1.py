@@ -9,12 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
+from support.bag_bytes import chunk, connection, index, message, unfinished
 from support.recorded import SMALL, facts, messages_in, sender_of
 from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
 from tfbus.recording.formats._bag_records import find_chunk, read_record
+from tfbus.recording.formats._raw_transforms import write_ros1
+from tfbus.recording.formats._ros1 import Ros1Storage
+from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import encode
 
 SECOND = 1_000_000_000
@@ -136,6 +140,32 @@ def test_all_messages_are_read_with_an_index_and_without(
         assert facts(recording) == (10, 159, 61, False)
 
 
+def test_a_finished_bag_without_messages_is_an_empty_recording(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(unfinished())
+    place = data.index(b"index_pos=") + 10
+    # Its index is behind the header at the earliest.
+    for begin in (len(data), len(data) - 1):
+        data[place : place + 8] = begin.to_bytes(8, "little")
+        path.write_bytes(data)
+        if begin == len(data):
+            with open_recording(path) as recording:
+                assert facts(recording) == (None, None, 0, True)
+                assert list(recording.messages()) == []
+        else:
+            with pytest.raises(RecordingError, match="ends before its first message"):
+                open_recording(path)
+
+
+def test_a_damaged_description_in_an_index_that_is_cut_does_not_count(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    data = bytearray(write_bag(path))
+    place = data.rindex(b"type=tf2_msgs") + 5
+    data[place] ^= 1
+    path.write_bytes(data[:-1])
+    assert read(path) == (EXPECTED, [])
+
+
 def test_an_index_behind_the_end_that_counts_nothing_hides_no_message(tmp_path: Path) -> None:
     path = tmp_path / "run.bag"
     data = bytearray(write_bag(path))
@@ -250,6 +280,156 @@ def test_a_chunk_that_claims_too_much_is_not_unfolded(tmp_path: Path) -> None:
     found, lost = read(path)
     assert len(found) < len(EXPECTED)
     assert "claims 314,572,800 bytes, and 268,435,456 is the bound" in lost[0]
+
+
+def test_an_index_is_used_up_to_its_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.bag"
+    data = write_bag(path)
+    size = len(data) - int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
+    for bound, finished in ((size, True), (size - 1, False)):
+        monkeypatch.setattr("tfbus.recording.formats._ros1.MAX_INDEX", bound)
+        with open_recording(path) as recording:
+            assert recording.finished == finished
+        assert read(path) == (EXPECTED, [])
+
+
+TF = {"type": b"tf2_msgs/TFMessage", "md5sum": b"94810edda583a504dfda3829e70d7eec"}
+
+
+def stored_in(path: Path, *records: bytes, **limits: int) -> tuple[list[tuple[int, str, bytes]], list[str]]:
+    """Log time in s, topic and payload of all messages of an unfinished bag, and the losses that are reported."""
+    path.write_bytes(unfinished(*records))
+    storage = Ros1Storage(path)
+    try:
+        found, lost = [], []
+        for received, channel, payload in storage.messages(lambda _: True, **limits):
+            if isinstance(channel, Channel):
+                assert received % SECOND == 5
+                found.append((received // SECOND, channel.topic, payload))
+            else:
+                lost.append(channel.detail)
+        return found, lost
+    finally:
+        storage.close()
+
+
+def test_the_topic_of_a_connection_is_that_of_its_record_or_else_that_of_its_description(tmp_path: Path) -> None:
+    # The second one is that to which the recorder subscribed.
+    content = connection(0, b"/tf", topic=b"/mapped", **TF) + connection(1, None, topic=b"/other", **TF)
+    content += message(0, 1, b"x") + message(1, 2, b"y")
+    assert stored_in(tmp_path / "run.bag", chunk(content)) == ([(1, "/tf", b"x"), (2, "/other", b"y")], [])
+
+
+def test_messages_on_connections_that_are_not_described_are_counted(tmp_path: Path) -> None:
+    content = connection(3, b"/tf", **TF) + b"".join(message(number, number, b"x") for number in (1, 2, 3, 4))
+    found, lost = stored_in(tmp_path / "run.bag", chunk(content), chunk(message(1, 5, b"y")))
+    assert found == [(3, "/tf", b"x")]
+    assert lost == ["4 messages are on connections that the file does not describe"]
+
+
+@pytest.mark.parametrize("other", [connection(3, b"/tf2", **TF), connection(3, b"/tf", type=b"std_msgs/String")])
+def test_descriptions_that_contradict_each_other_are_told_and_the_first_one_holds(tmp_path: Path, other: bytes) -> None:
+    one = connection(3, b"/tf", **TF)
+    again = connection(3, b"/tf", **{**TF, "callerid": b"/other"})
+    assert stored_in(tmp_path / "run.bag", chunk(one + again + message(3, 1, b"x"))) == ([(1, "/tf", b"x")], [])
+    found, lost = stored_in(tmp_path / "run.bag", chunk(one + other + message(3, 1, b"x")))
+    assert found == [(1, "/tf", b"x")]
+    assert lost == ["the descriptions of connection 3 contradict each other"]
+
+
+def test_a_range_of_a_bag_without_an_index_includes_both_ends(tmp_path: Path) -> None:
+    described = chunk(connection(0, b"/tf", **TF))
+    chunks = [chunk(message(0, begin, b"x") + message(0, begin + 1, b"y")) for begin in (10, 20, 30)]
+    for first, last in ((11, 30), (12, 29), (20, 21), (21, 21), (22, 29)):
+        found, lost = stored_in(
+            tmp_path / "run.bag", described, *chunks, since=first * SECOND + 5, until=last * SECOND + 5
+        )
+        assert [second for second, _, _ in found] == [
+            second for second in (10, 11, 20, 21, 30, 31) if first <= second <= last
+        ]
+        assert lost == []
+
+
+def test_damage_between_the_chunks_is_told_at_the_start_of_the_recording_or_of_the_range(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    one = chunk(connection(0, b"/tf", **TF) + message(0, 7, b""))
+    path.write_bytes(unfinished(b"\xff" * 40, one))
+    for since, told in ((None, 7 * SECOND + 5), (0, 7 * SECOND + 5), (9 * SECOND, 9 * SECOND)):
+        lost = [
+            message.received for message in messages_in(path, since) if "nothing can be read" in str(message.errors)
+        ]
+        assert lost == [told]
+    # Nothing is behind the whole, and a byte more is a record that is cut.
+    for rest in (b"", b"x"):
+        assert stored_in(path, one, rest) == ([(7, "/tf", b"")], [])
+
+
+def test_a_chunk_of_which_nothing_can_be_read_changes_neither_start_nor_end(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    damaged = chunk(b"\xff" * 50)
+    described = connection(0, b"/tf", **TF)
+    first, second = (chunk(described + message(0, seconds, write_ros1([]))) for seconds in (7, 9))
+    for parts in ((damaged, first, second), (first, damaged, second), (first, second, damaged)):
+        path.write_bytes(unfinished(*parts))
+        with open_recording(path) as recording:
+            assert (recording.start, recording.end) == (7 * SECOND + 5, 9 * SECOND + 5)
+            lost, *whole = recording.messages()
+        place = len(unfinished(*parts[: parts.index(damaged)]))
+        assert (lost.received, len(lost.errors)) == (7 * SECOND + 5, 1)
+        assert f"the chunk at byte {place}: " in str(lost.errors[0])
+        assert [(each.received, each.errors) for each in whole] == [(7 * SECOND + 5, ()), (9 * SECOND + 5, ())]
+    # With its index, its time is known.
+    path.write_bytes(unfinished(first, damaged, index(0, 8), second))
+    assert [(each.received // SECOND, len(each.errors)) for each in messages_in(path)] == [(7, 0), (8, 1), (9, 0)]
+    path.write_bytes(unfinished(damaged))
+    with pytest.raises(RecordingError, match=r"as a bag of ROS 1: the chunk at byte \d+: ") as raised:
+        open_recording(path)
+    assert raised.value.reason == "damaged"
+
+
+def test_the_indexes_behind_the_chunks_tell_how_many_messages_there_are(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    described = connection(0, b"/tf", **TF) + connection(1, b"/other", type=b"a/B")
+    first = chunk(described + message(0, 1, b"x") + message(1, 2, b"y") + message(0, 3, b"z"))
+    second = chunk(message(0, 8, b"x") + message(0, 9, b"x"))
+    whole = unfinished(first, index(0, 1, 3), index(1, 2), second, index(0, 8, 9))
+    path.write_bytes(whole)
+    with open_recording(path) as recording:
+        assert facts(recording) == (SECOND + 5, 9 * SECOND + 5, 4, False)
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 1), ("/tf", 4)]
+    # Of a chunk whose index is cut, and of one that is cut itself, only reading them tells.
+    end = len(index(0, 8, 9))
+    for cut, last, count in ((1, 9, 4), (end, 9, 4), (end + 1, 8, 3)):
+        path.write_bytes(whole[:-cut])
+        with open_recording(path) as recording:
+            assert facts(recording) == (SECOND + 5, last * SECOND + 5, None, False)
+            assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", None), ("/tf", None)]
+            # Of a part, nothing is known of the whole.
+            for part in ((0, None), (None, 99 * SECOND)):
+                assert len(list(recording.messages(*part))) == count
+                assert recording.count is None
+            assert len(list(recording.messages())) == recording.count == count
+            assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 1), ("/tf", count)]
+
+
+def test_a_chunk_of_which_its_index_has_an_unknown_connection_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    first = chunk(connection(0, b"/tf", **TF) + message(0, 1, write_ros1([])))
+    path.write_bytes(unfinished(first, index(0, 1), chunk(message(9, 2, b"y")), index(9, 2)))
+    whole, lost = messages_in(path)
+    assert (whole.received, whole.errors) == (SECOND + 5, ())
+    assert "1 messages are on connections that the file does not describe" in str(lost.errors[0])
+
+
+def test_a_topic_that_is_not_read_has_all_its_messages_counted(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    described = connection(0, b"/tf", **TF) + connection(1, b"/other", type=b"a/B")
+    # The second chunk is not read, as its index tells that nothing in it is wanted, so its damage is not met.
+    first, second = described + message(1, 1, b"x"), message(1, 2, b"y") + message(1, 3, b"z") + b"\xff" * 9
+    path.write_bytes(unfinished(chunk(first), chunk(second), index(1, 2, 3), chunk(message(0, 4, b"x"))))
+    with open_recording(path) as recording:
+        assert [message.received for message in recording.messages()] == [4 * SECOND + 5]
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/other", 3), ("/tf", 1)]
 
 
 def test_a_type_that_one_flipped_bit_has_made_unknown_is_mentioned(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from support.samples import moving, static
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
+from tfbus.recording.formats._sqlite import SqliteStorage
 from tfbus.tf_message import encode
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -90,6 +91,55 @@ def test_what_a_killed_writer_has_left_in_its_log_is_read(tmp_path: Path) -> Non
         assert not recording.finished
 
 
+def test_an_empty_log_is_that_of_a_finished_file(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    write(path).close()
+    Path(f"{path}-wal").touch()
+    with open_recording(path) as recording:
+        assert recording.finished
+    assert batches_in(path) == IN_ORDER
+
+
+def test_all_topics_are_told_with_their_definitions_and_the_number_of_their_messages(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        file.execute("INSERT INTO topics VALUES (5, '/silent', 'a/msg/B', 'cdr', '- history: 1')")
+        file.execute("CREATE TABLE message_definitions(topic_type, encoding, encoded_message_definition)")
+        file.execute("INSERT INTO message_definitions VALUES ('a/msg/B', 'ros2msg', 'int8 x')")
+    file.close()
+    with open_recording(path) as recording:
+        assert [(topic.name, topic.type, topic.count) for topic in recording.topics] == [
+            ("/camera", "sensor_msgs/msg/Image", 1),
+            ("/silent", "a/msg/B", 0),
+            ("/tf", "std_msgs/msg/String", 1),
+            ("/tf", TF, 3),
+            ("/tf_static", TF, 1),
+        ]
+    storage = SqliteStorage(path)
+    with closing(storage):
+        found = {channel.topic: channel for channel in storage.channels}
+        assert list(storage.messages(lambda channel: channel.topic == "/silent")) == []
+    silent, camera = found["/silent"], found["/camera"]
+    assert (silent.schema_encoding, silent.schema) == ("ros2msg", b"int8 x")
+    assert silent.metadata == {"offered_qos_profiles": "- history: 1"}
+    assert (camera.schema_encoding, camera.schema, camera.metadata) == ("", b"", {})
+
+
+def test_messages_on_topics_that_are_not_described_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        for number in (98, 99, 99):
+            add(file, number, 60, b"")
+    file.close()
+    *messages, lost = messages_in(path)
+    assert [(message.received, message.batch) for message in messages] == IN_ORDER
+    assert [error.reason for error in lost.errors] == ["damaged"]
+    assert "3 messages are on topics that the file does not describe" in str(lost.errors[0])
+    assert lost.received == 30
+    # Of a part, nothing can be said.
+    assert not any(message.errors for part in ((5, None), (None, 60)) for message in messages_in(path, *part))
+
+
 def test_reading_leaves_nothing_beside_the_file(tmp_path: Path) -> None:
     path = tmp_path / "run.db3"
     with closing(sqlite3.connect(path)) as file:
@@ -133,16 +183,19 @@ def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
     assert raised.value.reason == "damaged"
 
 
-def test_a_computed_column_cannot_claim_more_than_a_message_may_have(tmp_path: Path) -> None:
+@pytest.mark.parametrize("received", [0, 50])
+def test_a_computed_column_cannot_claim_more_than_a_message_may_have(tmp_path: Path, received: int) -> None:
     path = tmp_path / "run.db3"
     with write(path) as file:
         file.execute("ALTER TABLE messages RENAME TO stored")
         size = MAX_OTHER_MESSAGE + 1
         file.execute(f"CREATE TABLE messages(id INTEGER, topic_id, timestamp, data BLOB AS (zeroblob({size})))")
-        file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, 50)")
+        file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, ?)", (received,))
     file.close()
-    errors = [error for message in messages_in(path) for error in message.errors]
-    assert "too big" in str(errors[0])
+    lost, promised = messages_in(path)
+    assert "nothing more can be read: string or blob too big" in str(lost.errors[0])
+    assert "promises 1 messages on '/tf', and 0 were found" in str(promised.errors[0])
+    assert (lost.received, promised.received) == (received, received)
 
 
 def test_a_file_that_is_cut_is_refused_or_gives_what_is_left_and_says_so(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from collections import Counter
 
-from tfbus.recording.formats._storage import Channel, StoredMessage, select, shortfalls
+from tfbus.recording.formats._storage import Channel, StoredMessage, lost_message, select, shortfalls
+from tfbus.stamps import STAMP_MAX
 
 TF, OTHER, STATIC = Channel("/tf", "", "cdr"), Channel("/tf", "", "cdr"), Channel("/tf_static", "", "cdr")
 BLOCKS: list[list[StoredMessage]] = [[(1, TF, b"a"), (2, STATIC, b"b")], [], [(3, TF, b"c"), (4, TF, b"d")]]
@@ -18,6 +19,27 @@ def test_a_log_time_that_is_no_stamp_is_lost_at_the_time_before() -> None:
     _, (received, error, _), (last, _, _) = select(blocks, None, None, Counter())
     assert (received, last) == (7, 9)
     assert "has the log time 9223372036854775808 ns" in str(error)
+    # The last stamp is one, also beside a log time that is none.
+    first, second = select([[(STAMP_MAX, TF, b""), (STAMP_MAX + 1, TF, b"")]], None, None, Counter())
+    assert (first, isinstance(second[1], Channel)) == ((STAMP_MAX, TF, b""), False)
+
+
+def test_a_log_time_that_is_no_stamp_is_lost_at_the_start_of_the_range_or_behind_the_messages_of_its_block() -> None:
+    wrong: StoredMessage = (STAMP_MAX + 1, TF, b"")
+    cases: list[tuple[int | None, list[list[StoredMessage]], list[int]]] = [
+        (None, [[wrong]], [0]),
+        (5, [[wrong]], [5]),
+        (None, [[(7, TF, b""), (3, TF, b""), wrong]], [7, 3, 7]),
+        (None, [[(7, TF, b""), (9, TF, b"")], [wrong, (8, TF, b"")]], [7, 9, 9, 8]),
+    ]
+    for since, blocks, times in cases:
+        assert [received for received, _, _ in select(blocks, since, None, Counter())] == times
+
+
+def test_lost_messages_are_counted_by_none_of_the_channels() -> None:
+    read: Counter[Channel] = Counter()
+    assert len(list(select([[(1, TF, b""), lost_message(2, "gone")]], None, None, read))) == 2
+    assert (read[TF], read[OTHER]) == (1, 0)
 
 
 def test_what_is_promised_is_compared_by_topic() -> None:

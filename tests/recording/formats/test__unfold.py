@@ -1,5 +1,6 @@
 import bz2
 import io
+import tracemalloc
 from collections.abc import Callable
 from random import Random
 
@@ -40,8 +41,21 @@ def test_a_torn_part_gives_what_it_unfolds_to(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["lz4", "bz2"])
 def test_data_that_end_too_early_are_damage(kind: str) -> None:
-    with pytest.raises(UnfoldError, match="end too early"):
-        unfold(FOLD[kind](DATA)[:-10], kind, len(DATA))
+    # Without the last byte, all data are there, but not their end.
+    for missing in (1, 10):
+        with pytest.raises(UnfoldError, match="end too early"):
+            unfold(FOLD[kind](DATA)[:-missing], kind, len(DATA))
+
+
+@pytest.mark.parametrize("kind", COMPRESSED)
+def test_no_more_than_the_bound_is_unfolded(kind: str) -> None:
+    folded = FOLD[kind](bytes(2**23))
+    tracemalloc.start()
+    with pytest.raises(UnfoldError, match="more than 1,000 bytes"):
+        unfold(folded, kind, 1_000)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**20
 
 
 @pytest.mark.parametrize("kind", COMPRESSED)
@@ -56,6 +70,11 @@ def test_a_file_unfolds_into_another_up_to_the_bound() -> None:
     folded, unfolded = zstandard.compress(DATA), io.BytesIO()
     unfold_file(io.BytesIO(folded), unfolded, len(DATA))
     assert unfolded.getvalue() == DATA
+    # A file may have several frames, and stays open.
+    source, unfolded = io.BytesIO(folded + folded), io.BytesIO()
+    unfold_file(source, unfolded, 2 * len(DATA))
+    assert unfolded.getvalue() == DATA + DATA
+    assert not source.closed
     with pytest.raises(UnfoldError, match="which is the bound"):
         unfold_file(io.BytesIO(folded), io.BytesIO(), len(DATA) - 1)
     with pytest.raises(UnfoldError, match="cannot be decompressed"):

@@ -138,7 +138,7 @@ def find_chunk(file: IO[bytes], offset: int) -> int | None:
                     number_in(record.fields, b"size")
                 except DAMAGE:
                     continue
-                if record.kind == CHUNK and start < place < record.data:
+                if record.kind == CHUNK and place < record.data:
                     return start
         kept = text[-_LOOK_BACK - 8 :]
         offset += len(block)
@@ -204,14 +204,14 @@ def split_chunk(data: bytes) -> Content:
             header = data[start : start + length]
             if layout is not None and layout.fits(header):
                 messages.append((*layout.values(header), data[body:at]))
-                continue
-            fields = parse_fields(header)
-            kind = kind_of(fields)
-            if kind == MESSAGE:
-                messages.append((time_in(fields[b"time"]), number_in(fields, b"conn"), data[body:at]))
-                layout = _Layout(header)
-            elif kind == CONNECTION:
-                content.connections.append((fields, data[body:at]))
+            else:
+                fields = parse_fields(header)
+                kind = kind_of(fields)
+                if kind == MESSAGE:
+                    messages.append((time_in(fields[b"time"]), number_in(fields, b"conn"), data[body:at]))
+                    layout = _Layout(header)
+                elif kind == CONNECTION:
+                    content.connections.append((fields, data[body:at]))
             if len(messages) > MAX_CHUNK_MESSAGES:
                 raise ValueError(f"it has more than {MAX_CHUNK_MESSAGES:,} messages, which is the bound")
     except DAMAGE as error:

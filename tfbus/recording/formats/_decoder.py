@@ -6,7 +6,7 @@ from itertools import chain, repeat
 from typing import Literal
 
 from tfbus.geometry.stamped import TransformStamped, renamed
-from tfbus.recording.formats._raw_transforms import FOXGLOVE_TYPES, bounded, parser_of, write_cdr
+from tfbus.recording.formats._raw_transforms import bounded, parser_of, write_cdr
 from tfbus.recording.formats._storage import AUTHORITIES, Channel
 from tfbus.tf_message import Decoded, Tag, decode
 
@@ -39,7 +39,7 @@ class ChannelDecoder:
         self.prefix = prefix
         self.authorities = _authorities(channel)
         self._count = sum(count for _, count in self.authorities)
-        self._plain = channel.encoding == "cdr" and not (channel.type in FOXGLOVE_TYPES and _is_single(channel))
+        self._plain = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform")
         self._parse = parser_of(channel)
         self._names: dict[tuple[str, str], tuple[str, str]] = {}
 
@@ -83,10 +83,6 @@ class ChannelDecoder:
         if sample is None:
             return None
         return renamed(sample, self.prefix + sample.parent, self.prefix + sample.child)
-
-
-def _is_single(channel: Channel) -> bool:
-    return channel.type.endswith("FrameTransform")
 
 
 def _authorities(channel: Channel) -> tuple[Run, ...]:

@@ -191,7 +191,7 @@ class McapStorage:
         statistics: records.Statistics | None = None
         # Nearly all chunks have the same channels: one tuple for all of them saves most of the memory.
         shared: dict[tuple[int, ...], tuple[int, ...]] = {}
-        kinds = {0}
+        kinds = set[int]()
         self._file.seek(start)
         for _, opcode, content in read_records(self._file, self.size):
             record = None if content is None else parse_record(opcode, content)

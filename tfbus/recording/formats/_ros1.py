@@ -175,6 +175,11 @@ class Ros1Storage:
             numbers = ", ".join(map(str, sorted(self._contradictions)))
             yield lost_message(now, f"the descriptions of connection {numbers} contradict each other")
         if since is None and until is None:
+            known = {chunk.offset for chunk in chunks.values()}
+            for chunk in self._chunks:
+                # What was not read is in an index.
+                if chunk.offset not in known:
+                    counts.update(chunk.counts or {})
             self._counted = counts
             promised = self._promised
             if promised is not None:
@@ -248,10 +253,9 @@ class Ros1Storage:
                 at = following
         if self._chunks:
             return
-        if cause is not None and not isinstance(cause, CutOffError):
-            raise RecordingError(
-                f"it cannot be read as a bag of ROS 1: {cause}", path=str(self._path), reason="damaged"
-            )
+        why = next(iter(self._damage), None) if cause is None or isinstance(cause, CutOffError) else cause
+        if why is not None:
+            raise RecordingError(f"it cannot be read as a bag of ROS 1: {why}", path=str(self._path), reason="damaged")
         raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
 
     def _add_chunk(self, record: Record) -> int:
@@ -284,7 +288,8 @@ class Ros1Storage:
             content = self._content(record.offset, torn)
             times = times or [received for received, _, _ in content.messages]
             if not times and content.damage:
-                times = [0]
+                # It has no log time, so it is told at the start.
+                self._damage.append(f"the chunk at byte {record.offset}: {content.damage}")
         if times:
             self._chunks.append(_Chunk(min(times), max(times), record.offset, counts or None))
         return at

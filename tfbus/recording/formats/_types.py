@@ -1,9 +1,12 @@
 """Conversion of messages between CDR and the encoding of ROS 1, by the definitions of their types."""
 
 from functools import cache
-from typing import Any
+from typing import Any, Final
 
 from tfbus.recording.formats._storage import Channel
+
+_HEADER: Final = "std_msgs/msg/Header"
+_HEADER_OF_ROS1: Final = "uint32 seq\ntime stamp\nstring frame_id\n"
 
 
 class MessageTypes:
@@ -46,8 +49,13 @@ class MessageTypes:
         if channel.schema_encoding == "ros1msg" and digest:
             return channel.schema.decode(errors="replace"), digest
         self._register(channel)
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        store: Any = get_typestore(Stores.EMPTY)
+        # The payloads that `convert` gives have the number too.
+        store.fielddefs.update(self._store.fielddefs, **get_types_from_msg(_HEADER_OF_ROS1, _HEADER))
         try:
-            definition, digest = self._store.generate_msgdef(self.name(channel.type), ros_version=1)
+            definition, digest = store.generate_msgdef(self.name(channel.type), ros_version=1)
         except Exception as error:  # noqa: BLE001
             raise ValueError(f"the type {channel.type} has no definition: {error!r}"[:200]) from None
         return definition, digest
@@ -73,6 +81,4 @@ def types_with_header() -> frozenset[str]:
     from rosbags.typesys import Stores, get_typestore
 
     definitions = get_typestore(Stores.ROS2_HUMBLE).fielddefs
-    return frozenset(
-        kind for kind, (_, fields) in definitions.items() if fields and "std_msgs/msg/Header" in str(fields[0])
-    )
+    return frozenset(kind for kind, (_, fields) in definitions.items() if fields and _HEADER in str(fields[0]))
