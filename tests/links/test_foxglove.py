@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
 
+from support.processes import free_ports
 from support.samples import moving, static
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -181,8 +182,10 @@ async def test_a_port_that_is_taken_is_an_error(bus: Bus) -> None:
 
 
 async def test_after_its_end_a_server_has_no_address_and_its_port_is_free(bus: Bus) -> None:
-    async with FoxgloveServer(bus, 0) as server:
-        port = int(server.address.rpartition(":")[2])
+    # One that the system gives to nobody else meanwhile.
+    (port,) = free_ports(1)
+    async with FoxgloveServer(bus, port) as server:
+        socket.create_connection(("127.0.0.1", port)).close()
     assert server.address == ""
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", port))

@@ -199,7 +199,7 @@ class Reader:
 
 
 GONE = InvalidSample.__new__(InvalidSample)
-"""What the library gives in place of a message when a writer has gone."""
+"""The library gives this in place of a message when a writer has gone."""
 
 
 def said(payload: bytes, writer: int = 1) -> Any:
