@@ -286,7 +286,7 @@ def test_what_is_no_message_is_a_type_error(message: Any) -> None:
 
 
 def test_the_error_of_what_is_no_message_names_its_fields() -> None:
-    fields = {name: 0 for name in "lkjihgfedcba"}
+    fields = dict.fromkeys("lkjihgfedcba", 0)
     for message, kind in ((fields, "dict"), (as_object(fields), "SimpleNamespace")):
         with pytest.raises(TypeError) as caught:
             from_message(message)
