@@ -1,3 +1,4 @@
+import random
 from dataclasses import dataclass
 
 from hypothesis import given
@@ -166,6 +167,19 @@ def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
         world.remove(f"object {number}")
     assert size_of(world.staleness) < 200
     assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
+
+
+def test_frames_turn_stale_in_order_when_most_others_were_removed() -> None:
+    world = World()
+    stamps = random.Random(1).sample(range(1_000), 500)
+    for stamp in stamps:
+        world.send(f"frame {stamp}", stamp)
+    world.staleness.changes(0)
+    kept = stamps[::10]
+    for stamp in set(stamps) - set(kept):
+        world.remove(f"frame {stamp}")
+    stale = [event.frame for now in range(0, 1_100, 100) for event in world.staleness.changes(now + LIMIT)]
+    assert stale == [f"frame {stamp}" for stamp in sorted(kept)]
 
 
 def test_a_frame_that_is_removed_before_anybody_looks_leaves_no_entry() -> None:
