@@ -527,6 +527,15 @@ def test_the_error_copies_and_pickles(share: Callable[[MalformedMessageError], M
 
 
 def test_the_error_shows_the_fault() -> None:
+    good = encode([moving("map", "base", 0)])
+    with pytest.raises(MalformedMessageError, match=r"\(oversized\): 5 bytes behind the last transform$"):
+        decode(good + bytes(5))
+    with pytest.raises(MalformedMessageError, match=rf"\(truncated\): {len(good) - 5} bytes cannot hold 1 transforms$"):
+        decode(good[:-1])
+    with pytest.raises(MalformedMessageError, match=r"\(truncated\): 7 bytes$"):
+        decode(good[:7])
+    with pytest.raises(MalformedMessageError, match=r"\(text\): the string b'basex' does not end with NUL$"):
+        decode(good.replace(b"base\0", b"basex"))
     with pytest.raises(MalformedMessageError, match=r"\(truncated\): 80 bytes cannot hold 4294967295 transforms"):
         decode(b"\0\1\0\0" + b"\xff" * 4 + bytes(76))
     with pytest.raises(MalformedMessageError, match=r"\(encoding\): it is not plain CDR, its header is 00 07 00 00$"):

@@ -173,8 +173,8 @@ async def test_a_long_wait_has_one_timer_for_the_next_log_line_however_often_its
         asked.cancel()
 
 
-@pytest.mark.parametrize("ends", ["answered", "cancelled", "closed"])
-async def test_a_lookup_that_has_waited_leaves_no_timer(ends: str) -> None:
+@pytest.mark.parametrize("ends", ["answered", "timed out", "cancelled", "closed"])
+async def test_a_lookup_that_has_waited_leaves_no_timer_and_no_waiter(ends: str) -> None:
     clock = SimulatedClock()
     bus = Bus(clock)
     buffer = Buffer(bus)
@@ -184,11 +184,16 @@ async def test_a_lookup_that_has_waited_leaves_no_timer(ends: str) -> None:
         assert len(clock._timers) == 2, "one for the end, and one for the log line before it"
         if ends == "answered":
             bus.publish(driving("map", "base", 0.0))
+        elif ends == "timed out":
+            await clock.advance(60.0)
         elif ends == "cancelled":
             asked.cancel()
         else:
             buffer.close()
+    assert asked.ended
     assert clock._timers == []
+    assert buffer.pending() == ()
+    assert bus.statistics().buffers == () or bus.statistics().buffers[0].waiting == 0
 
 
 @pytest.mark.parametrize("source", ["base", "arm"])

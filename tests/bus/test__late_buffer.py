@@ -107,6 +107,7 @@ def test_a_prefilled_frame_with_another_newest_parent_than_on_the_bus_is_left_ou
 def test_a_prefill_with_the_newest_sample_of_the_bus_has_missed_nothing(held: int, superseded: int) -> None:
     bus = bus_with([moving("a", "x", 50)])
     late = Buffer(bus, prefill=tree_of(moving("a", "x", held)))
+    assert len(bus._late) == (held != 50), "it has caught up"
     bus.publish(moving("old", "x", 45))
     assert late.tree.frames() == (["a", "x"] if superseded else ["a", "old", "x"])
     assert bus.statistics().buffers[0].superseded == superseded

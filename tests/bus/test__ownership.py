@@ -223,6 +223,14 @@ def test_of_two_edges_of_others_the_one_that_came_last_is_removed(last: str, els
     assert {event.frame for event in bus._topology.known()} == {"base", "a", "map"} - {last}
 
 
+def test_another_edge_of_the_owner_below_the_same_parent_does_not_protect_that_of_the_other() -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish(moving("base", "map", 0, authority="stranger"))
+    with bus.reserve("base", "owner"):
+        bus.publish([moving("map", "base", 0, authority="owner"), moving("base", "tool", 0, authority="owner")])
+    assert {(event.parent, event.frame) for event in bus._topology.known()} == {("map", "base"), ("base", "tool")}
+
+
 def test_a_loop_of_the_owners_own_edges_or_those_of_other_owners_is_refused() -> None:
     bus = Bus(SimulatedClock())
     one, two = TransformBroadcaster(bus, "one"), TransformBroadcaster(bus, "two")

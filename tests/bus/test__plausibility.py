@@ -125,7 +125,7 @@ def test_a_stamp_ahead_of_the_clock_is_announced_logged_once_and_counted(caplog:
 @pytest.mark.parametrize("beyond", [0, 1])
 def test_a_stamp_is_ahead_only_beyond_the_bound(beyond: int) -> None:
     bus = bus_at(max_ahead=2.0)
-    Buffer(bus)
+    buffer = Buffer(bus)
     bus.publish(moving("map", "base", NOW + 2 * SECOND + beyond))
     bus.publish(moving("map", "base", NOW - HOUR))
     with bus.events() as events:
@@ -135,6 +135,9 @@ def test_a_stamp_is_ahead_only_beyond_the_bound(beyond: int) -> None:
     assert [event for event in found if isinstance(event, StampAhead)] == (
         [StampAhead(NOW, "base", NOW + 2 * SECOND + 1, "")] if beyond else []
     )
+    with pytest.raises(PastExtrapolationError) as caught:
+        buffer.lookup_nowait("map", "base", NOW - HOUR)
+    assert caught.value.ahead == (2 * SECOND + 1) * beyond
 
 
 def test_with_a_bound_beyond_the_last_stamp_none_is_ahead() -> None:

@@ -37,7 +37,7 @@ def sample(kernel: ModuleType, **changes: Any) -> Any:
     fields: dict[str, Any] = {"parent": "map", "child": "a", "stamp": 20, "x": 1.0, "authority": "me", "static": False}
     fields.update(changes)
     made = sample_class(_python_kernel if kernel is _python_judge else kernel)()
-    row = (fields["x"], 2.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    row = (fields["x"], 4.0, 8.0, 0.0, 0.0, 0.0, 1.0)
     made._fields = fields["parent"], fields["child"], fields["stamp"], row, fields["authority"], fields["static"]
     return made
 
@@ -47,11 +47,11 @@ def test_a_batch_that_continues_known_edges_is_plain_and_its_newest_stamps_are_n
     known = edges(kernel)
     known["b"].newest = None
     batch = (sample(kernel), sample(kernel, stamp=15), sample(kernel, child="b", stamp=-5), sample(kernel, stamp=30))
-    assert judge(kernel, known, batch, 30, 9.0)
+    assert judge(kernel, known, batch, 30, 81.0)
     assert [edge.newest for edge in known.values()] == [30, -5]
     assert judge(kernel, known, (sample(kernel, stamp=7),), 30, math.inf)
     assert known["a"].newest == 30
-    assert judge(kernel, known, (), 30, 9.0)
+    assert judge(kernel, known, (), 30, 81.0)
 
 
 @on_both
@@ -64,7 +64,7 @@ def test_a_batch_that_continues_known_edges_is_plain_and_its_newest_stamps_are_n
         ({"static": True}, STAMP_MAX, math.inf),
         ({"stamp": 41}, 40, math.inf),
         ({"stamp": STAMP_MIN + 1}, STAMP_MIN, math.inf),
-        ({}, STAMP_MAX, 8.999),
+        ({}, STAMP_MAX, 80.999),
         ({"x": math.nan}, STAMP_MAX, math.inf),
         ({"x": math.inf}, STAMP_MAX, 1e24),
     ],
@@ -90,7 +90,7 @@ def test_nobody_is_trusted_with_an_edge_that_trusts_nobody(kernel: Any) -> None:
 @on_both
 def test_a_batch_of_any_size_is_judged(kernel: Any) -> None:
     known = edges(kernel)
-    assert judge(kernel, known, tuple(sample(kernel, stamp=stamp) for stamp in range(500)), STAMP_MAX, 9.0)
+    assert judge(kernel, known, tuple(sample(kernel, stamp=stamp) for stamp in range(500)), STAMP_MAX, 81.0)
     assert known["a"].newest == 499
 
 

@@ -1,3 +1,4 @@
+import random
 from dataclasses import dataclass
 
 from hypothesis import given
@@ -73,6 +74,9 @@ def test_a_stale_frame_is_live_again_with_a_sample_that_is_recent_enough() -> No
     assert world.send("a", 190)
     assert world.staleness.changes(200) == [FrameLive(200, "a", 190, "")]
     assert world.staleness.due() == 201
+    assert not world.send("a", 195)
+    assert world.staleness.changes(205) == []
+    assert world.staleness.changes(206) == [FrameStale(206, "a", 195, "")]
 
 
 def test_a_late_sample_of_a_stale_frame_changes_nothing() -> None:
@@ -109,6 +113,16 @@ def test_a_static_frame_that_becomes_moving_is_checked_from_its_newest_stamp() -
     assert world.staleness.changes(60) == []
     assert world.staleness.due() == 61
     assert world.staleness.changes(61) == [FrameStale(61, "a", 50, "")]
+
+
+def test_a_frame_that_was_static_for_a_while_turns_stale_once() -> None:
+    world = World()
+    for stamp in (100, None, 50):
+        world.send("a", stamp)
+        assert world.staleness.changes(60) == []
+    assert world.staleness.changes(61) == [FrameStale(61, "a", 50, "")]
+    assert world.staleness.changes(500) == []
+    assert size_of(world.staleness) == 1, "only that it is stale"
 
 
 def test_frames_turn_stale_in_the_order_of_their_newest_stamps() -> None:
@@ -153,6 +167,19 @@ def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
         world.remove(f"object {number}")
     assert size_of(world.staleness) < 200
     assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
+
+
+def test_frames_turn_stale_in_order_when_most_others_were_removed() -> None:
+    world = World()
+    stamps = random.Random(1).sample(range(1_000), 500)
+    for stamp in stamps:
+        world.send(f"frame {stamp}", stamp)
+    world.staleness.changes(0)
+    kept = stamps[::10]
+    for stamp in set(stamps) - set(kept):
+        world.remove(f"frame {stamp}")
+    stale = [event.frame for now in range(0, 1_100, 100) for event in world.staleness.changes(now + LIMIT)]
+    assert stale == [f"frame {stamp}" for stamp in sorted(kept)]
 
 
 def test_a_frame_that_is_removed_before_anybody_looks_leaves_no_entry() -> None:

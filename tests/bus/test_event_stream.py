@@ -24,6 +24,7 @@ from tfbus import (
     SampleRejected,
     SimulatedClock,
     SubscriberFailed,
+    to_seconds,
 )
 
 pytestmark = pytest.mark.anyio
@@ -256,7 +257,8 @@ async def test_a_jump_back_is_an_event_and_pending_events_stay() -> None:
         ], "a moving frame is forgotten by a jump back, so it is new"
 
 
-async def test_a_frame_that_was_stale_before_a_jump_back_is_new_and_not_live_again() -> None:
+@pytest.mark.parametrize("end", [ClockReset, FrameRemoved])
+async def test_a_stale_frame_that_was_forgotten_is_new_and_not_live_again(end: type) -> None:
     clock = SimulatedClock(start=10 * SECOND)
     bus = Bus(clock)
     got: Events = []
@@ -265,10 +267,13 @@ async def test_a_frame_that_was_stale_before_a_jump_back_is_new_and_not_live_aga
             tasks.start_soon(read, events, got)
             bus.publish(driving("map", "base", 5.0))
             await settle()
-            clock.set(2 * SECOND)
-            bus.publish(driving("map", "base", 2.0))
+            if end is ClockReset:
+                clock.set(2 * SECOND)
+            else:
+                bus.remove_frame("base")
+            bus.publish(driving("map", "base", to_seconds(clock.now())))
             await settle()
-    assert [type(event) for event in got] == [FrameAdded, FrameStale, ClockReset, FrameAdded]
+    assert [type(event) for event in got] == [FrameAdded, FrameStale, end, FrameAdded]
 
 
 # The end

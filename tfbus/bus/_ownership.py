@@ -45,12 +45,12 @@ class Ownership:
     @property
     def restricts(self) -> bool:
         """Whether some sample could be refused."""
-        return self._first_keeps or len(self._reserved) > 0
+        return self._first_keeps or bool(self._reserved)
 
     @property
     def reserves(self) -> bool:
         """Whether some frame is reserved."""
-        return len(self._reserved) > 0
+        return bool(self._reserved)
 
     def remembers(self, frame: str) -> bool:
         """Whether a frame without an edge is kept for its first authority."""
