@@ -566,6 +566,26 @@ def test_a_range_begins_at_since_even_if_the_first_message_is_later(tmp_path: Pa
     in_virtual_time(play)
 
 
+@pytest.mark.parametrize(
+    ("chosen", "children"),
+    [
+        ({}, ["base"]),
+        ({"prefix": "x/"}, ["x/base"]),
+        ({"namespaces": True}, ["base", "r1/arm"]),
+        ({"topics": ["/r1/tf"]}, ["arm"]),
+    ],
+)
+async def test_the_topics_that_are_chosen_are_played(
+    tmp_path: Path, chosen: dict[str, Any], children: list[str]
+) -> None:
+    lines = [(START, "/tf", [moving("map", "base", START)]), (START + 1, "/r1/tf", [moving("map", "arm", START)])]
+    path = write_mcap(tmp_path / "run.mcap", lines)
+    with Bus() as bus:
+        heard = Listener(bus)
+        await Player(bus, path, rate=AS_FAST_AS_POSSIBLE, **chosen).play()
+    assert [sample.child for batch in heard.batches for sample in batch] == children
+
+
 async def test_problems_in_a_recording_are_counted_and_the_rest_is_played() -> None:
     with Bus(SimulatedClock()) as bus:
         player = Player(bus, SMALL, rate=AS_FAST_AS_POSSIBLE)
