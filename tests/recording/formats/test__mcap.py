@@ -91,8 +91,14 @@ def test_all_messages_are_read_in_every_layout_of_a_file(write: Write, options: 
 
 
 def test_a_file_with_an_index_knows_the_count_of_its_messages(write: Write) -> None:
-    with open_recording(write(LINES)) as recording:
+    path = write(LINES)
+    with open_recording(path) as recording:
         assert facts(recording) == (10, 99 + COUNT, COUNT + 1, True)
+    # A part is not held to it.
+    for part in ((None, 110), (110, None)):
+        messages = in_blocks(path, *part)
+        assert messages == messages_in(path, *part)
+        assert errors_in(messages) == []
 
 
 def test_a_file_without_an_index_does_not_know_the_count_of_its_messages(write: Write) -> None:
