@@ -428,7 +428,10 @@ async def test_wrong_options_are_refused_at_once(options: dict[str, Any]) -> Non
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-def test_a_pause_and_a_new_rate_count_from_their_moment(tmp_path: Path, simulated: bool) -> None:
+@pytest.mark.parametrize(("rate", "left"), [(None, 7.0), (5.0, 2.0 + (10.0 - 5.0) / 5.0)])
+def test_a_pause_and_a_new_rate_count_from_their_moment(
+    tmp_path: Path, simulated: bool, rate: float | None, left: float
+) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
     heard: list[float] = []
 
@@ -451,11 +454,12 @@ def test_a_pause_and_a_new_rate_count_from_their_moment(tmp_path: Path, simulate
                 player.pause()
                 await anyio.sleep(100.0)
                 player.resume()
-                await anyio.sleep(2.0)
-                player.rate = 5.0
+                if rate is not None:
+                    await anyio.sleep(2.0)
+                    player.rate = rate
 
     in_virtual_time(play)
-    assert heard[1] - heard[0] == pytest.approx(3.0 + 100.0 + 2.0 + (10.0 - 5.0) / 5.0, abs=1e-6)
+    assert heard[1] - heard[0] == pytest.approx(3.0 + 100.0 + left, abs=1e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -564,6 +568,26 @@ def test_a_range_begins_at_since_even_if_the_first_message_is_later(tmp_path: Pa
             assert anyio.current_time() - before == pytest.approx(6.0, abs=1e-6)
 
     in_virtual_time(play)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "children"),
+    [
+        ({}, ["base"]),
+        ({"prefix": "x/"}, ["x/base"]),
+        ({"namespaces": True}, ["base", "r1/arm"]),
+        ({"topics": ["/r1/tf"]}, ["arm"]),
+    ],
+)
+async def test_the_topics_that_are_chosen_are_played(
+    tmp_path: Path, chosen: dict[str, Any], children: list[str]
+) -> None:
+    lines = [(START, "/tf", [moving("map", "base", START)]), (START + 1, "/r1/tf", [moving("map", "arm", START)])]
+    path = write_mcap(tmp_path / "run.mcap", lines)
+    with Bus() as bus:
+        heard = Listener(bus)
+        await Player(bus, path, rate=AS_FAST_AS_POSSIBLE, **chosen).play()
+    assert [sample.child for batch in heard.batches for sample in batch] == children
 
 
 async def test_problems_in_a_recording_are_counted_and_the_rest_is_played() -> None:

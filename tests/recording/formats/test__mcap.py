@@ -91,8 +91,14 @@ def test_all_messages_are_read_in_every_layout_of_a_file(write: Write, options: 
 
 
 def test_a_file_with_an_index_knows_the_count_of_its_messages(write: Write) -> None:
-    with open_recording(write(LINES)) as recording:
+    path = write(LINES)
+    with open_recording(path) as recording:
         assert facts(recording) == (10, 99 + COUNT, COUNT + 1, True)
+    # A part is not held to it.
+    for part in ((None, 110), (110, None)):
+        messages = in_blocks(path, *part)
+        assert messages == messages_in(path, *part)
+        assert errors_in(messages) == []
 
 
 def test_a_file_without_an_index_does_not_know_the_count_of_its_messages(write: Write) -> None:
@@ -290,6 +296,41 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(write: Write) -> Non
     assert ["promises" in str(message.errors) for message in promised] == [True, True]
     assert 0 < len(read) < len(EXPECTED)
     assert [(message.received, message.batch) for message in read] == EXPECTED[-len(read) :]
+
+
+def test_an_index_entry_that_leads_to_another_record_loses_only_its_chunk(write: Write) -> None:
+    path = write(LINES, enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    entry = next(place for place, opcode in records_in(data) if opcode == Opcode.CHUNK_INDEX)
+    schema = next(place for place, opcode in records_in(data) if opcode == Opcode.SCHEMA)
+    # Where the chunk begins, and its length.
+    data[entry + 25 : entry + 41] = schema.to_bytes(8, "little") + bytes(8)
+    path.write_bytes(data)
+    for messages in (messages_in(path), in_blocks(path)):
+        told = errors_in(messages)
+        assert told[0].endswith(f"the chunk at byte {schema}: there is no chunk, or it is too large")
+        assert ["promises" in each for each in told[1:]] == [True, True]
+        read = [(message.received, message.batch) for message in messages if message.batch]
+        assert 0 < len(read) < len(EXPECTED)
+        assert read == EXPECTED[-len(read) :]
+
+
+def test_an_index_with_a_channel_that_has_no_schema_is_used(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer: Any = Writer(file)
+        writer.start("ros2", "tests")
+        kind = writer.register_schema("tf2_msgs/msg/TFMessage", "ros2msg", b"")
+        for topic, schema in (("/tf", kind), ("/log", 0)):
+            writer.add_message(writer.register_channel(topic, "cdr", schema), 5, encode([moving("a", "b", 5)]), 5)
+        writer.finish()
+    with open_recording(path) as recording:
+        assert [(topic.name, topic.type, topic.count) for topic in recording.topics] == [
+            ("/log", "", 1),
+            ("/tf", "tf2_msgs/msg/TFMessage", 1),
+        ]
+        assert recording.count == 1
+    assert batches_in(path) == [(5, (moving("a", "b", 5),))]
 
 
 def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Write) -> None:
