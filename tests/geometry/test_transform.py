@@ -222,6 +222,10 @@ BAD_NUMBERS = [math.nan, math.inf, -math.inf]
     [
         (((0, math.nan, 0),), "not finite", "translation"),
         (((1, 2),), "wrong length", "translation"),
+        (((0.0, 0.0),), "wrong length", "translation"),
+        (((0.0, 0.0, 0.0, 0.0),), "wrong length", "translation"),
+        (((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "wrong length", "rotation"),
+        (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 1.0)), "wrong length", "rotation"),
         (((0, 0, 0), (0, 0, 0, math.inf)), "not finite", "rotation"),
         (((0, 0, 0), (0, 0, 0, 0)), "zero quaternion", "rotation"),
         (((0, 0, 0), (0, 0, 0, 2)), "not a unit quaternion", "rotation"),
