@@ -425,3 +425,4 @@ def test_rows_become_as_many_transforms_and_none_become_none() -> None:
     row = (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
     assert [len(from_rows([row] * count)) for count in range(3)] == [0, 1, 2]
     assert from_rows([row])[0] == Transform((1.0, 2.0, 3.0))
+    assert (from_rows([]).translations.shape, from_rows([]).rotations.shape) == ((0, 3), (0, 4))

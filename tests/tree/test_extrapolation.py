@@ -347,6 +347,20 @@ def test_many_time_travels_have_the_greater_extrapolation_and_gap_of_both_legs(t
     assert found[1:].extrapolated_by.tolist() == [seconds(0.5)]
 
 
+@pytest.mark.parametrize("policy", [{"tolerance": 0.1}, {"max_gap": 1.0}, {"extrapolate": Hold(0.1)}])
+def test_many_lookups_under_any_policy_have_their_gaps_though_all_stamps_are_covered(
+    tree: TransformTree, policy: dict[str, Any]
+) -> None:
+    stamps = [seconds(0.5), seconds(1.0)]
+    # The path is known, and these questions have plain answers.
+    assert tree.lookup_many("odom", "base", stamps).gap is None
+    found = tree.lookup_many("odom", "base", stamps, **policy)
+    assert found.translations[:, 0].tolist() == [0.5, 1.0]
+    assert found.extrapolated_by.tolist() == [0, 0]
+    assert found.gap is not None
+    assert found.gap.tolist() == [seconds(1.0), 0]
+
+
 def test_many_lookups_without_a_policy_have_no_extrapolation_and_gap(tree: TransformTree) -> None:
     found = tree.lookup_many("odom", "tool", [seconds(3.0)])
     assert (found.extrapolated_by.tolist(), found.gap) == ([0], None)

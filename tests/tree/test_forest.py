@@ -444,6 +444,7 @@ def deep_tree(on_step: Callable[[bool], None]) -> TransformTree:
         lambda tree: tree.chain("f0", "f50"),
         lambda tree: tree.latest_common_stamp("f0", "f50"),
         lambda tree: tree.twist("f50", "f0", 5),
+        lambda tree: tree.twist("f1", "f0", 5, expressed_in="f50"),
     ],
 )
 def test_a_new_path_is_searched_while_others_may_insert(ask: Callable[[TransformTree], object]) -> None:

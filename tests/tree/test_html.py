@@ -37,6 +37,11 @@ def test_frames_have_the_colour_of_their_state() -> None:
     assert "; color" not in root
 
 
+def test_the_age_from_which_frames_are_stale_can_be_chosen() -> None:
+    for stale_after, state in ((1.0, EdgeState.MOVING), (0.9, EdgeState.STALE)):
+        assert f'color: {state.value}">base<' in to_html(EDGES, 5 * SECOND, stale_after)
+
+
 def test_marked_frames_stand_out() -> None:
     lines = to_html(EDGES, 0, marked=("lidar",)).split("\n")
     assert ["background" in line for line in lines] == [False, False, True]
