@@ -79,6 +79,9 @@ def test_an_unfinished_file_makes_an_unfinished_recording(tmp_path: Path) -> Non
     assert batches_in(tmp_path) == EXPECTED
     with open_recording(tmp_path) as recording:
         assert facts(recording) == (0, 29, None, False)
+        assert {topic.count for topic in recording.topics} == {None}
+        assert len(list(recording.messages())) == 30
+        assert sum(topic.count or 0 for topic in recording.topics) == 30
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"nonsense"])

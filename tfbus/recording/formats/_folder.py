@@ -126,8 +126,11 @@ class FolderStorage:
 
     @property
     def channels(self) -> Mapping[Channel, int | None]:
-        """The channels of all files."""
-        return {channel: count for file in self._files for channel, count in file.channels.items()}
+        """The channels of all files; while some file has not told all of its own, no count is known."""
+        complete = self.complete
+        return {
+            channel: count if complete else None for file in self._files for channel, count in file.channels.items()
+        }
 
     def close(self) -> None:
         """Close the files."""
