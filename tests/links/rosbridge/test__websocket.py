@@ -1,3 +1,4 @@
+import ssl
 from typing import Any
 
 import anyio
@@ -46,6 +47,8 @@ async def test_without_a_port_it_is_that_of_rosbridge_or_of_https(
         raise ConnectionRefusedError
 
     monkeypatch.setattr(anyio, "connect_tcp", connect)
+    # To load the certificates of this machine takes long.
+    monkeypatch.setattr(ssl, "create_default_context", lambda: None)
     with pytest.raises(ConnectionRefusedError):
         await WebSocket.connect(url, 100, 5)
     assert asked == [address]
