@@ -377,6 +377,11 @@ def test_of_what_two_buses_say_of_a_frame_a_removal_below_the_other_word_changes
         assert here.frames == ["a"], "the removal of the higher number is the one that holds"
         here.receive(static("map", "s"), origin=OTHER, sequence=13)
         assert set(here.frames) == {"s", "a"}
+        # So it is for a bus that had never said anything of the frame.
+        here.remove("a", sequence=15)
+        for sequence in (14, 16):
+            here.receive(moving("map", "a", sequence), origin=b"a third origin !", sequence=sequence)
+            assert ("a" in here.frames) is (sequence > 15)
 
 
 def test_a_removed_frame_comes_back_only_with_a_higher_number() -> None:

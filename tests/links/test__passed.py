@@ -61,6 +61,16 @@ def test_children_that_left_are_remembered_up_to_a_bound_and_one_that_came_back_
     assert size_of(memory) == 2 * GONE_CHILDREN + 2
 
 
+def test_a_child_that_leaves_once_more_is_the_last_that_left() -> None:
+    memory = PassedSamples(gone_children=2)
+    samples = {name: moving("map", name, 1) for name in "abc"}
+    for sample in samples.values():
+        memory.add(sample)
+    for name in "abac":
+        memory.retire(name)
+    assert [sample in memory for sample in samples.values()] == [True, False, True]
+
+
 def test_after_a_jump_back_only_static_samples_are_known() -> None:
     memory = passed(moving("map", "a", 1), static("map", "a"), moving("map", "b", 1))
     memory.retire("b")

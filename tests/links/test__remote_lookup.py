@@ -29,6 +29,13 @@ def test_a_question_and_its_cancellation_are_read_as_they_were_written(message: 
     assert read_question(write_question(message)) == message
 
 
+def test_so_large_a_message_is_read_and_no_larger_one() -> None:
+    largest = write_question(Cancellation("me", 2)).ljust(MAX_BYTES)
+    assert read_question(largest) == Cancellation("me", 2)
+    with pytest.raises(ValueError, match=f"{MAX_BYTES + 1} bytes, more than {MAX_BYTES}"):
+        read_question(largest + b" ")
+
+
 @pytest.mark.parametrize(
     "data",
     [

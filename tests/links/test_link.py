@@ -1,4 +1,5 @@
 import asyncio
+import logging
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -374,6 +375,19 @@ def test_items_received_after_a_crash_of_the_event_loop_do_no_harm() -> None:
         for _ in range(3):
             carrier.receive(message)
         assert link.statistics().queue.pending == 3
+
+
+async def test_what_is_not_sent_is_counted_each_time_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    class RefusingCarrier(LoggedCarrier):
+        async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
+            await super().open(receive, report)
+            for _ in range(2):
+                report.refused("frame name", ValueError("the name is too long"))
+
+    with Bus() as bus, caplog.at_level(logging.WARNING, "tfbus"):
+        async with Link(bus, "world", RefusingCarrier()) as link:
+            assert link.statistics().not_sent == {"frame name": 2}
+    assert caplog.messages == ["not sent over the link world: the name is too long"]
 
 
 async def test_a_link_tells_no_time_that_it_is_not_to_tell() -> None:

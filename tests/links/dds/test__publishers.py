@@ -1,6 +1,7 @@
 import pytest
 from support.wires import size_of
 
+from tfbus.links.dds import _publishers
 from tfbus.links.dds._publishers import MOST_WAITING, NODE_PATIENCE, PATIENCE, Publishers
 
 
@@ -87,6 +88,34 @@ def test_publishers_that_have_gone_are_forgotten_and_what_waits_is_delivered() -
     hall.publishers.keep_only(set())
     assert hall.delivered[1:] == [("q", "q", b"y", False)]
     assert size_of(hall.publishers) == 0
+
+
+def test_of_too_many_publishers_the_first_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 3)
+    hall = Hall()
+    for name in ("w1", "w2", "w3"):
+        hall.say(name)
+    hall.time = PATIENCE
+    hall.publishers.expire()
+    hall.delivered.clear()
+
+    def delivered_at_once(name: str) -> bool:
+        before = len(hall.delivered)
+        hall.say(name)
+        return len(hall.delivered) > before
+
+    assert [delivered_at_once(name) for name in ("w1", "w2", "w3")] == [True] * 3
+    assert [delivered_at_once(name) for name in ("w4", "w2", "w3", "w1")] == [False, True, True, False]
+
+
+def test_the_names_of_so_many_participants_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 3)
+    hall = Hall()
+    for name in "abcd":
+        hall.publishers.nodes(name, [(f"/{name}", [f"{name}1"])])
+    for name in "abcd":
+        hall.publishers.message(f"{name}1", name, b"x", False)
+    assert [node for _, node, _, _ in hall.delivered] == ["/b", "/c", "/d"]
 
 
 @pytest.mark.thorough

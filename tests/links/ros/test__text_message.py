@@ -25,6 +25,11 @@ def test_the_text_of_either_ros(content: Any) -> None:
     assert decode_text(content) == URDF
 
 
+@pytest.mark.parametrize("content", [bytes(4), b"\0\1\0\0" + bytes(4), b"\0\1\0\0\1\0\0\0\0", {"data": ""}])
+def test_a_text_may_be_empty(content: Any) -> None:
+    assert decode_text(content) == ""
+
+
 @pytest.mark.parametrize(
     "content",
     [b"", b"\0\1\0\0", b"\7\7\0\0\0\0\0\0", b"\0\1\0\0\5\0\0\0a", b"\1\0\0\0\xff", {}, {"data": 5}, None, [1]],

@@ -10,7 +10,7 @@ from support.samples import moving
 
 from tfbus import Transform, TransformStamped
 from tfbus.links.ros._transforms import as_mapping, decode_mapping, decode_ros1
-from tfbus.tf_message import MalformedMessageError
+from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 SAMPLES = [
     moving("map", "base", 5_000_000_007, 1.0),
@@ -115,6 +115,12 @@ def test_a_mapping_without_the_fields_is_malformed(path: tuple[str, ...], value:
 def test_what_is_no_mapping_of_transforms_is_malformed(message: Any) -> None:
     with pytest.raises(MalformedMessageError, match="encoding"):
         decode_mapping(message)
+
+
+def test_the_longest_names_come_in() -> None:
+    longest = [moving("p" * MAX_NAME, "c" * MAX_NAME, 5)]
+    assert decode_ros1(ros1(*map(ros1_of, longest))).samples == longest
+    assert decode_mapping({"transforms": list(map(as_mapping, longest))}).samples == longest
 
 
 def test_names_of_a_mapping_are_checked_as_those_of_bytes() -> None:

@@ -162,6 +162,18 @@ async def test_what_is_latched_is_asked_for_first_and_joints_never_in_decoded_cb
     assert alone.requests() == (again("/tf_static") + again("/tf")) * (encoding == "cbor-raw")
 
 
+async def test_what_waited_for_a_server_that_has_gone_is_not_sent_to_the_next_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    alone = Alone(monkeypatch)
+    await alone.connect(monkeypatch, 100.0)
+    first = list(alone.carrier._requests)
+    assert alone.carrier._publish([moving("map", "a", 1)], static=False)
+    await alone.connect(monkeypatch, 200.0)
+    assert list(alone.carrier._requests) == first
+    assert not alone.carrier._moving
+
+
 @pytest.mark.parametrize(
     ("of_ros2", "published", "held"), [(True, True, True), (False, True, False), (True, False, False)]
 )

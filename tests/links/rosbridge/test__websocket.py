@@ -1,3 +1,4 @@
+import ssl
 from typing import Any
 
 import anyio
@@ -25,6 +26,32 @@ def test_a_url_has_a_host_and_perhaps_a_port() -> None:
     parts = check_url("ws://[::1]:9091/path?token=1")
     assert (parts.hostname, parts.port, parts.path, parts.query) == ("::1", 9091, "/path", "token=1")
     assert check_url("wss://robot").port is None
+
+
+@pytest.mark.parametrize(
+    ("url", "address"),
+    [
+        ("ws://robot", ("robot", 9090)),
+        ("wss://robot/path", ("robot", 443)),
+        ("ws://robot:7", ("robot", 7)),
+        ("wss://[::1]:8", ("::1", 8)),
+    ],
+)
+async def test_without_a_port_it_is_that_of_rosbridge_or_of_https(
+    url: str, address: tuple[str, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, int]] = []
+
+    async def connect(host: str, port: int, **_: object) -> None:
+        asked.append((host, port))
+        raise ConnectionRefusedError
+
+    monkeypatch.setattr(anyio, "connect_tcp", connect)
+    # To load the certificates of this machine takes long.
+    monkeypatch.setattr(ssl, "create_default_context", lambda: None)
+    with pytest.raises(ConnectionRefusedError):
+        await WebSocket.connect(url, 100, 5)
+    assert asked == [address]
 
 
 async def test_messages_come_whole_and_a_ping_is_answered() -> None:

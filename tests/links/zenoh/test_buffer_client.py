@@ -204,6 +204,7 @@ def met(session: Session, monkeypatch: pytest.MonkeyPatch, **options: Any) -> Bu
     client._waker.bind()
     client._is_open = True
     client._note_server("server", True)
+    client._handle_arrived()
     return client
 
 
@@ -265,11 +266,36 @@ async def test_a_server_that_is_not_there_is_waited_for_no_longer_than_the_looku
     async def ask() -> None:
         answers.append(await client.lookup("map", "base"))
 
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(ask)
-        await settle()
-        client._note_server("server", True)
-    assert answers == [FOUND]
+    session = Session([FOUND] * 3)
+    client._session = session  # type: ignore[assignment]
+    with anyio.fail_after(PATIENCE / 2):
+        async with anyio.create_task_group() as tasks:
+            for _ in range(3):
+                tasks.start_soon(ask)
+            await settle()
+            client._note_server("server", True)
+    assert answers == [FOUND] * 3
+
+
+async def test_all_whose_questions_were_dropped_hear_at_once_that_the_server_has_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    client = met(Session([None] * 3), monkeypatch)
+    monkeypatch.setattr(buffer_client, "_SETTLING", 60.0)
+    reasons = []
+
+    async def ask() -> None:
+        with pytest.raises(RemoteLookupError) as lost:
+            await client.lookup("map", "base")
+        reasons.append(lost.value.reason)
+
+    with anyio.fail_after(PATIENCE / 2):
+        async with anyio.create_task_group() as tasks:
+            for _ in range(3):
+                tasks.start_soon(ask)
+            await settle()
+            client._note_server("server", False)
+    assert reasons == ["lost"] * 3
 
 
 @pytest.mark.parametrize("losses", [0, 1, 3, 4])

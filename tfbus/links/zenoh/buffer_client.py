@@ -92,8 +92,7 @@ class BufferClient:
         self._arrived: deque[tuple[int, bytes | None]] = deque()
         self._servers_changed: deque[tuple[str, bool]] = deque()
         self._servers: set[str] = set()
-        self._met = anyio.Event()
-        self._left = anyio.Event()
+        self._changed = anyio.Event()
         self._waker = LoopWaker(self._handle_arrived)
 
     async def __aenter__(self) -> Self:
@@ -195,8 +194,7 @@ class BufferClient:
         """Wait until there is a server."""
         with anyio.move_on_after(min(PATIENCE, max(until - monotonic(), 0.0))):
             while not self._servers:
-                self._met = anyio.Event()
-                await self._met.wait()
+                await self._changed.wait()
         if not self._servers:
             raise self._error("absent", "nobody offers it")
 
@@ -227,8 +225,7 @@ class BufferClient:
             # The news that the server has gone may come a moment after the end of its questions.
             with anyio.move_on_after(_SETTLING):
                 while self._servers:
-                    self._left = anyio.Event()
-                    await self._left.wait()
+                    await self._changed.wait()
             if not self._servers:
                 raise self._error("lost", "it has gone")
             raise self._error("silent", "it has dropped the question, or it has gone")
@@ -264,7 +261,9 @@ class BufferClient:
         while self._servers_changed:
             server, present = self._servers_changed.popleft()
             (self._servers.add if present else self._servers.discard)(server)
-            (self._met if present else self._left).set()
+            # It wakes all that wait now, and none that waits later.
+            self._changed.set()
+            self._changed = anyio.Event()
         if not self._servers:
             for pending in self._pending.values():
                 pending.done.set()
