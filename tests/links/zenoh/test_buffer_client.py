@@ -148,6 +148,8 @@ async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: st
             ZenohLink(bus, domain, connect=address) as link,
         ):
             client = BufferClient(link=link, capacity=1)
+            with pytest.raises(RuntimeError, match="not entered"):
+                await client.lookup("map", "base", timeout=0.0)
             async with client, anyio.create_task_group() as tasks:
                 tasks.start_soon(client.lookup, "map", "base", LATEST)
                 await until(lambda: server.statistics().waiting == 1)
