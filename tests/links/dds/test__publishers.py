@@ -108,6 +108,15 @@ def test_of_too_many_publishers_the_first_is_forgotten(monkeypatch: pytest.Monke
     assert [delivered_at_once(name) for name in ("w4", "w2", "w3", "w1")] == [False, True, True, False]
 
 
+def test_what_waits_of_a_publisher_that_is_forgotten_is_delivered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 1)
+    hall = Hall()
+    hall.say("w1")
+    assert hall.delivered == []
+    hall.say("w2")
+    assert len(hall.delivered) == 1
+
+
 def test_the_names_of_so_many_participants_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 3)
     hall = Hall()
@@ -115,7 +124,8 @@ def test_the_names_of_so_many_participants_are_remembered(monkeypatch: pytest.Mo
         hall.publishers.nodes(name, [(f"/{name}", [f"{name}1"])])
     for name in "abcd":
         hall.publishers.message(f"{name}1", name, b"x", False)
-    assert [node for _, node, _, _ in hall.delivered] == ["/b", "/c", "/d"]
+    names = {participant: node for participant, node, _, _ in hall.delivered}
+    assert names == {"a": "a", "b": "/b", "c": "/c", "d": "/d"}
 
 
 @pytest.mark.thorough

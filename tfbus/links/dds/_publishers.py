@@ -57,7 +57,7 @@ class Publishers:
             known = self._publishers.get(publisher)
             if known is None:
                 if len(self._publishers) >= _MOST_PUBLISHERS:
-                    del self._publishers[next(iter(self._publishers))]
+                    self._flush(self._publishers.pop(next(iter(self._publishers))))
                 patience = NODE_PATIENCE if self._is_of_ros(participant) else PATIENCE
                 known = self._publishers[publisher] = _Publisher(participant, self._now() + patience)
                 known.name = self._names.get(participant, {}).get(publisher, "")
