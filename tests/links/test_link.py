@@ -11,9 +11,10 @@ import pytest
 from support.foreign import ForeignCarrier, ForeignMessage, ForeignTransform, ForeignWorld
 from support.processes import until
 from support.samples import moving, static
+from support.wires import WireCarrier
 
 from tfbus import Bus, BusClosedError, PeerJoined, PeerLost, PeerRejected, SimulatedClock
-from tfbus.links import Link
+from tfbus.links import Link, _endpoint
 from tfbus.links._carrier import SendReport
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._outbox import Turn
@@ -342,6 +343,28 @@ async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() 
     assert (rejected.reason, str(rejected.error)) == ("not published", "broken")
     assert isinstance(lost, PeerLost)
     assert (lost.authorities, lost.frames) == (("foreign",), ("arm",))
+
+
+class AskingCarrier(WireCarrier):
+    """Takes what its link receives from a test, and tells whom the link asks."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        super().__init__("mine", lambda _: None, lambda peer, _: self.asked.append(peer), dict)
+
+    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
+        self.receive = receive
+        await super().open(receive, report)
+
+
+async def test_a_peer_that_comes_while_a_link_rests_is_asked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_endpoint, "CLAIM_PERIOD", 1_000.0)
+    carrier = AskingCarrier()
+    with Bus() as bus:
+        async with Link(bus, "wire", carrier):
+            await anyio.wait_all_tasks_blocked()
+            carrier.receive(Received("peer", Presence.JOINED))
+            await until(lambda: carrier.asked == ["peer"])
 
 
 async def test_only_wanted_frames_go_out_and_come_in() -> None:
