@@ -259,6 +259,17 @@ async def test_a_peer_whose_connection_was_gone_before_anybody_looked_is_dialled
         assert await there.next() == Received(here.id, Presence.JOINED)
 
 
+async def test_what_is_sent_for_a_filter_that_nobody_has_is_declared_no_more() -> None:
+    async with ends(1) as (here,):
+        declared = here.sessions._main.publishers._parts
+        for name in ("first", "second"):
+            here.sessions.put_part(name, Message(b"part", b"", 1))
+        here.sessions.serve({"second"})
+        assert declared.keys() == {"second"}
+        here.sessions.serve(())
+        assert not declared
+
+
 async def test_a_peer_is_asked_by_its_own_key_which_costs_a_router_nothing_for_other_robots() -> None:
     async with ends(1) as (here,), joined_to(here) as joining:
         joining.sessions.ask(here.id, 0)
