@@ -97,6 +97,15 @@ def test_several_transforms_are_one_message_in_either_encoding() -> None:
     assert parser_of(CDR)(cdr) == [ONE, OTHER, THIRD]
 
 
+def test_cdr_is_read_in_either_byte_order_and_in_the_usual_one_bit_for_bit() -> None:
+    swapped = struct.pack(">IiI", 1, 5, 6) + b"\0\0\0\4map\0" + b"\0\0\0\5base\0\0\0\0"
+    swapped += bytes(-len(swapped) % 8) + struct.pack(">7d", 1, 2, 3, 0, 0, 0, 1)
+    assert parser_of(CDR)(b"\0\0\0\0" + swapped) == [ONE]
+    # A signalling NaN.
+    odd = ONE._replace(numbers=bytes.fromhex("010000000000f07f") + NUMBERS[8:])
+    assert parser_of(CDR)(write_cdr([odd])) == [odd]
+
+
 @pytest.mark.parametrize(("channel", "payload"), [(CDR, write_cdr([ONE, OTHER])), (ROS1, write_ros1([ONE, OTHER]))])
 def test_a_message_that_is_cut_anywhere_is_malformed(channel: Channel, payload: bytes) -> None:
     reasons = set()
