@@ -52,6 +52,7 @@ def test_the_end_of_a_patch_ends_what_it_reaches_of_one_peer() -> None:
     assert scene.present["a"] == {DIRECT, (None, "x"), (OTHER, FIRST_SESSION)}
     assert scene.present["b"] == set(WAYS)
     assert scene.present.robots() == {"a": "robot of a", "b": "robot of b"}
+    assert [scene.present.robot(peer) for peer in ("a", "b")] == ["robot of a", "robot of b"]
     scene.present.end("nobody", PATCH)
     assert set(scene.present) == {"a", "b"}
 

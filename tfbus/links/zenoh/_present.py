@@ -28,7 +28,8 @@ class Present(Mapping[str, frozenset[Way]]):
         self._note_change = note_change
         self._lock = threading.Lock()
         self._ways: dict[str, frozenset[Way]] = {}
-        self._robots: dict[str, dict[str, None]] = {}
+        self._robots: dict[str, str] = {}
+        self._of_several: set[str] = set()
 
     def __getitem__(self, peer: str) -> frozenset[Way]:
         return self._ways[peer]
@@ -53,12 +54,11 @@ class Present(Mapping[str, frozenset[Way]]):
     def robots(self) -> dict[str, str]:
         """The robot of each peer; if it was announced with several, the first."""
         with self._lock:
-            return {peer: next(iter(robots)) for peer, robots in self._robots.items()}
+            return dict(self._robots)
 
     def robot(self, peer: str) -> str:
         """The robot of a peer; `ANY_ROBOT` if that is not known, or somebody has announced the peer with another."""
-        robots = tuple(self._robots.get(peer, ()))
-        return robots[0] if len(robots) == 1 else ANY_ROBOT
+        return ANY_ROBOT if peer in self._of_several else self._robots.get(peer, ANY_ROBOT)
 
     def note(self, peer: str, way: Way, presence: Presence, robot: str = NO_ROBOT) -> None:
         """Note that a peer has come or gone by one of its ways."""
@@ -67,9 +67,11 @@ class Present(Mapping[str, frozenset[Way]]):
             after = before | {way} if presence is Presence.JOINED else before - {way}
             if after:
                 self._ways[peer] = after
-                self._robots.setdefault(peer, {})[robot] = None
+                if presence is Presence.JOINED and self._robots.setdefault(peer, robot) != robot:
+                    self._of_several.add(peer)
             elif before:
                 del self._ways[peer], self._robots[peer]
+                self._of_several.discard(peer)
             changed = bool(after) is not bool(before)
             if changed:
                 self._receive(Received(peer, presence))
