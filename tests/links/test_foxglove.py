@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
 
-from support.processes import free_ports
+from support.processes import free_ports, is_free
 from support.samples import moving, static
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -102,15 +102,6 @@ async def until(holds: Callable[[], bool]) -> None:
             await anyio.sleep(0.01)
 
 
-def is_free(port: int) -> bool:
-    """Whether nobody listens at a port; the threads of the library may take a moment to end."""
-    try:
-        socket.create_connection(("127.0.0.1", port)).close()
-    except ConnectionRefusedError:
-        return True
-    return False
-
-
 @asynccontextmanager
 async def application(server: FoxgloveServer) -> AsyncIterator[Application]:
     found = await anyio.to_thread.run_sync(Application, server.address)
@@ -194,8 +185,9 @@ async def test_after_its_end_a_server_has_no_address_and_its_port_is_free(bus: B
     # One that the system gives to nobody else meanwhile.
     (port,) = free_ports(1)
     async with FoxgloveServer(bus, port) as server:
-        socket.create_connection(("127.0.0.1", port)).close()
+        assert not is_free(port)
     assert server.address == ""
+    # The threads of the library may take a moment to end.
     await until(lambda: is_free(port))
 
 

@@ -28,10 +28,11 @@ _ports = (12_000 + (os.getpid() * 997 + number) % 20_000 for number in count())
 
 def free_ports(how_many: int) -> list[int]:
     """Ports of the loopback that nobody listens at, and that nobody is given before the test uses them."""
-    return list(islice(filter(_is_free, _ports), how_many))
+    return list(islice(filter(is_free, _ports), how_many))
 
 
-def _is_free(port: int) -> bool:
+def is_free(port: int) -> bool:
+    """Whether nobody listens at a port of the loopback."""
     try:
         socket.create_server(("127.0.0.1", port)).close()
     except OSError:
