@@ -1,4 +1,5 @@
 import struct
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from queue import Queue
@@ -12,10 +13,10 @@ from support.processes import PATIENCE
 
 from tfbus.links._history import LONGEST_HISTORY
 from tfbus.links._message import MAX_BYTES, Message
-from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Received
+from tfbus.links._receive_queue import Answer, HistoryAnswer, HistoryQuestion, Presence, Question, Received
 from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT, Keys
-from tfbus.links.zenoh._session import MOST_NAMES, MOST_QUESTIONS, ZenohSession
+from tfbus.links.zenoh._session import MOST_NAMES, MOST_QUESTIONS, ZenohSession, directly
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError
 
@@ -264,6 +265,8 @@ def test_a_session_closed_before_it_was_open_does_not_stay_open(join: Join, doma
     second = End(B, domain, settings([], address, None, 2.0))
     second.session.close()
     second.session.open()
+    assert second.session.session.is_closed()
+    assert not second.session.is_open
     third = join(uuid4().hex)
     # The one that joins after it is the first that is seen.
     assert first.next() == Received(third.id, Presence.JOINED)
@@ -308,6 +311,7 @@ class Asked:
         (struct.pack("<d", 1.5) + b"x" * (2**16 + 1), None),
         (struct.pack("<d", LONGEST_HISTORY), (LONGEST_HISTORY, "")),
         (struct.pack("<d", LONGEST_HISTORY * 1.001), None),
+        (struct.pack("<d", 0.25), (0.25, "")),
         (struct.pack("<d", 0.0), None),
         (struct.pack("<d", float("nan")), None),
         (struct.pack("<d", 1.5) + b"\xff", None),
@@ -350,9 +354,24 @@ def test_the_filters_of_others_come_and_go_and_wrong_ones_are_refused() -> None:
     assert end.session._filters.wanted == {}
     assert end.items.empty()
     end.session._closed = False
-    wrong = SimpleNamespace(key_expr="tfbus/yard/x", kind=zenoh.SampleKind.PUT)
-    end.session._receive_filter(wrong)  # type: ignore[arg-type]
-    assert end.next().content.reason == "key"
+    malformed = Keys("yard", B, filter="x").filter_token(FIRST_SESSION)
+    for key, sender, reason in (("tfbus/yard/x", "", "key"), (malformed, B, "filter")):
+        wrong = SimpleNamespace(key_expr=key, kind=zenoh.SampleKind.PUT)
+        end.session._receive_filter(wrong)  # type: ignore[arg-type]
+        item = end.next()
+        assert (item.sender, item.content.reason) == (sender, reason)
+
+
+def test_the_filter_of_a_link_that_was_there_before_is_known_as_soon_as_the_link_is(address: str, domain: str) -> None:
+    chunk = write_filter(["*"], ["base"])
+    first = ZenohSession(settings(address, [], None, 2.0), Keys(domain, A, filter=chunk), print, lambda *_: None)
+    second = End(B, domain, settings([], address, None, 2.0))
+    with ExitStack() as stack:
+        for session in (first, second.session):
+            stack.callback(session.close)
+            session.open()
+        assert second.next() == Received(A, Presence.JOINED)
+        assert second.session._filters.wanted == {name_of(chunk): {"base"}}
 
 
 def test_a_link_hears_presence_of_others_only() -> None:
@@ -445,6 +464,7 @@ def test_an_answer_is_received_once_and_tells_whether_the_filter_is_served() -> 
     options = [options for _, _, options in network.asked]
     assert [each["payload"] for each in options[1:3]] == [struct.pack("<Q", 6), struct.pack("<d", 1.5) + b"lidar"]
     assert [each["attachment"] for each in options[:3]] == [Keys("yard", A).token(FIRST_SESSION), None, None]
+    assert not any(handler.indirect for _, handler, _ in network.asked), "a thread of its own would come later"
     Network(end, failing=True)
     end.session.ask(B, 8)
     assert end.next() == Received(B, Answer(None))
@@ -474,6 +494,7 @@ def test_the_sessions_that_a_peer_hears_are_told_once(replies: Sequence[bytes | 
     assert told == [(names, b"" if names is None else b"!")]
     assert (key, options["payload"]) == (f"tfbus/yard/*/hears/{B}", Keys("yard", A).token(FIRST_SESSION))
     assert options["attachment"] == b"known"
+    assert not handler.indirect, "a thread of its own would come later"
     Network(end, failing=True)
     end.session.ask_hearing(B, lambda *answer: told.append(answer))
     assert len(told) == 1
@@ -503,3 +524,83 @@ def test_connections_are_noted_with_their_session_and_both_addresses() -> None:
     end.session._note_connection = lambda *connection: noted.append(connection)
     end.session._receive_connection(event)
     assert noted == [("7", "tcp/127.0.0.1:1", "tcp/127.0.0.1:2")]
+
+
+def test_connections_are_told_that_were_made_while_the_session_began_and_later(address: str, domain: str) -> None:
+    (here, near), (there, far) = ((f"{uuid4().int | 1 << 127:032x}", Queue[tuple[str, str, str]]()) for _ in range(2))
+    with ExitStack() as stack:
+        for id, noted in ((here, near), (there, far)):  # noqa: A001
+            config = settings([] if noted is far else address, address if noted is far else None, {"id": id}, 2.0)
+            note = lambda *connection, noted=noted: noted.put(connection)  # noqa: E731
+            session = ZenohSession(config, Keys(domain, id), print, print, note_connection=note)
+            stack.callback(session.close)
+            session.open()
+        dialled, accepted = far.get(timeout=PATIENCE), near.get(timeout=PATIENCE)
+    assert (dialled[0], dialled[2]) == (here, address)
+    assert (accepted[0], accepted[1]) == (there, address)
+    assert accepted[2] == dialled[1]
+
+
+def test_a_session_that_is_closed_need_not_be_closed_at_the_end_of_the_program() -> None:
+    session = ZenohSession(settings("tcp/127.0.0.1:0", [], None, 2.0), Keys("yard", A), print, print)
+    assert not session.is_open
+    session.open()
+    at_exit = session._close_at_exit
+    assert at_exit is not None
+    assert (session.is_open, at_exit.alive) == (True, True)
+    session.close().join()
+    assert not at_exit.alive
+
+
+def test_a_session_opens_in_a_thread_that_the_interpreter_waits_for() -> None:
+    end, daemons = closed_end(), list[bool]()
+    end.session._open = lambda: daemons.append(threading.current_thread().daemon)  # type: ignore[method-assign]
+    # As a worker thread of trio.
+    worker = threading.Thread(target=end.session.open, daemon=True)
+    worker.start()
+    worker.join()
+    assert daemons == [False]
+
+
+def test_what_is_received_by_several_subscribers_stays_in_order() -> None:
+    assert not directly(print).indirect, "each would have a thread of its own"
+
+
+def test_a_link_with_a_filter_hears_all_of_some_peers_while_they_need_it(address: str, domain: str) -> None:
+    chunk, came, met = write_filter(["*"], ["base"]), Queue[Received](), Queue[str]()
+    here = ZenohSession(
+        settings(address, [], None, 2.0),
+        Keys(domain, A, filter=chunk),
+        came.put,
+        lambda link, *_: met.put(link),
+    )
+    peers = [End(link, domain, settings([], address, None, 2.0)) for link in (B, uuid4().hex)]
+    with ExitStack() as stack:
+        for session in (here, *(peer.session for peer in peers)):
+            stack.callback(session.close)
+            session.open()
+        assert {met.get(timeout=PATIENCE) for _ in peers} == {peer.id for peer in peers}
+        for unfiltered in ({B}, {B}, {peer.id for peer in peers}, {peers[1].id}, {peers[1].id, "gone"}, set(), {B}):
+            here.hear_all_of(unfiltered)
+            for peer in peers:
+                # The question goes behind what was declared, and its end comes behind what was sent.
+                here.ask(peer.id, 0)
+                questions = (item.content for item in iter(peer.next, None))
+                question = next(content for content in questions if isinstance(content, Question))
+                for kind in ("all", "part", "all"):
+                    message = Message(kind.encode(), b"", 1)
+                    if kind == "all":
+                        peer.session.publishers.put(message)
+                    else:
+                        peer.session.publishers.put_part(name_of(chunk), message)
+                question.handle.drop()
+                heard = iter(lambda: came.get(timeout=PATIENCE).content, Answer(None))
+                assert [payload for payload, _ in heard] == ([b"all"] * 2 if peer.id in unfiltered else [b"part"])
+
+
+def test_a_session_that_has_ended_has_no_connections() -> None:
+    end = closed_end()
+    end.session._session = zenoh.open(settings("tcp/127.0.0.1:0", [], None, 2.0))
+    assert (end.session.connected(), end.session.routers()) == (set(), [])
+    end.session._session.close()
+    assert (end.session.connected(), end.session.routers()) == (set(), [])

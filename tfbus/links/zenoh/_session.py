@@ -177,7 +177,8 @@ class ZenohSession:
     def hear_all_of(self, peers: Set[str]) -> None:
         """Hear the live keys of some peers, and of no others; for a link with a filter."""
         for peer in self._unfiltered.keys() - peers:
-            del self._unfiltered[peer]
+            # zenoh goes on calling a callback of which nobody has the subscriber.
+            self._unfiltered.pop(peer).undeclare()
         for peer in peers - self._unfiltered.keys():
             self._unfiltered[peer] = self.session.declare_subscriber(
                 self._keys.of("live", peer, ANY_ROBOT),
