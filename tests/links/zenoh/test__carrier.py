@@ -1,21 +1,25 @@
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from queue import Queue
-from typing import Any, ClassVar, cast
+from types import SimpleNamespace
 from uuid import uuid4
 
 import anyio
+import anyio.from_thread
 import pytest
-from support.processes import free_ports, new_domain, until
+import zenoh
+from support.processes import PATIENCE, free_ports, new_domain, until
 from support.samples import moving, static
 
 from tfbus.links._carrier import SendReport
 from tfbus.links._entries import MovingFrame, OutgoingBatch, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
+from tfbus.links._message import Message
 from tfbus.links._outbox import Turn
-from tfbus.links._part_writer import PartWriter
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
 from tfbus.links._state import StateStep
+from tfbus.links.zenoh import _carrier, _closing
 from tfbus.links.zenoh._carrier import ZenohCarrier
 from tfbus.links.zenoh._keys import Keys
 from tfbus.links.zenoh._settings import patch_settings, settings
@@ -137,45 +141,161 @@ async def test_nothing_is_written_while_nobody_hears_it_and_whoever_comes_back_s
         assert here.carrier._writer.write([RemovedFrame(ORIGIN, 8, "c")])[0].number == message.number + 2
 
 
-def test_sessions_serve_other_filters_as_soon_as_there_are_others() -> None:
-    class Sessions:
-        filters: ClassVar[dict[str, set[str]]] = {}
-        served: ClassVar[list[dict[str, set[str]]]] = []
-        serve = served.append
+class Sessions:
+    """Notes what a carrier has its sessions do."""
 
-    carrier = End(new_domain(), "tcp/127.0.0.1:0", listens=True).carrier
-    carrier._sessions = cast(Any, Sessions)
-    carrier._parts = PartWriter(SendReport(print))
-    carrier._filters = Sessions.filters
-    for filters in ({"near": {"a"}}, {}):
-        Sessions.filters = filters
-        carrier._serve_filters()
-        carrier._serve_filters()
-    assert Sessions.served == [{"near": {"a"}}, {}]
+    def __init__(self, slowly: bool = False, broken: bool = False) -> None:
+        self.filters: dict[str, set[str]] = {}
+        self.served: list[dict[str, set[str]]] = []
+        self.serve = self.served.append
+        self.sent: list[Message] = []
+        self.sent_slowly: list[Message] = []
+        self.parts: list[tuple[str, Message]] = []
+        self.is_heard_slowly = lambda: slowly
+        self.closing: list[threading.Thread] = []
+        self._broken = broken
+
+    def is_heard(self) -> bool:
+        self._check()
+        return True
+
+    def put(self, message: Message) -> None:
+        self._check()
+        self.sent.append(message)
+
+    def put_part(self, name: str, message: Message) -> None:
+        self._check()
+        self.parts.append((name, message))
+
+    def put_slowly(self, messages: list[Message]) -> None:
+        self._check()
+        self.sent_slowly += messages
+
+    def close(self) -> list[threading.Thread]:
+        return self.closing
+
+    def _check(self) -> None:
+        if self._broken:
+            raise zenoh.ZError("the session is closed")
 
 
-@pytest.mark.parametrize(("heard", "sent"), [(True, 1), (False, 0)])
-async def test_the_newest_samples_are_sent_slowly_once_if_anybody_hears_them(
-    monkeypatch: pytest.MonkeyPatch, heard: bool, sent: int
+async def alone(sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> End:
+    """A carrier that is open, with sessions that a test gives."""
+    monkeypatch.setattr(Sessions, "open", lambda _: None, raising=False)
+    monkeypatch.setattr(_carrier, "ZenohSessions", lambda *_: sessions)
+    end = End(new_domain(), "tcp/127.0.0.1:0", listens=True)
+    await end.carrier.open(end.put, end.report)
+    return end
+
+
+async def test_sessions_serve_other_filters_as_soon_as_there_are_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    sessions = Sessions()
+    sessions.filters = {"near": {"a"}}
+    carrier = (await alone(sessions, monkeypatch)).carrier
+    for _ in range(2):
+        carrier.claim(StateStep(0, 0, 0))
+    assert sessions.served == [{"near": {"a"}}]
+    assert [name for name, _ in sessions.parts] == ["near"] * 2
+    sessions.filters = {}
+    for _ in range(2):
+        carrier.send(Turn([OutgoingBatch(ORIGIN, 1, (moving("map", "a", 1),))], {}))
+    assert sessions.served == [{"near": {"a"}}, {}]
+    assert len(sessions.parts) == 2, "nobody has a filter any more"
+
+
+async def test_what_goes_to_a_filter_is_counted_as_a_message_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    sessions = Sessions()
+    sessions.filters = {"near": {"a", "b"}, "far": {"z"}}
+    end = await alone(sessions, monkeypatch)
+    names = ("a", "b", "c")
+    end.carrier.send(Turn([OutgoingBatch(ORIGIN, 1, tuple(moving("map", name, 1) for name in names))], {}))
+    assert (len(sessions.sent), [name for name, _ in sessions.parts]) == (1, ["near"])
+    assert (end.report.messages, end.report.samples) == (2, 5)
+
+
+async def test_a_claim_behind_what_cannot_be_sent_is_no_live_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    end = await alone(sessions := Sessions(), monkeypatch)
+    end.carrier.send(Turn([OutgoingBatch(ORIGIN, 1, (moving("map", "a", 2**62),))], {}, StateStep(0, 1, 99)))
+    assert [message.number for message in sessions.sent] == [0]
+    assert (end.report.messages, end.report.not_sent) == (0, {"stamp": 1})
+
+
+async def test_a_session_that_fails_is_taken_for_one_that_is_heard_so_that_it_is_reported(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class Sessions:
-        put: ClassVar[list[object]] = []
-        is_heard_slowly = staticmethod(lambda: heard)
-        put_slowly = put.extend
+    end = await alone(Sessions(broken=True), monkeypatch)
+    end.carrier.send(Turn([OutgoingBatch(ORIGIN, 1, (moving("map", "a", 1),))], {}))
+    assert ([type(error) for error in end.errors], end.report.messages) == ([zenoh.ZError], 0)
 
-    carrier = End(new_domain(), "tcp/127.0.0.1:0", listens=True).carrier
-    carrier._sessions = cast(Any, Sessions)
-    carrier._newest.claim(StateStep(3, 5, 99))
-    periods = iter(range(3))
 
-    async def sleep(_: float) -> None:
-        if next(periods) == 2:
+def two_periods(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Have the time pass at once until two periods have, and then end the task; returns the periods."""
+    slept: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        if len(slept) == 2:
             raise TimeoutError
+        slept.append(seconds)
 
     monkeypatch.setattr(anyio, "sleep", sleep)
+    return slept
+
+
+@pytest.mark.parametrize("heard", [True, False])
+async def test_the_newest_samples_are_sent_slowly_once_if_anybody_hears_them(
+    monkeypatch: pytest.MonkeyPatch, heard: bool
+) -> None:
+    end = await alone(sessions := Sessions(slowly=heard), monkeypatch)
+    end.carrier.send(Turn([OutgoingBatch(ORIGIN, 1, (moving("map", "a", 1),))], {}, StateStep(2, 3, 98)))
+    end.carrier.claim(StateStep(3, 5, 99))
+    assert two_periods(monkeypatch) == []
     with pytest.raises(TimeoutError):
-        await carrier._send_slowly()
-    assert len(Sessions.put) == sent
+        await end.carrier._send_slowly()
+    told = [end.carrier.read((message.payload, message.attachment)) for message in sessions.sent_slowly]
+    assert [(frames(message), message.step) for message in told] == [(["a"], StateStep(5, 5, 99))] * heard
+
+
+async def test_newest_samples_that_cannot_be_sent_are_reported_and_the_next_are_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    end = await alone(sessions := Sessions(slowly=True), monkeypatch)
+    end.carrier.claim(StateStep(3, 5, 99))
+    sessions._broken = True
+    slept = two_periods(monkeypatch)
+    with pytest.raises(TimeoutError):
+        await end.carrier._send_slowly()
+    assert [type(error) for error in end.errors] == [zenoh.ZError]
+    assert slept == [1.0, 1.0]
+
+
+@pytest.mark.parametrize("late", [True, False])
+async def test_sessions_that_do_not_close_in_time_are_reported(monkeypatch: pytest.MonkeyPatch, late: bool) -> None:
+    monkeypatch.setattr(_closing, "CLOSING_TIME", 0.01 if late else PATIENCE)
+    end, may_close = await alone(sessions := Sessions(), monkeypatch), threading.Event()
+    sessions.closing = [threading.Thread(target=may_close.wait)]
+    sessions.closing[0].start()
+    if not late:
+        may_close.set()
+    await end.carrier.close()
+    assert [type(error) for error in end.errors] == [TimeoutError] * late
+    may_close.set()
+
+
+async def test_an_end_that_is_cancelled_while_it_opens_does_not_wait_for_zenoh(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    may_open, opened = threading.Event(), list[bool]()
+
+    def open_slowly() -> None:
+        anyio.from_thread.run_sync(scope.cancel)
+        opened.append(may_open.wait(PATIENCE))
+
+    monkeypatch.setattr(_carrier, "ZenohSessions", lambda *_: SimpleNamespace(open=open_slowly))
+    end = End(new_domain(), "tcp/127.0.0.1:0", listens=True)
+    with anyio.CancelScope() as scope:
+        await end.carrier.open(end.put, end.report)
+    assert (scope.cancelled_caught, opened) == (True, [])
+    may_open.set()
 
 
 async def test_failures_to_send_are_reported_and_never_raised() -> None:

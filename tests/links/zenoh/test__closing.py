@@ -4,6 +4,7 @@ import threading
 from typing import Any
 
 import pytest
+from support.processes import PATIENCE
 
 pytest.importorskip("zenoh", reason='pip install "tfbus[zenoh]"')
 
@@ -32,6 +33,22 @@ async def test_a_session_that_does_not_close_is_left_behind_after_a_while(monkey
     session.may_close.set()
     closing.join()
     assert await wait_until_closed([closing]) is None
+
+
+@pytest.mark.parametrize("stuck", [False, True])
+def test_at_its_end_the_interpreter_waits_so_long_for_sessions_that_close(
+    stuck: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_closing, "LONGEST_CLOSE", 0.01 if stuck else PATIENCE)
+    session: Any = StuckSession()
+    closing = begin_to_close(session)
+    assert closing.daemon, "it must not wait without a limit"
+    if not stuck:
+        threading.Timer(0.02, session.may_close.set).start()
+    _closing._wait_at_exit()
+    assert closing.is_alive() is stuck
+    session.may_close.set()
+    closing.join()
 
 
 def test_there_may_be_no_session() -> None:

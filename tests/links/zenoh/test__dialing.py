@@ -1,3 +1,6 @@
+from types import SimpleNamespace
+
+import anyio
 import pytest
 from support.processes import free_ports
 
@@ -96,6 +99,19 @@ def test_a_peer_is_dialled_no_more_where_somebody_else_listens_now() -> None:
     assert not scene.dialing.is_dialled("a")
 
 
+def test_an_address_at_which_nobody_listens_is_forgotten_unless_it_is_the_only_one() -> None:
+    scene = Scene()
+    for address in ("tcp/there:1", "tcp/there:2"):
+        scene.dialing.reached("a", address)
+    scene.dialing.refused("a", "tcp/there:3")
+    scene.dialing.refused("nobody", "tcp/there:1")
+    assert scene.dialing.addresses("a") == ["tcp/there:2", "tcp/there:1"]
+    for address in ("tcp/there:2", "tcp/there:1"):
+        scene.dialing.refused("a", address)
+    assert scene.dialing.addresses("a") == ["tcp/there:1"]
+    assert scene.dialing.addresses("nobody") == []
+
+
 @pytest.mark.anyio
 async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:
     closed = f"127.0.0.1:{free_ports(1)[0]}"
@@ -103,3 +119,28 @@ async def test_an_address_is_probed_if_it_is_one_of_tcp() -> None:
     for protocol in ("tcp", "tls"):
         with pytest.raises(ConnectionRefusedError):
             await is_reachable(f"{protocol}/{closed}")
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize(
+    ("failure", "reachable"), [(None, True), (OSError("no route to host"), False), (TimeoutError(), False)]
+)
+async def test_whoever_cannot_be_reached_may_listen_later(
+    failure: OSError | None, reachable: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called: list[object] = []
+
+    async def connect(host: str, port: int) -> object:
+        called.append((host, port))
+        if failure is not None:
+            raise failure
+        return SimpleNamespace(aclose=close)
+
+    async def close() -> None:
+        called.append("close")
+
+    monkeypatch.setattr(anyio, "connect_tcp", connect)
+    for address in ("tcp/robot.local:7447", "tls/[fe80::1]:7448#iface=eth0"):
+        assert await is_reachable(address) is reachable
+    probed = [("robot.local", 7447), ("fe80::1", 7448)]
+    assert called == (probed if failure else [probed[0], "close", probed[1], "close"])

@@ -48,6 +48,15 @@ def test_a_peer_is_asked_soon_and_then_ever_more_seldom_until_it_leaves() -> Non
     assert not scene.hearing.is_deaf("a", hears=False)
 
 
+def test_a_peer_is_asked_no_later_than_it_is_due() -> None:
+    scene = Scene()
+    scene.hearing.joined("a")
+    for _ in range(3):
+        scene.time = scene.hearing.next_due() or 0.0
+        assert scene.hearing.take_due() == ["a"]
+        assert scene.hearing.take_due() == []
+
+
 def test_one_answer_that_it_hears_nothing_is_no_proof_and_several_in_a_row_are() -> None:
     scene = Scene()
     scene.hearing.joined("a")

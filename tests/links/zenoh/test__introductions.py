@@ -174,6 +174,14 @@ def test_whoever_asks_tells_where_it_listens() -> None:
     assert b"tcp/10.0.0.3:7447" in other.told_by(third)
 
 
+def test_a_question_has_a_line_of_addresses_one_of_whom_it_wants_and_one_of_the_beginnings_of_whom_it_knows() -> None:
+    here = End("r$*", "s", domain="yard", listen="tcp/10.0.0.3:7447")
+    here.knows(id="0123456789" + "a" * 22)
+    here.knows(id="b" * 32)
+    wanted = b"tfbus/yard/r$*/@alive/*/*,tfbus/yard/s/@alive/*/*"
+    assert here.introductions.question(here.others) == b"tcp/10.0.0.3:7447\n" + wanted + b"\n01234567bbbbbbbb"
+
+
 def test_nobody_is_named_whom_the_asker_has_or_who_asks() -> None:
     here, third = End(), End()
     third.knows(id=here.id)

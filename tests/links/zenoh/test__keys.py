@@ -4,6 +4,7 @@ import zenoh
 from tfbus.links.zenoh._filters import name_of, write_filter
 from tfbus.links.zenoh._keys import (
     ANY_ROBOT,
+    FIRST_SESSION,
     LONGEST_NAME,
     NO_ROBOT,
     Keys,
@@ -73,6 +74,16 @@ def test_the_sender_is_in_a_key(robot: str) -> None:
     assert keys.sender(other.own("state"), "live") is None
     assert keys.of("state", B, robot) == other.own("state")
     assert zenoh.KeyExpr(keys.of("state", B, ANY_ROBOT)).includes(zenoh.KeyExpr(other.own("state")))
+
+
+def test_of_a_token_the_robot_is_told_and_the_link_if_it_is_meant_to_be_heard() -> None:
+    keys = Keys("yard/arm", A, robots=("r$*",), slow_robots=(("s1", 2.0),))
+    for robot, heard in ((NO_ROBOT, None), ("r1", B), ("s1", B), ("x1", None)):
+        token = Keys("yard/arm", B, robot).token(FIRST_SESSION)
+        assert keys.robot_of(token) == robot
+        assert keys.heard_link(token.encode()) == heard
+    for token in (Keys("yard", B, "r1").token(FIRST_SESSION), Keys("yard/arm", B, "r1").token("x"), "", "\xff"):
+        assert keys.heard_link(token.encode("latin-1")) is None
 
 
 @pytest.mark.parametrize(

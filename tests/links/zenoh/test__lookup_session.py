@@ -1,13 +1,18 @@
 import subprocess
 import sys
 import threading
+import time
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
+import anyio
+import anyio.to_thread
 import pytest
 import zenoh
 from support.processes import until
 
+from tfbus.links.zenoh import _closing, _lookup_session
 from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 
 pytestmark = pytest.mark.anyio
@@ -36,6 +41,39 @@ async def test_servers_and_askers_of_one_robot_are_heard_of_and_no_others(addres
 
 async def test_without_a_domain_it_is_tf_and_without_a_robot_a_tilde() -> None:
     assert LookupSession(None, None, None, None, None, None, 2.0).key("@lookup", "a") == "tfbus/tf/~/@lookup/a"
+
+
+async def test_of_several_servers_of_one_robot_one_has_a_question_and_all_have_what_is_for_all(
+    address: str, domain: str
+) -> None:
+    servers = [LookupSession(domain, None, None, address, None, None, 2.0)]
+    servers.append(LookupSession(domain, None, None, None, address, None, 2.0))
+    asker = LookupSession(domain, None, None, None, address, None, 2.0)
+    asked, known, answers = list[tuple[int, bytes]](), set[str](), list[bytes | None]()
+
+    def answer_as(server: int, query: zenoh.Query) -> None:
+        assert query.payload is not None
+        asked.append((server, query.payload.to_bytes()))
+        reply_now(query, b"answer")
+
+    for session in (*servers, asker):
+        await session.open()
+    try:
+        for number, server in enumerate(servers):
+            server.answer(partial(answer_as, number), f"server {number}")
+        asker.follow("@lookup", lambda server, _: known.add(server))
+        await until(lambda: len(known) == 2)
+        for number in range(10):
+            asker.ask(b"%d" % number, answers.append, 10.0)
+            await until(lambda number=number: len(answers) > number)  # type: ignore[misc]
+        asker.ask(b"all", answers.append, 10.0, to_all=True)
+        await until(lambda: len(asked) >= 12)
+    finally:
+        for session in (*servers, asker):
+            await session.close()
+    assert answers == [b"answer"] * 11
+    assert [payload for _, payload in asked[:10]] == [b"%d" % number for number in range(10)]
+    assert sorted(asked[10:]) == [(0, b"all"), (1, b"all")]
 
 
 async def test_a_session_that_never_opened_closes() -> None:
@@ -78,6 +116,7 @@ async def test_a_question_has_one_answer_or_none(
     assert options["target"] == (zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING)
     # The sender must not wait in zenoh for others.
     assert options["express"] is True
+    assert not handler.indirect, "it needs no thread of its own"
 
 
 async def test_a_question_of_a_session_that_has_ended_has_no_answer() -> None:
@@ -88,15 +127,64 @@ async def test_a_question_of_a_session_that_has_ended_has_no_answer() -> None:
     assert took == [None]
 
 
-async def test_what_waits_to_be_sent_is_sent_before_the_session_ends(address: str, domain: str) -> None:
+@pytest.mark.parametrize("cancelled", [False, True])
+async def test_what_waits_to_be_sent_is_sent_before_the_session_ends(
+    address: str, domain: str, cancelled: bool
+) -> None:
     session, ending, sent = LookupSession(domain, None, None, address, None, None, 2.0), threading.Event(), list[bool]()
     await session.open()
     opened = session._opened()
     session._declared.append(SimpleNamespace(undeclare=ending.set))
     session.soon(lambda: ending.wait(10))
+    session.soon(partial(time.sleep, 0.02))
     session.soon(lambda: sent.append(opened.is_closed()))
+    at_exit = session._close_at_exit
+    assert at_exit is not None
+    with anyio.CancelScope() as scope:
+        if cancelled:
+            scope.cancel()
+        await session.close()
+    assert (sent, opened.is_closed(), at_exit.alive) == ([False], True, False)
+
+
+async def test_a_thread_that_does_not_come_back_is_left_behind_and_waited_for_at_the_end_of_the_interpreter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(_lookup_session, "_CLOSING_TIME", 0.01)
+    may_end = threading.Event()
+    session = LookupSession(None, None, None, "tcp/127.0.0.1:0", None, None, 2.0)
+    await session.open()
+    sender = session._sender
+    assert sender is not None
+    session._declared.append(SimpleNamespace(undeclare=lambda: may_end.wait(10)))
+    session.soon(lambda: may_end.wait(10))
     await session.close()
-    assert (sent, opened.is_closed()) == ([False], True)
+    assert sender.is_alive()
+    assert not may_end.is_set()
+    assert sender.daemon, "the interpreter must not wait for it without a limit"
+    threading.Timer(0.02, may_end.set).start()
+    _closing._wait_at_exit()
+    assert not sender.is_alive()
+
+
+@pytest.mark.parametrize("by_itself", [False, True])
+async def test_a_session_that_nobody_refers_to_ends_when_all_is_sent(by_itself: bool) -> None:
+    may_end, sent = threading.Event(), list[bool]()
+    session = LookupSession(None, None, None, "tcp/127.0.0.1:0", None, None, 2.0)
+    await session.open()
+    opened, sender = session._opened(), session._sender
+    assert sender is not None
+    if by_itself:
+        # What the thread sends holds the last reference.
+        session.soon(partial(lambda _: sent.append(may_end.wait(10)), session))
+        del session
+        may_end.set()
+        await anyio.to_thread.run_sync(sender.join)
+    else:
+        session.soon(lambda: sent.append(may_end.wait(10)))
+        threading.Timer(0.02, may_end.set).start()
+        del session
+    assert (sent, sender.is_alive(), opened.is_closed()) == ([True], False, True)
 
 
 @pytest.mark.thorough

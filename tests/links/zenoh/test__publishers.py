@@ -1,7 +1,8 @@
 from queue import Queue
 
+import pytest
 import zenoh
-from support.processes import PATIENCE
+from support.processes import PATIENCE, until
 
 from tfbus.links._message import Message
 from tfbus.links.zenoh._keys import Keys
@@ -13,7 +14,8 @@ LINK = "a" * 32
 NAME = "b" * 32
 
 
-def test_each_message_goes_to_those_who_hear_its_key_and_none_to_filters_that_have_gone(
+@pytest.mark.anyio
+async def test_each_message_goes_to_those_who_hear_its_key_and_none_to_filters_that_have_gone(
     address: str, domain: str
 ) -> None:
     keys, came = Keys(domain, LINK), Queue[zenoh.Sample]()
@@ -38,6 +40,16 @@ def test_each_message_goes_to_those_who_hear_its_key_and_none_to_filters_that_ha
             ]
             assert publishers.is_heard()
             assert not publishers.is_heard_slowly()
+            declared.append(hearer.declare_subscriber(f"tfbus/{domain}/~/slow/**", put))
+            await until(publishers.is_heard_slowly)
+            publishers.put_slowly(Message(b"slow", b"5", 1))
+            slow = came.get(timeout=PATIENCE)
+            assert slow.attachment is not None
+            assert (str(slow.key_expr), slow.payload.to_bytes(), slow.attachment.to_bytes()) == (
+                f"tfbus/{domain}/~/slow/{LINK}",
+                b"slow",
+                b"5",
+            )
             publishers.serve({NAME})
             assert publishers._parts.keys() == {NAME}
             publishers.serve(set())

@@ -8,7 +8,7 @@ connected, or were, and at which address, if they have dialled.
 
 from collections.abc import Callable, Container, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import anyio.to_thread
 import zenoh
@@ -27,9 +27,9 @@ _ANSWER_TIME = 1.0
 
 @dataclass(slots=True)
 class _Look:
-    due: float = 0.0
-    number: int = 0
-    addresses: list[str] = field(default_factory=list)
+    due: float
+    number: int
+    addresses: list[str]
 
 
 class Unmet:
@@ -87,10 +87,10 @@ class Unmet:
         """A connection to a session has come or gone; it is looked after unless a peer is behind it."""
         if session in self._routers or (session not in self._looks and len(self._looks) >= MOST_UNMET):
             return
-        look = self._looks.setdefault(session, _Look())
-        look.due, look.number = self._now() + PAUSES[0], 1
-        if address is not None:
-            look.addresses = newest_first(address, look.addresses)
+        before = self._looks.get(session)
+        known = [] if before is None else before.addresses
+        addresses = known if address is None else newest_first(address, known)
+        self._looks[session] = _Look(self._now() + PAUSES[0], 1, addresses)
 
     def next_due(self) -> float | None:
         """The time of the next look; None while all that are connected have been met."""
