@@ -13,6 +13,7 @@ from support.processes import crowd, free_ports, new_domain, until
 from support.samples import moving, static
 
 from tfbus import Buffer, Bus
+from tfbus.links._message import MAX_BYTES
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, ZenohRouter, _settings
 from tfbus.links.zenoh._settings import MEETING_POINT, Addresses, identity, patch_settings, settings
 
@@ -75,6 +76,17 @@ def test_only_a_link_with_a_listening_address_of_its_own_fails_if_it_cannot_list
     assert read("listen/exit_on_failure", connect="tcp/127.0.0.1:7000") is False
     assert read("listen/exit_on_failure", listen="tcp/127.0.0.1:7000") is not False
     assert read("listen/exit_on_failure", config={LISTEN: ["tcp/127.0.0.1:7000"]}) is not False
+
+
+def test_a_peer_waits_for_others_for_ever_and_a_client_or_for_an_address_that_is_taken_nobody_does() -> None:
+    # For zenoh -1 is for ever.
+    assert read("connect/timeout_ms") == {"peer": -1, "router": -1, "client": 0}
+    assert read("connect/exit_on_failure") is False
+    assert read("listen/timeout_ms") == 0
+
+
+def test_messages_that_no_link_takes_are_not_even_assembled() -> None:
+    assert MAX_BYTES < read("transport/link/rx/max_message_size") <= 2 * MAX_BYTES
 
 
 @pytest.mark.parametrize(

@@ -189,12 +189,15 @@ class Session:
             self.cancelled.append(question.number)
             return
         assert question.timeout is not None
-        assert timeout > question.timeout + PATIENCE, "zenoh must not give up before the client does"
+        assert timeout > question.timeout + buffer_client.PATIENCE, "zenoh must not give up before the client does"
         self.asked.append(question.timeout)
         for answer in islice(self._answers, 1):
             if isinstance(answer, LookupTimeoutError):
                 self.now += question.timeout
             take(None if answer is None else write_answer(answer))
+
+    async def close(self) -> None:
+        pass
 
 
 def met(session: Session, monkeypatch: pytest.MonkeyPatch, **options: Any) -> BufferClient:
@@ -244,13 +247,16 @@ async def test_a_long_wait_is_asked_for_in_parts(
     assert (session.asked, session.cancelled) == (asked, [])
 
 
-async def test_the_clock_of_the_other_bus_may_end_a_wait_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("timeout", [5.0, LONGEST_WAIT])
+async def test_the_clock_of_the_other_bus_may_end_a_wait_sooner(
+    timeout: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session = Session([LATE])
     client = met(session, monkeypatch)
     monkeypatch.setattr(buffer_client, "monotonic", lambda: 100.0)
     with pytest.raises(LookupTimeoutError):
-        await client.lookup("map", "base", timeout=5.0)
-    assert session.asked == [5.0]
+        await client.lookup("map", "base", timeout=timeout)
+    assert session.asked == [timeout]
 
 
 async def test_a_server_that_is_not_there_is_waited_for_no_longer_than_the_lookup_is(
@@ -324,6 +330,38 @@ async def test_a_question_that_was_dropped_is_not_asked_again_when_its_time_is_o
     with pytest.raises(RemoteLookupError) as silent:
         await client.lookup("map", "base", timeout=0.0)
     assert (silent.value.reason, session.asked) == ("silent", [0.0])
+
+
+async def test_a_server_that_says_nothing_is_given_up_after_a_while_and_told_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(buffer_client, "PATIENCE", 0.01)
+    session = Session([])
+    client = met(session, monkeypatch)
+    with pytest.raises(RemoteLookupError, match=r"it has not answered within 0\.01 s") as silent:
+        await client.lookup("map", "base", timeout=0.0)
+    assert silent.value.reason == "silent"
+    assert (session.asked, session.cancelled, client._pending) == ([0.0], [1], {})
+
+
+async def test_the_end_of_a_client_ends_its_lookups_though_the_session_is_that_of_a_link(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    client = met(Session([]), monkeypatch)
+    ended = []
+
+    async def ask() -> None:
+        with pytest.raises(RemoteLookupError, match="this client has ended") as lost:
+            await client.lookup("map", "base")
+        ended.append(lost.value.reason)
+
+    with anyio.fail_after(PATIENCE / 2):
+        async with anyio.create_task_group() as tasks:
+            for _ in range(2):
+                tasks.start_soon(ask)
+            await settle()
+            await client.__aexit__(None, None, None)
+    assert ended == ["lost"] * 2
 
 
 @pytest.mark.parametrize(("unsent", "cancelled"), [(1, [1, 2]), (2, [])])

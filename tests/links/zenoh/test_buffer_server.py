@@ -188,6 +188,54 @@ async def test_an_asker_ends_behind_its_questions_and_only_when_it_goes() -> Non
         assert list(server._received) == [(query, RemoteQuestion("me", 1, "map", "base", LATEST)), "me"]
 
 
+async def test_an_asker_that_goes_ends_its_own_questions_only() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        server, session = unopened(buffer)
+        queries = {(asker, number): Query() for asker in ("me", "other") for number in (1, 2)}
+        async with anyio.create_task_group() as tasks:
+            for (asker, number), query in queries.items():
+                question = RemoteQuestion(asker, number, "map", "base", LATEST, timeout=PATIENCE)
+                server._begin_to_wait(query, question, tasks)
+            tasks.start_soon(server._take_all, tasks)
+            for item, left in (("me", 2), ("nobody", 2), (Cancellation("other", 2), 1), (Cancellation("other", 3), 1)):
+                server._received.append(item)
+                server._came.set()
+                await settle()
+                assert server.statistics().waiting == left
+            assert [query.dropped for query in queries.values()] == [1, 1, 0, 1]
+            bus.publish(static("map", "base"))
+            await settle()
+            assert server.statistics().waiting == 0
+            tasks.cancel_scope.cancel()
+        assert [query for query, _ in session.replies] == [queries["other", 1]]
+        counts = server.statistics()
+        assert (counts.cancelled, counts.answered, counts.queue.pending) == (3, 1, 0)
+
+
+async def test_a_question_that_fails_for_no_reason_of_its_own_waits_where_its_error_is_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(**_: object) -> None:
+        raise RuntimeError("a bug")
+
+    with Bus() as bus, Buffer(bus) as buffer:
+        server, session = unopened(buffer)
+        monkeypatch.setattr(buffer, "lookup_nowait", fail)
+        question = RemoteQuestion("me", 1, "map", "base", LATEST)
+        server._take(query := Query(question))
+        assert list(server._received) == [(query, question)]
+        assert (session.replies, server.statistics().failed) == ([], 0)
+
+
+async def test_what_waits_for_the_event_loop_ends_with_the_server(address: str, domain: str) -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with BufferServer(buffer, domain, listen=address) as server:
+            # Nobody would answer it.
+            server._received.append("me")
+            assert server.statistics().queue.pending == 1
+        assert server.statistics().queue.pending == 0
+
+
 async def test_a_cancellation_needs_no_answer_and_a_question_that_is_cancelled_has_none() -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         server, session = unopened(buffer)

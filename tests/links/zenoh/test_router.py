@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 from support.processes import until
+from support.programs import free_address
 from support.samples import moving, static
 from support.wires import latched
 
@@ -35,6 +36,16 @@ async def test_clients_behind_a_router_hear_each_other_and_late_ones_have_everyt
                 await until(lambda: set(latched(late)) == {"lidar"} and len(link.peers) == 2)
                 one.publish(moving("map", "base", 2))
                 await until(lambda: late.statistics().frames == 2)
+
+
+async def test_clients_of_routers_that_are_connected_hear_each_other(address: str, domain: str) -> None:
+    other = free_address()
+    with Bus() as one, Bus() as two:
+        async with ZenohRouter(address), ZenohRouter(other, connect=address):
+            async with client(one, domain, address) as link, client(two, domain, other):
+                await until(lambda: len(link.peers) == 1)
+                one.publish(static("map", "lidar"))
+                await until(lambda: set(latched(two)) == {"lidar"})
 
 
 @pytest.mark.thorough
@@ -126,8 +137,18 @@ async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(add
                 raise AssertionError("it has opened")
         with pytest.raises(RuntimeError, match="entered once"):
             await router.__aenter__()
+        assert router._close_at_exit.alive
+    assert not router._close_at_exit.alive
     async with ZenohRouter(address):
         pass
+
+
+async def test_a_robot_is_heard_in_full_or_at_a_rate_and_not_both() -> None:
+    with Bus() as bus:
+        keys = ZenohLink(bus, robots={"r1": math.inf, "s*": 2.0})._zenoh._keys
+        assert (keys.robots, keys.slow_robots) == (("r1",), (("s$*", 2.0),))
+        keys = ZenohLink(bus, robots=["r1", "s*"])._zenoh._keys
+        assert (keys.robots, keys.slow_robots) == (("r1", "s$*"), ())
 
 
 async def test_what_makes_no_sense_is_refused_at_once() -> None:
