@@ -5,10 +5,11 @@ from contextlib import asynccontextmanager
 from queue import Queue
 from time import monotonic
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 from uuid import uuid4
 
 import anyio
+import anyio.from_thread
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
@@ -17,6 +18,7 @@ from support.processes import free_ports, new_domain, until
 
 from tfbus.links._message import Message
 from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links.zenoh import _sessions
 from tfbus.links.zenoh._dialing import FIRST_PAUSE, Dialing
 from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._hearing import DEAF
@@ -312,8 +314,8 @@ class Patch:
 class Alone(End):
     """The sessions of a link that was not opened, and a peer whose first session it hears."""
 
-    def __init__(self) -> None:
-        super().__init__(new_domain())
+    def __init__(self, frames: Collection[str] | None = None) -> None:
+        super().__init__(new_domain(), frames=frames)
         self.peer = uuid4().hex
         self.dialing.reached(self.peer, "tcp/10.0.0.7:1")
         self.patch: Any = Patch(self.peer)
@@ -549,3 +551,324 @@ async def test_the_loop_sleeps_until_the_next_peer_is_due() -> None:
     assert times == sorted(times, reverse=True)
     assert len(set(times)) == 3
     assert times[-1] == alone.dialing.next_due()
+
+
+async def test_the_end_leaves_answers_behind_and_closes_patches_once(caplog: pytest.LogCaptureFixture) -> None:
+    alone = Alone()
+    began, may_end, answered = threading.Event(), threading.Event(), list[Any]()
+
+    def answer(question: Any, _: Message) -> None:
+        answered.append(question)
+        began.set()
+        may_end.wait(10)
+
+    cast(Any, alone.sessions._main).answer = answer
+    alone.sessions._patches[alone.peer] = alone.patch
+    closing = threading.Thread()
+    alone.sessions._closing = [closing]
+    for question in ("first", "second"):
+        alone.sessions.answer(question, Message(b"", b"", 0))  # type: ignore[arg-type]
+    assert began.wait(10)
+    threads = alone.sessions.close()
+    assert not may_end.is_set()
+    assert closing in threads
+    assert (len(threads), alone.patch.closed, alone.sessions._patches) == (3, 1, {})
+    may_end.set()
+    alone.sessions._answering.shutdown()
+    assert (answered, caplog.records) == (["first"], [])
+
+
+async def test_whoever_is_told_again_that_it_is_not_heard_is_dialled(caplog: pytest.LogCaptureFixture) -> None:
+    alone, answered = Alone(), list[Any]()
+    main: Any = alone.sessions._main
+    main.answer_hearing = answered.extend
+    query = alone.question()
+    for _ in range(DEAF):
+        assert not alone.dialing.is_dialled(alone.peer)
+        alone.sessions._answer_hearing([query])
+        waiting = alone.sessions._hearing_answers
+        assert waiting is not None
+        await until(waiting.done)
+    assert alone.dialing.is_dialled(alone.peer)
+    assert (answered, caplog.records) == ([(query, [], b"")] * DEAF, [])
+
+    def fail(_: object) -> None:
+        raise MemoryError
+
+    main.answer_hearing = fail
+    alone.sessions._answer_hearing([query])
+    await until(lambda: bool(caplog.records))
+    assert [record.message for record in caplog.records] == ["an answer could not be sent"]
+
+
+async def test_a_link_is_heard_if_a_peer_has_no_filter_or_somebody_subscribes() -> None:
+    alone, heard = Alone(), [False]
+    alone.sessions._main.publishers = SimpleNamespace(is_heard=lambda: heard[0])  # type: ignore[assignment]
+    assert not alone.sessions.is_heard()
+    heard[0] = True
+    assert alone.sessions.is_heard()
+    heard[0] = False
+    alone.hears()
+    assert alone.sessions.is_heard()
+    alone.sessions._filters.joined((alone.peer, None, FIRST_SESSION), write_filter(["*"], ["base"]))
+    assert not alone.sessions.is_heard()
+
+
+async def test_newest_samples_go_to_those_sessions_that_are_heard_slowly() -> None:
+    alone, sent = Alone(), list[tuple[str, Message]]()
+
+    def publishers(name: str, heard: bool) -> Any:
+        return SimpleNamespace(is_heard_slowly=lambda: heard, put_slowly=lambda message: sent.append((name, message)))
+
+    alone.sessions._main.publishers = publishers("main", False)
+    assert not alone.sessions.is_heard_slowly()
+    for name, heard, is_open in (
+        ("first", True, True),
+        ("second", True, True),
+        ("deaf", False, True),
+        ("new", True, False),
+    ):
+        patch: Any = Patch(name)
+        patch.publishers, patch.is_open = publishers(name, heard), is_open
+        alone.sessions._patches[name] = patch
+    assert alone.sessions.is_heard_slowly()
+    messages = [Message(b"1", b"", 1), Message(b"2", b"", 1)]
+    alone.sessions.put_slowly(messages)
+    assert sent == [(name, message) for message in messages for name in ("first", "second")]
+
+
+async def test_whoever_was_found_instead_is_dialled_if_it_is_a_link_that_is_not_there() -> None:
+    alone = Alone()
+    dialing, unmet = alone.dialing, alone.sessions._unmet
+    link, bare = uuid4().hex, uuid4().hex
+    alone.hears()
+    for session, is_link in ((alone.id, True), (link, True), (bare, False), (alone.peer, True)):
+        alone.sessions._note_found(session, is_link, "tcp/10.0.0.8:1")
+    assert dialing.addresses(alone.id) == []
+    assert [dialing.addresses(session)[0] for session in (link, bare, alone.peer)] == ["tcp/10.0.0.8:1"] * 3
+    assert [session for session in (alone.id, link, bare, alone.peer) if dialing.is_dialled(session)] == [link]
+    assert unmet._looks.keys() == {bare}
+
+
+class Dialled(Patch):
+    """What is dialled when a peer is lost; a test says what it finds, and whether it opens."""
+
+    found: tuple[str, bool] | None = None
+    fails = False
+    opens: Any = None
+    made: list["Dialled"]
+
+    def __init__(self, _config: object, _keys: Keys, peer: str, *_: object) -> None:
+        super().__init__(peer)
+        self.made.append(self)
+
+    def open(self) -> None:
+        if self.fails:
+            raise OSError("nobody is there any more")
+        if self.opens is not None:
+            self.opens()
+
+    async def meet(self, is_present: object, seconds: float) -> None:
+        pass
+
+    def found_instead(self) -> tuple[str, bool] | None:
+        return self.found
+
+
+@pytest.fixture
+def dialled(monkeypatch: pytest.MonkeyPatch) -> type[Dialled]:
+    """The class of what the sessions dial with, where everybody is reachable."""
+
+    class One(Dialled):
+        made: ClassVar[list[Dialled]] = []  # type: ignore[misc]
+
+    async def is_reachable(address: str) -> bool:
+        return not address.startswith("udp/")
+
+    monkeypatch.setattr(_sessions, "Patch", One)
+    monkeypatch.setattr(_sessions, "is_reachable", is_reachable)
+    return One
+
+
+@pytest.mark.parametrize(
+    ("ways", "deaf", "found", "kept", "taken"),
+    [
+        (["patch"], False, None, True, False),
+        (["patch"], False, ("other", True), True, False),
+        ([], False, None, False, False),
+        ([], False, ("other", True), False, True),
+        (["patch", "direct"], False, None, False, False),
+        (["patch", "direct"], True, None, True, False),
+    ],
+)
+async def test_a_patch_stays_if_it_reaches_its_peer_and_nothing_else_does(
+    dialled: type[Dialled], ways: list[str], deaf: bool, found: tuple[str, bool] | None, kept: bool, taken: bool
+) -> None:
+    alone = Alone()
+    dialled.found = found
+    if "patch" in ways:
+        alone.sessions._present.note(alone.peer, (None, "x"), Presence.JOINED)
+    if "direct" in ways:
+        alone.hears()
+    if deaf:
+        alone.sessions._deaf.add(alone.peer)
+    await alone.sessions._patch(alone.peer, "tcp/10.0.0.7:1")
+    made: list[Any] = dialled.made
+    (patch,) = made
+    assert list(alone.sessions._patches.values()) == [patch] * kept
+    assert patch.closed == (not kept)
+    assert alone.dialing.addresses(alone.peer) == ([] if taken else ["tcp/10.0.0.7:1"])
+    assert alone.dialing.addresses("other") == (["tcp/10.0.0.7:1"] if taken else [])
+
+
+async def test_nobody_is_dialled_twice_or_where_nobody_can_be_reached(dialled: type[Dialled]) -> None:
+    alone = Alone()
+    await alone.sessions._patch(alone.peer, "udp/10.0.0.7:1")
+    assert dialled.made == []
+    alone.sessions._patches[alone.peer] = alone.patch
+    await alone.sessions._patch(alone.peer, "tcp/10.0.0.7:1")
+    assert (dialled.made, alone.patch.closed) == ([], 0)
+
+
+async def test_a_patch_that_does_not_open_ends(dialled: type[Dialled]) -> None:
+    alone = Alone()
+    dialled.fails = True
+    await alone.sessions._patch(alone.peer, "tcp/10.0.0.7:1")
+    assert ([patch.closed for patch in dialled.made], alone.sessions._patches) == ([1], {})
+
+
+async def test_a_patch_that_opens_for_long_is_not_waited_for_at_the_end(dialled: type[Dialled]) -> None:
+    alone = Alone()
+    may_open, opened = threading.Event(), list[bool]()
+
+    def open_slowly(_: Dialled) -> None:
+        anyio.from_thread.run_sync(scope.cancel)
+        opened.append(may_open.wait(10))
+
+    dialled.opens = open_slowly
+    with anyio.CancelScope() as scope:
+        await alone.sessions._patch(alone.peer, "tcp/10.0.0.7:1")
+    assert (scope.cancelled_caught, opened) == (True, [])
+    may_open.set()
+
+
+async def test_answers_come_from_peers_that_are_heard_directly_or_by_a_patch() -> None:
+    alone = Alone()
+    assert not alone.sessions._answers(alone.peer)
+    alone.sessions._patches[alone.peer] = alone.patch
+    assert alone.sessions._answers(alone.peer)
+    alone.sessions._patches.clear()
+    alone.hears()
+    assert alone.sessions._answers(alone.peer)
+
+
+async def test_a_link_hears_all_of_those_who_do_not_serve_its_filter_while_they_are_there() -> None:
+    alone = Alone()
+    notes, heard = alone.sessions._notes, list[frozenset[str]]()
+    # A link without a filter hears all of everybody in any case.
+    alone.sessions._note_served(alone.peer, False)
+    assert notes.since == math.inf
+    alone = Alone(frames=["base"])
+    notes, main = alone.sessions._notes, cast(Any, alone.sessions._main)
+    main.hear_all_of = heard.append
+    alone.hears()
+    notes.take()
+    for served, changed in ((True, False), (False, True), (False, False), (True, True), (False, True)):
+        alone.sessions._note_served(alone.peer, served)
+        assert (notes.since < math.inf) is changed, served
+        notes.take()
+        alone.sessions._hear_unserved()
+        assert heard.pop() == (set() if served else {alone.peer})
+    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT, NO_ROBOT)
+    alone.hears()
+    alone.sessions._note_directly(alone.peer, FIRST_SESSION, Presence.LEFT, NO_ROBOT)
+    notes.take()
+    alone.sessions._hear_unserved()
+    assert heard == [set()]
+
+    def fail(_: object) -> None:
+        raise zenoh.ZError("the session is closed")
+
+    main.hear_all_of = fail
+    alone.sessions._hear_unserved()
+    assert notes.since < math.inf, "it is tried again"
+
+
+async def one_round(alone: Alone, interval: float = 0.0) -> None:
+    """Have the link look once after what was noted; any time is later than an interval of nothing allows."""
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(alone.sessions.keep_connected, interval)
+        await until(lambda: alone.sessions._notes.since == math.inf)
+        await anyio.wait_all_tasks_blocked()
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_peer_that_is_heard_directly_is_asked_soon_after_a_change_of_its_connection() -> None:
+    alone = Alone()
+    alone.hears()
+    alone.note()
+    hearing, indirect = alone.sessions._hearing, uuid4().hex
+    hearing.is_heard(alone.peer)
+    seldom = hearing.next_due()
+    assert seldom is not None
+    alone.sessions._present.note(indirect, (None, "x"), Presence.JOINED)
+    for session in (alone.peer, indirect, "nobody"):
+        alone.sessions._notes.add_connection(session, "tcp/127.0.0.1:1", "tcp/10.0.0.7:1")
+    await one_round(alone)
+    assert hearing._checks.keys() == {alone.peer}
+    assert (hearing.next_due() or math.inf) < seldom
+
+
+async def test_silence_proves_nothing_while_the_loop_has_no_time_and_an_answer_does() -> None:
+    alone = Alone()
+    alone.sessions._main.ask_hearing = lambda *_: None  # type: ignore[method-assign]
+    alone.hears()
+    alone.note()
+    for answer, deaf in ((None, False), ([], True)):
+        for _ in range(DEAF):
+            assert not alone.dialing.is_dialled(alone.peer)
+            alone.sessions._notes.add_answer(alone.peer, answer, b"")
+            await one_round(alone)
+        assert alone.dialing.is_dialled(alone.peer) is deaf
+
+
+async def test_those_who_hear_this_link_are_asked_seldom_and_those_who_are_due_at_once() -> None:
+    alone, asked = Alone(), list[tuple[Any, ...]]()
+    hearing = alone.sessions._hearing
+    alone.sessions._main.ask_hearing = lambda *question: asked.append(question)  # type: ignore[method-assign]
+    alone.hears()
+    alone.note()
+    soon = hearing.next_due()
+    alone.sessions._note_heard(Keys(alone.domain, alone.peer).token(FIRST_SESSION).encode())
+    await one_round(alone)
+    assert (hearing.next_due() or 0.0) > (soon or math.inf)
+    assert asked == []
+    hearing._now = alone.sessions._introductions._now = lambda: monotonic() + 1_000.0
+    alone.sessions._notes.stir()
+    await one_round(alone)
+    # It is asked whether it hears this link, and for those whom this link lacks.
+    known = alone.sessions._introductions.question([alone.peer])
+    assert [(question[0], *question[2:]) for question in asked] == [(alone.peer,), (alone.peer, known)]
+    for _, take, *_ in asked:
+        take([FIRST_SESSION], b"named")
+    assert alone.sessions._notes.take().heard_by == [(alone.peer, [FIRST_SESSION], b"named")] * 2
+
+
+async def test_whoever_is_connected_and_was_not_met_is_dialled(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone, found, called = Alone(), list[tuple[str, str]](), list[tuple[str, str]]()
+
+    async def find(_: Unmet, connected: list[tuple[str, str | None]], *_rest: object) -> list[tuple[str, str]]:
+        found.extend((session, address or "") for session, address in connected)
+        return [(session, "tcp/10.0.0.9:1") for session, _ in connected]
+
+    async def dial(peer: str, address: str) -> None:
+        called.append((peer, address))
+
+    monkeypatch.setattr(Unmet, "find", find)
+    alone.sessions._patch = dial  # type: ignore[method-assign]
+    alone.sessions._patches[alone.peer] = alone.patch
+    for session in ("bare", alone.peer):
+        alone.sessions._notes.add_connection(session, "tcp/127.0.0.1:1", "tcp/10.0.0.8:1")
+    await one_round(alone)
+    assert found == [("bare", "tcp/10.0.0.8:1"), (alone.peer, "tcp/10.0.0.8:1")]
+    assert called == [("bare", "tcp/10.0.0.9:1")], "the other one is dialled already"

@@ -41,11 +41,15 @@ async def test_clients_behind_a_router_hear_each_other_and_late_ones_have_everyt
 async def test_clients_of_routers_that_are_connected_hear_each_other(address: str, domain: str) -> None:
     other = free_address()
     with Bus() as one, Bus() as two:
-        async with ZenohRouter(address), ZenohRouter(other, connect=address):
-            async with client(one, domain, address) as link, client(two, domain, other):
-                await until(lambda: len(link.peers) == 1)
-                one.publish(static("map", "lidar"))
-                await until(lambda: set(latched(two)) == {"lidar"})
+        async with (
+            ZenohRouter(address),
+            ZenohRouter(other, connect=address),
+            client(one, domain, address) as link,
+            client(two, domain, other),
+        ):
+            await until(lambda: len(link.peers) == 1)
+            one.publish(static("map", "lidar"))
+            await until(lambda: set(latched(two)) == {"lidar"})
 
 
 @pytest.mark.thorough
