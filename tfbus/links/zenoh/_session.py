@@ -141,7 +141,7 @@ class ZenohSession:
         self._close_at_exit = weakref.finalize(self, close_session, session)
         remote, keys = zenoh.Locality.REMOTE, self._keys
         self.publishers = Publishers(session, keys)
-        # Whoever sees the token can ask at once. zenoh undeclares what nobody refers to.
+        # Whoever sees the token can ask at once. zenoh undeclares a token that nobody refers to.
         self._declared = [
             *(
                 session.declare_subscriber(key, directly(self._receive_live), allowed_origin=remote)
