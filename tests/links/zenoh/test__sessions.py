@@ -558,9 +558,9 @@ async def test_the_end_leaves_answers_behind_and_closes_patches_once(caplog: pyt
     began, may_end, answered = threading.Event(), threading.Event(), list[Any]()
 
     def answer(question: Any, _: Message) -> None:
-        answered.append(question)
         began.set()
         may_end.wait(10)
+        answered.append(question)
 
     cast(Any, alone.sessions._main).answer = answer
     alone.sessions._patches[alone.peer] = alone.patch
@@ -570,7 +570,7 @@ async def test_the_end_leaves_answers_behind_and_closes_patches_once(caplog: pyt
         alone.sessions.answer(question, Message(b"", b"", 0))  # type: ignore[arg-type]
     assert began.wait(10)
     threads = alone.sessions.close()
-    assert not may_end.is_set()
+    assert answered == [], "nobody waits for it"
     assert closing in threads
     assert (len(threads), alone.patch.closed, alone.sessions._patches) == (3, 1, {})
     may_end.set()
@@ -817,6 +817,16 @@ async def test_a_peer_that_is_heard_directly_is_asked_soon_after_a_change_of_its
     await one_round(alone)
     assert hearing._checks.keys() == {alone.peer}
     assert (hearing.next_due() or math.inf) < seldom
+
+
+@pytest.mark.parametrize("frames", [None, ["base"]])
+async def test_whom_a_filter_does_not_suffice_for_is_looked_after_in_each_round(frames: list[str] | None) -> None:
+    alone, heard = Alone(frames), list[frozenset[str]]()
+    cast(Any, alone.sessions._main).hear_all_of = heard.append
+    alone.hears()
+    alone.sessions._note_served(alone.peer, False)
+    await one_round(alone)
+    assert heard == ([] if frames is None else [{alone.peer}])
 
 
 async def test_silence_proves_nothing_while_the_loop_has_no_time_and_an_answer_does() -> None:

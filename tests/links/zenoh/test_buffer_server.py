@@ -230,6 +230,7 @@ async def test_a_question_that_fails_for_no_reason_of_its_own_waits_where_its_er
 async def test_what_waits_for_the_event_loop_ends_with_the_server(address: str, domain: str) -> None:
     with Bus() as bus, Buffer(bus) as buffer:
         async with BufferServer(buffer, domain, listen=address) as server:
+            await settle()
             # Nobody would answer it.
             server._received.append("me")
             assert server.statistics().queue.pending == 1
