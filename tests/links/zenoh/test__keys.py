@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import pytest
 import zenoh
 
@@ -10,6 +12,7 @@ from tfbus.links.zenoh._keys import (
     Keys,
     check_domain,
     check_robot,
+    new_id,
     robots_expression,
 )
 
@@ -84,6 +87,13 @@ def test_of_a_token_the_robot_is_told_and_the_link_if_it_is_meant_to_be_heard() 
         assert keys.heard_link(token.encode()) == heard
     for token in (Keys("yard", B, "r1").token(FIRST_SESSION), Keys("yard/arm", B, "r1").token("x"), "", "\xff"):
         assert keys.heard_link(token.encode("latin-1")) is None
+
+
+def test_a_new_id_is_that_of_a_link_or_of_a_session_and_never_the_same() -> None:
+    ids = [new_id() for _ in range(100)]
+    assert len(set(ids)) == len(ids)
+    for link, session in pairwise(ids):
+        assert Keys("yard", A).session(Keys("yard", link).token(session)) == (link, session)
 
 
 @pytest.mark.parametrize(

@@ -651,7 +651,7 @@ async def test_whoever_was_found_instead_is_dialled_if_it_is_a_link_that_is_not_
 
 
 class Dialled(Patch):
-    """What is dialled when a peer is lost; a test says what it finds, and whether it opens."""
+    """A patch for a lost peer; a test says what it finds, and whether it opens."""
 
     found: tuple[str, bool] | None = None
     fails = False
@@ -677,7 +677,7 @@ class Dialled(Patch):
 
 @pytest.fixture
 def dialled(monkeypatch: pytest.MonkeyPatch) -> type[Dialled]:
-    """The class of what the sessions dial with, where everybody is reachable."""
+    """The class of the patches that the sessions make; nobody is reachable over UDP."""
 
     class One(Dialled):
         made: ClassVar[list[Dialled]] = []  # type: ignore[misc]

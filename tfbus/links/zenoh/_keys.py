@@ -16,6 +16,7 @@ Where *robot* is ``~`` for a link without one, and *link* is 32 hexadecimal digi
                                       another one, of a link that hears only some frames: its filter
 """
 
+import os
 import re
 from dataclasses import dataclass
 
@@ -134,6 +135,11 @@ class Keys:
         if not _ID.fullmatch(link) or not (robot == NO_ROBOT or _NAME.fullmatch(robot)):
             return None
         return link if key == f"tfbus/{self.domain}/{robot}/{kind}/{link}" else None
+
+
+def new_id() -> str:
+    """A random name of a link, of a session, or of whoever asks or answers lookups: 32 hexadecimal digits."""
+    return os.urandom(16).hex()
 
 
 def check_domain(domain: str) -> str:

@@ -1,6 +1,5 @@
 """A session that mends a broken connection to one peer."""
 
-import os
 from collections.abc import Callable
 
 import anyio
@@ -8,7 +7,7 @@ import zenoh
 
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.zenoh._filters import Filters
-from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
+from tfbus.links.zenoh._keys import FIRST_SESSION, Keys, new_id
 from tfbus.links.zenoh._session import ZenohSession
 
 
@@ -54,7 +53,7 @@ class Patch(ZenohSession):
             keys,
             self._receive_any,
             self._note_any,
-            os.urandom(16).hex(),
+            new_id(),
             note_connection=lambda session, *_: self._ends.setdefault(session),
             filters=filters,
             note_served=note_served,

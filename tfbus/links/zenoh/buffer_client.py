@@ -1,7 +1,6 @@
 """Lookups in the buffer of another process, which a `BufferServer` there answers."""
 
 import math
-import os
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,6 +15,7 @@ from tfbus.bus.sample_queue import check_capacity
 from tfbus.errors import LookupTimeoutError, RemoteLookupError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import Cancellation, RemoteQuestion, read_answer, write_question
+from tfbus.links.zenoh._keys import new_id
 from tfbus.links.zenoh._lookup_session import LookupSession
 from tfbus.links.zenoh._settings import Addresses
 from tfbus.links.zenoh.buffer_server import LONGEST_WAIT
@@ -84,7 +84,7 @@ class BufferClient:
         check_capacity(capacity)
         self._session = LookupSession(domain, robot, link, listen, connect, config, lease)
         self._capacity = capacity
-        self._id = os.urandom(16).hex()
+        self._id = new_id()
         self._entered = False
         self._is_open = False
         self._number = 0

@@ -1,6 +1,5 @@
 """The server of a buffer: other processes ask it, and wait for the answers, instead of hearing all that it holds."""
 
-import os
 import threading
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -28,6 +27,7 @@ from tfbus.links._remote_lookup import (
     read_question,
     write_answer,
 )
+from tfbus.links.zenoh._keys import new_id
 from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 from tfbus.links.zenoh._settings import Addresses
 from tfbus.links.zenoh.zenoh_link import ZenohLink
@@ -131,7 +131,7 @@ class BufferServer:
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._take_all, self._tasks)
         self._session.follow("@asking", self._note_asker)
-        self._session.answer(self._receive, os.urandom(16).hex())
+        self._session.answer(self._receive, new_id())
         return self
 
     async def __aexit__(
