@@ -147,14 +147,6 @@ async def test_an_address_in_use_is_an_os_error_and_a_router_is_entered_once(add
         pass
 
 
-async def test_a_robot_is_heard_in_full_or_at_a_rate_and_not_both() -> None:
-    with Bus() as bus:
-        keys = ZenohLink(bus, robots={"r1": math.inf, "s*": 2.0})._zenoh._keys
-        assert (keys.robots, keys.slow_robots) == (("r1",), (("s$*", 2.0),))
-        keys = ZenohLink(bus, robots=["r1", "s*"])._zenoh._keys
-        assert (keys.robots, keys.slow_robots) == (("r1", "s$*"), ())
-
-
 async def test_what_makes_no_sense_is_refused_at_once() -> None:
     with pytest.raises(ValueError, match="garbage"):
         ZenohRouter("garbage")

@@ -387,6 +387,14 @@ async def test_arguments_that_make_no_sense_are_refused_at_once() -> None:
             ZenohLink(bus, **{name: value})
 
 
+async def test_a_robot_is_heard_in_full_or_at_a_rate_and_not_both() -> None:
+    with Bus() as bus:
+        keys = ZenohLink(bus, robots={"r1": math.inf, "s*": 2.0})._zenoh._keys
+        assert (keys.robots, keys.slow_robots) == (("r1",), (("s$*", 2.0),))
+        keys = ZenohLink(bus, robots=["r1", "s*"])._zenoh._keys
+        assert (keys.robots, keys.slow_robots) == (("r1", "s$*"), ())
+
+
 async def test_the_bus_may_close_while_it_is_linked(place: Place) -> None:
     with Bus() as there:
         here = Bus()
