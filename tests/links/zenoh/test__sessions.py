@@ -1,6 +1,6 @@
 import math
 import threading
-from collections.abc import AsyncIterator, Collection, Iterable
+from collections.abc import AsyncIterator, Callable, Collection, Iterable
 from contextlib import asynccontextmanager
 from queue import Queue
 from time import monotonic
@@ -654,7 +654,7 @@ class Dialled(Patch):
     """A patch for a lost peer; a test says what it finds, and whether it opens."""
 
     found: tuple[str, bool] | None = None
-    fails = False
+    fails = met = False
     opens: Any = None
     made: list["Dialled"]
 
@@ -668,8 +668,9 @@ class Dialled(Patch):
         if self.opens is not None:
             self.opens()
 
-    async def meet(self, is_present: object, seconds: float) -> None:
-        pass
+    async def meet(self, is_present: Callable[[], bool], seconds: float) -> None:
+        assert seconds == _sessions._MEETING_TIME
+        self.met = is_present()
 
     def found_instead(self) -> tuple[str, bool] | None:
         return self.found
@@ -716,7 +717,7 @@ async def test_a_patch_stays_if_it_reaches_its_peer_and_nothing_else_does(
     made: list[Any] = dialled.made
     (patch,) = made
     assert list(alone.sessions._patches.values()) == [patch] * kept
-    assert patch.closed == (not kept)
+    assert (patch.closed, patch.met) == (not kept, ways != [])
     assert alone.dialing.addresses(alone.peer) == ([] if taken else ["tcp/10.0.0.7:1"])
     assert alone.dialing.addresses("other") == (["tcp/10.0.0.7:1"] if taken else [])
 
