@@ -147,6 +147,7 @@ def test_questions_are_limited_in_number_and_malformed_ones_are_dropped(join: Jo
         again = session.get(key, payload=bytes(8))
         first.session.answer(first.next().content.handle, Message(b"payload", b"", 0))
         assert len(list(again)) == 1
+    assert first.session._questions == 0
 
 
 def test_the_end_does_not_overtake_a_live_message(join: Join) -> None:
