@@ -463,6 +463,43 @@ def test_a_pause_and_a_new_rate_count_from_their_moment(
 
 
 @pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize(
+    ("goes_on", "left"),
+    [(Player.resume, 10.0), (Player.step, 0.0), (lambda player: setattr(player, "rate", 5.0), math.inf)],
+    ids=["resume", "step", "rate"],
+)
+def test_a_paused_player_that_waits_is_woken_by_what_makes_it_go_on(
+    tmp_path: Path, simulated: bool, goes_on: Callable[[Player], None], left: float
+) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+    heard: list[float] = []
+
+    async def play() -> None:
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            events = [anyio.Event(), anyio.Event()]
+
+            def hear(_: Batch) -> None:
+                events[len(heard)].set()
+                heard.append(anyio.current_time())
+
+            bus.subscribe(hear)
+            player = Player(bus, path)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                await events[0].wait()
+                player.pause()
+                await anyio.sleep(100.0)
+                goes_on(player)
+                with anyio.move_on_after(1_000.0):
+                    await events[1].wait()
+                tasks.cancel_scope.cancel()
+
+    in_virtual_time(play)
+    # Another rate alone does not end the pause.
+    assert [time - heard[0] for time in heard] == pytest.approx([0.0, 100.0 + left][: 1 + (left < math.inf)], abs=1e-6)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
 def test_a_seek_is_followed_at_once_and_a_pause_lasts_beyond_it(tmp_path: Path, simulated: bool) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1_000.0, 2_000.0)))
     times: list[float] = []
