@@ -317,6 +317,22 @@ async def test_the_last_samples_of_a_burst_are_written_when_a_period_is_over(
             await until(lambda: recorder.statistics().samples == 2)
 
 
+async def test_a_flush_and_the_end_do_not_wait_for_more_samples(
+    tmp_path: Path, writes: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tfbus.recording.recorder._WRITE_PERIOD", PATIENCE)
+    with Bus(SimulatedClock()) as bus, anyio.fail_after(PATIENCE / 4):
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
+            bus.publish(moving("map", "a", 1))
+            await settle()
+            assert writes == []
+            await recorder.flush()
+            assert writes == [(1, True)]
+            bus.publish(moving("map", "a", 2))
+            await settle()
+    assert recorder.statistics().samples == 2
+
+
 async def test_several_tasks_may_wait_for_a_flush(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
@@ -469,10 +485,14 @@ async def test_flush_returns_when_the_disk_fails(pipe: Pipe) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, pipe.path, overwrite=True) as recorder:
             pipe.break_off()
-            bus.publish(moving("map", "a", 1))
+            for stamp in range(_SLICE + 1):
+                bus.publish(moving("map", "a", stamp))
             with anyio.fail_after(PATIENCE):
                 await recorder.flush()
             assert isinstance(recorder.error, BrokenPipeError)
+        queue = recorder.statistics().queue
+        # Also what was not passed to the disk yet.
+        assert (queue.pending, queue.dropped) == (0, _SLICE + 1)
 
 
 FULL_DISK = """
