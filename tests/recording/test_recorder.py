@@ -333,6 +333,18 @@ async def test_a_flush_and_the_end_do_not_wait_for_more_samples(
     assert recorder.statistics().samples == 2
 
 
+async def test_what_a_message_cannot_hold_is_counted_and_not_pending(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, path) as recorder:
+            # A stamp of ROS has 31 bits for the seconds.
+            bus.publish([moving("map", "a", 2**31 * SECOND), moving("map", "b", 2**31 * SECOND - 1)])
+            await recorder.flush()
+            statistics = recorder.statistics()
+    assert (statistics.samples, statistics.messages, sum(statistics.refused.values())) == (1, 1, 1)
+    assert (statistics.queue.pending, offered(statistics)) == (0, 2)
+
+
 async def test_several_tasks_may_wait_for_a_flush(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
@@ -383,6 +395,8 @@ async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(t
 
 async def test_each_time_that_dropping_begins_there_is_one_event(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
+        # Also if something is pending from the beginning on.
+        bus.publish(static("map", "rig"))
         async with Recorder(bus, tmp_path / "run.mcap", capacity=10) as recorder:
             for _ in range(2):
                 for sample in noise(15):
