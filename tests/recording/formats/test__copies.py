@@ -1,5 +1,6 @@
 import json
 import sqlite3
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -8,7 +9,15 @@ from support.recorded import messages_in
 from support.samples import moving
 
 from tfbus.recording.formats._channels import TYPE_HASH
-from tfbus.recording.formats._copies import BagCopy, CannotWriteError, McapCopy, SqliteCopy, transform_channel
+from tfbus.recording.formats._copies import (
+    BagCopy,
+    CannotWriteError,
+    FoxgloveCopy,
+    McapCopy,
+    SqliteCopy,
+    transform_channel,
+)
+from tfbus.recording.formats._foxglove import FRAME_TRANSFORMS
 from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import encode
 
@@ -45,6 +54,49 @@ def test_transforms_get_a_channel_in_the_encoding_of_the_copy() -> None:
     assert transform_channel(TF, "cdr", {"a": "b"}).type == "tf2_msgs/msg/TFMessage"
     ros1 = transform_channel(TF, "ros1", {})
     assert (ros1.topic, ros1.type, ros1.encoding) == ("/tf", "tf2_msgs/TFMessage", "ros1")
+
+
+def test_a_copy_holds_transforms_in_its_own_encoding(tmp_path: Path) -> None:
+    pytest.importorskip("foxglove")
+    ros1, json_ = Channel("/tf", "tf2_msgs/TFMessage", "ros1"), Channel("/tf", FRAME_TRANSFORMS, "json")
+    foxglove, other = (Channel("/tf", kind, "protobuf") for kind in (FRAME_TRANSFORMS, "foxglove.FrameTransform"))
+    channels = (TF, ros1, json_, foxglove, other)
+    for kind, held in ((McapCopy, channels), (BagCopy, [ros1]), (SqliteCopy, [TF]), (FoxgloveCopy, [foxglove])):
+        copy = kind(tmp_path / "run", "run")
+        assert [channel for channel in channels if copy.holds(channel)] == list(held)
+        copy.close()
+
+
+def test_without_the_extra_a_copy_in_foxglove_s_schema_makes_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove.messages", None)
+    with pytest.raises(ImportError):
+        FoxgloveCopy(tmp_path / "run", "run")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("times", "start", "duration"),
+    [([], 0, 0), ([0], 0, 0), ([7, 5, 9], 5, 4), ([-9, -5, -7], -9, 4)],
+)
+def test_the_metadata_have_the_first_time_and_the_duration(
+    tmp_path: Path, times: list[int], start: int, duration: int
+) -> None:
+    path = tmp_path / "run.db3"
+    copy = SqliteCopy(path, "run.db3")
+    for time in times:
+        copy.write(TF, time, PAYLOAD)
+    copy.finish()
+    with closing(sqlite3.connect(path)) as file:
+        ((text,),) = file.execute("SELECT metadata FROM metadata")
+    metadata = json.loads(text)["rosbag2_bagfile_information"]
+    (of_file,) = metadata["files"]
+    for each in (metadata, of_file):
+        assert each["starting_time"] == {"nanoseconds_since_epoch": start}
+        assert each["duration"] == {"nanoseconds": duration}
+        assert each["message_count"] == len(times)
+    assert [topic["message_count"] for topic in metadata["topics_with_message_count"]] == [len(times)] * bool(times)
 
 
 def test_the_metadata_have_the_hash_of_a_type_where_it_is_known(tmp_path: Path) -> None:
