@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 from support.joint_messages import KIND, joint_state
+from support.open_files import is_open
 from support.recorded import real, write_mcap
 
 from tfbus import Joint, RecordingError, RobotModel, Transform, TransformStamped
@@ -69,6 +70,8 @@ def test_a_recording_without_positions_is_refused_and_says_where_there_are_some(
     with pytest.raises(RecordingError, match="topics with them: /arm/joint_states") as raised:
         load_joint_states(path, ARM)
     assert raised.value.reason == "no such topic"
+    # Its traceback still refers to the file.
+    assert not is_open(path)
     assert load_joint_states(path, ARM, "arm/joint_states").inserted == 1
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from rosbags.rosbag2 import StoragePlugin
+from support.open_files import is_open
 from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in
 from support.samples import moving, static
 
@@ -172,6 +173,8 @@ def test_another_database_is_no_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="an SQLite file, but no recording of ROS 2") as raised:
         open_recording(path)
     assert raised.value.reason == "foreign"
+    # Its traceback still refers to the file.
+    assert not is_open(path)
 
 
 def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
