@@ -166,12 +166,14 @@ def test_chunks_are_scanned_as_they_are_split() -> None:
     # One byte shorter than its header, and as long.
     for size, is_whole in ((21, False), (22, True)):
         one = record(Opcode.MESSAGE, bytes(size))
-        begins, ends = np.array([0, len(one)]), np.array([len(one), len(one) + len(parts[0])])
-        if is_whole:
-            assert scan_chunks(one + parts[0], begins, ends, registered.append).numbers.tolist() == [0, 3]
-        else:
-            with pytest.raises(ValueError, match="a message is too short"):
-                scan_chunks(one + parts[0], begins, ends, registered.append)
+        for order in ((one, parts[0]), (parts[0], one)):
+            begins, ends = np.array([0, len(order[0])]), np.cumsum([*map(len, order)])
+            if is_whole:
+                found = scan_chunks(b"".join(order), begins, ends, registered.append)
+                assert found.numbers.tolist() == [0 if each is one else 3 for each in order]
+            else:
+                with pytest.raises(ValueError, match="a message is too short"):
+                    scan_chunks(b"".join(order), begins, ends, registered.append)
 
 
 def chunk(data: bytes, size: int, crc: int = 0, compression: bytes = b"") -> bytes:
