@@ -5,6 +5,8 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
+from support.open_files import is_open
 from support.recorded import messages_in
 from support.samples import moving
 
@@ -35,9 +37,28 @@ def test_a_message_is_written_once_for_each_of_two_channels_of_one_topic(
     for received, channel in ((1, TF), (2, same), (3, TF)):
         copy.write(channel, received, PAYLOAD)
     copy.finish()
+    assert not is_open(path)
     assert [(message.received, message.batch) for message in messages_in(path)] == [
         (received, (moving("a", "b", 5),)) for received in (1, 2, 3)
     ]
+
+
+def test_a_copy_in_mcap_is_a_recording_of_ros_2(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    copy = McapCopy(path, "run")
+    copy.write(Channel("/log", "", "json"), 5, b"{}")
+    copy.write(TF, 6, PAYLOAD)
+    copy.finish()
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert [(entry.name, entry.metadata) for entry in reader.iter_metadata()] == [("rosbag2", {})]
+        assert (reader.get_header().profile, reader.get_header().library) == ("ros2", "tfbus")
+        # A message without a type has no schema.
+        found = [
+            (schema and schema.name, channel.topic, each.log_time, each.publish_time, each.data)
+            for schema, channel, each in reader.iter_messages()
+        ]
+    assert found == [(None, "/log", 5, 5, b"{}"), ("tf2_msgs/msg/TFMessage", "/tf", 6, 6, PAYLOAD)]
 
 
 def test_times_before_1970_are_refused_where_a_format_has_none(tmp_path: Path) -> None:

@@ -28,6 +28,8 @@ def packed(*contents: bytes, low: int = 0, high: int = 100) -> tuple[list[tuple[
     chunks = [OpenChunk(ChunkPlace(5, 9, at), content) for at, content in enumerate(contents)]
     found = []
     for block in ChunkPacker(CHANNELS.get, lambda _: None, counts.update).pack(chunks, low, high):
+        damaged = not isinstance(block, Packed) and any(not isinstance(channel, Channel) for _, channel, _ in block)
+        assert isinstance(block, Packed) != damaged
         for received, channel, payload in block.stored() if isinstance(block, Packed) else block:
             found.append((received, channel.type if isinstance(channel, Channel) else channel.detail, payload))
     return found, counts
@@ -62,7 +64,7 @@ def test_the_messages_of_the_good_chunks_are_counted_beside_a_damaged_one(
     lost = f"the chunk at byte 1: {why}"
     assert packed(good, damaged, good) == ([(5, lost, b""), *[(7, "b", b"x")] * 2], {3: 2, 8: 2})
     assert packed(damaged, low=6) == ([(6, lost.replace("1", "0", 1), b"")], {})
-    # So many are packed.
+    # Where nothing is damaged, so many are packed.
     assert packed(good, good) == ([(7, "b", b"x")] * 2, {3: 2, 8: 2})
 
 
