@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from rosbags.rosbag1 import Reader
 from support.open_files import is_open
 from support.recorded import messages_in
 from support.samples import moving
@@ -97,6 +98,30 @@ def test_without_the_extra_a_copy_in_foxglove_s_schema_makes_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_definition_of_a_type_stays_where_it_is_one_of_ros_2(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    copy = SqliteCopy(path, "run.db3")
+    for kind, encoding in (("a/msg/A", "ros2msg"), ("b/msg/B", "ros2idl"), ("c/msg/C", "")):
+        copy.write(Channel(f"/{kind}", kind, "cdr", encoding, b"int8 x"), 1, b"")
+    copy.write(Channel("/tf", TF.type, "cdr", "ros2msg", b"int8 y"), 1, b"")
+    copy.finish()
+    with closing(sqlite3.connect(path)) as file:
+        found = file.execute("SELECT * FROM message_definitions ORDER BY id").fetchall()
+    assert found == [(1, "a/msg/A", "ros2msg", "int8 x", ""), (2, TF.type, "ros2msg", "int8 y", TYPE_HASH)]
+
+
+def test_a_bag_is_latching_where_transforms_are_static(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    copy = BagCopy(path, "run.bag")
+    for topic in ("/tf", "/tf_static"):
+        copy.write(Channel(topic, TF.type, "cdr"), 1, PAYLOAD)
+    copy.finish()
+    with Reader(path) as bag:
+        # As a publisher of ROS 1 says it: not at all, or 1.
+        found = {each.topic: getattr(each.ext, "latching", "") for each in bag.connections}
+    assert found == {"/tf": None, "/tf_static": 1}
+
+
 @pytest.mark.parametrize(
     ("times", "start", "duration"),
     [([], 0, 0), ([0], 0, 0), ([7, 5, 9], 5, 4), ([-9, -5, -7], -9, 4)],
@@ -130,6 +155,8 @@ def test_the_metadata_have_the_hash_of_a_type_where_it_is_known(tmp_path: Path) 
         (metadata,) = file.execute("SELECT metadata FROM metadata").fetchone()
         columns = dict(file.execute("SELECT name, type_description_hash FROM topics"))
         assert [number for (number,) in file.execute("SELECT id FROM topics ORDER BY id")] == [1, 2]
+        ((version,),) = file.execute("SELECT metadata_version FROM metadata")
+    assert json.loads(metadata)["rosbag2_bagfile_information"]["version"] == version
     topics = json.loads(metadata)["rosbag2_bagfile_information"]["topics_with_message_count"]
     told = {topic["topic_metadata"]["name"]: topic["topic_metadata"]["type_description_hash"] for topic in topics}
     assert told == columns == {"/tf": TYPE_HASH, "/talk": ""}
