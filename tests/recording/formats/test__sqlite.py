@@ -137,7 +137,21 @@ def test_messages_on_topics_that_are_not_described_are_counted(tmp_path: Path) -
     assert [error.reason for error in lost.errors] == ["damaged"]
     assert "3 messages are on topics that the file does not describe" in str(lost.errors[0])
     assert lost.received == 30
-    # Of a part, nothing can be said.
+    # If these are all, at the start.
+    for received in (0, 7):
+        with closing(sqlite3.connect(path)) as file:
+            file.execute("DELETE FROM messages")
+            add(file, 99, received, b"")
+            file.commit()
+        (lost,) = messages_in(path)
+        assert (lost.received, len(lost.errors)) == (received, 1)
+
+
+def test_of_a_part_it_is_not_told_which_messages_are_on_topics_that_are_not_described(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        add(file, 99, 60, b"")
+    file.close()
     assert not any(message.errors for part in ((5, None), (None, 60)) for message in messages_in(path, *part))
 
 
