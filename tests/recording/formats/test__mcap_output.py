@@ -13,6 +13,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from support.open_files import is_open
 from support.samples import moving, static
 from support.strategies import samples
 
@@ -28,6 +29,7 @@ def written(path: Path, *entries: TimedBatch) -> McapOutput:
     with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write(entries)
         output.finish()
+        assert not is_open(path)
     return output
 
 

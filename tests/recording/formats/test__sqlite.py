@@ -1,5 +1,6 @@
 import shutil
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from support.samples import moving, static
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
-from tfbus.recording.formats._sqlite import SqliteStorage
+from tfbus.recording.formats._sqlite import _BLOCK, SqliteStorage
 from tfbus.tf_message import encode
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -213,6 +214,34 @@ def test_a_computed_column_cannot_claim_more_than_a_message_may_have(tmp_path: P
     assert "nothing more can be read: string or blob too big" in str(lost.errors[0])
     assert "promises 1 messages on '/tf', and 0 were found" in str(promised.errors[0])
     assert (lost.received, promised.received) == (received, received)
+
+
+def test_what_cannot_be_read_is_told_behind_the_last_message_that_was(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        file.execute("ALTER TABLE messages RENAME TO stored")
+        size = f"CASE WHEN timestamp < {_BLOCK + 7} THEN 1 ELSE {MAX_OTHER_MESSAGE + 1} END"
+        file.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob({size})))")
+        # So that they need not be sorted, for which all would be read.
+        file.execute("CREATE INDEX by_time ON messages(timestamp)")
+        for received in range(_BLOCK + 8):
+            file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, ?)", (received,))
+    file.close()
+    *read, lost, promised = messages_in(path)
+    # So many are read at once.
+    assert [message.received for message in read] == list(range(_BLOCK))
+    assert "nothing more can be read" in str(lost.errors[0])
+    assert (lost.received, promised.received) == (_BLOCK - 1, _BLOCK - 1)
+
+
+def test_a_file_that_one_thread_has_opened_is_read_and_closed_by_another(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    write(path).close()
+    with ThreadPoolExecutor(1) as other:
+        recording = other.submit(open_recording, path).result()
+    with recording:
+        assert [(message.received, message.batch) for message in recording.messages()] == IN_ORDER
+    assert not is_open(path)
 
 
 def test_a_file_that_is_cut_is_refused_or_gives_what_is_left_and_says_so(tmp_path: Path) -> None:
