@@ -27,3 +27,9 @@ def test_the_static_transforms_from_before_are_a_block_of_their_own(tmp_path: Pa
     assert isinstance(rest, Block)
     assert len(latched) == 1
     assert list(latched.messages()) == [RecordedMessage(3, (static("a", "b"),), ())]
+
+
+def test_messages_that_are_not_counted_yet_add_nothing_to_the_progress() -> None:
+    message = RecordedMessage(3, (static("a", "b"),), ())
+    block = DecodedBlock(iter([message]))
+    assert (len(block), list(block.messages())) == (0, [message])

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.allocations import peak_of
 
 from tfbus import SECOND
 from tfbus.recording._durations import _SINGLE, Durations
@@ -49,6 +50,21 @@ def test_zero_is_exact_and_nothing_has_no_spread() -> None:
     assert spread is not None
     assert (spread.mean, spread.p99, spread.max) == (0.0, 0.0, 0.0)
     assert Durations().spread() is None
+
+
+@pytest.mark.parametrize("at_once", [1, _SINGLE - 1])
+def test_durations_that_come_in_few_take_no_more_memory_the_more_there_are(at_once: int) -> None:
+    durations = Durations()
+
+    def count() -> None:
+        for _ in range(30 * _SINGLE // at_once):
+            if at_once == 1:
+                durations.add_one(7)
+            else:
+                durations.add(np.full(at_once, 7))
+
+    # Half of what they would take, at 8 bytes each.
+    assert peak_of(count) < 30 * _SINGLE * 8 / 2
 
 
 @pytest.mark.parametrize("at_once", [1, 7, _SINGLE - 1, _SINGLE, _SINGLE + 1, 2_500])

@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 import zstandard
 from rosbags.typesys import Stores, get_typestore
+from support.open_files import is_open
 from support.recorded import Line, real, write_mcap
 
 from tfbus import RecordingError
@@ -77,8 +78,12 @@ def test_without_headers_the_log_times_are_taken(tmp_path: Path) -> None:
 
 
 def test_a_topic_without_messages_is_an_error_that_names_the_others(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="nothing is on topic '/point'; there are /points"):
-        header_stamps(write(tmp_path / "run.mcap", POINT, b""), "/point")
+    path = write(tmp_path / "run.mcap", POINT, b"")
+    with pytest.raises(RecordingError, match="nothing is on topic '/point'; there are /points") as raised:
+        header_stamps(path, "/point")
+    # Its traceback still refers to the file.
+    assert raised.value.reason == "no such topic"
+    assert not is_open(path)
 
 
 @pytest.mark.parametrize(

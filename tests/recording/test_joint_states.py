@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 from support.joint_messages import KIND, joint_state
+from support.open_files import is_open
 from support.recorded import real, write_mcap
 
-from tfbus import Joint, RecordingError, RobotModel, Transform
+from tfbus import Joint, RecordingError, RobotModel, Transform, TransformStamped
 from tfbus.recording import load, load_joint_states
 
 ARM = RobotModel(
@@ -29,6 +30,8 @@ def test_the_links_are_where_the_positions_put_them(tmp_path: Path) -> None:
     for k, (x, y) in enumerate([(2.0, 0.0), (math.sqrt(2.0), math.sqrt(2.0)), (0.0, 2.0)]):
         assert tree.lookup("r/base", "r/tool", k).transform.translation == pytest.approx((x, y, 0.0), abs=1e-12)
     assert tree.lookup("r/upper", "r/tool").static
+    fixed = TransformStamped("r/upper", "r/tool", 0, Transform((2.0, 0.0, 0.0)), static=True)
+    assert fixed in tree.samples_around("r/tool", 2)
 
 
 def test_what_cannot_be_used_is_counted_and_the_rest_is_read(tmp_path: Path) -> None:
@@ -67,6 +70,8 @@ def test_a_recording_without_positions_is_refused_and_says_where_there_are_some(
     with pytest.raises(RecordingError, match="topics with them: /arm/joint_states") as raised:
         load_joint_states(path, ARM)
     assert raised.value.reason == "no such topic"
+    # Its traceback still refers to the file.
+    assert not is_open(path)
     assert load_joint_states(path, ARM, "arm/joint_states").inserted == 1
 
 

@@ -311,3 +311,14 @@ def test_samples_that_change_no_edge_are_stored_at_once_unless_one_is_beyond_the
     ]
     tree.insert(moving("a", "b", 84_920, 8_492.0))
     assert x_of(tree, "a", "b", 84_915) == 8_491.5
+
+
+def test_each_sample_of_a_block_is_inserted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Each message has a block of its own, and the first one names the frames.
+    monkeypatch.setattr("tfbus.recording.formats._mcap_reading._FIRST_BLOCK", 1)
+    stamps = [1, 2, 3, 4, 4, 5]
+    lines = [(at, "/tf", [moving("a", "b", stamp), moving("b", "c", stamp)]) for at, stamp in enumerate(stamps)]
+    tree = load(write_mcap(tmp_path / "run.mcap", lines, chunk_size=1))
+    # One stamp comes twice.
+    assert (tree.inserted, tree.replaced, tree.expired) == (2 * 5, 2, 0)
+    assert [(edge.child, edge.samples) for edge in tree.edges()] == [("b", 5), ("c", 5)]

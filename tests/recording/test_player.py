@@ -258,6 +258,41 @@ async def test_on_a_clock_that_cannot_jump_looping_removes_moving_frames(tmp_pat
     assert expired == 0
 
 
+async def test_only_what_moves_later_than_where_it_begins_again_is_removed(tmp_path: Path) -> None:
+    one = drive((0.0,))
+    later = (START + SECOND, (static("map", "base"), moving("map", "arm", START + SECOND)))
+    for entries, expected in ((one, []), ([*one, later], ["arm"])):
+        path = write_recording(tmp_path / "run.mcap", *entries)
+        with Bus() as bus, bus.events(stale_after=None) as events:
+            player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
+            for _ in range(2):
+                await player.play()
+            bus.close()
+            assert [event.frame async for event in events if isinstance(event, FrameRemoved)] == expected
+
+
+async def test_a_frame_that_another_sends_again_is_not_removed_with_those_that_were_played(tmp_path: Path) -> None:
+    arm = (START + 2 * SECOND, (moving("map", "arm", START + 2 * SECOND),))
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0)), arm)
+    with Bus() as bus, bus.events(stale_after=None) as events:
+        player = Player(bus, path, rate=AS_FAST_AS_POSSIBLE)
+        heard: list[str] = []
+
+        def begin_again(batch: Batch) -> None:
+            heard.append(batch[0].child)
+            if heard == ["base", "base", "arm", "base", "base"]:
+                bus.publish(moving("map", "arm", 5, authority="another"))
+            if heard[-1] == "arm" and len(heard) < 7:
+                player.seek(START)
+
+        bus.subscribe(begin_again)
+        await player.play()
+        bus.close()
+        removed = [event.frame async for event in events if isinstance(event, FrameRemoved)]
+    assert heard == ["base", "base", "arm"] + ["base", "base", "arm"] * 2
+    assert removed == ["base", "arm", "base"]
+
+
 async def test_a_frame_that_is_already_removed_is_no_error(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", *drive((0.0, 1.0)))
     with Bus() as bus:
@@ -460,6 +495,43 @@ def test_a_pause_and_a_new_rate_count_from_their_moment(
 
     in_virtual_time(play)
     assert heard[1] - heard[0] == pytest.approx(3.0 + 100.0 + left, abs=1e-6)
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+@pytest.mark.parametrize(
+    ("goes_on", "left"),
+    [(Player.resume, 10.0), (Player.step, 0.0), (lambda player: setattr(player, "rate", 5.0), math.inf)],
+    ids=["resume", "step", "rate"],
+)
+def test_a_paused_player_that_waits_is_woken_by_what_makes_it_go_on(
+    tmp_path: Path, simulated: bool, goes_on: Callable[[Player], None], left: float
+) -> None:
+    path = write_recording(tmp_path / "run.mcap", *drive((0.0, 10.0)))
+    heard: list[float] = []
+
+    async def play() -> None:
+        with Bus(SimulatedClock() if simulated else None) as bus:
+            events = [anyio.Event(), anyio.Event()]
+
+            def hear(_: Batch) -> None:
+                events[len(heard)].set()
+                heard.append(anyio.current_time())
+
+            bus.subscribe(hear)
+            player = Player(bus, path)
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(player.play)
+                await events[0].wait()
+                player.pause()
+                await anyio.sleep(100.0)
+                goes_on(player)
+                with anyio.move_on_after(1_000.0):
+                    await events[1].wait()
+                tasks.cancel_scope.cancel()
+
+    in_virtual_time(play)
+    # Another rate alone does not end the pause.
+    assert [time - heard[0] for time in heard] == pytest.approx([0.0, 100.0 + left][: 1 + (left < math.inf)], abs=1e-6)
 
 
 @pytest.mark.parametrize("simulated", [True, False])

@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import closing
 from io import BytesIO
 from pathlib import Path
 
 import anyio
+import anyio.from_thread
 import anyio.to_thread
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -27,6 +28,7 @@ from tfbus import (
     Bus,
     BusClosedError,
     Event,
+    QueueStatistics,
     RecorderStatistics,
     RecordingDropped,
     RecordingFailed,
@@ -37,8 +39,10 @@ from tfbus import (
     TransformStamped,
     TransformTree,
 )
+from tfbus.bus.sample_queue import TimedBatch
+from tfbus.recording.formats._mcap_output import McapOutput
 from tfbus.recording.load import load
-from tfbus.recording.recorder import Recorder
+from tfbus.recording.recorder import _SLICE, Recorder
 from tfbus.recording.recording import open_recording
 
 pytestmark = pytest.mark.anyio
@@ -231,6 +235,116 @@ async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(tmp_path: Pa
                 assert sum(map(len, recording.blocks())) == 5_120
 
 
+@pytest.fixture
+def writes(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, bool]]:
+    """The number of batches of each write, and whether it ends the chunk."""
+    found: list[tuple[int, bool]] = []
+    write = McapOutput.write
+
+    def note(output: McapOutput, batches: Iterable[TimedBatch], flush: bool = False) -> None:
+        several = list(batches)
+        write(output, several, flush)
+        found.append((len(several), flush))
+
+    monkeypatch.setattr(McapOutput, "write", note)
+    return found
+
+
+async def test_a_flush_ends_a_chunk_once_behind_all_that_is_pending(
+    tmp_path: Path, writes: list[tuple[int, bool]]
+) -> None:
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
+            for number in range(_SLICE + 1):
+                bus.publish(moving("map", "a", number))
+            await recorder.flush()
+            assert writes == [(_SLICE, False), (1, True)]
+
+
+async def test_a_flush_does_not_wait_for_what_comes_meanwhile(
+    tmp_path: Path, writes: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = McapOutput.write
+    more = iter(range(1, 100))
+
+    def publish_and_write(output: McapOutput, batches: Iterable[TimedBatch], flush: bool = False) -> None:
+        if (stamp := next(more, None)) is not None:
+            anyio.from_thread.run_sync(bus.publish, moving("map", "a", stamp))
+        write(output, batches, flush)
+
+    monkeypatch.setattr(McapOutput, "write", publish_and_write)
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
+            bus.publish(moving("map", "a", 0))
+            await recorder.flush()
+            assert writes == [(1, True)]
+            assert recorder.statistics().queue.pending == 1
+
+
+@pytest.mark.parametrize(("period", "flushed"), [(3_600.0, [True, False, False]), (0.0, [True] * 3)])
+async def test_a_chunk_ends_by_itself_when_a_period_is_over(
+    tmp_path: Path,
+    writes: list[tuple[int, bool]],
+    monkeypatch: pytest.MonkeyPatch,
+    period: float,
+    flushed: list[bool],
+) -> None:
+    monkeypatch.setattr("tfbus.recording.recorder._WRITE_PERIOD", 0.0)
+    monkeypatch.setattr("tfbus.recording.recorder._FLUSH_PERIOD", period)
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
+            for number in range(1, 4):
+                bus.publish(moving("map", "a", number))
+                await until(lambda number=number: len(writes) == number)  # type: ignore[misc]
+                statistics = recorder.statistics()
+                assert (statistics.samples, statistics.queue.pending) == (
+                    (number, 0) if period == 0.0 else (1, number - 1)
+                )
+            assert writes == [(1, flush) for flush in flushed]
+
+
+async def test_the_last_samples_of_a_burst_are_written_when_a_period_is_over(
+    tmp_path: Path, writes: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tfbus.recording.recorder._WRITE_PERIOD", 0.0)
+    monkeypatch.setattr("tfbus.recording.recorder._FLUSH_PERIOD", 0.02)
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
+            for number in range(2):
+                bus.publish(moving("map", "a", number))
+                await until(lambda number=number: len(writes) == number + 1)  # type: ignore[misc]
+            # Nothing more is published.
+            await until(lambda: recorder.statistics().samples == 2)
+
+
+async def test_a_flush_and_the_end_do_not_wait_for_more_samples(
+    tmp_path: Path, writes: list[tuple[int, bool]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tfbus.recording.recorder._WRITE_PERIOD", PATIENCE)
+    with Bus(SimulatedClock()) as bus, anyio.fail_after(PATIENCE / 4):
+        async with Recorder(bus, tmp_path / "run.mcap") as recorder:
+            bus.publish(moving("map", "a", 1))
+            await settle()
+            assert writes == []
+            await recorder.flush()
+            assert writes == [(1, True)]
+            bus.publish(moving("map", "a", 2))
+            await settle()
+    assert recorder.statistics().samples == 2
+
+
+async def test_what_a_message_cannot_hold_is_counted_and_not_pending(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, path) as recorder:
+            # A stamp of ROS has 31 bits for the seconds.
+            bus.publish([moving("map", "a", 2**31 * SECOND), moving("map", "b", 2**31 * SECOND - 1)])
+            await recorder.flush()
+            statistics = recorder.statistics()
+    assert (statistics.samples, statistics.messages, sum(statistics.refused.values())) == (1, 1, 1)
+    assert (statistics.queue.pending, offered(statistics)) == (0, 2)
+
+
 async def test_several_tasks_may_wait_for_a_flush(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, tmp_path / "run.mcap") as recorder, anyio.create_task_group() as tasks:
@@ -281,6 +395,8 @@ async def test_samples_faster_than_the_disk_are_recorded_or_counted_as_dropped(t
 
 async def test_each_time_that_dropping_begins_there_is_one_event(tmp_path: Path) -> None:
     with Bus(SimulatedClock()) as bus, bus.events() as events:
+        # Also if something is pending from the beginning on.
+        bus.publish(static("map", "rig"))
         async with Recorder(bus, tmp_path / "run.mcap", capacity=10) as recorder:
             for _ in range(2):
                 for sample in noise(15):
@@ -383,10 +499,14 @@ async def test_flush_returns_when_the_disk_fails(pipe: Pipe) -> None:
     with Bus(SimulatedClock()) as bus:
         async with Recorder(bus, pipe.path, overwrite=True) as recorder:
             pipe.break_off()
-            bus.publish(moving("map", "a", 1))
+            for stamp in range(_SLICE + 1):
+                bus.publish(moving("map", "a", stamp))
             with anyio.fail_after(PATIENCE):
                 await recorder.flush()
             assert isinstance(recorder.error, BrokenPipeError)
+        queue = recorder.statistics().queue
+        # Also what was not passed to the disk yet.
+        assert (queue.pending, queue.dropped) == (0, _SLICE + 1)
 
 
 FULL_DISK = """
@@ -620,3 +740,8 @@ def test_under_plain_asyncio_a_recorder_cancelled_while_opening_leaves_nothing_b
 def test_the_repr_is_one_line_with_file_and_samples(tmp_path: Path) -> None:
     recorder = Recorder(Bus(), tmp_path / "run.mcap")
     assert repr(recorder) == f"<Recorder of {str(tmp_path / 'run.mcap')!r}: 0 samples>"
+
+
+def test_before_it_begins_nothing_is_counted(tmp_path: Path) -> None:
+    queue = QueueStatistics("recording", "drop_oldest", 7, 0, 0)
+    assert Recorder(Bus(), tmp_path / "run.mcap", capacity=7).statistics() == RecorderStatistics(0, 0, 0, {}, queue)

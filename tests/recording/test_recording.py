@@ -13,14 +13,13 @@ import pytest
 from mcap.writer import Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from support.open_files import OPEN_FILES, is_open
 from support.recorded import SMALL, as_ros2, messages_in, write_mcap
 from support.samples import moving, static
 
 from tfbus import InvalidTransformError, RecordingError
 from tfbus.recording import RecordedTopic, open_recording
 from tfbus.tf_message import encode
-
-OPEN_FILES = Path("/proc/self/fd")
 
 SECOND = 1_000_000_000
 LINES = [
@@ -157,6 +156,9 @@ def test_other_files_are_refused_with_an_error_of_one_line(
     assert str(raised.value).startswith(f"recording {str(path)!r}: ")
     assert says in str(raised.value)
     assert "\n" not in str(raised.value)
+    # Its traceback still refers to all that was opened.
+    assert raised.tb is not None
+    assert not is_open(path)
 
 
 def test_a_topic_that_is_not_there_is_refused_with_ten_that_are(tmp_path: Path) -> None:
@@ -167,6 +169,8 @@ def test_a_topic_that_is_not_there_is_refused_with_ten_that_are(tmp_path: Path) 
     assert raised.value.reason == "no such topic"
     there = ", ".join(f"/robot_{number:02}/tf" for number in range(10))
     assert str(raised.value).endswith(f"topic 'gone' is not there; topics with transforms: {there}")
+    assert raised.tb is not None
+    assert not is_open(path)
 
 
 def test_a_file_that_does_not_exist_is_missing(tmp_path: Path) -> None:

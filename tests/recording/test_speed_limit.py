@@ -18,6 +18,8 @@ def kept(*places: float, speed: float = 2.0) -> tuple[list[float], Counter[str]]
     for at, x in enumerate(places):
         found += limit.admit((moving("a", "b", at * SECOND, x),))
     found += limit.undecided()
+    # Each of them once.
+    assert limit.undecided() == ()
     return [sample.transform.translation[0] for sample in found], limit.dropped
 
 

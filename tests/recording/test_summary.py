@@ -73,6 +73,18 @@ def test_a_frame_with_static_and_moving_samples_has_both_kinds(tmp_path: Path) -
     assert (frame.kind, frame.static, frame.moving, frame.parents) == ("both", 1, 2, ("a", "c"))
 
 
+@pytest.mark.parametrize("kinds", ["ms", "sm", "ss", "mm", "mss", "smm"])
+def test_samples_of_each_kind_are_counted_in_whatever_block_they_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kinds: str
+) -> None:
+    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", 1)
+    samples = [static("a", "b") if kind == "s" else moving("a", "b", at) for at, kind in enumerate(kinds)]
+    lines = [(at, "/tf_static" if sample.static else "/tf", [sample]) for at, sample in enumerate(samples)]
+    # Each has a block of its own.
+    (frame,) = summary_of(write_mcap(tmp_path / "run.mcap", lines, chunk_size=1)).frames
+    assert (frame.static, frame.moving) == (kinds.count("s"), kinds.count("m"))
+
+
 def test_an_empty_recording_has_an_empty_summary(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "run.mcap", [])
     assert summary_of(path) == RecordingSummary(path, True, None, None, 0, 0, (), (), {})

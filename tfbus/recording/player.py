@@ -182,7 +182,6 @@ class Player:
         if not self._paused:
             self._anchor()
             self._paused = True
-            self._stir()
 
     def resume(self) -> None:
         """Go on after a pause."""

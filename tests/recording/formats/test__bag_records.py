@@ -103,6 +103,8 @@ def test_a_record_of_another_kind_with_the_mark_of_a_chunk_in_a_field_is_no_chun
     real = record(field(b"size", bytes(4)) + field(b"op", b"\5"), mark)
     assert find_chunk(io.BytesIO(mark + real), 0) == len(mark)
     assert find_chunk(io.BytesIO(real), 1) is None
+    # It is at the very begin of the data of one that has none itself.
+    assert find_chunk(io.BytesIO(record(field(b"size", bytes(4)) + field(b"op", b"\5\0"), mark)), 0) is None
 
 
 def test_a_record_that_claims_more_than_its_bound_is_not_read() -> None:

@@ -1,3 +1,4 @@
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from support.samples import moving, static
 
 from tfbus import RecordingError
 from tfbus.recording import RecordedMessage, open_recording
+from tfbus.recording.formats._folder import _nameless_file
 
 ZSTD = {"fmt": CompressionFormat.ZSTD}
 LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
@@ -288,6 +290,11 @@ def test_a_compressed_file_unfolds_up_to_a_bound_and_nothing_of_it_stays(
         # What reads it has it open, and it has no name.
         assert list(temporary.iterdir()) == []
         assert sum(bool(message.batch) for message in recording.messages()) > 700
+
+
+def test_what_is_unpacked_is_for_nobody_else() -> None:
+    with _nameless_file() as file:
+        assert os.fstat(file.fileno()).st_mode & 0o077 == 0
 
 
 @pytest.mark.parametrize("received", [0, 7])

@@ -42,5 +42,16 @@ def test_the_bytes_are_those_of_foxglove_s_own_encoder() -> None:
 def test_a_name_that_is_no_text_is_refused() -> None:
     with pytest.raises(MalformedMessageError, match="UTF-8"):
         write_protobuf([RawTransform(0, 0, b"map", b"\xff", bytes(56))])
-    with pytest.raises(MalformedMessageError, match="does not fit"):
-        write_protobuf([RawTransform(2**63, 0, b"map", b"base", bytes(56))])
+
+
+def test_the_seconds_that_a_stamp_of_foxglove_holds_are_written() -> None:
+    for seconds in (-(2**63), -1, 2**63 - 1):
+        edge = RawTransform(seconds, 0, b"map", b"base", bytes(56))
+        assert parser_of(CHANNEL)(write_protobuf([edge])) == [edge]
+    # A negative number has ten bytes, as one of 64 bits in two's complement.
+    before = RawTransform(-1, 0, b"map", b"base", bytes(56))
+    assert b"\x08" + b"\xff" * 9 + b"\x01\x10" in write_protobuf([before])
+    for seconds in (-(2**63) - 1, 2**63):
+        with pytest.raises(MalformedMessageError, match=f"{seconds} s does not fit the stamp") as raised:
+            write_protobuf([RawTransform(seconds, 0, b"map", b"base", bytes(56))])
+        assert raised.value.reason == "stamp"

@@ -19,7 +19,8 @@ from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import RecordedMessage, open_recording
-from tfbus.recording.formats import _mcap_records
+from tfbus.recording.formats import _mcap_reading, _mcap_records
+from tfbus.stamps import STAMP_MAX
 from tfbus.tf_message import encode
 
 COUNT = 40
@@ -250,6 +251,31 @@ def test_damage_before_a_range_is_reported_at_the_start_of_the_range(write: Writ
     assert all(since <= received <= 114 for since, received in lost.items() if since <= 114)
 
 
+@pytest.mark.parametrize(("enough", "count"), [(1, 5), (2**16, 1)])
+def test_each_message_of_a_part_comes_once_in_blocks_of_any_size(
+    write: Write, monkeypatch: pytest.MonkeyPatch, enough: int, count: int
+) -> None:
+    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", enough)
+    times = (0, 1, 2, 3, STAMP_MAX)
+    path = write([(time, "/tf", [moving("a", "b", place)]) for place, time in enumerate(times)], chunk_size=1)
+    for since in (None, *times):
+        for until in (None, *times):
+            first, last = 0 if since is None else since, STAMP_MAX if until is None else until
+            expected = [
+                (time, (moving("a", "b", place),), ()) for place, time in enumerate(times) if first <= time <= last
+            ]
+            assert messages_in(path, since, until) == in_blocks(path, since, until) == expected
+    with open_recording(path) as recording:
+        assert len(list(recording.blocks())) == count
+
+
+def test_what_is_missing_is_told_behind_a_damaged_last_chunk(write: Write) -> None:
+    path = write([(time, "/tf", [moving("a", "b", time)]) for time in (5, 6, 7)], chunk_size=1)
+    damage(path, encode([moving("a", "b", 7)]))
+    for messages in (messages_in(path), in_blocks(path)):
+        assert [(message.received, len(message.errors)) for message in messages] == [(5, 0), (6, 0), (7, 1), (7, 1)]
+
+
 def test_a_chunk_without_transforms_is_not_read(write: Write) -> None:
     first, second = [moving("a", "b", 1)], [moving("a", "b", 3)]
     path = write([(1, "/tf", first), (2, "/camera", b"picture" * 1_000), (3, "/tf", second)], chunk_size=1)
@@ -343,6 +369,8 @@ def test_an_unreadable_record_is_reported_and_the_next_ones_are_read(write: Writ
     assert [(message.received, message.batch) for message in messages] == EXPECTED * 2
     assert [error.reason for error in lost.errors] == ["damaged"]
     assert f"the channel at byte {len(data)}" in str(lost.errors[0])
+    # At the last log time before it.
+    assert lost.received == EXPECTED[-1][0]
 
 
 def test_a_record_of_an_unknown_kind_or_beyond_its_bound_is_told_with_its_place(

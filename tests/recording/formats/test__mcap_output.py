@@ -13,6 +13,7 @@ from mcap.stream_reader import StreamReader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from support.open_files import is_open
 from support.samples import moving, static
 from support.strategies import samples
 
@@ -28,6 +29,7 @@ def written(path: Path, *entries: TimedBatch) -> McapOutput:
     with closing(McapOutput(str(path), overwrite=True)) as output:
         output.write(entries)
         output.finish()
+        assert not is_open(path)
     return output
 
 
@@ -208,6 +210,18 @@ def test_samples_counted_as_written_can_be_read_at_any_moment(tmp_path: Path) ->
         assert output.samples < 2_000
         output.write((), flush=True)
         assert output.samples == readable(path) == 2_000
+
+
+def test_a_message_that_fills_a_chunk_is_counted_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    # A transform has more than 56 bytes.
+    many = tuple(moving("map", f"f{k}", 1) for k in range(CHUNK_SIZE // 56))
+    with closing(McapOutput(str(path), overwrite=False)) as output:
+        output.write([(1, (moving("map", "a", 1),))])
+        assert (output.samples, output.messages, output.buffered) == (0, 0, 1)
+        output.write([(2, many)])
+        assert (output.samples, output.messages, output.buffered) == (len(many) + 1, 2, 0)
+        assert readable(path) == 2
 
 
 def test_a_chunk_ended_by_a_new_channel_is_not_counted_too_early(tmp_path: Path) -> None:

@@ -1,3 +1,5 @@
+import struct
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -5,10 +7,73 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from support.samples import moving
 
+from tfbus.recording.formats._chunks import ChunkPlace
 from tfbus.recording.formats._mcap import McapStorage
+from tfbus.recording.formats._mcap_packing import ChunkPacker, OpenChunk
 from tfbus.recording.formats._packed import Packed
 from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import encode
+
+
+def message(number: int, received: int, payload: bytes) -> bytes:
+    return struct.pack("<BQHIQQ", 5, 22 + len(payload), number, 0, received, 0) + payload
+
+
+CHANNELS = {0: Channel("/tf", "a", "cdr"), 3: Channel("/tf", "b", "cdr")}
+
+
+def packed(*contents: bytes, low: int = 0, high: int = 100) -> tuple[list[tuple[int, str, bytes]], Counter[int]]:
+    """Log time, kind of channel or damage, and payload of the messages in some chunks; and the number of all."""
+    counts: Counter[int] = Counter()
+    chunks = [OpenChunk(ChunkPlace(5, 9, at), content) for at, content in enumerate(contents)]
+    found = []
+    for block in ChunkPacker(CHANNELS.get, lambda _: None, counts.update).pack(chunks, low, high):
+        damaged = not isinstance(block, Packed) and any(not isinstance(channel, Channel) for _, channel, _ in block)
+        assert isinstance(block, Packed) != damaged
+        for received, channel, payload in block.stored() if isinstance(block, Packed) else block:
+            found.append((received, channel.type if isinstance(channel, Channel) else channel.detail, payload))
+    return found, counts
+
+
+def test_all_messages_are_counted_and_those_of_wanted_channels_are_packed_by_time() -> None:
+    first, second = message(3, 7, b"x") + message(8, 1, b""), message(0, 5, b"y") + message(3, 6, b"z")
+    expected = [(5, "a", b"y"), (6, "b", b"z"), (7, "b", b"x")]
+    assert packed(first, second) == (expected, {0: 1, 3: 2, 8: 1})
+    # Of a part, both ends belong to it, and all are counted.
+    assert packed(first, second, low=6, high=7) == (expected[1:], {0: 1, 3: 2, 8: 1})
+    assert packed(first, second, low=6, high=6) == (expected[1:2], {0: 1, 3: 2, 8: 1})
+    # Also if no channel is wanted, or nothing is there.
+    assert packed(message(8, 1, b"")) == ([], {8: 1})
+    assert packed() == packed(b"") == ([], {})
+
+
+@pytest.mark.parametrize(
+    ("damaged", "why"),
+    [
+        (message(3, 6, b"x")[:-1], "a record goes on behind the end of the chunk"),
+        (struct.pack("<BQ", 5, 21) + bytes(40), "a message is too short"),
+        (message(3, 6, b"x") * 3, "it has more than 2 messages, which is the bound"),
+    ],
+)
+def test_the_messages_of_the_good_chunks_are_counted_beside_a_damaged_one(
+    monkeypatch: pytest.MonkeyPatch, damaged: bytes, why: str
+) -> None:
+    for module in ("_mcap_packing", "_mcap_records"):
+        monkeypatch.setattr(f"tfbus.recording.formats.{module}.MAX_CHUNK_MESSAGES", 2)
+    good = message(3, 7, b"x") + message(8, 1, b"")
+    lost = f"the chunk at byte 1: {why}"
+    assert packed(good, damaged, good) == ([(5, lost, b""), *[(7, "b", b"x")] * 2], {3: 2, 8: 2})
+    assert packed(damaged, low=6) == ([(6, lost.replace("1", "0", 1), b"")], {})
+    # Where nothing is damaged, so many are packed.
+    assert packed(good, good) == ([(7, "b", b"x")] * 2, {3: 2, 8: 2})
+
+
+def test_a_record_that_ends_where_another_chunk_has_begun_is_damage() -> None:
+    good = message(3, 7, b"x")
+    # Together, their bytes are records again.
+    found, counts = packed(good[:20], good[20:])
+    assert [text.partition(":")[0] for _, text, _ in found] == ["the chunk at byte 0", "the chunk at byte 1"]
+    assert counts == {}
 
 
 @pytest.mark.parametrize("wrong", ["schema", "short"])

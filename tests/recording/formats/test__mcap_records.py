@@ -89,6 +89,13 @@ def test_the_part_of_a_record_that_there_is_comes_with_the_end_of_the_file(monke
         with pytest.raises(EndOfFile) as raised:
             next(found)
         assert raised.value.args == (() if torn is None else (torn,))
+        # What a writer has put behind it meanwhile is not read.
+        if torn is not None:
+            found = read_records(BytesIO(data + data + bytes(5)), 12 + size)
+            assert next(found) == (0, Opcode.MESSAGE, b"abc")
+            with pytest.raises(EndOfFile) as raised:
+                next(found)
+            assert raised.value.args == (torn,)
     # Of a huge one, no more than of a chunk.
     monkeypatch.setattr(_mcap_records, "MAX_CHUNK", 2)
     with pytest.raises(EndOfFile) as raised:
@@ -154,15 +161,19 @@ def test_chunks_are_scanned_as_they_are_split() -> None:
     assert (numbers.tolist(), received.tolist()) == ([3, 2**16 - 1, 4], [10, 2**64 - 1, 0])
     assert [data[start:end] for start, end in zip(starts.tolist(), ends.tolist(), strict=True)] == [b"x", b"", b"yy"]
     assert [getattr(each, "topic", None) for each in registered] == ["/tf"]
+    nothing = np.empty(0, np.int64)
+    assert scan_chunks(b"", nothing, nothing, registered.append).numbers.tolist() == []
     # One byte shorter than its header, and as long.
     for size, is_whole in ((21, False), (22, True)):
         one = record(Opcode.MESSAGE, bytes(size))
-        begins, ends = np.array([0, len(one)]), np.array([len(one), len(one) + len(parts[0])])
-        if is_whole:
-            assert scan_chunks(one + parts[0], begins, ends, registered.append).numbers.tolist() == [0, 3]
-        else:
-            with pytest.raises(ValueError, match="a message is too short"):
-                scan_chunks(one + parts[0], begins, ends, registered.append)
+        for order in ((one, parts[0]), (parts[0], one)):
+            begins, ends = np.array([0, len(order[0])]), np.cumsum([*map(len, order)])
+            if is_whole:
+                found = scan_chunks(b"".join(order), begins, ends, registered.append)
+                assert found.numbers.tolist() == [0 if each is one else 3 for each in order]
+            else:
+                with pytest.raises(ValueError, match="a message is too short"):
+                    scan_chunks(b"".join(order), begins, ends, registered.append)
 
 
 def chunk(data: bytes, size: int, crc: int = 0, compression: bytes = b"") -> bytes:

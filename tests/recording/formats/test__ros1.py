@@ -359,6 +359,11 @@ def test_damage_between_the_chunks_is_told_at_the_start_of_the_recording_or_of_t
             message.received for message in messages_in(path, since) if "nothing can be read" in str(message.errors)
         ]
         assert lost == [told]
+    # The chunk behind one byte is found.
+    begin = len(unfinished())
+    path.write_bytes(unfinished(b"\xff", one))
+    (damage, *_) = read(path)[1]
+    assert f"nothing can be read from byte {begin} to byte {begin + 1}" in damage
     # Nothing is behind the whole, and a byte more is a record that is cut.
     for rest in (b"", b"x"):
         assert stored_in(path, one, rest) == ([(7, "/tf", b"")], [])

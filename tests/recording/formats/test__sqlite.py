@@ -1,17 +1,19 @@
 import shutil
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 from rosbags.rosbag2 import StoragePlugin
+from support.open_files import is_open
 from support.recorded import SMALL, as_ros2, batches_in, facts, messages_in
 from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
-from tfbus.recording.formats._sqlite import SqliteStorage
+from tfbus.recording.formats._sqlite import _BLOCK, SqliteStorage
 from tfbus.tf_message import encode
 
 TF = "tf2_msgs/msg/TFMessage"
@@ -136,7 +138,21 @@ def test_messages_on_topics_that_are_not_described_are_counted(tmp_path: Path) -
     assert [error.reason for error in lost.errors] == ["damaged"]
     assert "3 messages are on topics that the file does not describe" in str(lost.errors[0])
     assert lost.received == 30
-    # Of a part, nothing can be said.
+    # If these are all, at the start.
+    for received in (0, 7):
+        with closing(sqlite3.connect(path)) as file:
+            file.execute("DELETE FROM messages")
+            add(file, 99, received, b"")
+            file.commit()
+        (lost,) = messages_in(path)
+        assert (lost.received, len(lost.errors)) == (received, 1)
+
+
+def test_of_a_part_it_is_not_told_which_messages_are_on_topics_that_are_not_described(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        add(file, 99, 60, b"")
+    file.close()
     assert not any(message.errors for part in ((5, None), (None, 60)) for message in messages_in(path, *part))
 
 
@@ -172,6 +188,8 @@ def test_another_database_is_no_recording(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="an SQLite file, but no recording of ROS 2") as raised:
         open_recording(path)
     assert raised.value.reason == "foreign"
+    # Its traceback still refers to the file.
+    assert not is_open(path)
 
 
 def test_a_name_that_is_no_text_is_damage(tmp_path: Path) -> None:
@@ -196,6 +214,34 @@ def test_a_computed_column_cannot_claim_more_than_a_message_may_have(tmp_path: P
     assert "nothing more can be read: string or blob too big" in str(lost.errors[0])
     assert "promises 1 messages on '/tf', and 0 were found" in str(promised.errors[0])
     assert (lost.received, promised.received) == (received, received)
+
+
+def test_what_cannot_be_read_is_told_behind_the_last_message_that_was(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    with write(path) as file:
+        file.execute("ALTER TABLE messages RENAME TO stored")
+        size = f"CASE WHEN timestamp < {_BLOCK + 7} THEN 1 ELSE {MAX_OTHER_MESSAGE + 1} END"
+        file.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob({size})))")
+        # So that they need not be sorted, for which all would be read.
+        file.execute("CREATE INDEX by_time ON messages(timestamp)")
+        for received in range(_BLOCK + 8):
+            file.execute("INSERT INTO messages(topic_id, timestamp) VALUES (2, ?)", (received,))
+    file.close()
+    *read, lost, promised = messages_in(path)
+    # So many are read at once.
+    assert [message.received for message in read] == list(range(_BLOCK))
+    assert "nothing more can be read" in str(lost.errors[0])
+    assert (lost.received, promised.received) == (_BLOCK - 1, _BLOCK - 1)
+
+
+def test_a_file_that_one_thread_has_opened_is_read_and_closed_by_another(tmp_path: Path) -> None:
+    path = tmp_path / "run.db3"
+    write(path).close()
+    with ThreadPoolExecutor(1) as other:
+        recording = other.submit(open_recording, path).result()
+    with recording:
+        assert [(message.received, message.batch) for message in recording.messages()] == IN_ORDER
+    assert not is_open(path)
 
 
 def test_a_file_that_is_cut_is_refused_or_gives_what_is_left_and_says_so(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from tfbus.recording.formats._unfold import UnfoldError, unfold, unfold_file
+from tfbus.recording.formats._unfold import _BLOCK, UnfoldError, unfold, unfold_file
 
 DATA = bytes(range(256)) * 256
 FOLD: dict[str, Callable[[bytes], bytes]] = {
@@ -27,6 +27,14 @@ def test_what_was_folded_unfolds_to_the_same_up_to_the_bound(kind: str) -> None:
     assert unfold(folded, kind, len(DATA)) == DATA
     with pytest.raises(UnfoldError, match=f"more than {len(DATA) - 1:,} bytes"):
         unfold(folded, kind, len(DATA) - 1)
+
+
+@pytest.mark.parametrize("kind", FOLD)
+def test_a_bound_of_whole_blocks_is_a_bound_too(kind: str) -> None:
+    data = bytes(2 * _BLOCK)
+    assert unfold(FOLD[kind](data), kind, len(data)) == data
+    with pytest.raises(UnfoldError, match=f"more than {len(data):,} bytes"):
+        unfold(FOLD[kind](data + b"x"), kind, len(data))
 
 
 @pytest.mark.parametrize("kind", COMPRESSED)

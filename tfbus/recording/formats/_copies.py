@@ -229,8 +229,7 @@ class SqliteCopy:
         self._types = MessageTypes()
         self._topics: dict[tuple[str, str], int] = {}
         self._counts: Counter[tuple[str, str]] = Counter()
-        self._start: int | None = None
-        self._end = 0
+        self._span: tuple[int, int] | None = None
 
     def holds(self, channel: Channel) -> bool:
         """Whether the channel is encoded in CDR."""
@@ -256,8 +255,8 @@ class SqliteCopy:
                 )
         self._execute("INSERT INTO messages VALUES (NULL, ?, ?, ?)", self._topics[key], received, payload)
         self._counts[key] += 1
-        self._start = received if self._start is None else min(self._start, received)
-        self._end = max(self._end, received)
+        first, last = self._span or (received, received)
+        self._span = min(first, received), max(last, received)
 
     def _execute(self, statement: str, *values: object) -> None:
         try:
@@ -280,9 +279,9 @@ class SqliteCopy:
 
     def _metadata(self) -> str:
         """The content of ``metadata.yaml``; JSON is YAML."""
-        start = self._start or 0
+        start, end = self._span or (0, 0)
         count = sum(self._counts.values())
-        duration = {"nanoseconds": max(0, self._end - start)}
+        duration = {"nanoseconds": end - start}
         begin = {"nanoseconds_since_epoch": start}
         topics = [
             {

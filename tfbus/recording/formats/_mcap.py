@@ -250,7 +250,6 @@ class McapStorage:
         try:
             self._file.seek(len(MAGIC))
             for _, opcode, content in read_records(self._file, self.size):
-                after = self._file.tell()
                 if content is not None and opcode == Opcode.MESSAGE:
                     received, _, _ = split_message(content)
                     yield received, received
@@ -259,7 +258,6 @@ class McapStorage:
                         chunk = Chunk.parse(content)
                         if chunk.end or self._times_in(chunk.unfold()):
                             yield chunk.start, chunk.end
-                self._file.seek(after)
         except EndOfFile as end:
             for torn in end.args:
                 with suppress(*DAMAGE):
