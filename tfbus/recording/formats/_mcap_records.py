@@ -167,11 +167,13 @@ def read_records(file: IO[bytes], size: int) -> Iterator[tuple[int, int, bytes |
     while True:
         offset = file.tell()
         head = file.read(RECORD.size)
-        if len(head) < RECORD.size:
+        left = size - offset - RECORD.size
+        # A writer may have put more behind the end meanwhile.
+        if len(head) < RECORD.size or left < 0:
             raise EndOfFile
         opcode, length = RECORD.unpack(head)
-        if offset + RECORD.size + length > size:
-            raise EndOfFile(Torn(opcode, file.read(min(MAX_CHUNK, size - offset - RECORD.size))))
+        if length > left:
+            raise EndOfFile(Torn(opcode, file.read(min(MAX_CHUNK, left))))
         if opcode == Opcode.FOOTER:
             return
         known = opcode in _READ or opcode in _BOUND or opcode == Opcode.DATA_END
