@@ -197,6 +197,8 @@ def test_no_stamps_are_no_stamps_in_any_unit(unit: str) -> None:
         (np.datetime64("2262-05"), "64-bit"),
         (np.datetime64("1677-09-21T00:12:43"), "64-bit"),
         (np.datetime64("2263"), "64-bit"),
+        (np.datetime64("9999-01"), r"'9999-01'.* 64-bit"),
+        (np.datetime64("9999"), r"'9999'.* 64-bit"),
         (np.datetime64(2**62, "Y"), "64-bit"),
         (np.datetime64(-(2**62), "us"), "64-bit"),
         (np.datetime64(1, (b"W", 2**31 - 1)), "64-bit"),

@@ -266,6 +266,17 @@ def test_the_last_row_of_a_matrix_may_be_off_by_just_the_tolerance(place: int, o
         Transform.from_matrix(matrix)
 
 
+def test_the_axes_of_a_matrix_may_be_off_a_right_angle_by_just_twice_the_tolerance() -> None:
+    def leaning(cosine: float) -> npt.NDArray[np.float64]:
+        matrix = np.eye(4)
+        matrix[1, :2] = cosine, math.sqrt(1.0 - cosine**2)
+        return matrix
+
+    assert Transform.from_matrix(leaning(2.0 * NORM_TOLERANCE)).translation == (0.0, 0.0, 0.0)
+    with pytest.raises(InvalidTransformError, match="rigid"):
+        Transform.from_matrix(leaning(math.nextafter(2.0 * NORM_TOLERANCE, 1.0)))
+
+
 SHEARED = np.eye(4)
 SHEARED[0, 1] = 0.1
 MIRRORED = np.diag([1.0, 1.0, -1.0, 1.0])
