@@ -150,6 +150,9 @@ DATES = [
     pytest.param(np.datetime64(-1, "ps"), -1, id="ps"),
     pytest.param(np.datetime64(1_999_999, "fs"), 1, id="fs"),
     pytest.param(np.datetime64(2 * SECOND, "as"), 2, id="as"),
+    pytest.param(np.datetime64(1_999, "ps"), 1, id="almost 2000 ps"),
+    pytest.param(np.datetime64(2_000, "ps"), 2, id="2000 ps"),
+    pytest.param(np.datetime64(2_000_000, "fs"), 2, id="2000000 fs"),
     pytest.param(np.datetime64("2262-04"), 9_222_422_400 * SECOND, id="last month"),
     pytest.param(np.datetime64("1677-10"), -106_742 * DAY, id="first month"),
     # 1972 to 2260 are 73 leap years but for 2100 and 2200; 1680 to 1968 but for 1700, 1800 and 1900.
