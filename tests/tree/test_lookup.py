@@ -632,6 +632,7 @@ def test_what_is_too_old_for_latest_lacks_what_cannot_be_held() -> None:
     with pytest.raises(FutureExtrapolationError) as caught:
         find(forest, "map", "arm", LATEST, Bounds(9, STAMP_MAX), extrapolation)
     assert (caught.value.child, caught.value.stamp, caught.value.slack) == ("arm", 9, 3)
+    assert caught.value.others == ("base",), "a sample of it may stand in for a missing one"
     assert find(forest, "map", "arm", LATEST, Bounds(8, STAMP_MAX), extrapolation)[0] == 8
 
 
