@@ -78,6 +78,12 @@ def test_there_are_samples_from_the_oldest_in_the_window_to_the_newest(kernel: M
     edge = history(kernel, [(stamp, x(stamp)) for stamp in range(166)], keep=160)
     assert [edge.stamp(index) for index in (0, 1, 160)] == [5, 6, 165]
     assert [edge.sample(index) for index in (0, 160)] == [(5, x(5.0)), (165, x(165.0))]
+    assert [edge.between(*span) for span in ((0, 200), (5, 5), (7, 164), (165, 165))] == [
+        (0, 161),
+        (0, 1),
+        (2, 160),
+        (160, 161),
+    ]
     for read in (edge.sample, edge.stamp):
         for index in (-1, -5, 161):
             with pytest.raises(IndexError, match="no sample has this index"):
