@@ -112,7 +112,7 @@ def test_an_unknown_fixed_frame_is_an_error() -> None:
 def test_parents_are_places_of_frames_and_a_root_has_none() -> None:
     poses = read(tree_of(static("map", "odom"), static("odom", "base")), "odom")
     by_name = {
-        frame: poses.frames[place] if place >= 0 else None
+        frame: poses.frames[place] if place != -1 else None
         for frame, place in zip(poses.frames, poses.parents.tolist(), strict=True)
     }
     assert by_name == {"odom": "map", "map": None, "base": "odom"}
