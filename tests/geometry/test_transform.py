@@ -15,7 +15,7 @@ from support.strategies import angles, rotations, small_angles, transforms, unit
 from transforms3d import affines, axangles, euler, quaternions
 
 from tfbus import InvalidTransformError, Transform, TransformError
-from tfbus.geometry.rows import NORM_TOLERANCE, Quaternion, Vector
+from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Quaternion, Vector
 
 HALF = math.sqrt(0.5)
 QUARTER_TURN_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)
@@ -153,6 +153,16 @@ def test_at_the_gimbal_lock_yaw_is_zero_and_roll_has_it_all(sign: float) -> None
     assert roll == pytest.approx(0.7 - sign * 0.3, abs=1e-14)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_gimbal_lock_reaches_as_far_as_the_rounding(sign: float) -> None:
+    def looking_up(off: float) -> Transform:
+        return Transform(rotation=(off, sign * math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+
+    within, beyond = looking_up(ROUNDING), looking_up(math.nextafter(ROUNDING, 1.0))
+    assert within.as_rpy() == pytest.approx((0.0, sign * math.pi / 2, 0.0), abs=1e-14)
+    assert beyond.as_rpy() == pytest.approx((math.pi / 2, sign * math.pi / 2, sign * math.pi / 2), abs=1e-14)
+
+
 def test_roll_is_applied_first_and_yaw_last() -> None:
     t = Transform.from_xyz_rpy((1, 2, 3), (0.1, 0.2, 0.3))
     about_x, about_y, about_z = (
@@ -264,6 +274,17 @@ def test_the_last_row_of_a_matrix_may_be_off_by_just_the_tolerance(place: int, o
     matrix[3, place] = np.nextafter(off, 2.0 * off)
     with pytest.raises(InvalidTransformError, match="last row"):
         Transform.from_matrix(matrix)
+
+
+def test_the_axes_of_a_matrix_may_be_off_a_right_angle_by_just_twice_the_tolerance() -> None:
+    def leaning(cosine: float) -> npt.NDArray[np.float64]:
+        matrix = np.eye(4)
+        matrix[1, :2] = cosine, math.sqrt(1.0 - cosine**2)
+        return matrix
+
+    assert Transform.from_matrix(leaning(2.0 * NORM_TOLERANCE)).translation == (0.0, 0.0, 0.0)
+    with pytest.raises(InvalidTransformError, match="rigid"):
+        Transform.from_matrix(leaning(math.nextafter(2.0 * NORM_TOLERANCE, 1.0)))
 
 
 SHEARED = np.eye(4)

@@ -14,7 +14,7 @@ from support.samples import over, tree_of
 from support.strategies import rotations, transforms, vectors
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformArray
-from tfbus.geometry.rows import Quaternion, Vector
+from tfbus.geometry.rows import ROUNDING, Quaternion, Vector
 from tfbus.geometry.transform_array import from_rows
 from tfbus.tree._kernel import ONE_BY_ONE
 
@@ -379,6 +379,13 @@ def test_the_repr_has_the_span_and_the_number_of_missing_transforms() -> None:
         ),
         max_size=5,
     )
+)
+@example(
+    [
+        Transform(rotation=(off, sign * math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+        for sign in (1.0, -1.0)
+        for off in (ROUNDING, math.nextafter(ROUNDING, 1.0))
+    ]
 )
 def test_wxyz_and_rpy_are_those_of_each_transform(poses: list[Transform]) -> None:
     steps = array_of(poses)

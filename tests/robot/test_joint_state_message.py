@@ -61,3 +61,5 @@ def test_a_count_that_no_message_can_hold_is_refused_at_once(count: int) -> None
     payload = b"\0\1\0\0" + struct.pack("<iII", 1, 2, 1) + b"\0" * 4 + struct.pack("<I", count)
     with pytest.raises(MalformedMessageError, match=f"cannot hold {count} names"):
         decode_joint_state(payload, ros1=False)
+    with pytest.raises(MalformedMessageError, match="are too few"):
+        decode_joint_state(payload[:-4] + struct.pack("<I", 5), ros1=False)

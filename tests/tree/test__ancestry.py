@@ -74,6 +74,12 @@ def test_walks_end_where_frames_have_been_each_others_parents() -> None:
             id="the sample has ended",
         ),
         pytest.param(
+            [moving("c", "a", 0), moving("b", "a", 7), moving("c", "a", 9), moving("a", "b", 7)],
+            moving("a", "b", 3),
+            None,
+            id="the loop is that of the next sample",
+        ),
+        pytest.param(
             [moving("b", "a", 5), moving("c", "a", 9)],
             moving("a", "b", 3),
             Loop(5, ("b", "a", "b")),

@@ -1,5 +1,6 @@
 from threading import Lock
 
+import pytest
 from support.histories import moving_edge
 
 from tfbus import Transform
@@ -35,6 +36,19 @@ def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() ->
     assert cache.find("a", "49999") is kept
     assert [cache.holds("a", name) for name in ("0", "41000", "49999", "wanted")] == [False, True, True, True]
     assert not cache.holds("b", "wanted")
+
+
+@pytest.mark.parametrize("cleared", [False, True])
+def test_two_generations_are_kept_to_the_last_path_and_a_third_forgets_the_first(cleared: bool) -> None:
+    cache, kept = PathCache(Lock()), path()
+    if cleared:
+        cache.keep("b", "a", kept)
+        cache.clear()
+    for number in range(2 * _GENERATION):
+        cache.keep("a", str(number), kept)
+    assert (len(cache), cache.holds("a", "0")) == (2 * _GENERATION, True)
+    cache.keep("a", "more", kept)
+    assert (len(cache), cache.holds("a", "0")) == (_GENERATION + 1, False)
 
 
 def test_as_many_pairs_as_a_generation_has_stay_known_however_often_they_are_asked_for_in_turn() -> None:

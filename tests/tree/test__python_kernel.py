@@ -78,6 +78,12 @@ def test_there_are_samples_from_the_oldest_in_the_window_to_the_newest(kernel: M
     edge = history(kernel, [(stamp, x(stamp)) for stamp in range(166)], keep=160)
     assert [edge.stamp(index) for index in (0, 1, 160)] == [5, 6, 165]
     assert [edge.sample(index) for index in (0, 160)] == [(5, x(5.0)), (165, x(165.0))]
+    assert [edge.between(*span) for span in ((0, 200), (5, 5), (7, 164), (165, 165))] == [
+        (0, 161),
+        (0, 1),
+        (2, 160),
+        (160, 161),
+    ]
     for read in (edge.sample, edge.stamp):
         for index in (-1, -5, 161):
             with pytest.raises(IndexError, match="no sample has this index"):
@@ -155,6 +161,25 @@ def test_a_long_history_slides_its_window_and_takes_another_one(kernel: ModuleTy
     assert contents(edge)[:1] == [(1_900, x(1_900.0))]
 
 
+@pytest.mark.parametrize(
+    "store",
+    [
+        lambda edge, stamp: edge.append("parent", stamp, x(stamp), ""),
+        lambda edge, stamp: edge.push(stamp, x(stamp)),
+        lambda edge, stamp: edge.push_many(np.array([stamp]), np.array([x(stamp)])),
+    ],
+    ids=["append", "push", "push many"],
+)
+def test_the_twin_has_no_more_samples_in_memory_than_the_window_and_a_sixteenth(store: Any) -> None:
+    edge = history(_python_kernel, [(0, x(0.0))], keep=160)
+    for stamps in (range(1, 1_000), range(-499, 0)):
+        for stamp in stamps:
+            store(edge, stamp)
+            assert len(edge.stamps) == len(edge.records) // 64 <= 161 + 10
+        edge.clear()
+        edge.push(-500, x(0.0))
+
+
 @on_both
 @pytest.mark.parametrize(("count", "keep"), [(0, 5), (1, 5), (3, None), (40, 5), (200, None)])
 def test_many_samples_are_stored_as_one_after_the_other(kernel: ModuleType, count: int, keep: int | None) -> None:
@@ -193,7 +218,7 @@ def test_many_samples_that_do_not_follow_are_refused_whole(kernel: ModuleType, s
 
 @on_both
 def test_the_row_of_a_history_is_that_of_a_chain_of_it_alone(kernel: ModuleType) -> None:
-    edge = history(kernel, [(0, x(1.0)), (10, x(2.0))], keep=100)
+    edge = history(kernel, [(0, x(1.0)), (10, x(2.0))], keep=10)
     chain = kernel.Chain((edge,), ())
     assert [edge.row(at) for at in (-1, 0, 4, 10, 11, 2**70)] == [None, x(1.0), x(1.4), x(2.0), None, None]
     assert bits(edge.row(3)) == bits(chain.row(3))

@@ -1,7 +1,7 @@
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tfbus.tree._runs import Runs
@@ -9,6 +9,7 @@ from tfbus.tree._runs import Runs
 STAMPS = st.integers(0, 20)
 
 
+@settings(max_examples=100)
 @given(st.lists(st.tuples(STAMPS, st.sampled_from("abc")), min_size=1), st.none() | st.integers(0, 12))
 def test_each_stamp_has_the_name_that_a_plain_dict_of_all_samples_gives_it(
     samples: list[tuple[int, str]], keep: int | None

@@ -199,6 +199,15 @@ def test_a_half_turn_has_the_direction_of_the_interpolation(start: Quaternion, a
     check_twist(tree.twist("body", "map", SECOND // 2), STILL, angular, tolerance=1e-6)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_half_turn_whose_quaternions_are_just_a_right_angle_apart_has_the_direction_of_the_second(
+    sign: float,
+) -> None:
+    half_turn = Transform(rotation=(0.0, 0.0, sign, 0.0))
+    tree = tree_of(moving("map", "body", 0), TransformStamped("map", "body", SECOND, half_turn))
+    check_twist(tree.twist("body", "map", SECOND // 2), STILL, (0.0, 0.0, sign * math.pi))
+
+
 # What tf1 and tf2 test
 
 
@@ -584,6 +593,17 @@ def test_outside_the_window_the_errors_are_those_of_lookup(frame: str, reference
         with pytest.raises(error) as caught:
             tree.twist(frame, reference, at, expressed_in=axes)
         assert (caught.value.child, caught.value.stamp) == ("body", at)
+
+
+@pytest.mark.parametrize(("frame", "reference"), [("hand", "map"), ("map", "hand")])
+def test_where_several_edges_have_no_answer_the_error_is_that_of_the_one_that_lags_most(
+    frame: str, reference: str
+) -> None:
+    arm = [moving("map", "arm", second * SECOND) for second in (0, 1)]
+    tree = tree_of(*arm, *(moving("arm", "hand", second * SECOND) for second in (0, 2)))
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree.twist(frame, reference, 3 * SECOND)
+    assert (caught.value.child, caught.value.newest) == ("arm", SECOND)
 
 
 def gap(axes_first: bool) -> TransformTree:

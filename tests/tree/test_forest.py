@@ -358,7 +358,9 @@ def test_an_error_of_a_reader_ends_the_reading() -> None:
     with pytest.raises(ZeroDivisionError):
         known.read_all(lambda _: 1 / 0)
     assert not known.lock.locked()
+    assert known.readers == {}, "nobody is to be told of changes any longer"
     assert known.read_all(len) == {"a": 1}
+    assert known.readers == {}
 
 
 # Loops of parents in the past

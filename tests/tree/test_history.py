@@ -2,7 +2,7 @@ import random
 from collections.abc import Iterable
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.histories import held
 
@@ -383,6 +383,7 @@ def test_parent_changes_are_the_stamps_of_samples_with_another_parent_than_befor
     assert samples.parent_changes() == [25, 30, 50, 60]
 
 
+@settings(max_examples=100)
 @given(
     st.lists(st.tuples(st.integers(0, 30), st.sampled_from("pq")), min_size=1, max_size=20), st.sampled_from([5, None])
 )

@@ -64,6 +64,13 @@ def test_find_gives_stamp_row_and_whether_the_answer_is_static(
     assert find(known, target, source, at, None) == found, "the same with the cached path"
 
 
+def test_the_latest_answer_of_a_frame_in_itself_has_its_newest_stamp_and_zero_without_one() -> None:
+    tree = tree_of(static("a", "b", stamp=0), moving("a", "c", 0), moving("a", "d", -7), moving("a", "e", 9))
+    assert [tree.lookup(frame, frame).stamp for frame in "abcde"] == [0, 0, 0, -7, 9]
+    tree.clear()
+    assert [tree.lookup(frame, frame).stamp for frame in "abcde"] == [0, 0, 0, 0, 0]
+
+
 @pytest.mark.parametrize("at", [-1, 31, LATEST])
 @pytest.mark.parametrize(("target", "source"), ["ac", "ca"])
 def test_a_cached_path_gives_the_same_error(target: str, source: str, at: int | Latest) -> None:
@@ -632,6 +639,7 @@ def test_what_is_too_old_for_latest_lacks_what_cannot_be_held() -> None:
     with pytest.raises(FutureExtrapolationError) as caught:
         find(forest, "map", "arm", LATEST, Bounds(9, STAMP_MAX), extrapolation)
     assert (caught.value.child, caught.value.stamp, caught.value.slack) == ("arm", 9, 3)
+    assert caught.value.others == ("base",), "a sample of it may stand in for a missing one"
     assert find(forest, "map", "arm", LATEST, Bounds(8, STAMP_MAX), extrapolation)[0] == 8
 
 

@@ -61,6 +61,10 @@ def test_a_path_has_the_children_of_its_edges_and_the_newest_stamp_of_its_static
     assert (path.root, path.children, path.static_stamp) == ("b", ["c", "d", "e"], 5)
     frames["e"] = moving_edge("b", "e", [(7, Transform())])
     assert find_path(frames, "c", "e", None).static_stamp == 3
+    assert find_path(frames, "b", "e", None).static_stamp == 0, "nothing is static"
+    zero = frames_of(static_edge("a", "b", Transform(), 0), static_edge("b", "c", Transform(), -5))
+    assert [find_path(zero, "a", source, None).static_stamp for source in "bc"] == [0, 0]
+    assert find_path(zero, "b", "c", None).static_stamp == -5
 
 
 def test_the_search_climbs_above_the_common_ancestor_no_further_than_the_shorter_side() -> None:

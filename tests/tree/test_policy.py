@@ -58,5 +58,7 @@ def test_a_hold_is_a_value() -> None:
     hold = Hold(0.2)
     assert pickle.loads(pickle.dumps(hold)) == hold == Hold(0.2)
     assert len({hold, Hold(0.2), Hold(0.3)}) == 2
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        hold.max_age = 1.0  # type: ignore[misc]
+    for value, name in ((hold, "max_age"), (Policy(), "hold")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(value, name, 1)
+        assert not hasattr(value, "__dict__")

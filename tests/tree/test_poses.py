@@ -104,14 +104,15 @@ def test_frames_of_another_tree_have_no_pose() -> None:
 
 
 def test_an_unknown_fixed_frame_is_an_error() -> None:
-    with pytest.raises(UnknownFrameError):
-        read(tree_of(static("map", "a")), "mop")
+    for at in (LATEST, 5):
+        with pytest.raises(UnknownFrameError):
+            read(tree_of(static("map", "a")), "mop", at)
 
 
 def test_parents_are_places_of_frames_and_a_root_has_none() -> None:
     poses = read(tree_of(static("map", "odom"), static("odom", "base")), "odom")
     by_name = {
-        frame: poses.frames[place] if place >= 0 else None
+        frame: poses.frames[place] if place != -1 else None
         for frame, place in zip(poses.frames, poses.parents.tolist(), strict=True)
     }
     assert by_name == {"odom": "map", "map": None, "base": "odom"}

@@ -211,6 +211,8 @@ def test_pop_all_gives_every_waiter_in_order_of_arrival_and_empties_the_index() 
     assert index.pop_all() == waiters
     assert (len(index), index.by_frame, index.pending(), index.pop_all()) == (0, {}, (), [])
     assert list(index.names) == []
+    index.park(waiters[0], unknown("camera"))
+    assert index.names == {"map", "tool"}, "a waiter may come back"
 
 
 def test_a_given_waiter_can_be_parked_again_with_another_error() -> None:

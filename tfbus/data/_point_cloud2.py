@@ -61,7 +61,7 @@ def new_layout(cloud: PointCloud) -> dict[str, Any]:
         code = codes.get(values.dtype.newbyteorder("="))
         if code is None or values.ndim > 2:
             raise ValueError(f"a PointCloud2 cannot hold field {name!r} of dtype {values.dtype}, shape {values.shape}")
-        columns.append((name, code, values.reshape(len(cloud), -1) if len(cloud) else values.reshape(0, 1)))
+        columns.append((name, code, values.reshape(len(cloud), *(values.shape[1:] or (1,)))))
     kind = np.dtype([(name, f"<{_KINDS[code]}", (values.shape[1],)) for name, code, values in columns])
     rows = np.zeros(len(cloud), kind)
     fields = []

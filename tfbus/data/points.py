@@ -16,7 +16,7 @@ from tfbus.plain import PlainData
 from tfbus.stamps import AtLike, Latest
 
 
-@dataclass(init=False, frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class PointStamped(PlainData):
     """A position.
 
@@ -41,7 +41,7 @@ class PointStamped(PlainData):
         object.__setattr__(self, "point", as_triple(self.point, "point"))
 
 
-@dataclass(init=False, frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Vector3Stamped(PlainData):
     """A direction with a length, such as a velocity or a normal: a transform rotates it but does not translate it.
 
@@ -66,7 +66,7 @@ class Vector3Stamped(PlainData):
         object.__setattr__(self, "vector", as_triple(self.vector, "vector"))
 
 
-@dataclass(init=False, frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class QuaternionStamped(PlainData):
     """An orientation.
 
@@ -92,7 +92,7 @@ class QuaternionStamped(PlainData):
         object.__setattr__(self, "quaternion", as_rotation(self.quaternion, "quaternion"))
 
 
-@dataclass(init=False, frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class PoseStamped(PlainData):
     """A position and an orientation.
 
@@ -117,7 +117,7 @@ class PoseStamped(PlainData):
         check_pose(self.pose)
 
 
-@dataclass(init=False, frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Polygon(CopiedByFields, PlainData):
     """The corners of an area, in order; the last one is joined to the first. Equal only to itself.
 

@@ -17,7 +17,7 @@ from tfbus.plain import PlainData
 from tfbus.stamps import AtLike, Latest
 
 
-@dataclass(init=False, frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class PoseWithCovarianceStamped(CopiedByFields, PlainData):
     """A pose and its covariance. Equal only to itself.
 
@@ -57,7 +57,7 @@ class PoseWithCovarianceStamped(CopiedByFields, PlainData):
         object.__setattr__(self, "covariance", locked(covariance.reshape(6, 6)))
 
 
-@dataclass(init=False, frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class TwistStamped(PlainData):
     """The velocity of a body at the origin of a frame that is fixed to it.
 
@@ -96,7 +96,7 @@ class TwistStamped(PlainData):
         object.__setattr__(self, "angular", as_triple(self.angular, "angular"))
 
 
-@dataclass(init=False, frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class WrenchStamped(PlainData):
     """A force on a body, and its torque about the origin of a frame.
 

@@ -163,10 +163,11 @@ class TransformArray:
     def as_rpy(self) -> Floats:
         """Roll, pitch, yaw of each in rad, as `Transform.as_rpy` gives them: a new array of shape (n, 3)."""
         x, y, z, w = self._columns[3:]
+        # Their squares add up to two, so that at most one of them is near zero.
         low, high = np.hypot(x + z, w - y), np.hypot(x - z, w + y)
         half_sum, half_difference = np.arctan2(x + z, w - y), np.arctan2(x - z, w + y)
         half_sum = np.where(low <= ROUNDING, half_difference, half_sum)
-        half_difference = np.where((high <= ROUNDING) & (low > ROUNDING), half_sum, half_difference)
+        half_difference = np.where(high <= ROUNDING, half_sum, half_difference)
         angles = half_sum + half_difference, half_sum - half_difference
         # To the same turn as `math.remainder`, which is exact.
         roll, yaw = (angle - math.tau * np.round(angle / math.tau) for angle in angles)

@@ -51,7 +51,7 @@ class _Plan(NamedTuple):
     """All children, and the parent of each."""
     frames: list[str]
     origins: list[int]
-    """The place of the frame from which each one is reached."""
+    """The place of the frame from which each one is reached; its own for the first."""
     edges: list[str]
     """The child of the edge between the two."""
     inverted: list[bool]
@@ -154,20 +154,20 @@ def _make_plan(fixed: str, topology: tuple[list[str], list[str]]) -> _Plan:
     for child, parent in above.items():
         below.setdefault(parent, []).append(child)
     places = {fixed: 0}
-    plan = _Plan(topology, [fixed], [-1], [""], [False], np.empty(0, np.intp))
-    for place, frame in enumerate(plan.frames):
+    frames, origins, edges, inverted = [fixed], [0], [""], [False]
+    for place, frame in enumerate(frames):
         reached = [(child, child, False) for child in below.get(frame, ())]
         if frame in above:
             reached.append((above[frame], frame, True))
-        for other, child, inverted in reached:
+        for other, child, upwards in reached:
             if other not in places:
-                places[other] = len(plan.frames)
-                plan.frames.append(other)
-                plan.origins.append(place)
-                plan.edges.append(child)
-                plan.inverted.append(inverted)
-    parents = [places.get(above.get(frame, ""), -1) for frame in plan.frames]
-    return plan._replace(parents=np.array(parents, np.intp))
+                places[other] = len(frames)
+                frames.append(other)
+                origins.append(place)
+                edges.append(child)
+                inverted.append(upwards)
+    parents = [places.get(above.get(frame, ""), -1) for frame in frames]
+    return _Plan(topology, frames, origins, edges, inverted, np.array(parents, np.intp))
 
 
 class _Gathered(NamedTuple):
@@ -227,7 +227,7 @@ class _Newest:
         rows = [history.static_row if history is not None and history.static else IDENTITY for history in histories]
         self._rows = np.array(rows)
         self._upside_down = np.flatnonzero(plan.inverted)
-        self._origins = np.array([0, *plan.origins[1:]], np.int64)
+        self._origins = np.array(plan.origins, np.int64)
         is_moving = {child: place in moving for place, child in enumerate(plan.edges) if place}
         self._static = np.array([not is_moving.get(frame, True) for frame in plan.frames])
         self._heard = np.array([is_moving.get(frame, False) for frame in plan.frames])
@@ -260,7 +260,7 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
     gathered = _Gathered(plan, bytearray(), [], [], [], [])
     _, rows, places, origins, answered, own = gathered
     before_each = plan.origins
-    # The stamp of each frame; None while the path from the fixed frame is static, and holds at every stamp.
+    # The stamp of each frame; None while no edge from the fixed frame to it has samples: static ones hold at any stamp.
     stamps: list[int | None] = []
     others: dict[tuple[int, int], int] = {}
 
@@ -304,9 +304,7 @@ def _gather(plan: _Plan, histories: Sequence[FrameHistory | None], at: int | Lat
         if history is not None and not history.static:
             if isinstance(at, int):
                 stamp = at
-            elif (newest := history.newest) is None:
-                stamp = before or 0
-            elif before is None or newest < before:
+            elif (newest := history.newest) is not None and (before is None or newest < before):
                 stamp = newest
         stamps.append(stamp)
         if before is None or before == stamp:
