@@ -6,6 +6,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
+from cyclonedds.core import Entity, ReadCondition
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -344,6 +345,22 @@ async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:
     writer._ref = 0
     carrier.send(Turn([OutgoingBatch(bytes(16), 1, [moving("map", "base", 1)])], {}))
     assert (len(errors), report.messages) == (1, 0)
+
+
+async def test_all_that_a_carrier_has_made_is_deleted_at_its_end_though_somebody_still_has_it(
+    domain_number: int,
+) -> None:
+    before = {*Entity._entities.values()}
+    takers: RosOptions = {"joint_states": print, "clock": SimulatedClock(), "robot_description": print}
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of(takers))
+    await carrier.open(print, SendReport(print))
+    # Topics and read conditions go with what they belong to.
+    made = [
+        each for each in Entity._entities.values() if each not in before and not isinstance(each, Topic | ReadCondition)
+    ]
+    await carrier.close()
+    assert len(made) > 10
+    assert [each for each in made if each in Entity._entities.values()] == []
 
 
 async def test_a_carrier_that_never_opened_closes(domain_number: int) -> None:

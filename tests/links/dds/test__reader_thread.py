@@ -17,6 +17,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from support.both_sides import node
 
+from tfbus.links.dds import _reader_thread
 from tfbus.links.dds._domains import configuration, domain
 from tfbus.links.dds._reader_thread import ReaderThread
 from tfbus.links.dds._types import RawString
@@ -27,8 +28,17 @@ CYCLONE_PEER = Path(__file__).parents[2] / "support" / "cyclone_peer.py"
 PATIENCE = 30.0
 
 
-def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(domain_number: int) -> None:
+def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(
+    domain_number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[Any] = []
+    serve, rounds = _reader_thread._serve, list[None]()
+
+    def count(watched: Any) -> None:
+        rounds.append(None)
+        serve(watched)
+
+    monkeypatch.setattr(_reader_thread, "_serve", count)
     errors: list[Exception] = []
     woken = Event()
 
@@ -73,6 +83,7 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(domain
         thread.stop()
         reader.__del__()
     assert told == [1, "first", "bad", "last", 0]
+    assert len(rounds) < 30, "it rests while nothing comes"
     assert [str(error) for error in errors] == ["bad"]
 
 

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import anyio
+import anyio.lowlevel
 import pytest
 
 pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
@@ -232,6 +233,54 @@ async def test_a_server_is_pinged_until_it_has_been_silent_for_too_long(monkeypa
         await alone.carrier._keep_alive(socket)
     assert alone.pauses == [_carrier.SILENCE / 4] * 5
     assert len(pings) == 4
+
+
+class Socket:
+    """An open connection to a server that says nothing."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, str]] = []
+        self.closed = False
+
+    async def send(self, text: str) -> None:
+        await anyio.lowlevel.checkpoint()
+        request = json.loads(text)
+        self.sent.append((request["op"], request["topic"]))
+
+    async def receive(self) -> str:
+        await anyio.sleep_forever()
+        raise AssertionError
+
+    async def close(self) -> None:
+        await anyio.lowlevel.checkpoint()
+        self.closed = True
+
+
+async def test_what_waits_is_sent_at_the_end_of_a_cancelled_link_too() -> None:
+    carrier, socket = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({})), Socket()
+    carrier._socket = socket  # type: ignore[assignment]
+    assert carrier._publish([moving("map", "a", 1)], static=False)
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        await carrier.close()
+    assert socket.sent == [("advertise", "/tf"), ("publish", "/tf")]
+    assert socket.closed
+
+
+async def test_a_carrier_talks_until_its_link_ends_and_then_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_carrier, "_CLOSING_TIME", 1_000.0)
+    carrier, socket = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({})), Socket()
+    opened: Any = socket
+    carrier._socket = opened
+    # A time of holding back that is over.
+    carrier._held_until = 0.0
+    with anyio.fail_after(20):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(carrier.run)
+            await until(lambda: socket.sent == again("/tf"))
+            tasks.cancel_scope.cancel()
+    assert carrier._socket is opened, "what is left is sent when it closes"
+    assert not socket.closed
 
 
 def again(topic: str) -> list[tuple[str, str]]:
