@@ -657,13 +657,19 @@ async def test_every_call_but_threadsafe_from_another_thread_is_an_error_while_a
     with Bus(clock) as bus, Buffer(bus) as buffer:
         bus.publish(moving("map", "base", 0))
         bus._check_thread()
-        for touch in (
+        touches: list[Callable[[], object]] = [
+            partial(bus.publish, moving("map", "other", 0)),
+            partial(bus.publish, moving("map", "base", 1), invalid="drop"),
+            bus.events,
+            partial(bus.reserve, "arm", "driver"),
+            partial(buffer.watch, "map", "base"),
             partial(Buffer, bus),
             partial(bus.subscribe, print),
             bus.stream,
             partial(bus.remove_frame, "base"),
             partial(clock.set, 0),
-        ):
+        ]
+        for touch in touches:
             with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
                 await anyio.to_thread.run_sync(touch)
         assert bus.statistics().frames == 1

@@ -135,7 +135,9 @@ def test_a_node_announces_its_topics_and_passes_messages_on_both_ways() -> None:
 
 def test_whoever_comes_late_gets_the_last_message_of_static_frames_and_no_moving_ones() -> None:
     address = free_address()
-    early = RmwZenohCarrier(7, "early", settings(address, None, None, 2.0), settings_of({}))
+    # Of several topics, the first is spoken to.
+    several = settings_of({"tf": ["/tf", "/other/tf"], "tf_static": ["/tf_static", "/other/tf_static"]})
+    early = RmwZenohCarrier(7, "early", settings(address, None, None, 2.0), several)
     late = RmwZenohCarrier(7, "late", settings(None, address, None, 2.0), settings_of({"send": False}))
     items = Queue[Received]()
     late._receive = items.put
@@ -150,6 +152,8 @@ def test_whoever_comes_late_gets_the_last_message_of_static_frames_and_no_moving
         encode([static("map", "lidar", stamp=2)]), static=True, authority="rmw_zenoh"
     )
     assert items.empty()
+    # One that is not to send has no publisher.
+    assert late._publish([static("map", "late")], static=True) is False
     for made in (late, early):
         anyio.run(made.close)
 
