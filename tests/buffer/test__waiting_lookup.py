@@ -23,6 +23,7 @@ from tfbus import (
     from_seconds,
     to_seconds,
 )
+from tfbus.buffer._hanging_report import REPORT_AFTER
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
@@ -171,6 +172,19 @@ async def test_a_long_wait_has_one_timer_for_the_next_log_line_however_often_its
         await clock.advance(3.0)
         assert len(caplog.messages) == 2
         asked.cancel()
+
+
+@pytest.mark.parametrize(("timeout", "timers"), [(REPORT_AFTER, 1), (REPORT_AFTER + 1e-9, 2), (None, 1), (0.0, 0)])
+async def test_only_a_lookup_that_may_wait_for_longer_has_a_timer_for_the_log_line(
+    timeout: float | None, timers: int
+) -> None:
+    clock = SimulatedClock()
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, partial(buffer.lookup, "map", "base", timeout=timeout))
+            await settle()
+            assert len(clock._timers) == timers
+            asked.cancel()
 
 
 @pytest.mark.parametrize("ends", ["answered", "timed out", "cancelled", "closed"])
