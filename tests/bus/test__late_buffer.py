@@ -143,6 +143,7 @@ def test_samples_of_a_prefill_that_are_ahead_of_the_bus_give_way_when_the_bus_re
     assert late.tree.edges()[0].newest == 90
     bus.publish(moving("b", "x", 70))
     assert [(edge.parent, edge.newest) for edge in late.tree.edges()] == [("b", 70)]
+    assert bus._late == {}, "it has caught up"
 
 
 @pytest.mark.parametrize("heard", [89, 90, 91])

@@ -439,6 +439,16 @@ async def test_a_link_tells_no_time_that_it_is_not_to_tell() -> None:
     assert told == [None]
 
 
+async def test_a_link_tells_the_time_that_it_finds_although_the_clock_stands_still() -> None:
+    clock, carrier = SimulatedClock(start=7), LoggedCarrier()
+    told: list[int | None] = []
+    carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier, tell_clock=True):
+            await anyio.wait_all_tasks_blocked()
+            assert told == [7]
+
+
 async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own() -> None:
     clock = SimulatedClock()
     followers: list[int] = []
