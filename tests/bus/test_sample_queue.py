@@ -144,6 +144,8 @@ def test_moving_samples_of_a_forgotten_child_count_as_dropped(overflow: Overflow
     assert emptied(queue) == [(moving("map", "b", 1),)]
     queue.put((moving("map", "c", 1), moving("map", "d", 1)))
     assert queue.dropped == 1, "there is room for two again"
+    queue.put((moving("map", "e", 1),))
+    assert queue.dropped == (2 if overflow == "conflate" else 3), "and for no more"
 
 
 @pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])

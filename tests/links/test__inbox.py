@@ -182,6 +182,16 @@ def test_received_samples_are_published_to_the_bit(samples: list[TransformStampe
             assert all(type(sample) is ReceivedTransform and sample._provenance.origin == ORIGIN for sample in got)
 
 
+def test_the_batches_of_a_message_that_was_kept_are_published_as_one() -> None:
+    first, second = [static("map", "a"), moving("map", "b", 1)], [static("map", "c")]
+    with receiver() as here:
+        entries = [batch(first), batch(second, sequence=2)]
+        here.receive_bytes(encode([*first, *second]), pack(0, entries))
+        assert here.heard == [(*first, *second)]
+        here.receive_bytes(encode([*first, *second]), pack(1, [batch(first, sequence=3), batch(second, sequence=4)]))
+        assert here.heard[1:] == [tuple(first), tuple(second)], "live ones stay apart"
+
+
 def test_an_empty_message_and_an_empty_batch_call_no_subscriber() -> None:
     with receiver() as here:
         here.receive_bytes(encode(()), pack(1, []))

@@ -241,6 +241,10 @@ class Socket:
     def __init__(self) -> None:
         self.sent: list[tuple[str, str]] = []
         self.closed = False
+        self.heard = math.inf
+
+    async def ping(self) -> None:
+        """It is heard for ever."""
 
     async def send(self, text: str) -> None:
         await anyio.lowlevel.checkpoint()
@@ -269,7 +273,8 @@ async def test_what_waits_is_sent_at_the_end_of_a_cancelled_link_too() -> None:
 
 async def test_a_carrier_talks_until_its_link_ends_and_then_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_carrier, "_CLOSING_TIME", 1_000.0)
-    carrier, socket = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({})), Socket()
+    monkeypatch.setattr(_carrier, "_MISS_PERIODS", (0.0, 1_000.0))
+    carrier, socket = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({}), lookup_waits=lambda: True), Socket()
     opened: Any = socket
     carrier._socket = opened
     # A time of holding back that is over.
@@ -277,7 +282,13 @@ async def test_a_carrier_talks_until_its_link_ends_and_then_ends_at_once(monkeyp
     with anyio.fail_after(20):
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(carrier.run)
-            await until(lambda: socket.sent == again("/tf"))
+            # For the lookup that waits, and because of that time.
+            asked = again("/tf_static") + 2 * again("/tf")
+            await until(lambda: sorted(socket.sent) == sorted(asked))
+            for _ in range(2):
+                socket.sent.clear()
+                assert carrier._publish([moving("map", "a", 1)], static=False)
+                await until(lambda: socket.sent[-1:] == [("publish", "/tf")])
             tasks.cancel_scope.cancel()
     assert carrier._socket is opened, "what is left is sent when it closes"
     assert not socket.closed
