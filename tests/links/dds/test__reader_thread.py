@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
+from cyclonedds.core import DDSStatus
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -90,6 +91,23 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(
     assert told == [1, "first", "bad", "last", 0]
     assert len(rounds) < 30, "it rests while nothing comes"
     assert errors == ["bad"]
+
+
+def test_only_what_is_served_wakes_the_thread(domain_number: int) -> None:
+    with domain(domain_number, CONFIG), ExitStack() as stack:
+        participant = DomainParticipant(domain_number)
+        stack.callback(participant.__del__)
+        topic = Topic(participant, "rt/text", RawString)
+        readers: list[DataReader[Any]] = [DataReader(participant, topic) for _ in range(2)]
+        thread = ReaderThread(participant, print)
+        thread.watch(readers[0], print)
+        thread.watch(readers[1], print, print)
+        thread.start()
+        masks = [reader.get_status_mask() for reader in readers]
+        thread.stop()
+        for reader in readers:
+            reader.__del__()
+    assert masks == [DDSStatus.DataAvailable, DDSStatus.DataAvailable | DDSStatus.SubscriptionMatched]
 
 
 TWO_LINKS = """

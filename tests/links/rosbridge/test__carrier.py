@@ -144,6 +144,9 @@ async def test_each_topic_has_its_kind_and_only_what_comes_again_may_be_dropped(
         Received(url, RosMessage("content", static=False, authority="", description=True), 7),
     ]
     assert alone.carrier._heard_moving
+    alone.carrier._take(Incoming("", "status: no such type", "none"), 7)
+    assert [str(error) for error in alone.errors] == [f"{url} says: status: no such type"]
+    assert len(alone.items) == 5
 
 
 @pytest.mark.parametrize(("encoding", "joints"), [("cbor", "none"), ("cbor-raw", "cbor-raw")])
