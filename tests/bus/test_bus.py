@@ -710,6 +710,13 @@ def test_a_frame_that_only_a_buffer_still_lists_can_be_removed() -> None:
             bus.remove_frame("base")
 
 
+@pytest.mark.anyio
+async def test_the_bounds_of_queues_for_which_none_is_given_are_in_the_statistics() -> None:
+    with Bus(SimulatedClock()) as bus, bus.stream(), bus.threadsafe(), bus.events():
+        bounds = {queue.kind: queue.capacity for queue in bus.statistics().queues}
+    assert bounds == {"stream": 1_000, "threadsafe": 10_000, "events": 1_000}
+
+
 def test_a_thread_publisher_that_is_never_entered_is_not_registered() -> None:
     with Bus() as bus:
         bus.threadsafe()

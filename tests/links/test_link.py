@@ -123,6 +123,7 @@ async def test_a_link_tells_its_name_and_how_many_peers_it_has() -> None:
     carrier, told = LoggedCarrier(), list[str]()
     with Bus() as bus:
         link = Link(bus, "world", carrier)
+        assert link.statistics().queue.capacity == 10_000
         told.append(repr(link))
         async with link:
             for count, name in enumerate(("a", "b")):
@@ -357,6 +358,16 @@ async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() 
     assert (rejected.reason, str(rejected.error)) == ("not published", "broken")
     assert isinstance(lost, PeerLost)
     assert (lost.authorities, lost.frames) == (("foreign",), ("arm",))
+
+
+async def test_the_frames_of_a_lost_peer_stay_unless_they_are_to_be_dropped() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier) as link:
+            for content in (Presence.JOINED, ForeignMessage(False, [ARM]), Presence.LEFT):
+                carrier.receive(Received("driver", content))
+            await until(lambda: link.statistics().queue.pending == 0)
+            assert (link.peers, bus.statistics().frames) == ((), 1)
 
 
 class AskingCarrier(WireCarrier):
