@@ -190,6 +190,14 @@ def test_the_batches_of_a_message_that_was_kept_are_published_as_one() -> None:
         assert here.heard == [(*first, *second)]
         here.receive_bytes(encode([*first, *second]), pack(1, [batch(first, sequence=3), batch(second, sequence=4)]))
         assert here.heard[1:] == [tuple(first), tuple(second)], "live ones stay apart"
+        # An answer is no live message either.
+        here.end.receive("peer", Presence.JOINED)
+        told = [ReceivedTransform("map", name, 2, Transform()) for name in "de"]
+        batches: list[ReceivedBatch | RemovedFrame | MovingFrame] = [
+            ReceivedBatch([sample], [], ORIGIN, 5 + number) for number, sample in enumerate(told)
+        ]
+        assert here.inbox.receive_answer("peer", ReceivedMessage(batches, step=StateStep(0, 2, 0, final=False)))
+        assert here.heard[3:] == [tuple(told)]
 
 
 def test_an_empty_message_and_an_empty_batch_call_no_subscriber() -> None:
@@ -224,6 +232,7 @@ def test_only_wanted_frames_come_in_or_go() -> None:
         ((5, 1, 2, 3), 0),
         ((5, 0, 0, 6), 0),
         ((0, 0, 0), 0),
+        ((0, 5, 6), 0),
         ((1, 3, 3, 3), 1),
         ((1, 3, 2, 4), 1),
         ((1, 2**32 + 2), 2**32),

@@ -11,10 +11,12 @@ pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
 from support.processes import until
 from support.rosbridge import rosbridge_server
-from support.samples import moving
+from support.samples import moving, static
 
 from tfbus import SimulatedClock
 from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros._carrier import RosMessage
 from tfbus.links.ros.settings import settings_of
@@ -176,6 +178,18 @@ async def test_what_waited_for_a_server_that_has_gone_is_not_sent_to_the_next_on
     await alone.connect(monkeypatch, 200.0)
     assert list(alone.carrier._requests) == first
     assert not alone.carrier._moving
+
+
+async def test_static_frames_are_sent_again_to_a_server_that_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = Alone(monkeypatch)
+    await alone.connect(monkeypatch, 100.0)
+    kept = OutgoingBatch(bytes(16), 1, [static("map", "lidar")])
+    alone.carrier.send(Turn([], {"lidar": kept}))
+    # Sent, and then the server goes.
+    text, alone.carrier._changed_statics = alone.carrier._changed_statics, None
+    await alone.connect(monkeypatch, 200.0)
+    assert alone.carrier._changed_statics == text
+    assert "lidar" in str(text)
 
 
 @pytest.mark.parametrize(
