@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 
 from tfbus.statistics import (
+    BufferServerStatistics,
     BufferStatistics,
     BusStatistics,
     LinkStatistics,
@@ -20,6 +21,7 @@ ONE_OF_EACH: list[Any] = [
     QUEUE,
     BusStatistics(1, {"cycle": 2}, 3, 4, 5, 6, 7, 8, (BUFFER,), (QUEUE,)),
     LinkStatistics(1, 2, 3, 4, 5, 6, 7, {"frame name": 8}, {"damaged": 9}, QUEUE),
+    BufferServerStatistics(1, 2, 3, 4, {"busy": 5}, QUEUE),
     RecorderStatistics(1, 2, 3, {"stamp": 4}, QUEUE),
     RobotStatistics(1, 2, {"elbow": 3}),
 ]
@@ -30,6 +32,7 @@ def test_statistics_are_frozen_and_serializable_as_json(statistics: Any) -> None
     names = [field.name for field in fields(statistics)]
     with pytest.raises(FrozenInstanceError):
         setattr(statistics, names[0], 0)
+    assert not hasattr(statistics, "__dict__")
     assert list(json.loads(json.dumps(asdict(statistics)))) == names
 
 

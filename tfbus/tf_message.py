@@ -164,14 +164,14 @@ def refusal(sample: TransformStamped) -> InvalidTransformError | None:
 
 @overload
 def decode(
-    payload: bytes | memoryview, tags: Iterable[Tag] | None = None, *, bare_names: bool = False
+    payload: bytes | memoryview, tags: Iterable[Tag] | None = ..., *, bare_names: bool = ...
 ) -> Decoded[TransformStamped]: ...
 @overload
 def decode(
     payload: bytes | memoryview,
-    tags: Iterable[Tag] | None = None,
+    tags: Iterable[Tag] | None = ...,
     kind: type[SampleT] = ...,
-    bare_names: bool = False,
+    bare_names: bool = ...,
 ) -> Decoded[SampleT]: ...
 def decode(
     payload: bytes | memoryview,

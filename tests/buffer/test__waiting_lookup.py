@@ -6,6 +6,7 @@ from typing import Any
 
 import anyio
 import anyio.lowlevel
+import anyio.to_thread
 import pytest
 from support.asking import Asked, driving, settle
 
@@ -23,6 +24,7 @@ from tfbus import (
     from_seconds,
     to_seconds,
 )
+from tfbus.buffer._hanging_report import REPORT_AFTER
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
@@ -171,6 +173,33 @@ async def test_a_long_wait_has_one_timer_for_the_next_log_line_however_often_its
         await clock.advance(3.0)
         assert len(caplog.messages) == 2
         asked.cancel()
+
+
+async def test_on_the_loop_of_another_thread_a_lookup_has_an_answer_and_does_not_wait_for_one() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        bus._check_thread()
+
+        async def ask() -> TransformStamped:
+            return await buffer.lookup("map", "base", timeout=0.001)
+
+        with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
+            await anyio.to_thread.run_sync(anyio.run, ask)
+        assert buffer.pending() == ()
+        bus.publish(driving("map", "base", 1.0))
+        assert (await anyio.to_thread.run_sync(anyio.run, ask)).stamp == SECOND
+
+
+@pytest.mark.parametrize(("timeout", "timers"), [(REPORT_AFTER, 1), (REPORT_AFTER + 1e-9, 2), (None, 1), (0.0, 0)])
+async def test_only_a_lookup_that_may_wait_for_longer_has_a_timer_for_the_log_line(
+    timeout: float | None, timers: int
+) -> None:
+    clock = SimulatedClock()
+    with Bus(clock) as bus, Buffer(bus) as buffer:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, partial(buffer.lookup, "map", "base", timeout=timeout))
+            await settle()
+            assert len(clock._timers) == timers
+            asked.cancel()
 
 
 @pytest.mark.parametrize("ends", ["answered", "timed out", "cancelled", "closed"])

@@ -12,6 +12,7 @@ from tfbus import (
     QueueStatistics,
     Reparented,
     SampleRejected,
+    StampAhead,
 )
 from tfbus.bus._event_queue import EventQueue
 
@@ -52,6 +53,15 @@ def test_the_initial_events_come_first_and_are_never_dropped() -> None:
     queue.put(FrameRemoved(0, "frame 8"))
     assert (len(queue), queue.dropped) == (51, 1)
     assert emptied(queue) == [*known, FrameRemoved(0, "frame 8")]
+
+
+def test_an_initial_event_of_a_frame_ahead_of_the_clock_is_given_once() -> None:
+    ahead = StampAhead(1, "a", 10**9, "x")
+    queue = EventQueue(10, [added("a"), ahead])
+    queue.put(StampAhead(2, "a", 2 * 10**9, "x"))
+    assert emptied(queue) == [added("a"), ahead]
+    queue.put(StampAhead(3, "a", 10**9, "y"))
+    assert emptied(queue) == [StampAhead(3, "a", 10**9, "y")]
 
 
 def test_a_conflict_of_two_authorities_is_given_once_for_a_frame_until_it_is_removed() -> None:

@@ -127,6 +127,22 @@ def test_a_prefilled_edge_that_closes_a_loop_with_the_bus_is_removed() -> None:
     assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("z", "p"), ("p", "y")]
 
 
+def test_a_prefilled_edge_gives_way_to_a_frame_that_is_back_after_a_jump_of_the_clock() -> None:
+    clock = SimulatedClock(10)
+    bus = Bus(clock)
+    bus.publish([moving("c", "b", 5), static("b", "e")])
+    late = Buffer(bus, prefill=tree_of(static("d", "c")))
+    bus.publish(moving("c", "b", 6))
+    clock.set(0)
+    bus.publish(moving("e", "d", 1))
+    held = {(edge.parent, edge.child) for edge in late.tree.edges() if edge.samples}
+    assert held == {("b", "e"), ("d", "c"), ("e", "d")}
+    # Under the same parent as before, but a loop by now.
+    bus.publish(moving("c", "b", 2))
+    held = {(edge.parent, edge.child) for edge in late.tree.edges() if edge.samples}
+    assert held == {("b", "e"), ("c", "b"), ("e", "d")}
+
+
 def test_only_the_prefilled_edges_in_the_loop_are_removed() -> None:
     bus = bus_with()
     late = Buffer(
@@ -143,6 +159,7 @@ def test_samples_of_a_prefill_that_are_ahead_of_the_bus_give_way_when_the_bus_re
     assert late.tree.edges()[0].newest == 90
     bus.publish(moving("b", "x", 70))
     assert [(edge.parent, edge.newest) for edge in late.tree.edges()] == [("b", 70)]
+    assert bus._late == {}, "it has caught up"
 
 
 @pytest.mark.parametrize("heard", [89, 90, 91])

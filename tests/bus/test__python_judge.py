@@ -55,6 +55,13 @@ def test_a_batch_that_continues_known_edges_is_plain_and_its_newest_stamps_are_n
 
 
 @on_both
+def test_of_two_frames_in_a_batch_both_are_noted(kernel: Any) -> None:
+    known = edges(kernel)
+    assert judge(kernel, known, (sample(kernel), sample(kernel, child="b", stamp=21)), STAMP_MAX, 81.0)
+    assert [edge.newest for edge in known.values()] == [20, 21]
+
+
+@on_both
 @pytest.mark.parametrize(
     ("changes", "horizon", "square"),
     [

@@ -86,6 +86,16 @@ def test_the_newest_stamp_of_a_known_edge_only_moves_forward() -> None:
         assert edge.newest == expected
 
 
+def test_the_authority_of_an_edge_is_that_of_its_newest_sample() -> None:
+    known = topology([moving("a", "b", 10, authority="x")])
+    for stamp, authority, expected in ((5, "y", "x"), (11, "y", "y"), (12, "y", "y"), (11, "x", "y"), (13, "x", "x")):
+        known.accept((moving("a", "b", stamp, authority=authority),), "raise")
+        edge = known.newest("b")
+        assert edge is not None
+        assert edge.authority == expected
+    assert known.conflicts == 2
+
+
 # Counts and log
 
 

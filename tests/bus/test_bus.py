@@ -657,13 +657,19 @@ async def test_every_call_but_threadsafe_from_another_thread_is_an_error_while_a
     with Bus(clock) as bus, Buffer(bus) as buffer:
         bus.publish(moving("map", "base", 0))
         bus._check_thread()
-        for touch in (
+        touches: list[Callable[[], object]] = [
+            partial(bus.publish, moving("map", "other", 0)),
+            partial(bus.publish, moving("map", "base", 1), invalid="drop"),
+            bus.events,
+            partial(bus.reserve, "arm", "driver"),
+            partial(buffer.watch, "map", "base"),
             partial(Buffer, bus),
             partial(bus.subscribe, print),
             bus.stream,
             partial(bus.remove_frame, "base"),
             partial(clock.set, 0),
-        ):
+        ]
+        for touch in touches:
             with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
                 await anyio.to_thread.run_sync(touch)
         assert bus.statistics().frames == 1
@@ -702,6 +708,13 @@ def test_a_frame_that_only_a_buffer_still_lists_can_be_removed() -> None:
         assert buffer.tree.frames() == []
         with pytest.raises(UnknownFrameError):
             bus.remove_frame("base")
+
+
+@pytest.mark.anyio
+async def test_the_bounds_of_queues_for_which_none_is_given_are_in_the_statistics() -> None:
+    with Bus(SimulatedClock()) as bus, bus.stream(), bus.threadsafe(), bus.events():
+        bounds = {queue.kind: queue.capacity for queue in bus.statistics().queues}
+    assert bounds == {"stream": 1_000, "threadsafe": 10_000, "events": 1_000}
 
 
 def test_a_thread_publisher_that_is_never_entered_is_not_registered() -> None:

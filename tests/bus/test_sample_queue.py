@@ -58,6 +58,13 @@ def test_drop_oldest_keeps_the_newest_static_sample_of_each_child() -> None:
     assert queue.dropped == 2
 
 
+def test_kept_static_samples_come_in_the_order_of_their_last_publication() -> None:
+    queue = SampleQueue(1, "drop_oldest")
+    for sample in (static("map", "a", x=1.0), static("map", "b"), static("map", "a", x=2.0), moving("map", "c", 1)):
+        queue.put((sample,))
+    assert emptied(queue) == [(static("map", "b"), static("map", "a", x=2.0)), (moving("map", "c", 1),)]
+
+
 def test_repeated_static_samples_do_not_fill_the_queue() -> None:
     queue = SampleQueue(10, "drop_oldest")
     for time in range(1_000):
@@ -137,6 +144,8 @@ def test_moving_samples_of_a_forgotten_child_count_as_dropped(overflow: Overflow
     assert emptied(queue) == [(moving("map", "b", 1),)]
     queue.put((moving("map", "c", 1), moving("map", "d", 1)))
     assert queue.dropped == 1, "there is room for two again"
+    queue.put((moving("map", "e", 1),))
+    assert queue.dropped == (2 if overflow == "conflate" else 3), "and for no more"
 
 
 @pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])

@@ -15,10 +15,12 @@ from tfbus import Bus, Event, SimulatedClock
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import FIRST_PAUSE, PATIENCE, SETTLING
 from tfbus.links._endpoint import CLAIM_PERIOD, Endpoint
-from tfbus.links._message import Message
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._message import Message, write_answer
 from tfbus.links._outbox import Turn
 from tfbus.links._peers import MAX_PEERS
-from tfbus.links._receive_queue import Answer, Presence, Question, Received
+from tfbus.links._receive_queue import Answer, HistoryAnswer, Presence, Question, Received
+from tfbus.links._state import StateStep
 from tfbus.tf_message import MalformedMessageError
 
 
@@ -214,6 +216,17 @@ def test_a_peer_without_an_answer_of_use_is_asked_again_after_a_pause(
     assert due is not None
     assert 0.5 * FIRST_PAUSE <= due - domain.time <= 1.5 * FIRST_PAUSE
     assert end.endpoint.peers.rejected == rejected
+    for made in (end, peer):
+        made.leave()
+
+
+@pytest.mark.parametrize("history", [None, 5.0])
+def test_an_answer_about_the_past_that_nobody_has_asked_for_changes_nothing(history: float | None) -> None:
+    domain = Domain()
+    end, peer = domain.join(Bus(SimulatedClock()), history=history), domain.join(Bus(SimulatedClock()))
+    said = write_answer([OutgoingBatch(bytes(16), 1, [moving("map", "a", 1)])], StateStep(0, 0, 0))
+    end.receive(peer.id, HistoryAnswer(said))
+    assert (end.bus.statistics().frames, end.endpoint.peers.rejected) == (0, {})
     for made in (end, peer):
         made.leave()
 

@@ -1,3 +1,4 @@
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -245,6 +246,8 @@ def test_a_peer_whose_answers_lead_nowhere_is_asked_no_more() -> None:
 
 def test_it_has_to_be_a_time_that_passes() -> None:
     with Bus() as bus:
-        for seconds in (0.0, -1.0, 2 * LONGEST_HISTORY, float("nan")):
+        for seconds in (0.0, -1.0, math.nextafter(LONGEST_HISTORY, math.inf), float("nan")):
             with pytest.raises(ValueError, match="history"):
                 ZenohLink(bus, history=seconds)
+        for seconds in (1e-3, LONGEST_HISTORY):
+            ZenohLink(bus, history=seconds)

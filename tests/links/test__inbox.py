@@ -182,6 +182,24 @@ def test_received_samples_are_published_to_the_bit(samples: list[TransformStampe
             assert all(type(sample) is ReceivedTransform and sample._provenance.origin == ORIGIN for sample in got)
 
 
+def test_the_batches_of_a_message_that_was_kept_are_published_as_one() -> None:
+    first, second = [static("map", "a"), moving("map", "b", 1)], [static("map", "c")]
+    with receiver() as here:
+        entries = [batch(first), batch(second, sequence=2)]
+        here.receive_bytes(encode([*first, *second]), pack(0, entries))
+        assert here.heard == [(*first, *second)]
+        here.receive_bytes(encode([*first, *second]), pack(1, [batch(first, sequence=3), batch(second, sequence=4)]))
+        assert here.heard[1:] == [tuple(first), tuple(second)], "live ones stay apart"
+        # An answer is no live message either.
+        here.end.receive("peer", Presence.JOINED)
+        told = [ReceivedTransform("map", name, 2, Transform()) for name in "de"]
+        batches: list[ReceivedBatch | RemovedFrame | MovingFrame] = [
+            ReceivedBatch([sample], [], ORIGIN, 5 + number) for number, sample in enumerate(told)
+        ]
+        assert here.inbox.receive_answer("peer", ReceivedMessage(batches, step=StateStep(0, 2, 0, final=False)))
+        assert here.heard[3:] == [tuple(told)]
+
+
 def test_an_empty_message_and_an_empty_batch_call_no_subscriber() -> None:
     with receiver() as here:
         here.receive_bytes(encode(()), pack(1, []))
@@ -214,6 +232,7 @@ def test_only_wanted_frames_come_in_or_go() -> None:
         ((5, 1, 2, 3), 0),
         ((5, 0, 0, 6), 0),
         ((0, 0, 0), 0),
+        ((0, 5, 6), 0),
         ((1, 3, 3, 3), 1),
         ((1, 3, 2, 4), 1),
         ((1, 2**32 + 2), 2**32),
@@ -276,7 +295,28 @@ def test_when_a_peer_has_told_its_whole_state_the_frames_go_that_it_brings_no_mo
         assert set(here.frames) == set("abcd"), "the rest may follow"
         assert here.inbox.receive_answer("peer", ReceivedMessage([MovingFrame("c")], step=last))
         assert set(here.frames) == set("acd")
-        assert here.counts == (6, 4, 0, 0)
+        assert not here.inbox.receive_answer("peer", ReceivedMessage([MovingFrame("c")], step=last)), "told already"
+        assert here.counts == (7, 4, 0, 0)
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_the_frames_of_a_peer_go_that_tells_of_a_state_without_any_change(told: bool) -> None:
+    with receiver() as here:
+        here.receive(moving("map", "b", 1), sequence=1, sender="other")
+        here.receive(moving("map", "a", 1), sequence=1)
+        here.lose()
+        here.end.receive("peer", Presence.JOINED)
+        here.receive(moving("map", "a", 2), sequence=2)
+        if told:
+            step = StateStep(0, 1, digest_moving("a"))
+            assert here.inbox.receive_answer("peer", ReceivedMessage([MovingFrame("a")], step=step))
+        assert set(here.frames) == {"a", "b"}
+        peer = here.peers.find("peer")
+        assert peer is not None
+        assert peer.mirror is not None
+        peer.mirror.asks()
+        assert not here.inbox.receive_answer("peer", ReceivedMessage([], step=StateStep(0, 0, 0)))
+        assert here.frames == ["b"]
 
 
 def test_a_claim_that_is_near_a_large_number_is_believed() -> None:
@@ -500,6 +540,14 @@ def test_a_loss_is_passed_on_towards_the_owner_once_though_several_peers_tell_of
         assert here.frames == ["s"]
         losses = {number: [RemovedFrame(OTHER, number, "s", lost=True)] for number in (9, 10)}
         assert passed_on == [[], losses[9], [], losses[10], []]
+        # The owner, too, loses it and has it again.
+        for number, entry in ((2, RemovedFrame(OTHER, 11, "s", lost=True)), (3, batch([static("map", "s")]))):
+            samples = [static("map", "s")] if number == 3 else []
+            towards.receive("owner", Message(encode(samples), pack(number, [entry]), number))
+            assert here.frames == ["s"] * (number == 3)
+        towards.endpoint.outbox.flush()
+        here.remove("s", origin=OTHER, sequence=10, lost=True)
+        assert towards.endpoint.outbox.flush().entries == losses[10], "what was passed on before counts no more"
         towards.leave()
 
 
@@ -818,7 +866,8 @@ def test_what_a_peer_tells_that_has_gone_is_not_taken() -> None:
         assert not here.inbox.receive_answer("peer", told)
         here.inbox.receive_history("peer", told)
         assert (here.counts, here.peers.rejected) == ((0, 0, 0, 0), {})
-        # While it is there, what of that is invalid is counted.
+        # While it is there, what of that is invalid is counted, and only batches of known buses are of the past.
+        told.entries += [RemovedFrame(ORIGIN, 2, "a"), MovingFrame("a"), ReceivedBatch([], [], None)]
         here.peers.find("peer")
         here.inbox.receive_history("peer", told)
         assert (here.counts, here.peers.rejected) == ((1, 0, 0, 0), {"bad": 1})

@@ -134,8 +134,9 @@ def test_the_step_of_a_turn_is_in_its_only_message_or_behind_all_of_them() -> No
         (1, STEP._replace(message=1))
     ]
     assert steps(writer.write([batch, batch], STEP)) == [(2, None), (3, None), (0, STEP._replace(message=3))]
-    assert steps(writer.write([bad], STEP)) == [(0, STEP._replace(message=3))]
-    assert steps([writer.claim(STEP)]) == [(0, STEP._replace(message=3))]
+    assert steps(writer.write([batch], STEP)) == [(4, None), (0, STEP._replace(message=4))]
+    assert steps(writer.write([bad], STEP)) == [(0, STEP._replace(message=4))]
+    assert steps([writer.claim(STEP)]) == [(0, STEP._replace(message=4))]
 
 
 @pytest.mark.thorough

@@ -154,6 +154,19 @@ def test_an_echo_does_not_go_out_and_replaces_what_is_kept() -> None:
     assert not any(map(sender.outbox.state.brings, ("s", "t", "u", "new", "a"))), "another link brings them"
     sender.add(static("map", "s", 8.0), origin=OTHER, echo=True)
     assert sender.notified == 3
+    # Not brought any more, but still kept for late joiners.
+    sender.add(moving("map", "s", 9), origin=OTHER, echo=True)
+    assert (sender.notified, sender.kept()) == (4, {"s": None})
+
+
+def test_a_frame_that_another_link_brings_now_is_released_with_the_number_of_what_is_lost() -> None:
+    sender = Sender()
+    sender.add(static("map", "s"), moving("map", "a", 1))
+    sender.add(static("map", "s"), static("map", "a"), origin=OTHER, echo=True)
+    state = sender.outbox.state
+    assert state.entry("s") == RemovedFrame(ORIGIN, 1, "s", lost=True)
+    # A moving frame is in the state without a number.
+    assert state.entry("a") == RemovedFrame(bytes(16), 0, "a", lost=True)
 
 
 def test_a_turn_tells_what_it_changes_of_the_state_unless_an_echo_has_changed_it() -> None:

@@ -98,6 +98,23 @@ def test_a_second_link_of_a_bus_brings_its_static_frames_to_another_domain() -> 
         assert [bus.statistics().samples for bus in net.buses[:2]] == [3, 3]
 
 
+def test_a_static_frame_goes_out_by_a_later_link_with_the_number_that_it_has() -> None:
+    with Network([[0], [0], [0, 1]]) as net:
+        bus = net.buses[0]
+        net.buses[1].publish(static("map", "theirs"))
+        net.settle()
+        bus.publish([static("map", "mine"), static("map", "too")])
+        net.settle()
+        first, _, home = (end for end in net.ends if end.bus is bus)
+        later = Domain().join(bus).endpoint.outbox.state
+        for frame in ("mine", "too", "theirs"):
+            entry, known = later.entry(frame), first.endpoint.outbox.state.entry(frame)
+            assert isinstance(entry, OutgoingBatch)
+            assert isinstance(known, OutgoingBatch)
+            assert (entry.origin, entry.sequence) == (known.origin, known.sequence)
+        assert home.endpoint.outbox.state.entry("theirs") is None, "nothing goes back"
+
+
 def test_samples_of_several_origins_in_one_batch_keep_their_origins() -> None:
     with Network(RING) as net:
         a, b, c = net.buses
@@ -653,7 +670,9 @@ def test_the_links_of_a_bus_share_a_relay_that_forgets_everything_when_the_last_
         first.leave()
         assert size_of(first.relay) > len(first.relay.origin), "the other link still needs it"
         second.leave()
-        assert size_of(first.relay) == len(first.relay.origin)
+        a.publish([static("map", "later"), moving("map", "a", 2)])
+        a.remove_frame("t")
+        assert size_of(first.relay) == len(first.relay.origin), "and hears of nothing more"
         for domain in net.domains:
             domain.ends = [end for end in domain.ends if end.bus is not a]
 

@@ -60,6 +60,18 @@ def test_of_two_removals_of_samples_of_one_origin_that_of_the_newer_sample_is_re
     assert not removals.is_late(word(5, Peer("q")), "s")
 
 
+def test_of_very_many_removals_the_first_are_forgotten_and_one_that_is_repeated_is_the_last() -> None:
+    removals = Removals()
+    peer = Peer("p")
+    unknown = removals.rank("unknown")
+    for number in range(10_000):
+        removals.remove(f"{number}", word(number, peer))
+    assert removals.rank("0") == (0, A)
+    removals.remove("0", word(20_000, peer))
+    removals.remove("one more", word(20_001, peer))
+    assert [removals.rank(frame) for frame in ("0", "1", "2")] == [(20_000, A), unknown, (2, A)]
+
+
 @pytest.mark.parametrize("live", [True, False])
 def test_of_the_removals_that_are_forgotten_the_highest_number_outdates_live_samples_of_unknown_frames(
     live: bool,

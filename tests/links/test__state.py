@@ -76,6 +76,8 @@ def test_a_long_state_is_told_in_chunks() -> None:
         state.change(f"{number}", kept(f"{number}"))
     first, step = state.changes(0)
     assert (len(first), step) == (CHUNK, StateStep(0, CHUNK, 0, final=False))
+    last, step = state.changes(CHUNK)
+    assert (len(last), step) == (CHUNK, StateStep(CHUNK, 2 * CHUNK, state.digest)), "there is nothing behind it"
     state.change("0", kept("0", 9))
     second, step = state.changes(CHUNK, 400)
     assert (len(second), step) == (400, StateStep(CHUNK, CHUNK + 400, 0, final=False))

@@ -150,6 +150,20 @@ async def test_a_second_application_gets_the_static_frames_of_now(bus: Bus) -> N
             assert lidar[2:4] == ("lidar", (3.0, 0.0, 0.0))
 
 
+async def test_static_frames_that_went_while_nobody_had_subscribed_are_not_sent_later(bus: Bus) -> None:
+    bus.publish([static("base", "lidar", 2.0, START), static("base", "gone", 1.0, START)])
+    async with FoxgloveServer(bus, 0) as server:
+        async with application(server) as first:
+            first.subscribe()
+            assert len(await anyio.to_thread.run_sync(first.transforms)) == 2
+        await until(lambda: not bus._subscribers.callbacks)
+        bus.remove_frame("gone")
+        async with application(server) as second, application(server) as third:
+            for later in (second, third):
+                later.subscribe()
+                assert [each[2] for each in await anyio.to_thread.run_sync(later.transforms)] == ["lidar"]
+
+
 async def test_while_nobody_has_subscribed_the_bus_is_not_listened_to(bus: Bus) -> None:
     async with FoxgloveServer(bus, 0) as server:
         bus.publish(moving("map", "base", START))
@@ -163,13 +177,13 @@ async def test_while_nobody_has_subscribed_the_bus_is_not_listened_to(bus: Bus) 
 
 
 async def test_stamps_that_foxglove_cannot_hold_are_counted(bus: Bus) -> None:
-    bus.publish(
-        [static("map", "early", stamp=-1), static("map", "late", stamp=2**32 * SECOND), static("map", "ok", 1.0)]
-    )
+    end = 2**32 * SECOND
+    bus.publish([static("map", "early", stamp=-1), static("map", "late", stamp=end), static("map", "ok", 1.0)])
+    bus.publish(static("map", "last", stamp=end - 1))
     async with FoxgloveServer(bus, 0) as server, application(server) as app:
         app.subscribe()
-        assert [each[2] for each in await anyio.to_thread.run_sync(app.transforms)] == ["ok"]
-        assert (server.sent, server.not_sent) == (1, 2)
+        assert [each[2] for each in await anyio.to_thread.run_sync(app.transforms)] == ["ok", "last"]
+        assert (server.sent, server.not_sent) == (2, 2)
 
 
 async def test_a_port_that_is_taken_is_an_error(bus: Bus) -> None:

@@ -123,6 +123,7 @@ async def test_a_link_tells_its_name_and_how_many_peers_it_has() -> None:
     carrier, told = LoggedCarrier(), list[str]()
     with Bus() as bus:
         link = Link(bus, "world", carrier)
+        assert link.statistics().queue.capacity == 10_000
         told.append(repr(link))
         async with link:
             for count, name in enumerate(("a", "b")):
@@ -311,12 +312,26 @@ async def test_moving_items_that_wait_when_the_clock_jumps_back_are_dropped() ->
             for is_static in (False, True):
                 message = ForeignMessage(is_static, [ARM._replace(child=f"{is_static}")])
                 carrier.receive(Received("driver", message, moving=not is_static))
-            clock.set(20)
-            assert link.statistics().queue.dropped == 0
+            for now in (20, 20):
+                clock.set(now)
+                assert link.statistics().queue.dropped == 0
             clock.set(5)
             await receive_samples(link, 1)
             assert link.statistics().queue.dropped == 1
             assert bus.statistics().frames == 1
+
+
+async def test_a_sample_that_comes_once_more_is_news_again_when_the_clock_has_jumped_back() -> None:
+    clock, carrier = SimulatedClock(start=10), LoggedCarrier()
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier) as link:
+            counts = []
+            for now in (10, 20, 20, 5):
+                clock.set(now)
+                carrier.receive(Received("driver", ForeignMessage(False, [ARM]), moving=True))
+                await until(lambda: link.statistics().queue.pending == 0)
+                counts.append((link.statistics().received_samples, link.statistics().duplicates))
+    assert counts == [(1, 0), (1, 1), (1, 2), (2, 2)]
 
 
 async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() -> None:
@@ -343,6 +358,16 @@ async def test_presence_and_refusals_are_announced_under_the_name_of_the_link() 
     assert (rejected.reason, str(rejected.error)) == ("not published", "broken")
     assert isinstance(lost, PeerLost)
     assert (lost.authorities, lost.frames) == (("foreign",), ("arm",))
+
+
+async def test_the_frames_of_a_lost_peer_stay_unless_they_are_to_be_dropped() -> None:
+    carrier = LoggedCarrier()
+    with Bus() as bus:
+        async with Link(bus, "world", carrier) as link:
+            for content in (Presence.JOINED, ForeignMessage(False, [ARM]), Presence.LEFT):
+                carrier.receive(Received("driver", content))
+            await until(lambda: link.statistics().queue.pending == 0)
+            assert (link.peers, bus.statistics().frames) == ((), 1)
 
 
 class AskingCarrier(WireCarrier):
@@ -425,6 +450,16 @@ async def test_a_link_tells_no_time_that_it_is_not_to_tell() -> None:
     assert told == [None]
 
 
+async def test_a_link_tells_the_time_that_it_finds_although_the_clock_stands_still() -> None:
+    clock, carrier = SimulatedClock(start=7), LoggedCarrier()
+    told: list[int | None] = []
+    carrier.send = lambda turn: told.append(turn.time)  # type: ignore[method-assign]
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier, tell_clock=True):
+            await anyio.wait_all_tasks_blocked()
+            assert told == [7]
+
+
 async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own() -> None:
     clock = SimulatedClock()
     followers: list[int] = []
@@ -445,4 +480,6 @@ async def test_a_link_drives_a_clock_that_follows_and_tells_the_time_of_its_own(
             await until(lambda: told[-1] == 1_500)
     assert followers == [1_000, 1_500]
     await clock.advance(1.0)
-    assert max(filter(None, told)) == 1_500
+    clock.set(1)
+    await anyio.wait_all_tasks_blocked()
+    assert told[-1] == max(filter(None, told)) == 1_500, "behind the end nothing is told"

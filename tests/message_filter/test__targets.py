@@ -40,7 +40,8 @@ def test_one_target_gives_a_transform_and_several_give_a_tuple() -> None:
 def test_a_target_that_is_the_frame_of_the_message_needs_no_lookup() -> None:
     bus, targets = make("laser", tolerance=1.0)
     assert list(targets.questions("laser", 5)) == []
-    assert targets.lookup_nowait("laser", 5).stamp == 5
+    answer = targets.lookup_nowait("laser", 5)
+    assert (answer.parent, answer.child, answer.stamp, answer.static) == ("laser", "laser", 5, True)
     bus.clock.set(8)  # type: ignore[attr-defined]
     assert targets.lookup_nowait("laser", LATEST).stamp == 8
 

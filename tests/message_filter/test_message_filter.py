@@ -9,7 +9,8 @@ from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from inspect import signature
+from typing import Any, get_overloads
 
 import anyio
 import pytest
@@ -177,10 +178,21 @@ async def test_a_full_queue_drops_the_oldest_messages(bus: Bus, buffer: Buffer, 
         for stamp, (_, _, error) in enumerate(drops.all, 1):
             assert isinstance(error, FutureExtrapolationError)
             assert (error.child, error.stamp, error.newest) == ("laser", stamp, 0)
+        # No lookup goes on for a message that was dropped.
+        assert [waiting.question.at for waiting in buffer.pending()] == list(range(11, 21))
         bus.publish(moving("map", "laser", 20))
         await settle()
         assert stamps([await anext(pairs) for _ in range(10)]) == list(range(11, 21))
         assert (pairs.arrived, pairs.delivered, pairs.pending) == (20, 10, 0)
+
+
+def test_the_defaults_that_type_checkers_and_pages_show_are_those_of_the_filter() -> None:
+    def defaults(function: Callable[..., object]) -> dict[str, object]:
+        return {name: parameter.default for name, parameter in signature(function).parameters.items()}
+
+    shown = [defaults(overload) for overload in get_overloads(MessageFilter.__init__)]
+    assert shown == [defaults(MessageFilter.__init__)] * 2
+    assert shown[0]["capacity"] == 100
 
 
 async def test_the_target_can_be_changed_while_messages_wait(bus: Bus, buffer: Buffer, streams: Streams) -> None:

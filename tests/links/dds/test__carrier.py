@@ -1,3 +1,5 @@
+from threading import Event
+from threading import enumerate as enumerate_threads
 from types import SimpleNamespace
 from typing import Any, Unpack
 
@@ -6,6 +8,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
+from cyclonedds.core import Entity, ReadCondition
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -20,6 +23,7 @@ from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.dds import _carrier
 from tfbus.links.dds._carrier import _MOVING, _STATIC, _STATICS, DdsCarrier, _nodes_of
 from tfbus.links.dds._domains import configuration, domain
 from tfbus.links.dds._publishers import PATIENCE, Publishers
@@ -344,6 +348,37 @@ async def test_what_dds_does_not_take_is_reported(domain_number: int) -> None:
     writer._ref = 0
     carrier.send(Turn([OutgoingBatch(bytes(16), 1, [moving("map", "base", 1)])], {}))
     assert (len(errors), report.messages) == (1, 0)
+
+
+async def test_all_that_a_carrier_has_made_is_deleted_at_its_end_though_somebody_still_has_it(
+    domain_number: int,
+) -> None:
+    before = {*Entity._entities.values()}
+    takers: RosOptions = {"joint_states": print, "clock": SimulatedClock(), "robot_description": print}
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of(takers))
+    await carrier.open(print, SendReport(print))
+    # Topics and read conditions go with what they belong to.
+    made = [
+        each for each in Entity._entities.values() if each not in before and not isinstance(each, Topic | ReadCondition)
+    ]
+    await carrier.close()
+    assert len(made) > 10
+    assert [each for each in made if each in Entity._entities.values()] == []
+
+
+async def test_a_domain_that_cannot_be_left_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_carrier, "_CLOSING_TIME", 0.01)
+    carrier, _ = unopened()
+    going_on, left = Event(), Event()
+    carrier._open.callback(left.set)
+    carrier._open.callback(going_on.wait, 20.0)
+    await carrier.close()
+    (closing,) = [thread for thread in enumerate_threads() if thread.name == "tfbus dds close"]
+    ended_before = left.is_set()
+    going_on.set()
+    closing.join(20.0)
+    assert (ended_before, left.is_set()) == (False, True)
+    assert closing.daemon, "nor at the end of the program"
 
 
 async def test_a_carrier_that_never_opened_closes(domain_number: int) -> None:

@@ -40,6 +40,8 @@ def test_a_domain_is_open_until_its_last_user_ends(domain_number: int) -> None:
         with domain(domain_number, HERE):
             assert _open[domain_number].users == 2
         assert _open[domain_number].users == 1
+        # As the traceback of an error may.
+        kept = _open[domain_number]
         with (
             pytest.raises(OSError, match="another configuration"),
             domain(domain_number, configuration("subnet", (), None)),
@@ -48,6 +50,7 @@ def test_a_domain_is_open_until_its_last_user_ends(domain_number: int) -> None:
     assert _open == {}
     with domain(domain_number, configuration("localhost", ("127.0.0.1",), None)):
         assert _open[domain_number].users == 1
+    assert kept.users == 0
 
 
 def test_a_configuration_that_cannot_be_read_is_an_os_error(domain_number: int, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+import weakref
 from contextlib import ExitStack
 from pathlib import Path
 from threading import Event
@@ -10,6 +11,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
+from cyclonedds.core import DDSStatus
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
@@ -17,6 +19,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from support.both_sides import node
 
+from tfbus.links.dds import _reader_thread
 from tfbus.links.dds._domains import configuration, domain
 from tfbus.links.dds._reader_thread import ReaderThread
 from tfbus.links.dds._types import RawString
@@ -27,9 +30,18 @@ CYCLONE_PEER = Path(__file__).parents[2] / "support" / "cyclone_peer.py"
 PATIENCE = 30.0
 
 
-def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(domain_number: int) -> None:
+def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(
+    domain_number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[Any] = []
-    errors: list[Exception] = []
+    serve, rounds = _reader_thread._serve, list[None]()
+
+    def count(watched: Any) -> None:
+        rounds.append(None)
+        serve(watched)
+
+    monkeypatch.setattr(_reader_thread, "_serve", count)
+    errors: list[str] = []
     woken = Event()
 
     def take(reader: DataReader[Any]) -> None:
@@ -50,7 +62,8 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(domain
         woken.set()
 
     def fail(error: Exception) -> None:
-        errors.append(error)
+        # Its traceback would keep the reader.
+        errors.append(str(error))
         woken.set()
 
     with domain(domain_number, CONFIG), ExitStack() as stack:
@@ -72,8 +85,29 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(domain
         wait_for(6)
         thread.stop()
         reader.__del__()
+        gone = weakref.ref(reader)
+        del reader
+        assert gone() is None, "the thread has let go of it"
     assert told == [1, "first", "bad", "last", 0]
-    assert [str(error) for error in errors] == ["bad"]
+    assert len(rounds) < 30, "it rests while nothing comes"
+    assert errors == ["bad"]
+
+
+def test_only_what_is_served_wakes_the_thread(domain_number: int) -> None:
+    with domain(domain_number, CONFIG), ExitStack() as stack:
+        participant = DomainParticipant(domain_number)
+        stack.callback(participant.__del__)
+        topic = Topic(participant, "rt/text", RawString)
+        readers: list[DataReader[Any]] = [DataReader(participant, topic) for _ in range(2)]
+        thread = ReaderThread(participant, print)
+        thread.watch(readers[0], print)
+        thread.watch(readers[1], print, print)
+        thread.start()
+        masks = [reader.get_status_mask() for reader in readers]
+        thread.stop()
+        for reader in readers:
+            reader.__del__()
+    assert masks == [DDSStatus.DataAvailable, DDSStatus.DataAvailable | DDSStatus.SubscriptionMatched]
 
 
 TWO_LINKS = """

@@ -3,6 +3,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import anyio
+import pytest
 import zenoh
 from support.processes import until
 from support.programs import free_address
@@ -10,6 +11,7 @@ from support.samples import moving, static
 
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Received
+from tfbus.links.rmw_zenoh import _carrier
 from tfbus.links.rmw_zenoh._carrier import RmwZenohCarrier
 from tfbus.links.rmw_zenoh._wire import (
     CLOCK_HASH,
@@ -81,7 +83,8 @@ def test_a_node_announces_its_topics_and_passes_messages_on_both_ways() -> None:
     nothing: Any = print
     options = settings_of({"joint_states": nothing, "clock": nothing, "robot_description": nothing})
     made, items = RmwZenohCarrier(7, "tfbus", settings(address, None, None, 2.0), options), Queue[Received]()
-    made._receive, made._report = items.put, SendReport(print)
+    errors = list[Exception]()
+    made._receive, made._report = items.put, SendReport(errors.append)
     heard = Queue[zenoh.Sample]()
     made._join()
     assert made._session is not None
@@ -131,11 +134,16 @@ def test_a_node_announces_its_topics_and_passes_messages_on_both_ways() -> None:
             assert found == (key == "/joint_states", key == "/clock", key == "/robot_description")
     anyio.run(made.close)
     assert made._publish([moving("map", "base", 3)], static=False) is False
+    assert errors == [], "its end is no failure"
+    assert made._close_at_exit is not None
+    assert not made._close_at_exit.alive, "nothing is left to do when the program exits"
 
 
 def test_whoever_comes_late_gets_the_last_message_of_static_frames_and_no_moving_ones() -> None:
     address = free_address()
-    early = RmwZenohCarrier(7, "early", settings(address, None, None, 2.0), settings_of({}))
+    # Of several topics, the first is spoken to.
+    several = settings_of({"tf": ["/tf", "/other/tf"], "tf_static": ["/tf_static", "/other/tf_static"]})
+    early = RmwZenohCarrier(7, "early", settings(address, None, None, 2.0), several)
     late = RmwZenohCarrier(7, "late", settings(None, address, None, 2.0), settings_of({"send": False}))
     items = Queue[Received]()
     late._receive = items.put
@@ -150,6 +158,8 @@ def test_whoever_comes_late_gets_the_last_message_of_static_frames_and_no_moving
         encode([static("map", "lidar", stamp=2)]), static=True, authority="rmw_zenoh"
     )
     assert items.empty()
+    # One that is not to send has no publisher.
+    assert late._publish([static("map", "late")], static=True) is False
     for made in (late, early):
         anyio.run(made.close)
 
@@ -167,6 +177,20 @@ def test_what_cannot_be_sent_is_not_counted_as_sent() -> None:
     made._publishers[True] = closed
     assert made._publish([static("map", "lidar")], static=True) is False
     assert ["the session is closed" in str(error) for error in errors] == [True]
+
+
+def test_a_session_that_does_not_close_in_time_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, _ = carrier()
+    errors: list[Exception] = []
+    made._report = SendReport(errors.append)
+    late = TimeoutError("it goes on")
+
+    async def wait(_: object) -> TimeoutError:
+        return late
+
+    monkeypatch.setattr(_carrier, "wait_until_closed", wait)
+    anyio.run(made.close)
+    assert errors == [late]
 
 
 def test_a_carrier_that_never_opened_closes() -> None:

@@ -6,6 +6,7 @@ from tfbus.links.rmw_zenoh._wire import (
     HASH,
     JOINT_HASH,
     JOINT_TYPE,
+    TEXT_HASH,
     Attachment,
     endpoint_token,
     node_token,
@@ -22,6 +23,7 @@ def test_the_hash_is_that_of_the_type() -> None:
     assert hash_of("tf2_msgs/msg/TFMessage") == HASH
     assert hash_of("sensor_msgs/msg/JointState") == JOINT_HASH
     assert hash_of("rosgraph_msgs/msg/Clock") == CLOCK_HASH
+    assert hash_of("std_msgs/msg/String") == TEXT_HASH
 
 
 def test_keys_and_tokens_are_those_of_rmw_zenoh() -> None:

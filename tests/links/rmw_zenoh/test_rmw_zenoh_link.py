@@ -21,6 +21,7 @@ from support.wires import latched
 from tfbus import SECOND, Buffer, Bus, PeerRejected
 from tfbus.links.rmw_zenoh import RmwZenohLink
 from tfbus.links.rmw_zenoh._wire import HASH, JOINT_HASH, JOINT_TYPE, TEXT_HASH, TEXT_TYPE, TYPE
+from tfbus.links.rmw_zenoh.rmw_zenoh_link import _config
 from tfbus.links.zenoh import ZenohRouter
 from tfbus.tf_message import encode
 
@@ -232,6 +233,17 @@ async def test_links_begin_and_end_again_and_again() -> None:
 def test_arguments_that_are_not_valid_are_refused(arguments: Any, error: type[Exception], said: str) -> None:
     with pytest.raises(error, match=said):
         RmwZenohLink(Bus(), **arguments)
+
+
+def test_settings_of_zenoh_are_laid_over_those_of_a_client_of_the_router() -> None:
+    config = _config("tcp/robot:7447", {"scouting/multicast/enabled": True, "connect/timeout_ms": 500})
+    read = {
+        path: json.loads(config.get_json(path))
+        for path in ("mode", "connect/endpoints", "timestamping/enabled", "scouting/multicast/enabled")
+    }
+    # Without time stamps nothing is kept for late joiners.
+    assert list(read.values()) == ["client", ["tcp/robot:7447"], True, True]
+    assert json.loads(_config("tcp/robot:7447", {}).get_json("scouting/multicast/enabled")) is False
 
 
 def test_the_domain_is_that_of_the_variable_unless_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,16 +4,19 @@ from types import SimpleNamespace
 from typing import Any
 
 import anyio
+import anyio.lowlevel
 import pytest
 
 pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
 from support.processes import until
 from support.rosbridge import rosbridge_server
-from support.samples import moving
+from support.samples import moving, static
 
 from tfbus import SimulatedClock
 from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros._carrier import RosMessage
 from tfbus.links.ros.settings import settings_of
@@ -143,6 +146,9 @@ async def test_each_topic_has_its_kind_and_only_what_comes_again_may_be_dropped(
         Received(url, RosMessage("content", static=False, authority="", description=True), 7),
     ]
     assert alone.carrier._heard_moving
+    alone.carrier._take(Incoming("", "status: no such type", "none"), 7)
+    assert [str(error) for error in alone.errors] == [f"{url} says: status: no such type"]
+    assert len(alone.items) == 5
 
 
 @pytest.mark.parametrize(("encoding", "joints"), [("cbor", "none"), ("cbor-raw", "cbor-raw")])
@@ -172,6 +178,18 @@ async def test_what_waited_for_a_server_that_has_gone_is_not_sent_to_the_next_on
     await alone.connect(monkeypatch, 200.0)
     assert list(alone.carrier._requests) == first
     assert not alone.carrier._moving
+
+
+async def test_static_frames_are_sent_again_to_a_server_that_is_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = Alone(monkeypatch)
+    await alone.connect(monkeypatch, 100.0)
+    kept = OutgoingBatch(bytes(16), 1, [static("map", "lidar")])
+    alone.carrier.send(Turn([], {"lidar": kept}))
+    # Sent, and then the server goes.
+    text, alone.carrier._changed_statics = alone.carrier._changed_statics, None
+    await alone.connect(monkeypatch, 200.0)
+    assert alone.carrier._changed_statics == text
+    assert "lidar" in str(text)
 
 
 @pytest.mark.parametrize(
@@ -232,6 +250,65 @@ async def test_a_server_is_pinged_until_it_has_been_silent_for_too_long(monkeypa
         await alone.carrier._keep_alive(socket)
     assert alone.pauses == [_carrier.SILENCE / 4] * 5
     assert len(pings) == 4
+
+
+class Socket:
+    """An open connection to a server that says nothing."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[str, str]] = []
+        self.closed = False
+        self.heard = math.inf
+
+    async def ping(self) -> None:
+        """It is heard for ever."""
+
+    async def send(self, text: str) -> None:
+        await anyio.lowlevel.checkpoint()
+        request = json.loads(text)
+        self.sent.append((request["op"], request["topic"]))
+
+    async def receive(self) -> str:
+        await anyio.sleep_forever()
+        raise AssertionError
+
+    async def close(self) -> None:
+        await anyio.lowlevel.checkpoint()
+        self.closed = True
+
+
+async def test_what_waits_is_sent_at_the_end_of_a_cancelled_link_too() -> None:
+    carrier, socket = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({})), Socket()
+    carrier._socket = socket  # type: ignore[assignment]
+    assert carrier._publish([moving("map", "a", 1)], static=False)
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        await carrier.close()
+    assert socket.sent == [("advertise", "/tf"), ("publish", "/tf")]
+    assert socket.closed
+
+
+async def test_a_carrier_talks_until_its_link_ends_and_then_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_carrier, "_CLOSING_TIME", 1_000.0)
+    monkeypatch.setattr(_carrier, "_MISS_PERIODS", (0.0, 1_000.0))
+    carrier, socket = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({}), lookup_waits=lambda: True), Socket()
+    opened: Any = socket
+    carrier._socket = opened
+    # A time of holding back that is over.
+    carrier._held_until = 0.0
+    with anyio.fail_after(20):
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(carrier.run)
+            # For the lookup that waits, and because of that time.
+            asked = again("/tf_static") + 2 * again("/tf")
+            await until(lambda: sorted(socket.sent) == sorted(asked))
+            for _ in range(2):
+                socket.sent.clear()
+                assert carrier._publish([moving("map", "a", 1)], static=False)
+                await until(lambda: socket.sent[-1:] == [("publish", "/tf")])
+            tasks.cancel_scope.cancel()
+    assert carrier._socket is opened, "what is left is sent when it closes"
+    assert not socket.closed
 
 
 def again(topic: str) -> list[tuple[str, str]]:

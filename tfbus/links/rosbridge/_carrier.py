@@ -85,7 +85,7 @@ class RosbridgeCarrier(RosCarrier):
         self._connected_at = self._broken_at = self._held_until = -inf
         # Made when the server is there: anyio makes none without an event loop.
         self._writing: anyio.CancelScope
-        self._ending = False
+        self._ending: bool
 
     async def _connect(self) -> None:
         self._socket = await WebSocket.connect(self._url, MAX_SIZE, CONNECT_TIME)
