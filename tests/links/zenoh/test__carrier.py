@@ -155,6 +155,9 @@ class Sessions:
         self.closing: list[threading.Thread] = []
         self._broken = broken
 
+    def open(self) -> None:
+        pass
+
     def is_heard(self) -> bool:
         self._check()
         return True
@@ -181,7 +184,6 @@ class Sessions:
 
 async def alone(sessions: Sessions, monkeypatch: pytest.MonkeyPatch) -> End:
     """A carrier that is open, with sessions that a test gives."""
-    monkeypatch.setattr(Sessions, "open", lambda _: None, raising=False)
     monkeypatch.setattr(_carrier, "ZenohSessions", lambda *_: sessions)
     end = End(new_domain(), "tcp/127.0.0.1:0", listens=True)
     await end.carrier.open(end.put, end.report)
