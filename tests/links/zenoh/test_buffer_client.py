@@ -285,15 +285,13 @@ async def test_a_server_that_is_not_there_is_waited_for_no_longer_than_the_looku
     assert answers == [FOUND] * 3
 
 
-async def test_all_whose_questions_were_dropped_hear_at_once_that_the_server_has_gone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    client = met(Session([None] * 3), monkeypatch)
-    monkeypatch.setattr(buffer_client, "_SETTLING", 60.0)
+@asynccontextmanager
+async def all_lost(client: BufferClient, why: str) -> AsyncIterator[None]:
+    """Three lookups wait while the body begins, and it makes each of them fail."""
     reasons = []
 
     async def ask() -> None:
-        with pytest.raises(RemoteLookupError) as lost:
+        with pytest.raises(RemoteLookupError, match=why) as lost:
             await client.lookup("map", "base")
         reasons.append(lost.value.reason)
 
@@ -302,8 +300,17 @@ async def test_all_whose_questions_were_dropped_hear_at_once_that_the_server_has
             for _ in range(3):
                 tasks.start_soon(ask)
             await settle()
-            client._note_server("server", False)
+            yield
     assert reasons == ["lost"] * 3
+
+
+async def test_all_whose_questions_were_dropped_hear_at_once_that_the_server_has_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    client = met(Session([None] * 3), monkeypatch)
+    monkeypatch.setattr(buffer_client, "_SETTLING", 60.0)
+    async with all_lost(client, "it has gone"):
+        client._note_server("server", False)
 
 
 @pytest.mark.parametrize("losses", [0, 1, 3, 4])
@@ -348,20 +355,8 @@ async def test_the_end_of_a_client_ends_its_lookups_though_the_session_is_that_o
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     client = met(Session([]), monkeypatch)
-    ended = []
-
-    async def ask() -> None:
-        with pytest.raises(RemoteLookupError, match="this client has ended") as lost:
-            await client.lookup("map", "base")
-        ended.append(lost.value.reason)
-
-    with anyio.fail_after(PATIENCE / 2):
-        async with anyio.create_task_group() as tasks:
-            for _ in range(2):
-                tasks.start_soon(ask)
-            await settle()
-            await client.__aexit__(None, None, None)
-    assert ended == ["lost"] * 2
+    async with all_lost(client, "this client has ended"):
+        await client.__aexit__(None, None, None)
 
 
 @pytest.mark.parametrize(("unsent", "cancelled"), [(1, [1, 2]), (2, [])])
