@@ -656,7 +656,7 @@ class Dialled(Patch):
     found: tuple[str, bool] | None = None
     fails = met = False
     opens: Any = None
-    made: list["Dialled"]
+    made: ClassVar[list["Dialled"]]
 
     def __init__(self, _config: object, _keys: Keys, peer: str, *_: object) -> None:
         super().__init__(peer)
@@ -681,7 +681,7 @@ def dialled(monkeypatch: pytest.MonkeyPatch) -> type[Dialled]:
     """The class of the patches that the sessions make; nobody is reachable over UDP."""
 
     class One(Dialled):
-        made: ClassVar[list[Dialled]] = []  # type: ignore[misc]
+        made: ClassVar[list[Dialled]] = []
 
     async def is_reachable(address: str) -> bool:
         return not address.startswith("udp/")
