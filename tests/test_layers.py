@@ -12,7 +12,20 @@ import tfbus
 
 PACKAGE = Path(tfbus.__file__).parent
 
-GROUND = ("stamps", "plain", "errors", "events", "frames", "registration", "statistics", "clock", "_aio")
+GROUND = (
+    "stamps",
+    "plain",
+    "errors",
+    "events",
+    "frames",
+    "registration",
+    "statistics",
+    "rows",
+    "_python_kernel",
+    "which_kernel",
+    "clock",
+    "_aio",
+)
 
 # Each room with the rooms that it may import. It may import from the ground, and from the rooms that those may import.
 ROOMS: dict[str, tuple[str, ...]] = {
@@ -132,21 +145,8 @@ def foreign_imports(module: str) -> set[str]:
     return {name.partition(".")[0] for name in imports(module)} - {"tfbus"}
 
 
-def code_lines(module: str) -> int:
-    """The number of lines without docstrings, comments and blank lines."""
-    docstrings: set[int] = set()
-    for node in ast.walk(parsed(module)):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and node.body:
-            first = node.body[0]
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                docstrings.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
-    lines = enumerate(SOURCES[module].read_text(encoding="utf-8").splitlines(), 1)
-    return sum(1 for number, line in lines if number not in docstrings and line.strip() and line.strip()[0] != "#")
-
-
-def test_every_module_is_in_a_room_of_the_plan_and_the_plan_has_at_most_25_rooms() -> None:
+def test_every_module_is_in_a_room_of_the_plan() -> None:
     assert {room_of(module) for module in MODULES} == set(ROOMS)
-    assert len(ROOMS.keys() - {"__init__", "__main__"}) <= 25
 
 
 def test_no_room_may_import_itself_through_another() -> None:
@@ -171,18 +171,6 @@ def test_nothing_above_the_async_line_imports_a_loop_a_thread_a_socket_or_a_cloc
     assert {module: names for module, names in found.items() if names} == ALLOWED_EFFECTS
 
 
-def test_a_module_that_only_its_own_room_uses_starts_with_an_underscore_and_no_other() -> None:
-    inner = [module for module in MODULES if module not in DOORS | ROOMS.keys() and room_of(module) != "cli"]
-    private = {module for module in inner if module.rpartition(".")[2].startswith("_")}
-    used_outside = {
-        module
-        for other in MODULES
-        for module in own_imports(other)
-        if room_of(other) != room_of(module) or other in DOORS
-    }
-    assert set(inner) - used_outside == private
-
-
 def test_a_module_imports_nothing_beyond_the_dependencies_but_the_extras_of_its_room() -> None:
     wrong = [
         (module, name)
@@ -197,11 +185,6 @@ def test_no_import_hides_behind_type_checking() -> None:
     assert [module for module in MODULES if "TYPE_CHECKING" in SOURCES[module].read_text(encoding="utf-8")] == []
 
 
-def test_no_module_has_more_than_300_lines_of_code() -> None:
-    long = [module for module in MODULES if SOURCES[module].read_text(encoding="utf-8").count("\n") > 300]
-    assert [module for module in long if code_lines(module) > 300] == []
-
-
 def options_of_dataclasses(module: str) -> Iterator[tuple[str, dict[str, object]]]:
     """The name of each dataclass of a module, with the options that it is made with."""
     classes = [node for node in ast.walk(parsed(module)) if isinstance(node, ast.ClassDef)]
@@ -212,40 +195,27 @@ def options_of_dataclasses(module: str) -> Iterator[tuple[str, dict[str, object]
                 yield f"{module}.{node.name}", options
 
 
-# They count on, or collect, while something goes on.
-MUTABLE = {
-    "links._asker._Question",
-    "links._history._Open",
-    "links._inbox.ReceivedMessage",
-    "links._outbox.Turn",
-    "links.dds._publishers._Publisher",
-    "links.zenoh._dialing._Lost",
-    "links.zenoh._hearing._Check",
-    "links.zenoh._unmet._Look",
-    "recording.convert.Conversion",
-}
-
-
-def test_a_dataclass_has_slots_and_all_but_a_few_are_frozen() -> None:
+def test_every_dataclass_has_slots() -> None:
     found = dict(pair for module in MODULES for pair in options_of_dataclasses(module))
     assert len(found) > 80
     assert [name for name, options in found.items() if options.get("slots") is not True] == []
-    assert {name for name, options in found.items() if options.get("frozen") is not True} == MUTABLE
-    assert all(options.get(name, False) is False for options in found.values() for name in ("init", "eq"))
+
+
+def test_no_room_imports_what_another_marks_as_its_own() -> None:
+    # An underscore marks what no other room may import. The kernels and the event loops belong to all.
+    wrong = [
+        (module, name)
+        for module in MODULES
+        for name in imports(module)
+        if name.startswith("tfbus.")
+        and any(part.startswith("_") and not part.startswith("__") for part in name.split(".")[2:])
+        and room_of(name.removeprefix("tfbus.")) not in {room_of(module), "_aio"}
+    ]
+    assert wrong == []
 
 
 def test_every_door_says_what_its_room_is_for() -> None:
     assert [room for room in sorted(DOORS) if not ast.get_docstring(parsed(room))] == []
-
-
-def test_every_module_has_a_test_of_its_name() -> None:
-    tests = Path(__file__).parent
-    missing = []
-    for module in MODULES:
-        folder, _, name = module.rpartition(".")
-        if module not in DOORS and not (tests / folder.replace(".", "/") / f"test_{name}.py").exists():
-            missing.append(module)
-    assert missing == []
 
 
 def loaded_by(statement: str) -> set[str]:

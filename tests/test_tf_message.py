@@ -17,7 +17,7 @@ from support.allocations import peak_of
 from support.samples import moving
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped, tf_message
-from tfbus.geometry.rows import IDENTITY, Row
+from tfbus.rows import IDENTITY, Row
 from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, encode, refusal
 
 MESSAGE = "tf2_msgs/msg/TFMessage"

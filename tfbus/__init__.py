@@ -14,14 +14,8 @@ _NAMES_IN = {
     "bus.broadcaster": ("TransformBroadcaster",),
     "bus.bus": ("Bus",),
     "bus.event_stream": ("EventStream",),
-    "bus.stream": ("Stream",),
-    "bus.thread_publisher": ("ThreadPublisher",),
-    "clock": (
-        "Clock",
-        "SimulatedClock",
-        "SystemClock",
-        "Ticks",
-    ),
+    "bus.queues": ("Stream", "ThreadPublisher"),
+    "clock": ("Clock", "SimulatedClock", "SystemClock", "Ticks"),
     "data": (
         "LaserScan",
         "PointCloud",
@@ -78,26 +72,12 @@ _NAMES_IN = {
     "geometry.stamped": ("TransformStamped",),
     "geometry.transform": ("Transform",),
     "geometry.transform_array": ("TransformArray",),
-    "geometry.which_kernel": ("kernel",),
     "message_filter.message_filter": ("MessageFilter",),
     "registration": ("Registration",),
-    "robot.joint": (
-        "Joint",
-        "Mimic",
-    ),
-    "robot.model": (
-        "LimitViolation",
-        "RobotModel",
-    ),
+    "robot.joint": ("Joint", "Mimic"),
+    "robot.model": ("LimitViolation", "RobotModel"),
     "robot.state_publisher": ("RobotStatePublisher",),
-    "stamps": (
-        "LATEST",
-        "Latest",
-        "SECOND",
-        "format_stamp",
-        "from_seconds",
-        "to_seconds",
-    ),
+    "stamps": ("LATEST", "Latest", "SECOND", "format_stamp", "from_seconds", "to_seconds"),
     "statistics": (
         "BufferServerStatistics",
         "BufferStatistics",
@@ -107,18 +87,12 @@ _NAMES_IN = {
         "RecorderStatistics",
         "RobotStatistics",
     ),
-    "tree.explanation": (
-        "ExplainedEdge",
-        "Explanation",
-    ),
-    "tree.history": (
-        "Edge",
-        "Outcome",
-    ),
-    "tree.policy": ("Hold",),
-    "tree.question": ("Question",),
+    "tree.explanation": ("ExplainedEdge", "Explanation"),
+    "tree.history": ("Edge", "Outcome"),
+    "tree.lookup": ("Hold", "Question"),
     "tree.tree": ("TransformTree",),
-    "waiting.waiting_index": ("PendingLookup",),
+    "waiting.live_tree": ("PendingLookup",),
+    "which_kernel": ("kernel",),
 }
 """The public names by the module that each is in. `__init__.pyi` says the same to type checkers, as imports."""
 

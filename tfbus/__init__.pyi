@@ -12,8 +12,8 @@ from tfbus.buffer.watch import Watch as Watch
 from tfbus.bus.broadcaster import TransformBroadcaster as TransformBroadcaster
 from tfbus.bus.bus import Bus as Bus
 from tfbus.bus.event_stream import EventStream as EventStream
-from tfbus.bus.stream import Stream as Stream
-from tfbus.bus.thread_publisher import ThreadPublisher as ThreadPublisher
+from tfbus.bus.queues import Stream as Stream
+from tfbus.bus.queues import ThreadPublisher as ThreadPublisher
 from tfbus.clock import Clock as Clock
 from tfbus.clock import SimulatedClock as SimulatedClock
 from tfbus.clock import SystemClock as SystemClock
@@ -68,7 +68,6 @@ from tfbus.events import SubscriberFailed as SubscriberFailed
 from tfbus.geometry.stamped import TransformStamped as TransformStamped
 from tfbus.geometry.transform import Transform as Transform
 from tfbus.geometry.transform_array import TransformArray as TransformArray
-from tfbus.geometry.which_kernel import kernel as kernel
 from tfbus.message_filter.message_filter import MessageFilter as MessageFilter
 from tfbus.registration import Registration as Registration
 from tfbus.robot.joint import Joint as Joint
@@ -93,10 +92,11 @@ from tfbus.tree.explanation import ExplainedEdge as ExplainedEdge
 from tfbus.tree.explanation import Explanation as Explanation
 from tfbus.tree.history import Edge as Edge
 from tfbus.tree.history import Outcome as Outcome
-from tfbus.tree.policy import Hold as Hold
-from tfbus.tree.question import Question as Question
+from tfbus.tree.lookup import Hold as Hold
+from tfbus.tree.lookup import Question as Question
 from tfbus.tree.tree import TransformTree as TransformTree
-from tfbus.waiting.waiting_index import PendingLookup as PendingLookup
+from tfbus.waiting.live_tree import PendingLookup as PendingLookup
+from tfbus.which_kernel import kernel as kernel
 
 __all__: list[str]
 __version__: str

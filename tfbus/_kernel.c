@@ -1,7 +1,7 @@
 /* The compiled kernel: samples, the history of an edge, a path, the plain answer and the plain commit.
  *
  * The Python twins, which tfbus/_kernel.pyi names, are its definition. Both give the same bits, so every sum below is
- * added in the order of tfbus/geometry/rows.py, and the compiler must not fuse a multiplication with an addition
+ * added in the order of tfbus/rows.py, and the compiler must not fuse a multiplication with an addition
  * (-ffp-contract=off). Whatever is not plain is handed back: None, False or a count says so, and Python decides. There
  * is no policy and no text of a transform error here.
  *
@@ -218,7 +218,7 @@ set_string_of(PyObject *self, PyObject *value, void *closure)
     return 0;
 }
 
-/* The row of a @ b: tfbus.geometry.rows.compose. `out` may be `b`. */
+/* The row of a @ b: tfbus.rows.compose. `out` may be `b`. */
 static void
 compose(const double *a, const double *b, double *out)
 {
@@ -236,7 +236,7 @@ compose(const double *a, const double *b, double *out)
     out[6] = aw * bw - ai * bi - aj * bj - ak * bk;
 }
 
-/* The row of the inverse: tfbus.geometry.rows.invert. */
+/* The row of the inverse: tfbus.rows.invert. */
 static void
 invert(const double *a, double *out)
 {
@@ -1057,7 +1057,7 @@ typedef struct {
     const double *a, *b; /* their rows; `a` is NULL if the stamp is that of `b` */
 } Segment;
 
-/* The rotation from one sample to the next: tfbus.geometry.rows.interpolate up to the fraction. */
+/* The rotation from one sample to the next: tfbus.rows.interpolate up to the fraction. */
 typedef struct {
     double angle, scale;
     char turns, flipped;
@@ -2846,8 +2846,8 @@ intake_batch(const Intake *self, PyObject *samples)
     return batch;
 }
 
-/* take(samples, invalid): judge a batch and insert it into all buffers if it is plain and nobody else listens, else do
- * nothing. */
+/* take(samples, invalid): judge a batch and insert it into all buffers if it is plain and nobody else listens. Returns
+ * True then; None if the judge does not accept it; False if the judge was not asked. */
 static PyObject *
 intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
 {
@@ -2873,6 +2873,10 @@ intake_take(Intake *self, PyObject *const *args, Py_ssize_t nargs)
     PyObject *accepted = judge_accepts((Judge *)self->judge, batch);
     if (accepted != Py_True) {
         Py_DECREF(batch);
+        if (accepted == Py_False) {
+            Py_DECREF(accepted);
+            Py_RETURN_NONE;
+        }
         return accepted;
     }
     self->samples += PyTuple_Size(batch);
@@ -2926,7 +2930,7 @@ intake_set_feeds(Intake *self, PyObject *value, void *Py_UNUSED(closure))
 static PyMethodDef intake_methods[] = {
     {"take", FAST(intake_take), METH_FASTCALL,
      PyDoc_STR("take(samples, invalid): judge a batch and insert it into all buffers if it is plain and nobody else "
-               "listens; else do nothing.")},
+               "listens: True; None if the judge does not accept it, False if it was not asked.")},
     {NULL}
 };
 

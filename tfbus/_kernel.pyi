@@ -1,8 +1,6 @@
-"""The compiled kernel. Its Python twins say what each class does.
+"""The compiled kernel. Its Python twin, `tfbus._python_kernel`, says what each class does.
 
-They are `tfbus.geometry._python_sample` for `Sample`, `tfbus.bus._python_judge` for `Edge` and `Judge`,
-`tfbus.bus._python_intake` for `Intake`, `tfbus.waiting._python_feed` for `Parked`, `Line` and `Feed`, and
-`tfbus.tree._python_kernel` for the rest. `Method` has none: see `tfbus.tree.plain_first`.
+`Feed`, `Intake` and `Method` have no twin: without the compiled kernel the ordinary way runs; see `tfbus.which_kernel`.
 """
 
 from collections.abc import Mapping
@@ -127,7 +125,7 @@ class Intake:
     samples: int
     thread: int
     def __init__(self, judge: Judge, kind: type[Sample], listeners: tuple[Any, ...], /) -> None: ...
-    def take(self, samples: object, invalid: object, /) -> bool: ...
+    def take(self, samples: object, invalid: object, /) -> bool | None: ...
 
 class Method:
     __wrapped__: Any

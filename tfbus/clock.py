@@ -15,7 +15,7 @@ from typing import Protocol
 import anyio
 import anyio.lowlevel
 
-from tfbus._aio.settling import settling
+from tfbus._aio.loops import settling
 from tfbus.errors import ClockResetError
 from tfbus.registration import Registration
 from tfbus.stamps import SECOND, STAMP_MAX, as_duration, as_stamp, from_seconds, is_real

@@ -25,9 +25,9 @@ from itertools import islice, repeat
 from typing import Any, Final, Generic, NamedTuple, TypeVar, cast, overload
 
 from tfbus.errors import InvalidTransformError
-from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Row
 from tfbus.geometry.stamped import Fields, TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.rows import NORM_TOLERANCE, ROUNDING, Row
 from tfbus.stamps import SECOND, format_stamp
 
 MAX_NAME: Final = 1_024

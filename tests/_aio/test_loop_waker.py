@@ -8,7 +8,7 @@ import anyio.to_thread
 import pytest
 from support.asking import settle
 
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

@@ -7,7 +7,7 @@ import anyio
 import pytest
 from support.asking import Asked, settle
 
-from tfbus._aio.one_reader import OneReader, OneReaderStream
+from tfbus._aio.task_groups import OneReader, OneReaderStream
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

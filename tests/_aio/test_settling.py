@@ -9,7 +9,7 @@ import anyio.lowlevel
 import anyio.to_thread
 import pytest
 
-from tfbus._aio.settling import settling
+from tfbus._aio.loops import settling
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

@@ -3,7 +3,7 @@ from threading import Event, Thread
 import anyio
 import pytest
 
-from tfbus._aio.threads import join_all, wait_for_all
+from tfbus._aio.loops import join_all, wait_for_all
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

@@ -19,7 +19,7 @@ from support.processes import crowd, free_ports, new_domain
 from support.samples import moving, static
 
 from tfbus import Buffer, Bus, TransformStamped
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
 
 pytest_plugins = ["side_by_side"]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.asking import HandClock
 
 from tfbus import SimulatedClock, SystemClock
-from tfbus.buffer._alarms import LoopAlarms, SimulatedAlarms, _AlarmHeap, alarms_of
+from tfbus.buffer.lookups import LoopAlarms, SimulatedAlarms, _AlarmHeap, alarms_of
 
 
 class HandLoop:

@@ -9,8 +9,8 @@ from support.asking import Asked, settle
 from support.samples import moving
 
 from tfbus import LATEST, SECOND, Buffer, Bus, Question, SimulatedClock, UnknownFrameError
-from tfbus.buffer._hanging_report import HangingReport
-from tfbus.waiting.waiting_index import Waiter, WaitingIndex
+from tfbus.buffer.lookups import HangingReport
+from tfbus.waiting.live_tree import Waiter, WaitingIndex
 
 
 @pytest.fixture(autouse=True)

@@ -24,7 +24,7 @@ from tfbus import (
     from_seconds,
     to_seconds,
 )
-from tfbus.buffer._hanging_report import REPORT_AFTER
+from tfbus.buffer.lookups import REPORT_AFTER
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

@@ -1,7 +1,7 @@
 from collections import deque
 
 from tfbus import ClockReset, Event, FrameRemoved
-from tfbus.bus._announcer import Announcer
+from tfbus.bus.subscribers import Announcer
 
 
 class Recorder:

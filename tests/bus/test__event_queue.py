@@ -14,7 +14,7 @@ from tfbus import (
     SampleRejected,
     StampAhead,
 )
-from tfbus.bus._event_queue import EventQueue
+from tfbus.bus.event_stream import EventQueue
 
 
 def emptied(queue: EventQueue) -> list[Event]:

@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tfbus.bus._owner_thread import OwnerThread
+from tfbus.bus.queues import OwnerThread
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 

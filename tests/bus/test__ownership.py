@@ -15,7 +15,7 @@ from tfbus import (
     Transform,
     TransformBroadcaster,
 )
-from tfbus.bus._ownership import OnConflict, Ownership
+from tfbus.bus.ownership import OnConflict, Ownership
 
 POLICIES: list[OnConflict] = ["last", "reject"]
 

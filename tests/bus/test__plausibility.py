@@ -27,7 +27,7 @@ from tfbus import (
     TransformTree,
     do_transform,
 )
-from tfbus.bus._plausibility import Plausibility
+from tfbus.bus.topology import Plausibility
 from tfbus.stamps import STAMP_MAX
 
 pytestmark = pytest.mark.anyio

@@ -7,12 +7,11 @@ from typing import Any
 import pytest
 from support.both_kernels import COMPILED, needs_both, sample_class
 
-from tfbus.bus import _python_judge
+from tfbus import _python_kernel
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree import _python_kernel
 
 on_both = pytest.mark.parametrize(
-    "kernel", [pytest.param(_python_judge, id="python"), pytest.param(COMPILED, id="compiled", marks=needs_both)]
+    "kernel", [pytest.param(_python_kernel, id="python"), pytest.param(COMPILED, id="compiled", marks=needs_both)]
 )
 
 
@@ -36,7 +35,7 @@ def judge(kernel: Any, edges: dict[str, Any], batch: Any, horizon: int, square: 
 def sample(kernel: ModuleType, **changes: Any) -> Any:
     fields: dict[str, Any] = {"parent": "map", "child": "a", "stamp": 20, "x": 1.0, "authority": "me", "static": False}
     fields.update(changes)
-    made = sample_class(_python_kernel if kernel is _python_judge else kernel)()
+    made = sample_class(_python_kernel if kernel is _python_kernel else kernel)()
     row = (fields["x"], 4.0, 8.0, 0.0, 0.0, 0.0, 1.0)
     made._fields = fields["parent"], fields["child"], fields["stamp"], row, fields["authority"], fields["static"]
     return made

@@ -7,7 +7,7 @@ from support.samples import moving, static
 from support.wires import size_of
 
 from tfbus import FrameLive, FrameStale
-from tfbus.bus._staleness import Staleness
+from tfbus.bus.event_stream import Staleness
 
 LIMIT = 10
 

@@ -7,12 +7,10 @@ from hypothesis import strategies as st
 from support.samples import any_samples, moving, newest_samples, static
 
 from tfbus import InvalidTransformError, SimulatedClock, TransformStamped
-from tfbus.bus._announcer import Announcer
-from tfbus.bus._ownership import OnConflict, Ownership
-from tfbus.bus._plausibility import Plausibility
-from tfbus.bus._topology import Topology
-from tfbus.bus.once_logger import OnceLogger
-from tfbus.geometry.bounds import MAX_TRANSLATION
+from tfbus.bus.ownership import OnConflict, Ownership
+from tfbus.bus.subscribers import Announcer, OnceLogger
+from tfbus.bus.topology import Plausibility, Topology
+from tfbus.geometry.stamped import MAX_TRANSLATION
 
 
 def topology(*batches: Sequence[TransformStamped], on_conflict: OnConflict = "last") -> Topology:

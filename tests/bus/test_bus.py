@@ -28,8 +28,8 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
-from tfbus.bus._ownership import OnConflict
-from tfbus.waiting.waiting_index import Waiter
+from tfbus.bus.ownership import OnConflict
+from tfbus.waiting.live_tree import Waiter
 
 pytestmark = pytest.mark.anyio
 

@@ -2,7 +2,7 @@ import pytest
 from support.samples import moving, static
 
 from tfbus import SECOND
-from tfbus.bus.delays import Delays
+from tfbus.analysis.arrivals import Delays
 
 
 def test_the_delay_is_the_time_from_the_stamp_to_the_arrival() -> None:

@@ -2,7 +2,7 @@ import logging
 
 import pytest
 
-from tfbus.bus.once_logger import OnceLogger, SeenKeys
+from tfbus.bus.subscribers import OnceLogger, SeenKeys
 
 LOGGER = logging.getLogger("tests.once")
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.samples import moving, static
 
 from tfbus import QueueStatistics, TransformStamped
-from tfbus.bus.sample_queue import Overflow, SampleQueue
+from tfbus.bus.queues import Overflow, SampleQueue
 
 Batches = list[tuple[TransformStamped, ...]]
 

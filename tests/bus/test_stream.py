@@ -8,7 +8,7 @@ from support.asking import Asked, driving, settle
 from support.samples import moving, static
 
 from tfbus import Bus, BusClosedError, SimulatedClock, Stream, TransformStamped
-from tfbus.bus.sample_queue import Overflow
+from tfbus.bus.queues import Overflow
 
 pytestmark = pytest.mark.anyio
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tfbus.data._message_fields import filled, get, has, numbers
+from tfbus.data.messages import filled, get, has, numbers
 
 
 @pytest.mark.parametrize("message", [{"a": {"b": 5}}, SimpleNamespace(a=SimpleNamespace(b=5))])

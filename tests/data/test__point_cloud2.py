@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tfbus import PointCloud
-from tfbus.data._point_cloud2 import layout_of, new_layout, read_cloud
+from tfbus.data.messages import layout_of, new_layout, read_cloud
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -9,7 +9,7 @@ from support.stamped_data import ANSWER, CLOUD
 from support.strategies import TODAY, transforms, vectors
 
 from tfbus import PointCloud, PointStamped, Transform, TransformStamped, do_transform
-from tfbus.geometry.rows import Vector
+from tfbus.rows import Vector
 
 POINTS = np.zeros((2, 3))
 

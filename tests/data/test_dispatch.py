@@ -10,7 +10,7 @@ from support.stamped_data import ANSWER, MOVABLE, POINTS, SCAN, arrays_of, conte
 from support.strategies import transforms
 
 from tfbus import LATEST, Latest, PointCloud, PointStamped, Transform, TransformStamped, do_transform
-from tfbus.geometry.rows import Vector
+from tfbus.rows import Vector
 
 
 @pytest.mark.parametrize("data", MOVABLE, ids=name_of)

@@ -18,7 +18,7 @@ from tfbus import (
     Vector3Stamped,
     do_transform,
 )
-from tfbus.geometry.rows import Quaternion, Vector
+from tfbus.rows import Quaternion, Vector
 
 
 def test_a_point_is_rotated_and_translated() -> None:

@@ -17,7 +17,7 @@ from tfbus import (
     WrenchStamped,
     do_transform,
 )
-from tfbus.geometry.rows import Vector
+from tfbus.rows import Vector
 
 HALF_TURN = (1.0, 0.0, 0.0, 0.0)
 SIX = st.tuples(vectors(10.0), vectors(10.0))

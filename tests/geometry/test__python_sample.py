@@ -4,7 +4,7 @@ import pickle
 import pytest
 
 from tfbus import LATEST, SECOND, Hold, Transform, TransformStamped, TransformTree
-from tfbus.geometry._python_sample import Sample
+from tfbus._python_kernel import Sample
 
 
 def test_the_sample_in_python_reads_its_fields() -> None:

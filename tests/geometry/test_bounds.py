@@ -5,7 +5,7 @@ import pytest
 from support.samples import moving
 
 from tfbus import InvalidTransformError, Transform, TransformStamped
-from tfbus.geometry.bounds import GREATEST_BOUND, as_max_translation, check_translations, is_within, not_physical
+from tfbus.geometry.stamped import GREATEST_BOUND, as_max_translation, check_translations, is_within, not_physical
 
 FAR = Transform((1e308, 0.0, 0.0))
 

@@ -5,7 +5,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from tfbus.geometry.read_only import locked, read_only
+from tfbus.geometry.transform_array import locked, read_only
 
 Array = npt.NDArray[Any]
 LAYOUTS: list[Any] = [

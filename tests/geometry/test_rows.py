@@ -11,7 +11,7 @@ from support.strategies import rotations, transforms, unit_vectors, vectors
 from transforms3d import quaternions
 
 from tfbus import InvalidTransformError, Transform
-from tfbus.geometry.rows import (
+from tfbus.rows import (
     Columns,
     Quaternion,
     Row,

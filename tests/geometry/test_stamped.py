@@ -10,8 +10,8 @@ from hypothesis import given
 from support.strategies import samples
 
 from tfbus import LATEST, InvalidTransformError, Transform, TransformStamped
-from tfbus.geometry.rows import IDENTITY
 from tfbus.geometry.stamped import answer_of, as_batch, qualified_answer
+from tfbus.rows import IDENTITY
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MOVE = Transform((1.0, 2.0, 3.0))

@@ -15,7 +15,7 @@ from support.strategies import angles, rotations, small_angles, transforms, unit
 from transforms3d import affines, axangles, euler, quaternions
 
 from tfbus import InvalidTransformError, Transform, TransformError
-from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Quaternion, Vector
+from tfbus.rows import NORM_TOLERANCE, ROUNDING, Quaternion, Vector
 
 HALF = math.sqrt(0.5)
 QUARTER_TURN_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)

@@ -6,11 +6,11 @@ import pytest
 from support.both_kernels import COMPILED, needs_both
 
 import tfbus
-from tfbus.geometry.which_kernel import _choose
+from tfbus.which_kernel import _choose
 
 SHOW = """
 from tfbus import TransformStamped
-from tfbus.geometry.which_kernel import kernel
+from tfbus.which_kernel import kernel
 print(kernel, TransformStamped.__mro__[1].__module__)
 """
 
@@ -26,7 +26,7 @@ def run(wanted: str | None, script: str = SHOW) -> subprocess.CompletedProcess[s
 
 
 def test_python_is_the_twin() -> None:
-    assert run("python").stdout.split() == ["python", "tfbus.geometry._python_sample"]
+    assert run("python").stdout.split() == ["python", "tfbus._python_kernel"]
 
 
 @needs_both
@@ -44,7 +44,7 @@ WITHOUT = "import sys; sys.modules['tfbus._kernel'] = None\n"
 
 
 def test_the_twin_runs_where_the_compiled_kernel_is_missing() -> None:
-    assert run(None, WITHOUT + SHOW).stdout.split() == ["python", "tfbus.geometry._python_sample"]
+    assert run(None, WITHOUT + SHOW).stdout.split() == ["python", "tfbus._python_kernel"]
 
 
 def test_a_compiled_kernel_that_is_asked_for_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:

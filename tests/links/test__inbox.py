@@ -26,7 +26,7 @@ from tfbus import (
     Transform,
     TransformStamped,
 )
-from tfbus.bus._ownership import OnConflict
+from tfbus.bus.ownership import OnConflict
 from tfbus.links._attachment import MAX_ENTRIES, Entry, PublishedBatch, pack
 from tfbus.links._entries import MovingFrame, RemovedFrame
 from tfbus.links._inbox import ReceivedBatch, ReceivedMessage

@@ -13,7 +13,7 @@ from tfbus import (
     TransformError,
     UnknownFrameError,
 )
-from tfbus.message_filter._dropped_messages import DroppedMessages, DropReason, reason_of
+from tfbus.message_filter.message_filter import DroppedMessages, DropReason, reason_of
 
 FUTURE = FutureExtrapolationError(child="laser", stamp=5, oldest=1, newest=2)
 UNKNOWN = UnknownFrameError(frame="laser")

@@ -2,7 +2,7 @@ from typing import Any
 
 import pytest
 
-from tfbus.message_filter._message_queue import MessageQueue, Order, PendingMessage
+from tfbus.message_filter.message_filter import MessageQueue, Order, PendingMessage
 from tfbus.stamps import LATEST
 
 Pending = PendingMessage[str, str]

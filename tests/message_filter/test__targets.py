@@ -19,7 +19,7 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
-from tfbus.message_filter._targets import Targets
+from tfbus.message_filter.message_filter import Targets
 from tfbus.stamps import STAMP_MAX
 
 

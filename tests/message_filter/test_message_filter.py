@@ -37,7 +37,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.errors import TransformError
-from tfbus.message_filter._dropped_messages import DropReason
+from tfbus.message_filter.message_filter import DropReason
 
 pytestmark = pytest.mark.anyio
 

@@ -32,7 +32,7 @@ from tfbus import (
     SimulatedClock,
     SystemClock,
 )
-from tfbus.bus.sample_queue import TimedBatch
+from tfbus.bus.queues import TimedBatch
 from tfbus.geometry.stamped import Batch
 from tfbus.recording import Player, Recorder, load
 from tfbus.recording.formats._mcap_output import McapOutput

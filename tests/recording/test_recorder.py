@@ -39,7 +39,7 @@ from tfbus import (
     TransformStamped,
     TransformTree,
 )
-from tfbus.bus.sample_queue import TimedBatch
+from tfbus.bus.queues import TimedBatch
 from tfbus.recording.formats._mcap_output import McapOutput
 from tfbus.recording.load import load
 from tfbus.recording.recorder import _SLICE, Recorder

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from support.strategies import angles, transforms, unit_vectors, vectors
 
 from tfbus import InvalidRobotError, InvalidTransformError, Joint, Mimic, Transform
-from tfbus.geometry.rows import Vector
 from tfbus.robot.joint import KINDS
+from tfbus.rows import Vector
 
 Matrix = npt.NDArray[np.float64]
 

@@ -38,7 +38,7 @@ from tfbus import (
     TransformStamped,
     UnknownFrameError,
 )
-from tfbus.bus._ownership import OnConflict
+from tfbus.bus.ownership import OnConflict
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 

@@ -19,7 +19,7 @@ from support.threads import threads_that
 
 import tfbus
 from tfbus import LATEST, Buffer, Bus, TransformLookupError, TransformTree
-from tfbus.tree._kernel import History
+from tfbus.which_kernel import History
 
 pytestmark = pytest.mark.thorough
 

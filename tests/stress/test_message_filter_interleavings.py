@@ -21,9 +21,7 @@ from support.asking import Asked
 
 from tfbus import SECOND, Buffer, Bus, MessageFilter, SimulatedClock, Transform, TransformStamped, UnknownFrameError
 from tfbus.errors import TransformError
-from tfbus.message_filter._dropped_messages import DropReason
-from tfbus.message_filter._message_queue import Order
-from tfbus.message_filter.message_filter import MessageOverflow
+from tfbus.message_filter.message_filter import DropReason, MessageOverflow, Order
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 

@@ -17,7 +17,7 @@ from support.samples import moving, static
 import tfbus
 from tfbus import Buffer, Bus, FutureExtrapolationError, Question, TransformArray, TransformStamped, UnknownFrameError
 from tfbus.tree.poses import PoseReader
-from tfbus.waiting.waiting_index import Waiter
+from tfbus.waiting.live_tree import Waiter
 
 pytestmark = [
     pytest.mark.thorough,

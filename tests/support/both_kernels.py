@@ -10,9 +10,8 @@ from typing import Any
 import pytest
 
 import tfbus
-from tfbus.geometry import _python_sample
-from tfbus.geometry.rows import Row
-from tfbus.tree import _python_kernel
+from tfbus import _python_kernel
+from tfbus.rows import Row
 
 try:
     COMPILED: ModuleType | None = importlib.import_module("tfbus._kernel")
@@ -30,7 +29,7 @@ KERNELS = [
 
 def sample_class(kernel: ModuleType) -> Any:
     """The class of samples that a kernel stores."""
-    return _python_sample.Sample if kernel is _python_kernel else kernel.Sample
+    return _python_kernel.Sample if kernel is _python_kernel else kernel.Sample
 
 
 def bits(row: Row | None) -> bytes | None:

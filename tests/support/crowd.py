@@ -33,7 +33,7 @@ from tfbus import (
     UnknownFrameError,
     from_seconds,
 )
-from tfbus.bus.sample_queue import Overflow
+from tfbus.bus.queues import Overflow
 from tfbus.geometry.stamped import Batch
 
 Ending = Literal["the bus closes", "all is cancelled", "buffers close one by one"]

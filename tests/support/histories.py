@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import tfbus
 from tfbus import Transform
-from tfbus.geometry.rows import Row
+from tfbus.rows import Row
 from tfbus.tree.history import FrameHistory
 
 

@@ -5,7 +5,7 @@ import math
 from hypothesis import strategies as st
 
 from tfbus import LATEST, SECOND, Latest, Transform, TransformStamped
-from tfbus.geometry.rows import Quaternion, Vector
+from tfbus.rows import Quaternion, Vector
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 TODAY = 1_790_000_000 * SECOND

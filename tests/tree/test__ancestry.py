@@ -3,8 +3,7 @@ from support.samples import moving, static
 
 from tfbus import TransformStamped
 from tfbus.stamps import STAMP_MIN
-from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
-from tfbus.tree.forest import Forest
+from tfbus.tree.forest import Forest, Loop, edges_above, names_below, past_loop
 
 
 def forest(*batch: TransformStamped) -> Forest:

@@ -6,10 +6,9 @@ from support.samples import moving, over, static, tree_of
 
 import tfbus
 from tfbus import TransformStamped, TransformTree, UnknownFrameError
-from tfbus.geometry.rows import Row
-from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Query, copy_paths
-from tfbus.tree._runs import Runs
-from tfbus.tree.history import Samples
+from tfbus.rows import Row
+from tfbus.tree.history import Runs, Samples
+from tfbus.tree.lookup_many import CopiedPath, PathsOverTime, Query, copy_paths
 from tfbus.tree.tree import forest_of
 
 

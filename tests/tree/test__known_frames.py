@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.tree._known_frames import KnownFrames
+from tfbus.tree.forest import KnownFrames
 
 FRAMES = ("a", "b", "c", "d")
 Change = tuple[str, tuple[str, ...]]

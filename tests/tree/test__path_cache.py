@@ -4,8 +4,7 @@ import pytest
 from support.histories import moving_edge
 
 from tfbus import Transform
-from tfbus.tree._path_cache import _GENERATION, PathCache
-from tfbus.tree.path import Path, find_path
+from tfbus.tree.path import _GENERATION, Path, PathCache, find_path
 
 
 def path() -> Path:

@@ -6,8 +6,7 @@ from support.samples import moving, over, static, tree_of
 
 import tfbus
 from tfbus import PastExtrapolationError, TransformTree
-from tfbus.tree._copied_paths import Query
-from tfbus.tree._plain_columns import plain_columns
+from tfbus.tree.lookup_many import Query, plain_columns
 from tfbus.tree.tree import forest_of
 
 compiled = pytest.mark.skipif(tfbus.kernel != "compiled", reason="the kernel in Python gives no answers at many stamps")

@@ -8,11 +8,11 @@ from support.both_kernels import COMPILED, needs_both
 from support.histories import row_of
 from support.strategies import transforms
 
-from tfbus.geometry.rows import Row, compose
-from tfbus.tree import _python_composition
+from tfbus import _python_kernel
+from tfbus.rows import Row, compose
 
 COMPOSERS = [
-    pytest.param(_python_composition.compose_paths, id="python"),
+    pytest.param(_python_kernel.compose_paths, id="python"),
     pytest.param(getattr(COMPILED, "compose_paths", None), id="compiled", marks=needs_both),
 ]
 

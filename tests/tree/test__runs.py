@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tfbus.tree._runs import Runs
+from tfbus.tree.history import Runs
 
 STAMPS = st.integers(0, 20)
 

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from support.strategies import TODAY, rotations, small_angles, transforms, unit_vectors
 
 from tfbus import SECOND, Transform
-from tfbus.geometry.rows import Vector
+from tfbus.rows import Vector
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree._segments import Segments
 from tfbus.tree.history import FrameHistory
+from tfbus.tree.lookup_many import Segments
 
 NOT_QUITE_ONE = (-0.3982359927017631, 0.19157674456173793, -0.8783998564754538, -0.1819893876133163)
 """A rotation whose scalar product with itself rounds to less than one."""

@@ -23,7 +23,7 @@ from tfbus import (
     UnknownFrameError,
     do_transform,
 )
-from tfbus.geometry.rows import Quaternion, Vector, rotate
+from tfbus.rows import Quaternion, Vector, rotate
 
 STILL = (0.0, 0.0, 0.0)
 Z = (0.0, 0.0, 1.0)

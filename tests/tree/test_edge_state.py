@@ -1,7 +1,7 @@
 import pytest
 
 from tfbus import SECOND, Edge
-from tfbus.tree.edge_state import EdgeState, state_of
+from tfbus.tree.history import EdgeState, state_of
 
 
 def moving(newest: int | None) -> Edge:

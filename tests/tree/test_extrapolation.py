@@ -19,9 +19,8 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree.extrapolation import ReadStamp, read_stamp, read_stamps, read_stamps_at_many
 from tfbus.tree.history import FrameHistory, Samples
-from tfbus.tree.policy import Policy
+from tfbus.tree.lookup import Policy, ReadStamp, read_stamp, read_stamps, read_stamps_at_many
 
 ROW = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 

@@ -8,8 +8,7 @@ import pytest
 from support.samples import moving, static
 
 from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped, TransformTree
-from tfbus.tree._saved_frames import save_frame
-from tfbus.tree.forest import Forest
+from tfbus.tree.forest import Forest, save_frame
 from tfbus.tree.history import FrameHistory
 
 

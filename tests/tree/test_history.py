@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.histories import held
 
 from tfbus import LATEST, SECOND, FutureExtrapolationError, Latest, Outcome, PastExtrapolationError
-from tfbus.geometry.rows import Row
+from tfbus.rows import Row
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree.history import FrameHistory
 

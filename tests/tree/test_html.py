@@ -4,8 +4,8 @@ from html import unescape
 from support.samples import moving, static, tree_of
 
 from tfbus import SECOND, Buffer, Bus, Edge, SimulatedClock
-from tfbus.tree.edge_state import EdgeState
-from tfbus.tree.html import legend, to_html
+from tfbus.tree.history import EdgeState
+from tfbus.tree.rendering import legend, to_html
 
 EDGES = [
     Edge("map", "base", False, 101, 2 * SECOND, 4 * SECOND, "odometry"),

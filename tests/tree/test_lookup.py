@@ -25,10 +25,8 @@ from tfbus import (
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.testing import assert_close
-from tfbus.tree.extrapolation import Extrapolation
 from tfbus.tree.forest import Forest
-from tfbus.tree.lookup import Bounds, find, find_in_time_travel
-from tfbus.tree.policy import Policy
+from tfbus.tree.lookup import Bounds, Extrapolation, Policy, find, find_in_time_travel
 from tfbus.tree.tree import forest_of
 
 

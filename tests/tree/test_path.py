@@ -14,8 +14,8 @@ from tfbus import (
     PastExtrapolationError,
     Transform,
 )
-from tfbus.geometry.rows import IDENTITY
 from tfbus.geometry.transform import from_row
+from tfbus.rows import IDENTITY
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.path import Path, find_path, path_at

@@ -7,7 +7,7 @@ import pytest
 
 from tfbus import Hold
 from tfbus.stamps import STAMP_MAX
-from tfbus.tree.policy import Policy, policy_of
+from tfbus.tree.lookup import Policy, policy_of
 
 
 def test_three_arguments_make_a_policy_in_nanoseconds() -> None:

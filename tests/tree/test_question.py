@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from tfbus import LATEST, LaserScan, Latest, PointStamped, Question, TransformStamped, do_transform
-from tfbus.tree.policy import Policy
-from tfbus.tree.question import question_of
+from tfbus.tree.lookup import Policy, question_of
 
 POLICY = Policy(tolerance=5)
 

@@ -6,7 +6,7 @@ from support.samples import moving, over, static, tree_of
 
 from tfbus import LATEST, SECOND, Latest, Transform, TransformStamped, TransformTree
 from tfbus.errors import UnknownFrameError
-from tfbus.tree.edge_state import EdgeState
+from tfbus.tree.history import EdgeState
 from tfbus.tree.tree import forest_of
 from tfbus.view._scene import NO_SCENE, Scene, SceneReader, largest_root
 

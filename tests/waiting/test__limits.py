@@ -3,8 +3,8 @@ from support.live_trees import live_tree
 from support.samples import moving, static
 
 from tfbus import LATEST, Question, TransformStamped
-from tfbus.tree.policy import Policy
-from tfbus.waiting._limits import limits_of
+from tfbus.tree.lookup import Policy
+from tfbus.waiting.live_tree import limits_of
 
 
 def limits(

@@ -28,10 +28,8 @@ from tfbus import (
 from tfbus.errors import MAY_COME
 from tfbus.tree.forest import LoopingSample
 from tfbus.tree.history import FrameHistory
-from tfbus.tree.lookup import answer
-from tfbus.tree.policy import Policy
-from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.waiting_index import Waiter
+from tfbus.tree.lookup import Policy, answer
+from tfbus.waiting.live_tree import LiveTree, Waiter
 
 
 def park(live: LiveTree, target: str, source: str, at: int, woken: list[str]) -> None:

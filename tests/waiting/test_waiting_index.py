@@ -18,8 +18,8 @@ from tfbus import (
     TransformLookupError,
     UnknownFrameError,
 )
-from tfbus.waiting import waiting_index
-from tfbus.waiting.waiting_index import Waiter, WaitingIndex, blocking_frames, without_traceback
+from tfbus.waiting import live_tree
+from tfbus.waiting.live_tree import Waiter, WaitingIndex, blocking_frames, without_traceback
 
 
 def waiter(wake: Callable[[], object] = list) -> Waiter:
@@ -318,7 +318,7 @@ def test_a_waiter_for_which_there_is_no_memory_leaves_nothing_and_disturbs_no_ot
         raise MemoryError
 
     with monkeypatch.context() as patch:
-        patch.setattr(waiting_index, "insort", fail)
+        patch.setattr(live_tree, "insort", fail)
         with pytest.raises(MemoryError):
             index.park(waiter(), short_of("tool", 5))
     assert index.pop_unblocked("tool", 9) == [other]

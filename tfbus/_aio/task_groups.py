@@ -1,8 +1,119 @@
 """Task groups that belong to an object with an ``async with`` of its own."""
 
-from typing import NoReturn
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Generic, NoReturn, Self, TypeVar
 
+import anyio
 import anyio.abc
+import anyio.lowlevel
+
+ItemT = TypeVar("ItemT")
+
+
+class OneReader(anyio.ResourceGuard):
+    """A ``with`` for the one task that reads and waits; a second task gets `anyio.BusyResourceError`.
+
+    Nothing is lost between a look for an item and `wait`: the reader and the code that calls `wake` run in one thread,
+    and the reader does not pass a checkpoint in between.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("reading from")
+        self._woken: anyio.Event | None = None
+        self._was_woken = False
+
+    @property
+    def waiting(self) -> bool:
+        """Whether the reader waits."""
+        return self._woken is not None
+
+    @property
+    def was_woken(self) -> bool:
+        """Whether `wake` was called during the last wait, also if that was cancelled in the same turn of the loop."""
+        return self._was_woken
+
+    def wake(self) -> None:
+        """End the wait of the reader, if it waits."""
+        if self._woken is not None:
+            self._woken.set()
+
+    async def wait(self) -> None:
+        """Wait for the next call of `wake`."""
+        self._woken = woken = anyio.Event()
+        try:
+            await woken.wait()
+        finally:
+            self._was_woken = woken.is_set()
+            self._woken = None
+
+
+class OneReaderStream(Generic[ItemT]):
+    """An async iterator that one task at a time may read, filled by a bus.
+
+    The iteration ends when the stream is closed and all pending items have been read. A subclass implements `_next`.
+
+    Parameters
+    ----------
+    check_thread : callable
+        Raises unless the calling thread may read here.
+    detach : callable
+        Takes the stream off the bus.
+    """
+
+    def __init__(self, check_thread: Callable[[], object], detach: Callable[[Any], object]) -> None:
+        self._check_thread = check_thread
+        self._detach = detach
+        self._reader = OneReader()
+        self._ended = False
+
+    @property
+    def waiting(self) -> bool:
+        """Whether a reader waits for an item."""
+        return self._reader.waiting
+
+    def wake(self) -> None:
+        """Have a waiting reader look for the next item again."""
+        self._reader.wake()
+
+    def end(self) -> None:
+        """Let the reader read all pending items, then end the iteration."""
+        self._ended = True
+        self.wake()
+
+    def close(self) -> None:
+        """Take the stream off the bus; a second call does nothing."""
+        self._detach(self)
+        self.end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> ItemT:
+        self._check_thread()
+        with self._reader:
+            await anyio.lowlevel.checkpoint()
+            while (item := self._next()) is None:
+                if self._ended:
+                    raise StopAsyncIteration
+                await self._wait()
+        return item
+
+    def _next(self) -> ItemT | None:
+        """The next item; None while there is none."""
+        raise NotImplementedError
+
+    async def _wait(self) -> None:
+        """Wait until `wake` is called, or until it is time to look again."""
+        await self._reader.wait()
 
 
 async def close_task_group(tasks: anyio.abc.TaskGroup) -> None:

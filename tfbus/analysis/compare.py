@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from tfbus.analysis.alignment import Alignment
 from tfbus.analysis.pose_errors import PoseErrors
-from tfbus.geometry.rows import Columns, compose, invert
+from tfbus.rows import Columns, compose, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds
 from tfbus.tree.tree import TransformTree, forest_of
 

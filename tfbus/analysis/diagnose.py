@@ -7,8 +7,8 @@ from typing import NamedTuple
 from tfbus.analysis.examiner import Examiner
 from tfbus.analysis.finding import Finding
 from tfbus.analysis.limits import Limits
-from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.rows import Row
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree.history import Edge, FrameHistory, Samples
 from tfbus.tree.tree import TransformTree, forest_of

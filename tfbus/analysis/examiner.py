@@ -9,8 +9,8 @@ import numpy as np
 from tfbus.analysis._motion import MovingSamples
 from tfbus.analysis.finding import Finding
 from tfbus.analysis.limits import Limits
-from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.rows import Row
 from tfbus.stamps import SECOND
 
 _SHOWN = 5

@@ -6,8 +6,7 @@ from typing import Any, SupportsIndex, TypeVar
 
 import anyio.lowlevel
 
-from tfbus.buffer._local_names import LocalNames
-from tfbus.buffer._waiting_lookup import Lookups
+from tfbus.buffer.lookups import LocalNames, Lookups
 from tfbus.buffer.watch import Watch
 from tfbus.bus.bus import Bus
 from tfbus.data import Stamped, do_transform
@@ -19,15 +18,11 @@ from tfbus.stamps import LATEST, AtLike, as_at
 from tfbus.tree.explanation import Explanation
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import Edge
-from tfbus.tree.html import legend, to_html
-from tfbus.tree.lookup import answer
-from tfbus.tree.plain_first import plain_first
-from tfbus.tree.policy import Hold, policy_of
-from tfbus.tree.question import Question, question_of
-from tfbus.tree.rendering import counted, describe
+from tfbus.tree.lookup import Hold, Question, answer, policy_of, question_of
+from tfbus.tree.rendering import counted, describe, legend, to_html
 from tfbus.tree.tree import TransformTree, forest_of, tree_of, window_of
-from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.waiting_index import PendingLookup
+from tfbus.waiting.live_tree import LiveTree, PendingLookup
+from tfbus.which_kernel import plain_first
 
 DataT = TypeVar("DataT", bound=Stamped)
 
@@ -165,15 +160,7 @@ class Buffer:
         """
         bounds = None if max_age is None else self._lookups.bounds(max_age, as_at(at), as_at(source_at))
         names = self._local_names
-        policy = None
-        if tolerance == 0.0 and max_gap is None and extrapolate is None:
-            if self._paths is not None and source_at is None and fixed is None and bounds is None:
-                # Nearly all questions are plain, and a call on the way costs a fifth of the answer.
-                plain = self._paths.answer(target, source, at)
-                if plain is not None:
-                    return plain
-        else:
-            policy = policy_of(tolerance, max_gap, extrapolate)
+        policy = policy_of(tolerance, max_gap, extrapolate)
         try:
             if names is None:
                 return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)

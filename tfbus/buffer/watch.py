@@ -6,17 +6,15 @@ from types import TracebackType
 
 import anyio.lowlevel
 
-from tfbus._aio.one_reader import OneReader
-from tfbus.buffer._hanging_report import REPORT_AFTER
-from tfbus.buffer._waiting_lookup import Lookups
+from tfbus._aio.task_groups import OneReader
+from tfbus.buffer.lookups import REPORT_AFTER, Lookups
 from tfbus.clock import Clock
 from tfbus.errors import MAY_COME, AheadError, ClockResetError, TransformLookupError, UnknownFrameError
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import SECOND, STAMP_MAX, is_real, to_seconds
-from tfbus.tree.question import Question
-from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.waiting_index import Waiter, without_traceback
+from tfbus.tree.lookup import Question
+from tfbus.waiting.live_tree import LiveTree, Waiter, without_traceback
 from tfbus.waiting.watch_index import WatchState
 
 _NO_ANSWER = (*MAY_COME, AheadError)

@@ -3,7 +3,6 @@
 from tfbus.bus.broadcaster import TransformBroadcaster
 from tfbus.bus.bus import Bus
 from tfbus.bus.event_stream import EventStream
-from tfbus.bus.stream import Stream
-from tfbus.bus.thread_publisher import ThreadPublisher
+from tfbus.bus.queues import Stream, ThreadPublisher
 
 __all__ = ["Bus", "EventStream", "Stream", "ThreadPublisher", "TransformBroadcaster"]

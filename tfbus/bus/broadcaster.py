@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
-from tfbus.bus._topology import Invalid, as_invalid
 from tfbus.bus.bus import Bus
+from tfbus.bus.topology import Invalid, as_invalid
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.frames import as_prefix
 from tfbus.geometry.stamped import TransformStamped

@@ -6,34 +6,28 @@ nothing can be lost between "sent" and "buffered".
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from threading import get_ident
 from types import TracebackType
+from typing import Any
 
-from tfbus.bus._announcer import Announcer
-from tfbus.bus._intake import Intake
-from tfbus.bus._late_buffer import LateBuffer
-from tfbus.bus._owner_thread import OwnerThread
-from tfbus.bus._ownership import OnConflict, Ownership
-from tfbus.bus._plausibility import Plausibility
-from tfbus.bus._subscribers import BatchCallback, FrameCallback, Subscribers
-from tfbus.bus._topology import Invalid, Topology, as_invalid
 from tfbus.bus.event_stream import EventStream
-from tfbus.bus.once_logger import OnceLogger
-from tfbus.bus.sample_queue import Overflow
-from tfbus.bus.stream import Stream
-from tfbus.bus.thread_publisher import ThreadPublisher
+from tfbus.bus.late_buffer import LateBuffer
+from tfbus.bus.ownership import OnConflict, Ownership
+from tfbus.bus.queues import Overflow, OwnerThread, Stream, ThreadPublisher
+from tfbus.bus.subscribers import Announcer, BatchCallback, FrameCallback, OnceLogger, Subscribers
+from tfbus.bus.topology import Invalid, Plausibility, Topology, as_invalid
 from tfbus.clock import Clock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError
 from tfbus.events import ClockReset, Event, PastLoop
-from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
-from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
+from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, as_batch, check_translations
 from tfbus.registration import Registration
 from tfbus.stamps import format_stamp
 from tfbus.statistics import BusStatistics
 from tfbus.tree.forest import LoopingSample
 from tfbus.waiting.live_tree import LiveTree
+from tfbus.which_kernel import Intake
 
 
 class Bus:
@@ -101,10 +95,14 @@ class Bus:
         self._late: dict[LiveTree, LateBuffer] = {}
         self._streams: list[Stream] = []
         self._threads: list[ThreadPublisher] = []
-        listeners = self._subscribers.callbacks, self._streams, self._events, self._late
-        self._intake = Intake(self._topology.judge, TransformStamped, listeners)
-        self._intake.thread = self._owner.thread
-        self._take = self._intake.take
+        self._published = 0
+        self._intake: Any = None
+        self._take: Callable[[object, object], bool | None] = _take_nothing
+        if Intake is not None:
+            listeners = self._subscribers.callbacks, self._streams, self._events, self._late
+            self._intake = Intake(self._topology.judge, TransformStamped, listeners)
+            self._intake.thread = self._owner.thread
+            self._take = self._intake.take
         self._resets = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
@@ -147,7 +145,8 @@ class Bus:
             If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
         """
         # Nearly always samples only continue known edges, and the buffers are all that hears of them.
-        if self._take(samples, invalid):
+        taken = self._take(samples, invalid)
+        if taken:
             return
         if get_ident() != self._owner.thread:
             self._check_thread()
@@ -164,10 +163,10 @@ class Bus:
         callbacks = self._subscribers.callbacks
         if callbacks:
             self._subscribers.check_backlog()
-        batch = self._topology.accept(batch, invalid)
+        batch = self._topology.accept(batch, invalid, judged=taken is None)
         if not batch:
             return
-        self._intake.samples += len(batch)
+        self._published += len(batch)
         error = self._insert(batch)
         for stream in self._streams:
             stream.put(batch)
@@ -185,7 +184,8 @@ class Bus:
         The first event loop to use a bus that another thread has made takes it over.
         """
         self._owner.check()
-        self._intake.thread = self._owner.thread
+        if self._intake is not None:
+            self._intake.thread = self._owner.thread
 
     def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
@@ -312,7 +312,7 @@ class Bus:
         latched = tuple(self._topology.latched.values())
         late = LateBuffer(buffer, self._topology.moving(), self._topology.newest)
         buffer.is_ahead = self._topology.is_ahead
-        self._buffers[buffer] = self._intake.samples - len(latched)
+        self._buffers[buffer] = self._samples() - len(latched)
         if latched:
             late.insert(latched)
         if not late.has_caught_up:
@@ -356,8 +356,9 @@ class Bus:
 
     def statistics(self) -> BusStatistics:
         """All counters, as they are now."""
+        samples = self._samples()
         return BusStatistics(
-            samples=self._intake.samples,
+            samples=samples,
             rejected=dict(self._topology.rejected),
             reparented=self._topology.reparented,
             kind_changes=self._topology.kind_changes,
@@ -365,7 +366,7 @@ class Bus:
             clock_resets=self._resets,
             callbacks_failed=self._subscribers.failures,
             frames=len(self._topology),
-            buffers=tuple(buffer.statistics(self._intake.samples - before) for buffer, before in self._buffers.items()),
+            buffers=tuple(buffer.statistics(samples - before) for buffer, before in self._buffers.items()),
             queues=(
                 *(stream.queue.statistics("stream") for stream in self._streams),
                 *(publisher.queue.statistics("threadsafe") for publisher in self._threads),
@@ -390,7 +391,8 @@ class Bus:
         if any(reader.waiting for reader in readers) or any(buffer.has_waiters for buffer in self._buffers):
             self._check_thread()
         self._closed = True
-        self._intake.open = False
+        if self._intake is not None:
+            self._intake.open = False
         self._jumps.close()
         for publisher in self._threads:
             publisher.end()
@@ -413,7 +415,12 @@ class Bus:
         self.close()
 
     def _connect_feeds(self) -> None:
-        self._intake.feeds = tuple((buffer.feed, buffer.insert_closely) for buffer in self._buffers)
+        if self._intake is not None:
+            self._intake.feeds = tuple((buffer.feed, buffer.insert_closely) for buffer in self._buffers)
+
+    def _samples(self) -> int:
+        """Number of samples that were published."""
+        return self._published + (0 if self._intake is None else int(self._intake.samples))
 
     def _check_usable(self) -> None:
         self._check_thread()
@@ -498,3 +505,8 @@ class Bus:
             buffer.reset(before, after)
         for late in self._late.values():
             late.clear_moving()
+
+
+def _take_nothing(_samples: object, _invalid: object) -> bool:
+    """Without the compiled kernel every batch goes the ordinary way."""
+    return False

@@ -23,7 +23,7 @@ def _version() -> str:
     # Loaded here, because most commands do without.
     from importlib.metadata import version
 
-    from tfbus.geometry.which_kernel import kernel
+    from tfbus.which_kernel import kernel
 
     return f"{version('tfbus')} ({kernel} kernel)"
 

@@ -16,8 +16,8 @@ from tfbus.cli.output import format_seconds
 from tfbus.clock import Clock, SimulatedClock
 from tfbus.data import PointStamped
 from tfbus.errors import TransformError
-from tfbus.geometry.rows import Vector
 from tfbus.geometry.transform import Transform
+from tfbus.rows import Vector
 from tfbus.stamps import LATEST, to_seconds
 
 BASE, LASER = "base_link", "base_laser"

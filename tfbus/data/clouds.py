@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data._arrays import CopiedByFields, as_points
-from tfbus.data._header import check_header
-from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.geometry.read_only import read_only
+from tfbus.data.dispatch import CopiedByFields, as_points, check_header, do_transform, moved_header
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.transform_array import read_only
 from tfbus.plain import PlainData
 from tfbus.stamps import Latest, as_stamps
 

@@ -1,11 +1,69 @@
 """`do_transform`, which transforms data of any registered type into another frame."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from functools import singledispatch
+from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, cast, overload
 
+import numpy as np
+import numpy.typing as npt
+
+from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import Latest
+from tfbus.geometry.transform import Transform
+from tfbus.rows import Vector
+from tfbus.stamps import LATEST, Latest, as_stamp
+
+
+def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
+    """An array of floats: an array of floats is not copied, integers become float64.
+
+    Raises
+    ------
+    TypeError
+        If they are not numbers. The message names `name` and the dtype.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind in "iu":
+        return array.astype(np.float64)
+    if array.dtype.kind != "f":
+        raise TypeError(f"{name} must be numbers, not of dtype {array.dtype}")
+    return array
+
+
+def as_points(value: npt.ArrayLike) -> npt.NDArray[Any]:
+    """Points as an array of shape (n, 3) of floats, converted by `as_floats`.
+
+    Raises
+    ------
+    ValueError
+        If the shape is another. The message has the shape.
+    TypeError
+        If they are not numbers.
+    """
+    array = as_floats(value, "points")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points must have shape (n, 3), got {array.shape}")
+    return array
+
+
+class CopiedByFields:
+    """A base of dataclasses: copies and unpickled objects are built from the fields, so that arrays are read-only."""
+
+    __slots__ = ()
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+        for name, value in values.items():
+            if isinstance(value, MappingProxyType):
+                values[name] = dict(value)
+        return _build, (type(self), values)
+
+
+def _build(kind: type, values: dict[str, Any]) -> Any:
+    return kind(**values)
 
 
 class Stamped(Protocol):
@@ -97,3 +155,60 @@ def moved_header(data: Stamped, transform: TransformStamped) -> tuple[str, int]:
     if data.frame != transform.child:
         raise ValueError(f"the data are in frame {data.frame!r}, but the transform is from {transform.child!r}")
     return transform.parent, transform.stamp
+
+
+def construct(data: Any, *values: object) -> None:
+    """Set the fields of a frozen dataclass, and check them: what its own ``__init__`` does.
+
+    A class writes its ``__init__`` for the types of its arguments, which are wider than those of its fields.
+    """
+    # The fields of a subclass begin with those of its base.
+    for name, value in zip(data.__match_args__, values, strict=False):
+        object.__setattr__(data, name, value)
+    data.__post_init__()
+
+
+def check_header(data: Stamped) -> None:
+    """Check the frame and the stamp of a frozen dataclass under construction; the stamp becomes a plain ``int``.
+
+    Raises
+    ------
+    InvalidTransformError
+        If the frame is empty or starts with ``/``.
+    TypeError, ValueError
+        If the stamp is neither `LATEST` nor an integer of 64 bits.
+    """
+    check_frame(data.frame)
+    if data.stamp is not LATEST:
+        object.__setattr__(data, "stamp", as_stamp(data.stamp))
+
+
+def check_pose(pose: object) -> None:
+    """Raise `TypeError` unless `pose` is a `Transform`."""
+    if not isinstance(pose, Transform):
+        raise TypeError(f"pose must be a Transform, not {pose!r}")
+
+
+def as_triple(value: Any, name: str) -> Vector:
+    """Three numbers as a tuple of floats; NaN and infinity are allowed, since sensors send them.
+
+    Raises
+    ------
+    ValueError
+        If there are not three. The message has the shape.
+    TypeError
+        If they are not numbers in a sequence or an array.
+    """
+    if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, np.ndarray)):
+        raise TypeError(f"{name} must be three numbers, not {value!r}")
+    shape = getattr(value, "shape", (len(value),))
+    if shape != (3,):
+        raise ValueError(f"{name} must be three numbers, got shape {shape}")
+    try:
+        for part in value:
+            # `float` would read digits in a string.
+            math.isnan(part)
+    except TypeError:
+        raise TypeError(f"{name} must be three numbers, not {value!r}") from None
+    x, y, z = value
+    return float(x), float(y), float(z)

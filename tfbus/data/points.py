@@ -5,14 +5,21 @@ from typing import Any
 
 import numpy.typing as npt
 
-from tfbus.data._arrays import CopiedByFields, as_points
-from tfbus.data._header import as_triple, check_header, check_pose, construct
-from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.geometry.read_only import locked
-from tfbus.geometry.rows import Numbers, Quaternion, Vector, as_rotation, rotate
+from tfbus.data.dispatch import (
+    CopiedByFields,
+    as_points,
+    as_triple,
+    check_header,
+    check_pose,
+    construct,
+    do_transform,
+    moved_header,
+)
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform_array import locked
 from tfbus.plain import PlainData
+from tfbus.rows import Numbers, Quaternion, Vector, as_rotation, rotate
 from tfbus.stamps import AtLike, Latest
 
 

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data._arrays import CopiedByFields, as_floats
-from tfbus.data._header import check_header
 from tfbus.data.clouds import PointCloud
-from tfbus.geometry.read_only import read_only
+from tfbus.data.dispatch import CopiedByFields, as_floats, check_header
+from tfbus.geometry.transform_array import read_only
 from tfbus.plain import PlainData
 from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
 

@@ -6,14 +6,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.data._arrays import CopiedByFields, as_floats
-from tfbus.data._header import as_triple, check_header, check_pose, construct
-from tfbus.data.dispatch import do_transform, moved_header
-from tfbus.geometry.read_only import locked
-from tfbus.geometry.rows import Numbers, Vector, rotate
+from tfbus.data.dispatch import (
+    CopiedByFields,
+    as_floats,
+    as_triple,
+    check_header,
+    check_pose,
+    construct,
+    do_transform,
+    moved_header,
+)
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.geometry.transform_array import locked
 from tfbus.plain import PlainData
+from tfbus.rows import Numbers, Vector, rotate
 from tfbus.stamps import AtLike, Latest
 
 

@@ -1,18 +1,19 @@
 """`TransformStamped`, a transform between two frames at an instant, and batches of such samples."""
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from tfbus.errors import InvalidTransformError
 from tfbus.frames import check_frame
-from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
-from tfbus.geometry.which_kernel import kernel
 from tfbus.plain import from_fields
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp
+from tfbus.rows import Row
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp, is_real
+from tfbus.which_kernel import kernel
 
 if kernel == "python":
-    from tfbus.geometry._python_sample import Sample
+    from tfbus._python_kernel import Sample
 else:
     from tfbus._kernel import Sample  # type: ignore[assignment]
 
@@ -263,3 +264,60 @@ def as_batch(samples: TransformStamped | Iterable[TransformStamped]) -> Batch:
         if not isinstance(sample, TransformStamped):
             raise TypeError(f"expected a TransformStamped, not {sample!r}")
     return batch
+
+
+MAX_TRANSLATION = 1e12
+"""The default bound on the magnitude of a translation, in m: about six times the way to Saturn."""
+GREATEST_BOUND = 1e100
+"""The greatest bound, in m. The square of a translation, and the sum along any path, are finite below it."""
+
+
+def as_max_translation(bound: float) -> float:
+    """The argument `max_translation`, in m, as a float.
+
+    Raises
+    ------
+    TypeError
+        If it is not a real number.
+    ValueError
+        If it is not greater than zero, or greater than 1e100.
+    """
+    if not is_real(bound):
+        raise TypeError(f"max_translation must be a number in m, not {bound!r}")
+    if not 0.0 < bound <= GREATEST_BOUND:
+        raise ValueError(f"max_translation must be greater than 0 and at most {GREATEST_BOUND:g} m, got {bound!r}")
+    return float(bound)
+
+
+def is_within(sample: TransformStamped, bound: float) -> bool:
+    """Whether the translation of a sample is finite, and no longer than `bound` in m."""
+    # The square is quicker to have, and only near the bound may it be on the other side than the magnitude.
+    return sample._square < 0.99 * bound * bound or math.hypot(*sample._row[:3]) <= bound
+
+
+def check_translations(batch: Batch, bound: float) -> None:
+    """Raise `InvalidTransformError` for the first sample whose translation is longer than `bound` in m."""
+    for sample in batch:
+        if not is_within(sample, bound):
+            raise not_physical(sample, bound)
+
+
+def not_physical(sample: TransformStamped, bound: float) -> InvalidTransformError:
+    """The error of a sample that is not within the bound, in m.
+
+    Its reason is ``"not physical"``; or ``"not finite"``, which the product of two transforms may be.
+    """
+    parent, child, _, row, authority, _ = sample._fields
+    length = math.hypot(*row[:3])
+    if all(map(math.isfinite, row[:3])):
+        why, reason = f"{length:.6g} m long, which is not physical (at most {bound:g} m)", "not physical"
+    else:
+        why, reason = "not finite", "not finite"
+    sender = f", from {authority!r}" if authority else ""
+    return InvalidTransformError(
+        f"the translation of {child!r} in {parent!r} is {why}{sender}",
+        reason=reason,
+        parent=parent,
+        child=child,
+        authority=authority,
+    )

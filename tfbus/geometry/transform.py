@@ -5,7 +5,7 @@ neighbours cancel in ``map_from_base @ base_from_lidar``. Quaternions are ``(x, 
 conversions, has ``w`` first, so every crossing says ``wxyz``. It is imported where it is used: programs that need no
 conversion start sooner without it.
 
-A transform holds one tuple of seven floats, a row; `tfbus.geometry.rows` has the arithmetic.
+A transform holds one tuple of seven floats, a row; `tfbus.rows` has the arithmetic.
 """
 
 import math
@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import InvalidTransformError
-from tfbus.geometry.rows import (
+from tfbus.plain import from_fields
+from tfbus.rows import (
     IDENTITY,
     NORM_TOLERANCE,
     ROUNDING,
@@ -32,7 +33,6 @@ from tfbus.geometry.rows import (
     invert,
     rotate,
 )
-from tfbus.plain import from_fields
 
 
 class Transform:

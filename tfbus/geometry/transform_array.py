@@ -1,7 +1,7 @@
 """`TransformArray`, many transforms at once.
 
 It holds seven columns, ``tx, ty, tz, qx, qy, qz, qw``, each an array over the transforms. The functions of
-`tfbus.geometry.rows` take columns as well as the seven floats of a row, so each formula is written once.
+`tfbus.rows` take columns as well as the seven floats of a row, so each formula is written once.
 """
 
 import math
@@ -13,10 +13,27 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import InvalidTransformError
-from tfbus.geometry.read_only import locked
-from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Columns, Row, compose, invert, rotate
 from tfbus.geometry.transform import Transform, from_row
+from tfbus.rows import NORM_TOLERANCE, ROUNDING, Columns, Row, compose, invert, rotate
 from tfbus.stamps import StampsLike, as_stamps, format_stamp
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """A read-only view of an array that its owner may still write to; a read-only array is returned as it is."""
+    if not array.flags.writeable:
+        return array
+    view = array.view()
+    view.flags.writeable = False
+    return view
+
+
+def locked(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """An array of numbers that nobody can make writable again, nor any view of it; the caller gives up the original.
+
+    Clearing the array's own ``writeable`` flag is not enough: the owner of the memory can set it again.
+    """
+    return np.asarray(array.data.toreadonly())
+
 
 _RECORD = 8 * 8
 """The bytes of a transform and its stamp."""

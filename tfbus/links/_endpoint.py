@@ -7,7 +7,7 @@ from math import inf
 from time import monotonic
 
 from tfbus.bus.bus import Bus
-from tfbus.bus.once_logger import OnceLogger
+from tfbus.bus.subscribers import OnceLogger
 from tfbus.events import PeerJoined, PeerLost, PeerRejected
 from tfbus.links._asker import Asker
 from tfbus.links._carrier import AskableCarrier, Carrier, HistoryCarrier

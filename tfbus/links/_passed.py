@@ -1,7 +1,7 @@
 """`PassedSamples`, the memory by which a bus knows what it has passed on already, in a world without origins."""
 
-from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.rows import Row
 
 PER_CHILD = 256
 GONE_CHILDREN = 1_000

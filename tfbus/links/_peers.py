@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count
 
-from tfbus.bus.once_logger import SeenKeys
+from tfbus.bus.subscribers import SeenKeys
 from tfbus.links._mirror import Mirror
 
 MAX_PEERS = 1_000

@@ -8,7 +8,7 @@ from typing import Self
 import anyio
 import anyio.to_thread
 
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped

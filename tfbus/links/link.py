@@ -9,11 +9,11 @@ from typing import Self
 import anyio
 import anyio.abc
 
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
-from tfbus.bus.once_logger import OnceLogger
-from tfbus.bus.sample_queue import check_capacity
+from tfbus.bus.queues import check_capacity
+from tfbus.bus.subscribers import OnceLogger
 from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
 from tfbus.links._carrier import Carrier, SendReport

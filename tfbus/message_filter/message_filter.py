@@ -5,32 +5,325 @@ that waits for its transforms, so there are never more than `capacity` tasks. No
 dropped, and an error of the source is kept for the reader.
 """
 
+import logging
 import math
+from bisect import bisect_left, insort
 from collections import Counter
-from collections.abc import AsyncGenerator, AsyncIterable, Callable, Sequence
+from collections.abc import AsyncGenerator, AsyncIterable, Callable, Iterator, Sequence
 from contextlib import suppress
+from inspect import iscoroutinefunction
+from itertools import count
 from operator import attrgetter
 from types import TracebackType
-from typing import Generic, Literal, TypeVar, overload
+from typing import Generic, Literal, TypeVar, cast, overload
 
 import anyio
 import anyio.abc
 import anyio.lowlevel
 
-from tfbus._aio.one_reader import OneReader
-from tfbus._aio.task_groups import close_task_group, raise_unchanged
+from tfbus._aio.task_groups import OneReader, close_task_group, raise_unchanged
 from tfbus.buffer.buffer import Buffer
-from tfbus.errors import MAY_COME, ClockResetError, TransformError, TransformLookupError, UnknownFrameError
+from tfbus.bus.queues import check_capacity
+from tfbus.bus.subscribers import OnceLogger
+from tfbus.errors import (
+    MAY_COME,
+    BusClosedError,
+    ClockResetError,
+    LookupTimeoutError,
+    TransformError,
+    TransformLookupError,
+    UnknownFrameError,
+)
 from tfbus.frames import is_frame
-from tfbus.geometry.stamped import TransformStamped
-from tfbus.message_filter._dropped_messages import DroppedMessages, DropReason, reason_of
-from tfbus.message_filter._message_queue import MessageQueue, Order, PendingMessage
-from tfbus.message_filter._targets import Targets
+from tfbus.geometry.stamped import TransformStamped, answer_of
 from tfbus.registration import Registration
-from tfbus.stamps import LATEST, Latest, as_duration, as_stamp
+from tfbus.rows import IDENTITY
+from tfbus.stamps import LATEST, STAMP_MAX, Latest, as_duration, as_stamp, from_seconds
+from tfbus.tree.lookup import Question
 
 MessageT = TypeVar("MessageT")
+
+DropReason = Literal["too old", "queue full", "timed out", "unknown frame", "clock reset", "closed"]
+
+
+class DroppedMessages(Generic[MessageT]):
+    """Counts dropped messages and calls a callback for each; its errors are logged and counted.
+
+    Parameters
+    ----------
+    on_drop : callable or None
+        Called with the message, the reason and the error, if there is one.
+
+    Attributes
+    ----------
+    counts : Counter
+        By reason.
+    callbacks_failed : int
+        Number of exceptions that the callback raised.
+    """
+
+    def __init__(self, on_drop: Callable[[MessageT, DropReason, TransformError | None], object] | None) -> None:
+        if on_drop is not None and not callable(on_drop):
+            raise TypeError(f"on_drop must be callable, not {on_drop!r}")
+        if iscoroutinefunction(on_drop):
+            raise TypeError(f"on_drop must not be async, as {on_drop!r} is")
+        self._on_drop = on_drop
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+        self.counts: Counter[DropReason] = Counter()
+        self.callbacks_failed = 0
+
+    def drop(self, message: MessageT, reason: DropReason, error: TransformError | None) -> None:
+        """Count a message and call the callback; its first `Exception` is logged."""
+        self.counts[reason] += 1
+        if self._on_drop is None:
+            return
+        try:
+            self._on_drop(message, reason, error)
+        except Exception as raised:  # noqa: BLE001 - the callback must not stop the filter
+            self.callbacks_failed += 1
+            self._log.warning("on_drop", "the on_drop callback %r raised", self._on_drop, exc_info=raised)
+
+
+def reason_of(error: TransformError) -> DropReason:
+    """The reason for dropping a message whose lookup ended with `error`."""
+    if isinstance(error, LookupTimeoutError):
+        return "unknown frame" if isinstance(error.__cause__, UnknownFrameError) else "timed out"
+    if isinstance(error, UnknownFrameError):
+        return "unknown frame"
+    if isinstance(error, ClockResetError):
+        return "clock reset"
+    return "closed" if isinstance(error, BusClosedError) else "too old"
+
+
 AnswerT = TypeVar("AnswerT")
+
+Order = Literal["ready", "stamp", "arrival"]
+"""The order of delivery: as messages become ready, by stamp, or by arrival."""
+
+
+class PendingMessage(Generic[MessageT, AnswerT]):
+    """One message, its frame and its stamp.
+
+    Attributes
+    ----------
+    answer : transform or tuple of transforms, or None
+        Delivered with the message; None while it waits.
+    stop_waiting : callable
+        Ends the wait for the answer.
+    number : int
+        Number of messages that arrived before it.
+    place : tuple of int or None
+        Its place in the order of delivery: its rank, then its number.
+    """
+
+    __slots__ = ("answer", "frame", "message", "number", "place", "stamp", "stop_waiting")
+
+    def __init__(self, message: MessageT, frame: str, stamp: int | Latest) -> None:
+        self.message = message
+        self.frame = frame
+        self.stamp = stamp
+        self.answer: AnswerT | None = None
+        self.stop_waiting: Callable[[], object] = _nothing
+        self.number = -1
+        self.place: tuple[int, int] | None = None
+
+
+class MessageQueue(Generic[MessageT, AnswerT]):
+    """A bounded queue from which the reader gets only answered messages.
+
+    Parameters
+    ----------
+    capacity : int
+        How many may wait or be ready; at least one. The caller of `append` makes room first.
+    order : {"ready", "stamp", "arrival"}
+        With ``"stamp"`` and ``"arrival"``, a message that waits holds back those behind it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If `capacity` is not an integer of at least one, or `order` none of these.
+    """
+
+    def __init__(self, capacity: int, order: Order) -> None:
+        check_capacity(capacity)
+        if order not in ("ready", "stamp", "arrival"):
+            raise ValueError(f"order must be 'ready', 'stamp' or 'arrival', not {order!r}")
+        self.capacity = capacity
+        self.order: Order = order
+        self.unanswered = 0
+        self._arrivals = count()
+        self._pending: dict[int, PendingMessage[MessageT, AnswerT]] = {}
+        # The places in the order of delivery; with "ready", only those of answered messages.
+        self._line: list[tuple[int, int]] = []
+
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def __contains__(self, pending: PendingMessage[MessageT, AnswerT]) -> bool:
+        return pending.number in self._pending
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for another message."""
+        return len(self._pending) >= self.capacity
+
+    @property
+    def messages(self) -> tuple[PendingMessage[MessageT, AnswerT], ...]:
+        """All messages, in the order of arrival."""
+        return tuple(self._pending.values())
+
+    @property
+    def waiting(self) -> tuple[PendingMessage[MessageT, AnswerT], ...]:
+        """The messages without an answer, in the order of arrival."""
+        return tuple(pending for pending in self._pending.values() if pending.answer is None)
+
+    @property
+    def oldest(self) -> PendingMessage[MessageT, AnswerT]:
+        """The message that arrived first."""
+        return next(iter(self._pending.values()))
+
+    def is_waiting(self, pending: PendingMessage[MessageT, AnswerT]) -> bool:
+        """Whether a message is in the queue and has no answer."""
+        return pending in self and pending.answer is None
+
+    def append(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
+        """Add a message without an answer; with the order "stamp" it must have a stamp."""
+        pending.number = next(self._arrivals)
+        self._pending[pending.number] = pending
+        self.unanswered += 1
+        if self.order == "arrival":
+            self._line_up(pending, pending.number)
+        elif self.order == "stamp" and not isinstance(pending.stamp, Latest):
+            self._line_up(pending, pending.stamp)
+
+    def set_answer(self, pending: PendingMessage[MessageT, AnswerT], answer: AnswerT, moment: int) -> None:
+        """Give a waiting message its answer. Of two at one moment, the one that arrived first is ready first."""
+        pending.answer = answer
+        self.unanswered -= 1
+        if pending.place is None:
+            self._line_up(pending, moment)
+
+    def remove(self, pending: PendingMessage[MessageT, AnswerT]) -> None:
+        """Remove a message, answered or not."""
+        del self._pending[pending.number]
+        self.unanswered -= pending.answer is None
+        if pending.place is not None:
+            del self._line[bisect_left(self._line, pending.place)]
+
+    def pop_ready(self) -> tuple[MessageT, AnswerT] | None:
+        """Remove the next message in the order of delivery if it has its answer, and return both."""
+        if not self._line:
+            return None
+        pending = self._pending[self._line[0][1]]
+        if pending.answer is None:
+            return None
+        self.remove(pending)
+        return pending.message, pending.answer
+
+    def _line_up(self, pending: PendingMessage[MessageT, AnswerT], rank: int) -> None:
+        pending.place = rank, pending.number
+        insort(self._line, pending.place)
+
+
+def _nothing() -> None:
+    """Do nothing: no wait has been started."""
+
+
+class Targets(Generic[AnswerT]):
+    """The target frames of a message filter.
+
+    Parameters
+    ----------
+    buffer : Buffer
+    target : str or sequence of str
+        With one, an answer is a transform; with a sequence, a tuple of transforms in that order.
+    tolerance : float
+        In s. The transform at this much later has to be known too.
+
+    Raises
+    ------
+    UnknownFrameError
+        If a target cannot be the name of a frame.
+    TypeError, ValueError
+        If there is no target, or `tolerance` is not a duration.
+    """
+
+    def __init__(self, buffer: Buffer, target: str | Sequence[str], tolerance: float) -> None:
+        self._buffer = buffer
+        self._one = isinstance(target, str)
+        self._names = self._names_of(target)
+        self._tolerance = from_seconds(as_duration(tolerance, "tolerance"))
+
+    def replace(self, target: str | Sequence[str]) -> None:
+        """Change the targets; `TypeError` unless both are one frame, or both a sequence."""
+        if isinstance(target, str) is not self._one:
+            wanted = "one target" if self._one else "a sequence of targets"
+            raise TypeError(f"the filter was made for {wanted}, and its pairs keep their shape: not {target!r}")
+        self._names = self._names_of(target)
+
+    def questions(self, frame: str, stamp: int | Latest) -> Iterator[tuple[str, int | Latest]]:
+        """The targets and stamps (ns) to look up; the last one of each target gives its transform."""
+        for target in self._names:
+            if target == frame:
+                continue
+            if self._tolerance and not isinstance(stamp, Latest):
+                yield target, min(stamp + self._tolerance, STAMP_MAX)
+            yield target, stamp
+
+    def lookup_nowait(self, frame: str, stamp: int | Latest) -> AnswerT:
+        """The answer, or an error at once.
+
+        Raises
+        ------
+        TransformLookupError
+            If there is none. An error that waiting cannot help is raised before one that it may help.
+        """
+        now = self._buffer.bus.clock.now() if isinstance(stamp, Latest) else stamp
+        found = {frame: answer_of(frame, frame, now, IDENTITY, static=True)}
+        blocker: TransformLookupError | None = None
+        for target, at in self.questions(frame, stamp):
+            try:
+                found[target] = self._buffer.lookup_nowait(target, frame, at)
+            except MAY_COME as error:
+                blocker = blocker or error
+        if blocker is not None:
+            raise blocker
+        answers = tuple(found[target] for target in self._names)
+        return cast(AnswerT, answers[0] if self._one else answers)
+
+    async def wait(self, frame: str, stamp: int | Latest) -> None:
+        """Wait until each question has had an answer; the errors are those of `Buffer.lookup`."""
+        await self._buffer._lookup_among([Question(target, frame, at) for target, at in self.questions(frame, stamp)])
+
+    def blocker(self, frame: str, stamp: int | Latest) -> TransformLookupError | None:
+        """The error that an answer has now; None if there is an answer."""
+        try:
+            self.lookup_nowait(frame, stamp)
+        except TransformLookupError as error:
+            return error
+        return None
+
+    def lookup_at_timeout(self, frame: str, stamp: int | Latest, timeout: float) -> AnswerT:
+        """The answer for a message that has waited `timeout` s; `LookupTimeoutError` where waiting might still help."""
+        try:
+            return self.lookup_nowait(frame, stamp)
+        except MAY_COME:
+            for target, at in self.questions(frame, stamp):
+                try:
+                    self._buffer.lookup_nowait(target, frame, at)
+                except MAY_COME as blocker:
+                    raise LookupTimeoutError(target=target, source=frame, timeout=timeout, missing=blocker) from blocker
+            raise
+
+    def _names_of(self, target: str | Sequence[str]) -> tuple[str, ...]:
+        names = (target,) if isinstance(target, str) else tuple(target)
+        if not names:
+            raise ValueError("there must be at least one target")
+        for name in names:
+            if not is_frame(name):
+                raise UnknownFrameError(frame=name, known=self._buffer.tree.frames())
+        return names
+
 
 MessageOverflow = Literal["drop_oldest", "drop_newest", "block"]
 """Drop the message that arrived first, drop the one that arrives, or stop reading the source."""

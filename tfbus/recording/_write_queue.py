@@ -1,6 +1,6 @@
 """The batches that wait to be written to the disk, with the instants at which they were published."""
 
-from tfbus.bus.sample_queue import SampleQueue, TimedBatch
+from tfbus.bus.queues import SampleQueue, TimedBatch
 from tfbus.geometry.stamped import TransformStamped
 
 

@@ -7,8 +7,7 @@ from collections.abc import Callable, Container, Iterator, Mapping
 from operator import itemgetter
 
 from tfbus.errors import InvalidTransformError
-from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
-from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, is_within, not_physical
 from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._selection import Topics
 from tfbus.recording.formats._columns import Columns

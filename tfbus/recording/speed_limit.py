@@ -3,8 +3,8 @@
 import math
 from collections import Counter
 
-from tfbus.geometry.rows import Row
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.rows import Row
 from tfbus.stamps import SECOND, is_real
 
 _MAX_CANDIDATES = 16

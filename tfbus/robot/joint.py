@@ -7,8 +7,8 @@ from numbers import Real
 from typing import Literal, TypeAlias, get_args
 
 from tfbus.errors import InvalidRobotError, InvalidTransformError
-from tfbus.geometry.rows import Numbers, Quaternion, Row, Vector, as_vector, compose, rotate
 from tfbus.geometry.transform import Transform, from_row
+from tfbus.rows import Numbers, Quaternion, Row, Vector, as_vector, compose, rotate
 
 JointKind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic", "planar", "floating"]
 Position: TypeAlias = float | Sequence[float] | Transform

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.bus.bus import Bus
-from tfbus.bus.once_logger import OnceLogger
+from tfbus.bus.subscribers import OnceLogger
 from tfbus.frames import as_prefix
 from tfbus.robot.joint import Position
 from tfbus.robot.model import RobotModel

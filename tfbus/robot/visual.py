@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from tfbus.errors import InvalidRobotError
-from tfbus.geometry.rows import Vector
 from tfbus.geometry.transform import Transform
 from tfbus.robot._urdf import read_elements, transform_of
+from tfbus.rows import Vector
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,7 @@ No clock, no event loop, no input or output, and nothing of a bus: this room can
 
 from tfbus.tree.explanation import ExplainedEdge, Explanation
 from tfbus.tree.history import Edge, Outcome
-from tfbus.tree.policy import Hold
-from tfbus.tree.question import Question
+from tfbus.tree.lookup import Hold, Question
 from tfbus.tree.tree import TransformTree
 
 __all__ = ["Edge", "ExplainedEdge", "Explanation", "Hold", "Outcome", "Question", "TransformTree"]

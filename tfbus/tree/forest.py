@@ -5,7 +5,8 @@ held for one lookup or one batch, so worker threads may read while the loop inse
 """
 
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from itertools import groupby
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -13,15 +14,228 @@ import numpy.typing as npt
 
 from tfbus.errors import DisconnectedError, UnknownFrameError
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.stamps import STAMP_MIN, Latest, as_stamp
-from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
-from tfbus.tree._kernel import commit
-from tfbus.tree._known_frames import KnownFrames
-from tfbus.tree._path_cache import PathCache
-from tfbus.tree._saved_frames import SavedFrame, load_frame
+from tfbus.geometry.transform import from_row
+from tfbus.rows import Row
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps, as_stamp
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
-from tfbus.tree.path import Path, find_edges, find_path, path_at
+from tfbus.tree.path import Path, PathCache, find_edges, find_path, path_at
+from tfbus.which_kernel import commit
+
+
+class KnownFrames:
+    """Counts the samples that name each frame, so that a frame is forgotten with the last sample that names it."""
+
+    __slots__ = ("_mentions", "_parents_of", "_sorted")
+
+    def __init__(self) -> None:
+        self._parents_of: dict[str, tuple[str, ...]] = {}
+        self._mentions: dict[str, int] = {}
+        self._sorted: tuple[str, ...] | None = None
+
+    def __contains__(self, frame: object) -> bool:
+        return frame in self._parents_of or frame in self._mentions
+
+    def __iter__(self) -> Iterator[str]:
+        """The names in alphabetical order, sorted only now: most errors that hold them never look at them."""
+        return iter(self.sorted())
+
+    @property
+    def parents(self) -> Collection[str]:
+        """The frames that a sample names as a parent."""
+        return self._mentions.keys()
+
+    def update(self, child: str, parents: tuple[str, ...]) -> None:
+        """Note that the samples of `child` name exactly these parents."""
+        before = self._parents_of.get(child)
+        if before == parents:
+            return
+        for parent in parents:
+            self._mentions[parent] = self._mentions.get(parent, 0) + 1
+        self._forget_mentions(before or ())
+        self._parents_of[child] = parents
+        self._sorted = None
+
+    def remove(self, child: str) -> None:
+        """Note that no sample of `child` is left."""
+        self._forget_mentions(self._parents_of.pop(child))
+        self._sorted = None
+
+    def sorted(self) -> tuple[str, ...]:
+        """All names in alphabetical order."""
+        if self._sorted is None:
+            self._sorted = tuple(sorted({*self._parents_of, *self._mentions}))
+        return self._sorted
+
+    def copy(self) -> "KnownFrames":
+        """An independent copy."""
+        twin = KnownFrames()
+        twin._parents_of = self._parents_of.copy()
+        twin._mentions = self._mentions.copy()
+        return twin
+
+    def _forget_mentions(self, parents: tuple[str, ...]) -> None:
+        for parent in parents:
+            self._mentions[parent] -= 1
+            if not self._mentions[parent]:
+                del self._mentions[parent]
+
+
+class SavedFrame(NamedTuple):
+    """All samples of one frame, in types of Python and numpy."""
+
+    child: str
+    parent: str
+    """Of the newest sample; it stays when a frame has none."""
+    authority: str
+    static: tuple[int, Row] | None
+    """The stamp and the transform of a frame that is static."""
+    stamps: Stamps
+    """ns, ascending."""
+    rows: npt.NDArray[np.float64]
+    """Translation (m) and quaternion (x, y, z, w) of each sample; shape (n, 7)."""
+    runs: list[tuple[str, str, int]]
+    """Parent and authority, and how many samples have them one after the other."""
+
+
+def save_frame(history: FrameHistory, oldest: int = STAMP_MIN) -> SavedFrame:
+    """The samples of a frame from the stamp `oldest` on, in ns; a static sample has no age."""
+    stamps, rows, origins = _columns(history, oldest, STAMP_MAX)
+    first = int(np.searchsorted(stamps, oldest))
+    runs = [(parent, authority, len(list(run))) for (parent, authority), run in groupby(origins[first:])]
+    static = None
+    if history.static and history.static_stamp is not None:
+        static = history.static_stamp, history.static_row
+    return SavedFrame(history.child, history.parent, history.authority, static, stamps[first:], rows[first:], runs)
+
+
+def load_frame(saved: SavedFrame, window: int | None) -> FrameHistory:
+    """A history with the samples that were saved, and a window in ns before the newest."""
+    history = FrameHistory(saved.child, saved.parent, saved.static is not None, window)
+    history.authority = saved.authority
+    if saved.static is not None:
+        stamp, row = saved.static
+        history.insert_static(saved.parent, stamp, row, saved.authority)
+    first = 0
+    for parent, authority, count in saved.runs:
+        end = first + count
+        history.insert(parent, int(saved.stamps[first]), _row(saved.rows[first]), authority)
+        if history.can_append(parent, authority, STAMP_MAX):
+            if count > 1:
+                history.append_many(saved.stamps[first + 1 : end], saved.rows[first + 1 : end])
+        else:
+            for at in range(first + 1, end):
+                history.insert(parent, int(saved.stamps[at]), _row(saved.rows[at]), authority)
+        first = end
+    history.changed = False
+    return history
+
+
+def samples_of(history: FrameHistory, low: int, high: int) -> Iterator[TransformStamped]:
+    """The moving samples from stamp `low` to `high`, and the next one on either side; or the static one."""
+    if history.static:
+        stamp = history.static_stamp or 0
+        yield TransformStamped(
+            history.parent, history.child, stamp, from_row(history.static_row), history.authority, static=True
+        )
+        return
+    stamps, rows, origins = _columns(history, low, high)
+    for stamp, row, (parent, authority) in zip(stamps.tolist(), rows, origins, strict=True):
+        yield TransformStamped(parent, history.child, stamp, from_row(_row(row)), authority)
+
+
+def _columns(
+    history: FrameHistory, low: int, high: int
+) -> tuple[Stamps, npt.NDArray[np.float64], list[tuple[str, str]]]:
+    """Stamps, rows, parents and authorities of the samples from `low` to `high`, and of the next one on either side."""
+    samples = history.samples_between(low, high)
+    count = len(samples)
+    parents = samples.parents or [history.parent] * count
+    authorities = samples.authorities or [history.authority] * count
+    return samples.stamps, np.ascontiguousarray(samples.rows), list(zip(parents, authorities, strict=True))
+
+
+def _row(row: npt.NDArray[np.float64]) -> Row:
+    x, y, z, qx, qy, qz, qw = row.tolist()
+    return x, y, z, qx, qy, qz, qw
+
+
+# Walks along all edges of all stamps: the frames above or below some others, and loops of parents at past stamps.
+#
+# All of them climb from the frames that are asked for, so their cost depends on the height of the tree, not on its
+# size.
+
+
+Frames = Mapping[str, FrameHistory]
+"""By child."""
+
+
+class Loop(NamedTuple):
+    """A loop of parents at a stamp.
+
+    Attributes
+    ----------
+    stamp : int
+        ns.
+    frames : tuple of str
+        From child to parent, the first one repeated at the end.
+    """
+
+    stamp: int
+    frames: tuple[str, ...]
+
+
+def edges_above(frames: Frames, names: Iterable[str]) -> dict[str, FrameHistory]:
+    """The edges of some frames and of all above them, by any parent that a sample in the window names."""
+    found: dict[str, FrameHistory] = {}
+    ahead = list(names)
+    while ahead:
+        edge = frames.get(ahead.pop())
+        if edge is not None and edge.child not in found:
+            found[edge.child] = edge
+            ahead += edge.named_parents
+    return found
+
+
+def names_below(frames: Frames, names: Iterable[str], above: set[str]) -> set[str]:
+    """Those of `names` that are in `above`, or below one of these by any parent that a sample in the window names."""
+    asked = set(names)
+    children: dict[str, list[str]] = {}
+    for child, edge in edges_above(frames, asked).items():
+        for parent in edge.named_parents:
+            children.setdefault(parent, []).append(child)
+    found = set(above)
+    ahead = list(above)
+    while ahead:
+        new = [child for child in children.get(ahead.pop(), ()) if child not in found]
+        found.update(new)
+        ahead += new
+    return found & asked
+
+
+def past_loop(frames: Frames, child: str, stamp: int) -> Loop | None:
+    """The loop of parents that the sample of a frame at a stamp is part of, if there is one.
+
+    The sample holds from its stamp to the next one. An edge counts from its oldest sample on.
+    """
+    edge = frames[child]
+    above = edges_above(frames, edge.named_parents)
+    if child not in above:
+        return None
+    _, until = edge.neighbours(stamp + 1)
+    instants = {stamp}
+    for other in above.values():
+        instants.update(at for at in other.beginnings() if stamp < at and (until is None or at < until))
+    for at in sorted(instants):
+        walk = {child: None}
+        here = edge.parent_at(at)
+        while here not in walk and (up := frames.get(here)) is not None and up.begins_by(at):
+            walk[here] = None
+            here = up.parent_at(at)
+        if here == child:
+            return Loop(at, (*walk, child))
+    return None
+
 
 AT_A_TIME = 100
 """The number of frames that are read before the lock is released, for questions about all of them."""

@@ -5,18 +5,103 @@ is decided here: late samples, changes of the parent, static samples. Every samp
 frame may be reparented; parents and authorities are stored as runs of samples with the same one.
 """
 
+from bisect import bisect_right
 from dataclasses import dataclass
 from enum import Enum
+from operator import itemgetter
 from typing import final
 
 import numpy as np
 import numpy.typing as npt
 
+from tfbus._python_kernel import Columns
 from tfbus.errors import ExtrapolationError, FutureExtrapolationError, PastExtrapolationError
-from tfbus.geometry.rows import IDENTITY, Row, interpolate
-from tfbus.stamps import SECOND, Latest, Stamps
-from tfbus.tree._kernel import Columns, History
-from tfbus.tree._runs import Runs
+from tfbus.rows import IDENTITY, Row, interpolate
+from tfbus.stamps import SECOND, STAMP_MIN, Latest, Stamps
+from tfbus.which_kernel import History
+
+_begin_of = itemgetter(0)
+
+
+class Runs:
+    """The names that the samples of a history carry, kept once for each run of samples with the same.
+
+    It is empty, and false, while all samples agree; the history itself holds the name of its newest sample.
+    """
+
+    __slots__ = ("_runs",)
+
+    def __init__(self) -> None:
+        # The stamp from which each name holds, in order. The first one holds from any earlier stamp as well.
+        self._runs: list[tuple[int, str]] = []
+
+    def __bool__(self) -> bool:
+        return bool(self._runs)
+
+    def at(self, stamp: int) -> str:
+        """The name that holds at a stamp; there are several."""
+        return self._runs[max(bisect_right(self._runs, stamp, key=_begin_of) - 1, 0)][1]
+
+    def at_all(self, stamps: Stamps) -> list[str]:
+        """The names that hold at many stamps."""
+        begins = np.array([begin for begin, _ in self._runs], np.int64)
+        numbers = np.maximum(begins.searchsorted(stamps, "right") - 1, 0)
+        return [self._runs[number][1] for number in numbers]
+
+    def names(self) -> tuple[str, ...]:
+        """Each name once, in the order in which they first hold."""
+        return tuple(dict.fromkeys(name for _, name in self._runs))
+
+    def changes(self) -> list[int]:
+        """The stamps at which another name begins to hold."""
+        return [begin for begin, _ in self._runs[1:]]
+
+    def push(self, stamp: int, name: str, newest: str) -> None:
+        """Note the name of a sample that is newer than all others, the newest of which has the name `newest`."""
+        if name != newest:
+            if not self._runs:
+                self._runs.append((STAMP_MIN, newest))
+            self._runs.append((stamp, name))
+
+    def put(self, stamp: int, name: str, before: int | None, after: int | None, newest: str) -> None:
+        """Note the name of a sample between those at two stamps, of which there may be none; `newest` as in `push`."""
+        if not self._runs:
+            if name == newest:
+                return
+            self._runs.append((STAMP_MIN, newest))
+        runs = self._runs
+        low = 0 if before is None else bisect_right(runs, before, key=_begin_of)
+        high = len(runs) if after is None else bisect_right(runs, after, key=_begin_of)
+        fresh = [] if low and runs[low - 1][1] == name else [(stamp, name)]
+        if after is not None and runs[high - 1][1] != name:
+            fresh.append((after, runs[high - 1][1]))
+        runs[low:high] = fresh
+        self._close()
+
+    def forget_before(self, oldest: int) -> bool:
+        """Forget the names that no sample from a stamp on carries; returns whether there were any."""
+        runs = self._runs
+        old = 0
+        while old + 1 < len(runs) and runs[old + 1][0] <= oldest:
+            old += 1
+        del runs[:old]
+        self._close()
+        return old > 0
+
+    def clear(self) -> None:
+        """Forget all names."""
+        self._runs.clear()
+
+    def copy(self) -> "Runs":
+        """An independent copy."""
+        twin = Runs()
+        twin._runs = self._runs.copy()
+        return twin
+
+    def _close(self) -> None:
+        if len(self._runs) == 1:
+            self._runs.clear()
+
 
 _BLOCK = 64
 """Up to this many samples for each stamp, all samples are copied at once, which is faster than to pick some."""
@@ -351,3 +436,33 @@ class FrameHistory(History):
             if self._parents.forget_before(oldest):
                 self.changed = True
         self.mixed = bool(self._parents)
+
+
+STALE_AFTER = 1.0
+"""s; the age from which pictures show a moving frame as stale unless they are told otherwise."""
+
+
+class EdgeState(Enum):
+    """A state, and the colour of its edges in every picture.
+
+    The colours are those of M. Okabe and K. Ito, "Color Universal Design" (2008), which people tell apart with any
+    kind of colour vision.
+    """
+
+    STATIC = "#0072b2"
+    """It holds at every stamp."""
+    MOVING = "#009e73"
+    """It has a sample that is recent enough."""
+    STALE = "#d55e00"
+    """Its newest sample is too old."""
+    SILENT = "#767676"
+    """It has no sample."""
+
+
+def state_of(edge: Edge, now: int, stale_after: float = STALE_AFTER) -> EdgeState:
+    """The state of an edge at the stamp `now` (ns); moving edges are stale after so many s."""
+    if edge.static:
+        return EdgeState.STATIC
+    if edge.newest is None:
+        return EdgeState.SILENT
+    return EdgeState.STALE if now - edge.newest > stale_after * SECOND else EdgeState.MOVING

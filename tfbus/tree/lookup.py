@@ -1,8 +1,14 @@
 """Lookups at one stamp: the stamp that `LATEST` means, the transform along the path, and the error if there is none."""
 
+import math
+from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
+from tfbus.data import Stamped, check_registered
 from tfbus.errors import (
     AheadError,
     DisconnectedError,
@@ -11,14 +17,274 @@ from tfbus.errors import (
     GapError,
     TransformLookupError,
 )
-from tfbus.geometry.rows import Row, compose
 from tfbus.geometry.stamped import TransformStamped, answer_of, qualified_answer
-from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, AtLike, Latest, StampLike, as_at, as_stamp
-from tfbus.tree.extrapolation import Extrapolation
+from tfbus.rows import IDENTITY, Row, compose, invert
+from tfbus.stamps import (
+    LATEST,
+    STAMP_MAX,
+    STAMP_MIN,
+    AtLike,
+    Latest,
+    StampLike,
+    Stamps,
+    as_at,
+    as_duration,
+    as_stamp,
+    from_seconds,
+)
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import FrameHistory
-from tfbus.tree.path import Path
-from tfbus.tree.policy import Policy
+from tfbus.tree.history import FrameHistory, Samples
+from tfbus.tree.path import Path, Step
+
+# Policies: which stamps a lookup may answer although no two close samples surround them.
+#
+# Without a policy nothing is extrapolated, and any two samples are interpolated between, however far apart they are.
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Let a sample stand in for the stamps after it, up to the edge's next sample.
+
+    It does so where an edge has no sample after the stamp, or none that `max_gap` lets it interpolate to.
+
+    Parameters
+    ----------
+    max_age : float
+        For how long, in s.
+    """
+
+    max_age: float
+
+    def __post_init__(self) -> None:
+        as_duration(self.max_age, "max_age")
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """The limits of how far an answer may depart from its stamp; all in ns. Made by `policy_of`.
+
+    Parameters
+    ----------
+    tolerance : int
+        How far the nearest sample may be from a stamp that is not covered, or in a gap that is too long.
+    max_gap : int or None
+        How far two samples may be apart that are interpolated between; None for any distance.
+    hold : int
+        For how long a sample may stand in for the stamps after it.
+    """
+
+    tolerance: int = 0
+    max_gap: int | None = None
+    hold: int = 0
+
+    @property
+    def longest_hold(self) -> int:
+        """The longest time that a sample may stand in for later stamps, by `tolerance` or by `hold`, in ns."""
+        return max(self.tolerance, self.hold)
+
+
+def policy_of(tolerance: float, max_gap: float | None, extrapolate: Hold | None) -> Policy | None:
+    """The policy that three arguments in s make; None if they allow and refuse nothing.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one is not a duration, or `extrapolate` not a `Hold`.
+    """
+    if tolerance == 0.0 and max_gap is None and extrapolate is None:
+        return None
+    if extrapolate is not None and not isinstance(extrapolate, Hold):
+        raise TypeError(f"extrapolate must be a Hold, not {extrapolate!r}")
+    return Policy(
+        _nanoseconds(tolerance, "tolerance"),
+        None if max_gap is None else _nanoseconds(max_gap, "max_gap"),
+        0 if extrapolate is None else _nanoseconds(extrapolate.max_age, "max_age"),
+    )
+
+
+def _nanoseconds(seconds: float, name: str) -> int:
+    duration = as_duration(seconds, name)
+    return STAMP_MAX if duration == math.inf else from_seconds(duration)
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """The arguments of a lookup: stamps in ns, `max_age` in s."""
+
+    target: str
+    source: str
+    at: int | Latest
+    source_at: int | Latest | None = None
+    fixed: str | None = None
+    max_age: float | None = None
+    policy: Policy | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it asks for nothing but a stamp, so that the kernel may answer it."""
+        return self.source_at is None and self.fixed is None and self.max_age is None and self.policy is None
+
+
+def question_of(
+    data: Stamped, target: str, at: int | Latest | None, fixed: str | None, max_age: float | None, policy: Policy | None
+) -> Question:
+    """The question whose answer moves `data`; the arguments are those of `Buffer.transform`.
+
+    Raises
+    ------
+    TypeError
+        If `data` are of a type that is not registered or has no frame and stamp, or only one of `at` and `fixed` is
+        given.
+    """
+    check_registered(data)
+    if not (hasattr(data, "frame") and hasattr(data, "stamp")):
+        kind = type(data).__name__
+        raise TypeError(f"a {kind} has no frame and stamp of its own: look the transform up and call do_transform")
+    if at is None and fixed is None:
+        return Question(target, data.frame, data.stamp, max_age=max_age, policy=policy)
+    if at is None or fixed is None:
+        raise TypeError("at and fixed go together: the data at their stamp, carried to `at` through the fixed frame")
+    return Question(target, data.frame, at, data.stamp, fixed, max_age, policy)
+
+
+class ReadStamp(NamedTuple):
+    """The stamp at which an edge is read in place of the one that was asked, and how far they differ; all in ns."""
+
+    stamp: int
+    extrapolated_by: int
+    gap: int
+
+
+def read_stamp(edge: FrameHistory, at: int, policy: Policy) -> ReadStamp:
+    """The stamp at which to read an edge for the stamp `at`.
+
+    Raises
+    ------
+    ExtrapolationError
+        If the policy does not allow any sample to stand in.
+    """
+    before, after = edge.neighbours(at)
+    if after == at:
+        return ReadStamp(at, 0, 0)
+    if before is not None and after is not None and (policy.max_gap is None or after - before <= policy.max_gap):
+        return ReadStamp(at, 0, after - before)
+    patience = policy.longest_hold
+    standing_in = []
+    if before is not None and at - before <= patience:
+        standing_in.append(ReadStamp(before, at - before, 0))
+    if after is not None and after - at <= policy.tolerance and edge.parent_at(after) == edge.parent_at(at):
+        standing_in.append(ReadStamp(after, after - at, 0))
+    if standing_in:
+        return min(standing_in, key=lambda found: found.extrapolated_by)
+    if before is None or after is None or policy.max_gap is None:
+        raise edge.extrapolation_error(at, patience if after is None else policy.tolerance)
+    raise GapError(
+        child=edge.child,
+        stamp=at,
+        oldest=edge.oldest,
+        newest=edge.newest,
+        authority=edge.authority,
+        slack=patience,
+        before=before,
+        after=after,
+        max_gap=policy.max_gap,
+    )
+
+
+def read_stamps(edges: tuple[FrameHistory, ...], at: int, policy: Policy) -> list[ReadStamp]:
+    """The stamps at which to read some edges for the stamp `at`.
+
+    Raises
+    ------
+    ExtrapolationError
+        Of the deciding edge: the first that waiting cannot help, else the one that lags most.
+    """
+    found: list[ReadStamp] = []
+    errors: list[ExtrapolationError] = []
+    for edge in edges:
+        try:
+            found.append(read_stamp(edge, at, policy))
+        except ExtrapolationError as error:
+            errors.append(error)
+    if errors:
+        raise min(errors, key=_decisive)
+    return found
+
+
+def _decisive(error: ExtrapolationError) -> int:
+    if not isinstance(error, FutureExtrapolationError):
+        return STAMP_MIN - 1
+    return STAMP_MIN if error.newest is None else error.newest
+
+
+def read_stamps_at_many(samples: Samples, stamps: Stamps, policy: Policy) -> tuple[Stamps, Stamps, Stamps]:
+    """The fields of `ReadStamp` at many stamps, as arrays of shape (n,); `extrapolated_by` is -1 without an answer."""
+    own = samples.stamps
+    if not len(own):
+        return stamps, np.full(len(stamps), -1), np.zeros(len(stamps), np.int64)
+    i = own.searchsorted(stamps)
+    following = np.minimum(i, len(own) - 1)
+    before, after = own[np.maximum(i - 1, 0)], own[following]
+    has_before, has_after = i > 0, i < len(own)
+    exact = after == stamps
+    # Unsigned, because two stamps may be further apart than a signed difference can say.
+    late, early, gap = (difference.view(np.uint64) for difference in (stamps - before, after - stamps, after - before))
+    between = has_before & has_after & ~exact
+    if policy.max_gap is not None:
+        between &= gap <= policy.max_gap
+    alone = ~(exact | between)
+    by_before = alone & has_before & (late <= policy.longest_hold)
+    by_after = alone & has_after & (early <= policy.tolerance) & ~(by_before & (late <= early))
+    if samples.parents is not None:
+        parents = np.array(samples.parents, object)
+        same = np.concatenate(([True], parents[1:] == parents[:-1]))
+        by_after &= same[following]
+    read_at = np.where(by_after, after, np.where(by_before, before, stamps))
+    away = np.where(by_after, early, np.where(by_before, late, 0)).astype(np.int64)
+    away[alone & ~by_before & ~by_after] = -1
+    return read_at, away, np.minimum(np.where(between, gap, 0), STAMP_MAX).astype(np.int64)
+
+
+class Extrapolation:
+    """Reads the edges of one lookup as a policy allows, and records how far that went.
+
+    Attributes
+    ----------
+    policy : Policy
+    extrapolated_by, gap : int
+        The greatest values over all edges that were read, in ns, as in `TransformStamped`.
+    """
+
+    __slots__ = ("extrapolated_by", "gap", "policy")
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+        self.extrapolated_by = 0
+        self.gap = 0
+
+    def row(self, path: Path, at: int) -> Row:
+        """Source in target along a path.
+
+        Raises
+        ------
+        ExtrapolationError
+        """
+        stamps = read_stamps(path.moving, at, self.policy)
+        for found in stamps:
+            self.extrapolated_by = max(self.extrapolated_by, found.extrapolated_by)
+            self.gap = max(self.gap, found.gap)
+        ahead = iter(stamps)
+        up = _climb(path.up, ahead)
+        return up if not path.down else compose(invert(_climb(path.down, ahead)), up)
+
+
+def _climb(steps: tuple[Step, ...], stamps: Iterator[ReadStamp]) -> Row:
+    row = IDENTITY
+    for step in steps:
+        here = step.row_at(next(stamps).stamp) if isinstance(step, FrameHistory) else step
+        row = compose(here, row)
+    return row
+
 
 At = int | Latest
 Found = tuple[int, Row, bool]
@@ -61,11 +327,7 @@ def answer(
     bounds: Bounds | None,
     policy: Policy | None,
 ) -> TransformStamped:
-    """The answer of `TransformTree.lookup`, without keywords: each of them costs a twentieth of a lookup."""
-    if policy is None and bounds is None and source_at is None and fixed is None:
-        found = forest.paths.answer(target, source, at)
-        if found is not None:
-            return found
+    """The answer of `TransformTree.lookup` to a question that has no plain answer, or is not plain."""
     if bounds is not None and at is not LATEST and source_at is not LATEST:
         raise TypeError(AT_LATEST_ONLY)
     if type(at) is not int and at is not LATEST:

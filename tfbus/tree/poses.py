@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import TransformLookupError
-from tfbus.geometry.rows import IDENTITY, Row, invert
+from tfbus.rows import IDENTITY, Row, invert
 from tfbus.stamps import LATEST, STAMP_MIN, Latest
-from tfbus.tree._kernel import compose_paths
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import find
+from tfbus.which_kernel import compose_paths
 
 _WIDTH = 7
 _pack = Struct(f"{_WIDTH}d").pack

@@ -2,12 +2,12 @@
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from html import escape
 from typing import NamedTuple
 
 from tfbus.stamps import SECOND, format_age, format_duration, format_stamp
-from tfbus.tree.edge_state import state_of
-from tfbus.tree.history import Edge
+from tfbus.tree.history import STALE_AFTER, Edge, EdgeState, state_of
 
 _NOT_IN_YAML = re.compile(r"[\x7f-\xa0\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
@@ -165,3 +165,58 @@ def _seconds(stamp: int | None) -> str:
 def _quoted(text: str) -> str:
     """In double quotes as YAML and Graphviz read them; Graphviz knows no ``\\u``, so letters of any alphabet stay."""
     return _NOT_IN_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(text, ensure_ascii=False))
+
+
+_PRE = "font-family: monospace; font-size: 12px; line-height: 1.35; margin: 0; white-space: pre; overflow-x: auto"
+_MARK = "background: #f0e442; color: #000000"
+
+
+def to_html(
+    edges: Sequence[Edge],
+    now: int,
+    stale_after: float = STALE_AFTER,
+    *,
+    marked: Collection[str] = (),
+    with_facts: bool = True,
+) -> str:
+    """The edges as an indented tree, one frame a line, each frame in the colour of its state.
+
+    Parameters
+    ----------
+    edges : sequence of Edge
+    now : int
+        The stamp (ns) that ages are counted from.
+    stale_after : float
+        The age, in s, from which a moving frame is stale.
+    marked : collection of str
+        Frames to highlight.
+    with_facts : bool
+        Whether the rate, age, span and authority follow each frame.
+
+    Returns
+    -------
+    str
+        One ``<pre>`` element. All names are escaped.
+    """
+    drawn = list(branches(edges))
+    if not drawn:
+        return f'<pre style="{_PRE}">(no frames)</pre>'
+    width = max(len(branch.guides + branch.frame) for branch in drawn) + 2
+    lines = []
+    for guides, frame, edge in drawn:
+        style = "font-weight: bold"
+        if edge is not None:
+            style += f"; color: {state_of(edge, now, stale_after).value}"
+        if frame in marked:
+            style += f"; {_MARK}"
+        line = f'{guides}<span style="{style}">{escape(frame)}</span>'
+        if edge is not None and with_facts:
+            line += " " * (width - len(guides + frame)) + escape("  ".join(facts(edge, now).values()))
+        lines.append(line)
+    return f'<pre style="{_PRE}">{chr(10).join(lines)}</pre>'
+
+
+def legend() -> str:
+    """The colours of the states, as one line of HTML."""
+    names = (f'<span style="color: {state.value}">\u25cf {state.name.lower()}</span>' for state in EdgeState)
+    return f'<div style="font-size: 12px">{" &nbsp; ".join(names)}</div>'

@@ -12,9 +12,15 @@ import numpy as np
 
 from tfbus.data import PointCloud, TwistStamped
 from tfbus.errors import TransformLookupError
-from tfbus.geometry.bounds import MAX_TRANSLATION, as_max_translation, check_translations, is_within
-from tfbus.geometry.stamped import TransformStamped, as_batch
-from tfbus.geometry.transform_array import TransformArray, from_memory, with_stamps
+from tfbus.geometry.stamped import (
+    MAX_TRANSLATION,
+    TransformStamped,
+    as_batch,
+    as_max_translation,
+    check_translations,
+    is_within,
+)
+from tfbus.geometry.transform_array import TransformArray, with_stamps
 from tfbus.stamps import (
     LATEST,
     AtLike,
@@ -28,17 +34,14 @@ from tfbus.stamps import (
     format_stamp,
     from_seconds,
 )
-from tfbus.tree._lookup_many import OutOfRange, deskew, lookup_many
-from tfbus.tree._saved_frames import SavedFrame, samples_of, save_frame
-from tfbus.tree._velocity import twist
 from tfbus.tree.explanation import Explanation, explain
-from tfbus.tree.forest import Forest
+from tfbus.tree.forest import Forest, SavedFrame, samples_of, save_frame
 from tfbus.tree.history import Edge, FrameHistory, Outcome
-from tfbus.tree.html import legend, to_html
-from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, answer, bounds_of
-from tfbus.tree.plain_first import plain_first, plain_many_first
-from tfbus.tree.policy import Hold, policy_of
-from tfbus.tree.rendering import counted, describe, to_dot, to_yaml
+from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, Hold, answer, bounds_of, policy_of
+from tfbus.tree.lookup_many import OutOfRange, deskew, lookup_many
+from tfbus.tree.rendering import counted, describe, legend, to_dot, to_html, to_yaml
+from tfbus.tree.twist import twist
+from tfbus.which_kernel import plain_first
 
 
 class TransformTree:
@@ -211,15 +214,7 @@ class TransformTree:
         the way that has them. If both others have them, the frames count as not connected at that stamp. `looped`
         counts the samples that form such loops. The answer depends on the samples only, never on earlier questions.
         """
-        policy = None
-        if tolerance == 0.0 and max_gap is None and extrapolate is None:
-            if source_at is None and fixed is None and not_before is None and not_after is None:
-                # Nearly all questions are plain, and a call on the way costs a fifth of the answer.
-                found = self._paths.answer(target, source, at)
-                if found is not None:
-                    return found
-        else:
-            policy = policy_of(tolerance, max_gap, extrapolate)
+        policy = policy_of(tolerance, max_gap, extrapolate)
         bounds = bounds_of(not_before, not_after)
         return answer(self._forest, target, source, at, source_at, fixed, bounds, policy)
 
@@ -266,7 +261,7 @@ class TransformTree:
             at = as_stamp(at)
         return explain(self._forest, target, source, at, bounds, policy, now)
 
-    @plain_many_first
+    @partial(plain_first, many=TransformArray)
     def lookup_many(
         self,
         target: str,
@@ -324,18 +319,6 @@ class TransformTree:
                [ 5.,  0.,  0.],
                [10.,  0.,  0.]])
         """
-        if (
-            tolerance == 0.0
-            and max_gap is None
-            and extrapolate is None
-            and source_at is None
-            and fixed is None
-            and (out_of_range == "raise" or out_of_range == "nan")
-        ):
-            # Nearly all questions are plain, and for a few stamps the way to numpy takes longer than the answers.
-            memory = self._paths.answer_many(target, source, stamps)
-            if memory is not None:
-                return from_memory(memory)
         asked = as_stamps(stamps)
         if (source_at is None) != (fixed is None):
             raise TypeError(GO_TOGETHER)

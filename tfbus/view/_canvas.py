@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from tfbus.data import PointCloud
-from tfbus.geometry.rows import Row
+from tfbus.rows import Row
 from tfbus.view._page import Picture
 from tfbus.view._scene import NO_SCENE, Scene
 from tfbus.view._solids import Solids

@@ -4,7 +4,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 from tfbus.statistics import QueueStatistics
 
 CAPACITY = 1_000

@@ -14,8 +14,8 @@ import numpy as np
 from tfbus.errors import UnknownFrameError
 from tfbus.events import Event
 from tfbus.stamps import LATEST, SECOND, format_stamp
-from tfbus.tree.edge_state import STALE_AFTER
-from tfbus.tree.html import legend, to_html
+from tfbus.tree.history import STALE_AFTER
+from tfbus.tree.rendering import legend, to_html
 from tfbus.tree.tree import TransformTree, forest_of
 from tfbus.view._scene import NO_SCENE, Floats, Scene, SceneReader, largest_root
 from tfbus.view._selection import selection_facts

@@ -7,8 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.stamps import SECOND, STAMP_MIN, Latest
-from tfbus.tree.edge_state import STALE_AFTER, EdgeState
 from tfbus.tree.forest import Forest
+from tfbus.tree.history import STALE_AFTER, EdgeState
 from tfbus.tree.poses import PoseReader, Poses
 
 Floats = npt.NDArray[np.float32]

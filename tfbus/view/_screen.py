@@ -8,7 +8,7 @@ import viser
 
 from tfbus.data import PointCloud
 from tfbus.errors import TransformLookupError
-from tfbus.geometry.rows import Row
+from tfbus.rows import Row
 from tfbus.stamps import SECOND
 from tfbus.view._canvas import Canvas
 from tfbus.view._meshes import Solid

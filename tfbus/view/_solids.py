@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import viser
 
-from tfbus.geometry.rows import compose
+from tfbus.rows import compose
 from tfbus.view._meshes import Solid
 from tfbus.view._scene import Scene
 

@@ -15,12 +15,12 @@ import anyio.lowlevel
 import anyio.to_thread
 import numpy as np
 
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 from tfbus._aio.task_groups import close_task_group
+from tfbus.analysis.arrivals import Delays
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.bus.delays import Delays
-from tfbus.bus.once_logger import OnceLogger
+from tfbus.bus.subscribers import OnceLogger
 from tfbus.data import PointCloud
 from tfbus.errors import BusClosedError
 from tfbus.events import FrameAdded
@@ -29,7 +29,7 @@ from tfbus.geometry.stamped import Batch
 from tfbus.robot.visual import read_visuals
 from tfbus.stamps import as_duration, is_real
 from tfbus.statistics import QueueStatistics
-from tfbus.tree.edge_state import STALE_AFTER
+from tfbus.tree.history import STALE_AFTER
 from tfbus.view._controls import Controls
 from tfbus.view._meshes import MeshFiles, Solid, solids_of
 from tfbus.view._page import Page

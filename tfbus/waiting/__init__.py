@@ -3,6 +3,6 @@
 There is no event loop here: each waiter brings along the function that wakes it.
 """
 
-from tfbus.waiting.waiting_index import PendingLookup
+from tfbus.waiting.live_tree import PendingLookup
 
 __all__ = ["PendingLookup"]

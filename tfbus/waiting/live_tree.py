@@ -4,17 +4,468 @@ It knows no event loop: to wake a waiter is to call the function that the waiter
 """
 
 import logging
-from collections.abc import Callable, Iterable
+from bisect import bisect_left, insort
+from collections.abc import Callable, Iterable, Iterator, KeysView
+from dataclasses import dataclass
+from itertools import count, takewhile
+from typing import Any
 
-from tfbus.errors import ClockResetError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
+from tfbus._python_kernel import Place
+from tfbus.errors import (
+    MAY_COME,
+    AheadError,
+    ClockResetError,
+    DisconnectedError,
+    ExtrapolationError,
+    FutureExtrapolationError,
+    GapError,
+    TransformLookupError,
+    UnknownFrameError,
+)
 from tfbus.geometry.stamped import Batch
 from tfbus.registration import Registration
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest
 from tfbus.statistics import BufferStatistics
 from tfbus.tree.forest import Forest, LoopingSample
-from tfbus.waiting._feed import Feed
-from tfbus.waiting._limits import limits_of
-from tfbus.waiting.waiting_index import Waiter, WaitingIndex
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.lookup import Policy, Question, read_stamp
 from tfbus.waiting.watch_index import WatchIndex, WatchState
+from tfbus.which_kernel import Feed, Line, Parked
+
+Limits = list[tuple[str, int]]
+
+
+def limits_of(forest: Forest, question: Question, blocking: str | None) -> Limits:
+    """The moving edges of a question, each with a limit in ns: a newer sample of it may mean that no answer will come.
+
+    An edge that keeps all samples has no limit. Neither has a lookup at `LATEST`, because its stamp is never too old.
+    Only the thread that fills the forest may call this.
+
+    Parameters
+    ----------
+    forest : Forest
+    question : Question
+    blocking : str or None
+        An edge to leave out, because each of its samples is noticed anyway.
+    """
+    target, source, fixed = question.target, question.source, question.fixed
+    if fixed is None:
+        return _limits_at(forest, target, source, question.at, question.policy, blocking)
+    return [
+        *_limits_at(forest, target, fixed, question.at, question.policy, blocking),
+        *_limits_at(forest, fixed, source, question.source_at, question.policy, blocking),
+    ]
+
+
+def _limits_at(
+    forest: Forest, target: str, source: str, at: int | Latest | None, policy: Policy | None, blocking: str | None
+) -> Limits:
+    if at is None or isinstance(at, Latest):
+        return []
+    path = forest.paths.find(target, source)
+    edges = _edges(forest, target, source, at) if path is None or path.root in forest.frames else path.moving
+    window = STAMP_MAX if forest.window is None else forest.window
+    limits = []
+    asked = at
+    if policy is not None:
+        at = min(at + policy.tolerance, STAMP_MAX)
+    for edge in edges:
+        if edge.child == blocking:
+            continue
+        before, after = edge.around(at)
+        if before is None:
+            # The first sample decides, or has decided.
+            limit = at
+        elif after is not None:
+            # Until the sample before the stamp leaves the window.
+            limit = before + window
+            if policy is not None and policy.max_gap is not None and _is_in_gap(edge, asked, policy):
+                limit = at
+        else:
+            # Until a sample after the stamp comes, and the one before it has left the window or is too far away.
+            near = window if policy is None or policy.max_gap is None else min(window, policy.max_gap)
+            limit = max(before + near, at)
+        if limit < STAMP_MAX:
+            limits.append((edge.child, limit))
+    return limits
+
+
+def _is_in_gap(edge: FrameHistory, at: int, policy: Policy) -> bool:
+    try:
+        read_stamp(edge, at, policy)
+    except GapError:
+        return True
+    except ExtrapolationError:
+        pass
+    return False
+
+
+def _edges(forest: Forest, target: str, source: str, at: int) -> tuple[FrameHistory, ...]:
+    """The moving edges that decide whether there will be an answer."""
+    with forest.lock:
+        try:
+            path = forest.find_path(target, source, at)
+        except UnknownFrameError:
+            return ()
+        except DisconnectedError as error:
+            # A loop ends when one of its edges loses the stamp.
+            loop = [forest.frames[child] for child in dict.fromkeys(error.loop)]
+            return tuple(edge for edge in loop if not edge.static)
+    return path.moving if path.rival is None else (*path.moving, *path.rival.moving)
+
+
+# An index of the waiting lookups by the frames that block them.
+#
+# A lookup that cannot be answered is parked under the frame that blocks it: an edge whose newest stamp is too old,
+# ordered by the stamp that the lookup needs; an unknown frame; or the roots of two trees. An insertion then finds the
+# lookups that it may have unblocked without looking at the others. Nothing here waits or computes an answer: the
+# inserting code pops the waiters that may have an answer and wakes them, each with its answer if that is plain.
+#
+# A lookup also ends when another edge of its path loses the stamp, because its window has slid on. Each of these edges
+# has a limit: the newest stamp that it may reach until then. A waiter is kept by its first limit in one list for all
+# frames, so an insertion costs one comparison, as long as it is in nobody's future. Once some frame has passed a limit,
+# the waiter is kept under the edges that have not, such as one that has stopped.
+
+
+_NEVER = 2**64
+
+
+@dataclass(frozen=True, slots=True)
+class PendingLookup:
+    """A waiting lookup: its question, when it began to wait (ns on the bus's clock), and the error that blocks it."""
+
+    question: Question
+    since: int
+    blocked_by: TransformLookupError
+
+    def __str__(self) -> str:
+        return f"{self.question.source!r} in {self.question.target!r}: {self.blocked_by}"
+
+
+class Waiter(Parked):
+    """A parked lookup.
+
+    Parameters
+    ----------
+    question : Question
+    since : int
+        The stamp at which the lookup began to wait, in ns.
+    wake : callable
+        Called once, after the waiter was popped from the index.
+    others : tuple of Question
+        Questions whose answers are needed as well: if one of them can have no answer any more, the waiter is woken.
+
+    Attributes
+    ----------
+    answer : TransformStamped or None
+        The answer that whoever woke it has found, if there was one then.
+    version : int
+        That of the forest which has this answer.
+    """
+
+    __slots__ = (
+        "blocked_by",
+        "indexed",
+        "limit",
+        "limits",
+        "names",
+        "others",
+        "question",
+        "since",
+    )
+
+    def __init__(
+        self, question: Question, since: int, wake: Callable[[], object], others: tuple[Question, ...] = ()
+    ) -> None:
+        self.question = question
+        self.since = since
+        self.wake = wake
+        self.others = others
+        self.plain = (question.target, question.source, question.at) if question.is_plain else None
+        self.answer = None
+        self.version = 0
+        self.place = None
+        self.elsewhere = False
+        self.blocked_by: TransformLookupError | None = None
+        self.names: tuple[str, ...] = ()
+        self.limit: Place | None = None
+        self.limits: list[tuple[str, Place]] = []
+        self.indexed = False
+
+    def asked(self) -> set[str]:
+        """The frames that the questions name."""
+        names = {self.question.target, self.question.source}
+        if self.question.fixed is not None:
+            names.add(self.question.fixed)
+        for other in self.others:
+            names.update((other.target, other.source))
+        return names
+
+
+def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
+    """The frames of which a new sample may remove the cause of `error`.
+
+    Raises
+    ------
+    TypeError
+        If `error` is of a kind that waiting cannot help.
+    """
+    if isinstance(error, FutureExtrapolationError):
+        return (error.child, *error.others)
+    if isinstance(error, AheadError):
+        return (error.child,)
+    if isinstance(error, UnknownFrameError):
+        return (error.frame,)
+    if isinstance(error, DisconnectedError):
+        return error.roots
+    raise TypeError(f"waiting cannot help against {error!r}")
+
+
+def without_traceback(error: TransformLookupError) -> TransformLookupError:
+    """The error without its traceback, to be kept while a lookup waits.
+
+    A traceback refers to the waiting stack frame, which refers to the error: every wait would leave a reference cycle,
+    and the garbage collector then stops the loop for 100 ms now and then.
+    """
+    here: BaseException | None = error
+    while here is not None:
+        here.__traceback__ = None
+        here = here.__cause__
+    return error
+
+
+class WaitingIndex:
+    """The parked lookups of one buffer.
+
+    Attributes
+    ----------
+    by_frame : dict of str to Line
+        The waiters under each frame that blocks a lookup, or whose next sample may make one hopeless.
+    parked : dict of Waiter to None
+        All waiters in the order in which they came.
+    limits : list of (-stamp, -order, Waiter)
+        The first limit of each waiter that has one, if no frame has passed it, sorted.
+    """
+
+    def __init__(self) -> None:
+        self.by_frame: dict[str, Line] = {}
+        self.parked: dict[Waiter, None] = {}
+        # Made when it is read, because most waiters are woken by the edge that blocks them: the first ones have their
+        # places in it, and those that were parked since have not.
+        self._by_name: dict[str, dict[Waiter, None]] = {}
+        self.limits: list[Place] = []
+        self._passed = STAMP_MIN
+        self._order = count()
+
+    def __len__(self) -> int:
+        return len(self.parked)
+
+    @property
+    def names(self) -> KeysView[str]:
+        """The frames that the questions of the waiters name."""
+        return self._index().keys()
+
+    @property
+    def limit(self) -> int:
+        """A sample at a newer stamp (ns) may have made a waiter hopeless, whatever its frame."""
+        return -self.limits[-1][0] if self.limits else _NEVER
+
+    def park(self, waiter: Waiter, error: TransformLookupError, limits: Iterable[tuple[str, int]] = ()) -> None:
+        """Put a waiter under the frames that `error` says it lacks.
+
+        Parameters
+        ----------
+        waiter : Waiter
+        error : TransformLookupError
+        limits : iterable of (str, int)
+            Other edges on its path, each with the newest stamp (ns) that it may reach before it loses the waiter's.
+
+        Raises
+        ------
+        TypeError
+            If `error` is of a kind that waiting cannot help.
+        """
+        waiter.names = blocking_frames(error)
+        cause = error.__cause__
+        if isinstance(cause, (*MAY_COME, GapError)):
+            # At the newest common stamp something else is missing as well; late data may bring it.
+            also = (cause.child,) if isinstance(cause, GapError) else blocking_frames(cause)
+            waiter.names = tuple(dict.fromkeys((*waiter.names, *also)))
+        waiter.blocked_by = error
+        self.parked[waiter] = None
+        try:
+            if isinstance(error, FutureExtrapolationError) and len(waiter.names) == 1:
+                needed = STAMP_MIN if isinstance(error.stamp, Latest) else error.stamp - error.slack
+                waiter.place = (-needed, -next(self._order), waiter)
+                insort(self._under(error.child).places, waiter.place)
+            else:
+                waiter.place = None
+                for name in waiter.names:
+                    self._under(name).for_any[waiter] = None
+            self.set_limits(waiter, limits)
+        except BaseException:
+            # Out of memory.
+            self.remove(waiter)
+            raise
+
+    def set_limits(self, waiter: Waiter, limits: Iterable[tuple[str, int]]) -> None:
+        """Note the limits of a parked waiter that has none."""
+        first = _NEVER
+        for frame, limit in limits:
+            if limit < self._passed:
+                place = (-limit, -next(self._order), waiter)
+                waiter.elsewhere = True
+                waiter.limits.append((frame, place))
+                insort(self._under(frame).limits, place)
+            elif limit < first:
+                first = limit
+        if first < _NEVER:
+            waiter.limit = (-first, -next(self._order), waiter)
+            waiter.elsewhere = True
+            insort(self.limits, waiter.limit)
+
+    def remove(self, waiter: Waiter) -> None:
+        """Remove one waiter, if it is still parked."""
+        if waiter not in self.parked:
+            return
+        self.forget(waiter)
+        for name in waiter.names:
+            blocked = self.by_frame.get(name)
+            if blocked is not None:
+                if waiter.place is not None:
+                    _discard(blocked.places, waiter.place)
+                blocked.for_any.pop(waiter, None)
+                self._drop_if_empty(name, blocked)
+        waiter.place = None
+
+    def pop_unblocked(self, frame: str, stamp: int | None) -> list[Waiter]:
+        """Remove and return the waiters that a sample of `frame` at `stamp` may have unblocked or made hopeless.
+
+        These are the waiters that need any sample, those that need this stamp or an older one, and those whose limit
+        for this frame is older. No waiter needs a stamp older than the newest sample, so a late sample unblocks no
+        others.
+        """
+        blocked = self.by_frame.get(frame)
+        if blocked is None:
+            return []
+        ready = list(blocked.for_any)
+        for waiter in ready:
+            self.remove(waiter)
+        if stamp is not None:
+            limits, places = blocked.limits, blocked.places
+            while limits and -limits[-1][0] < stamp:
+                waiter = limits[-1][2]
+                self.remove(waiter)
+                ready.append(waiter)
+            while places and -places[-1][0] <= stamp:
+                waiter = places.pop()[2]
+                # The place refers to the waiter: without this line they form a reference cycle.
+                waiter.place = None
+                self.forget(waiter)
+                ready.append(waiter)
+        self._drop_if_empty(frame, blocked)
+        return ready
+
+    def pop_limited(self, stamp: int) -> list[Waiter]:
+        """Take the first limit from the waiters, still parked, for which it is older than `stamp`; return them."""
+        self._passed = max(self._passed, stamp)
+        limits = self.limits
+        found = []
+        while limits and -limits[-1][0] < stamp:
+            waiter = limits.pop()[2]
+            waiter.limit = None
+            self._forget_limits(waiter)
+            if waiter in self.parked:
+                found.append(waiter)
+        return found
+
+    def pop_asking_for(self, frames: Iterable[str]) -> list[Waiter]:
+        """Remove and return the waiters whose question names one of the frames."""
+        by_name = self._index()
+        ready = dict.fromkeys(waiter for name in frames for waiter in by_name.get(name, ()))
+        for waiter in ready:
+            self.remove(waiter)
+        return list(ready)
+
+    def pop_all(self) -> list[Waiter]:
+        """Remove and return all waiters."""
+        ready = list(self.parked)
+        for waiter in ready:
+            waiter.place = waiter.limit = None
+            waiter.limits.clear()
+            waiter.indexed = False
+        self.parked.clear()
+        self._by_name.clear()
+        self.by_frame.clear()
+        self.limits.clear()
+        self._passed = STAMP_MIN
+        return ready
+
+    def forget(self, waiter: Waiter) -> None:
+        """Forget a waiter, but for the frames that block it."""
+        try:
+            if waiter.limit is not None:
+                _discard(self.limits, waiter.limit)
+                waiter.limit = None
+            if waiter.limits:
+                self._forget_limits(waiter)
+            if waiter.indexed:
+                for name in waiter.asked():
+                    waiters = self._by_name.get(name)
+                    if waiters is not None:
+                        waiters.pop(waiter, None)
+                        if not waiters:
+                            del self._by_name[name]
+                waiter.indexed = False
+        finally:
+            # Even if there is no memory for the rest, which is then forgotten when its turn comes.
+            self.parked.pop(waiter, None)
+
+    def _index(self) -> dict[str, dict[Waiter, None]]:
+        """The waiters by the frames that their questions name."""
+        fresh = list(takewhile(lambda waiter: not waiter.indexed, reversed(self.parked)))
+        for waiter in reversed(fresh):
+            waiter.indexed = waiter.elsewhere = True
+            for name in waiter.asked():
+                self._by_name.setdefault(name, {})[waiter] = None
+        return self._by_name
+
+    def _forget_limits(self, waiter: Waiter) -> None:
+        """Take a waiter from under the edges that it is kept under by limit."""
+        for frame, place in waiter.limits:
+            blocked = self.by_frame.get(frame)
+            if blocked is not None:
+                _discard(blocked.limits, place)
+                self._drop_if_empty(frame, blocked)
+        waiter.limits.clear()
+
+    def _under(self, frame: str) -> Line:
+        blocked = self.by_frame.get(frame)
+        if blocked is None:
+            blocked = self.by_frame[frame] = Line()
+        return blocked
+
+    def _drop_if_empty(self, frame: str, blocked: Line) -> None:
+        if not (blocked.places or blocked.for_any or blocked.limits):
+            self.by_frame.pop(frame, None)
+
+    def pending(self) -> tuple[PendingLookup, ...]:
+        """All waiting lookups with the errors that block them."""
+        return tuple(self.waiting_since(_NEVER))
+
+    def waiting_since(self, stamp: int) -> Iterator[PendingLookup]:
+        """The lookups that have waited since a stamp (ns) or longer, with the errors that block them."""
+        # Copied first, because another thread may call this while the loop parks and wakes.
+        for waiter in list(self.parked):
+            if waiter.since <= stamp and waiter.blocked_by is not None:
+                yield PendingLookup(waiter.question, waiter.since, waiter.blocked_by)
+
+
+def _discard(places: list[Place], place: Place) -> None:
+    """Remove a place from a sorted list, if it is in it."""
+    i = bisect_left(places, place)
+    if i < len(places) and places[i] is place:
+        del places[i]
 
 
 class LiveTree:
@@ -40,8 +491,8 @@ class LiveTree:
         Says whether the newest stamp of a frame, in ns, from an authority is ahead of the clock. The bus sets it.
     expired_ahead, superseded : int
         As in `BufferStatistics`; the bus counts the superseded ones.
-    feed : Feed
-        Does what `insert` does with a batch, if all of it is plain.
+    feed : Feed or None
+        Does what `insert` does with a batch, if all of it is plain; only the compiled kernel has one.
     """
 
     def __init__(self, forest: Forest, on_loop: Callable[[LoopingSample], object] | None = None) -> None:
@@ -58,20 +509,22 @@ class LiveTree:
         self._watches = self.watching.by_frame
         self._end_callbacks: dict[Registration, Callable[[], object]] = {}
         waiting = self.waiting
-        self.feed = Feed(
-            forest.paths,
-            forest.frames,
-            forest.readers,
-            waiting.by_frame,
-            waiting.parked,
-            waiting.limits,
-            self.watching.by_frame,
-            waiting.forget,
-        )
+        self.feed: Any = None
+        if Feed is not None:
+            self.feed = Feed(
+                forest.paths,
+                forest.frames,
+                forest.readers,
+                waiting.by_frame,
+                waiting.parked,
+                waiting.limits,
+                self.watching.by_frame,
+                waiting.forget,
+            )
 
     def insert(self, batch: Batch) -> None:
         """Insert a batch that the bus has judged, and wake the lookups and watches that it concerns."""
-        if not self.feed.insert(batch):
+        if self.feed is None or not self.feed.insert(batch):
             self.insert_closely(batch)
 
     def insert_closely(self, batch: Batch) -> None:

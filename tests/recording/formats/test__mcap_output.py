@@ -18,7 +18,7 @@ from support.samples import moving, static
 from support.strategies import samples
 
 from tfbus import Transform, TransformStamped
-from tfbus.bus.sample_queue import TimedBatch
+from tfbus.bus.queues import TimedBatch
 from tfbus.recording.formats._channels import TYPE_HASH
 from tfbus.recording.formats._mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, McapOutput
 from tfbus.stamps import SECOND

@@ -16,7 +16,7 @@ from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, Trans
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import format_duration, to_seconds
-from tfbus.waiting.waiting_index import blocking_frames
+from tfbus.waiting.live_tree import blocking_frames
 
 _Cause = tuple[type[BaseException], tuple[str, ...]]
 

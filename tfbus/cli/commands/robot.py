@@ -18,7 +18,7 @@ from tfbus.cli.arguments import Flag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_numbers, format_transform, printable, say, warn
 from tfbus.errors import InvalidRobotError, InvalidTransformError
-from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
+from tfbus.geometry.stamped import MAX_TRANSLATION, check_translations
 from tfbus.geometry.transform import Transform
 from tfbus.robot.joint import Joint, Position
 from tfbus.robot.model import RobotModel

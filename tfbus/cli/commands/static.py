@@ -14,11 +14,10 @@ from tfbus.cli.arguments import UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import format_numbers, format_transform, say, warn
 from tfbus.errors import InvalidTransformError
-from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
-from tfbus.geometry.rows import Quaternion, Vector
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.geometry.stamped import MAX_TRANSLATION, TransformStamped, check_translations
 from tfbus.geometry.transform import Transform
 from tfbus.recording.static_frames import load_static
+from tfbus.rows import Quaternion, Vector
 from tfbus.tf_message import refusal
 
 _FILES = (".json", ".yaml", ".yml")

@@ -7,9 +7,9 @@ from typing import Any
 
 import anyio.to_thread
 
+from tfbus.analysis.arrivals import Delays
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
-from tfbus.bus.delays import Delays
 from tfbus.cli._graphviz import draw
 from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate

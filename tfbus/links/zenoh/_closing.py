@@ -12,7 +12,7 @@ from contextlib import suppress
 
 import zenoh
 
-from tfbus._aio.threads import join_all, wait_for_all
+from tfbus._aio.loops import join_all, wait_for_all
 
 CLOSING_TIME = 1.0
 LONGEST_CLOSE = 15.0

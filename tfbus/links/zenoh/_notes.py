@@ -9,7 +9,7 @@ from typing import NamedTuple
 import anyio
 import zenoh
 
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 from tfbus.links._receive_queue import Presence
 
 MOST_ASKING = 1_000

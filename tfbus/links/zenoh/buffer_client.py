@@ -10,8 +10,8 @@ from typing import Any, Self
 
 import anyio
 
-from tfbus._aio.loop_waker import LoopWaker
-from tfbus.bus.sample_queue import check_capacity
+from tfbus._aio.loops import LoopWaker
+from tfbus.bus.queues import check_capacity
 from tfbus.errors import LookupTimeoutError, RemoteLookupError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import Cancellation, RemoteQuestion, read_answer, write_question
@@ -21,7 +21,7 @@ from tfbus.links.zenoh._settings import Addresses
 from tfbus.links.zenoh.buffer_server import LONGEST_WAIT
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp
-from tfbus.tree.policy import Hold, policy_of
+from tfbus.tree.lookup import Hold, policy_of
 
 PATIENCE = 3.0
 """s; a client waits for so long for a server that it has not met, and for an answer that is late."""

@@ -13,10 +13,10 @@ import anyio
 import anyio.abc
 import zenoh
 
-from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.loops import LoopWaker
 from tfbus._aio.task_groups import close_task_group
 from tfbus.buffer.buffer import Buffer
-from tfbus.bus.sample_queue import check_capacity
+from tfbus.bus.queues import check_capacity
 from tfbus.errors import MAY_COME, RemoteLookupError, TransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import (
@@ -32,7 +32,7 @@ from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 from tfbus.links.zenoh._settings import Addresses
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 from tfbus.statistics import BufferServerStatistics, QueueStatistics
-from tfbus.tree.policy import Hold
+from tfbus.tree.lookup import Hold
 
 _Item = tuple[zenoh.Query, RemoteQuestion] | Cancellation | str
 """A question that has to wait, the end of one, or an asker that has gone."""

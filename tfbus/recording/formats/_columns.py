@@ -15,12 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.frames import is_frame
-from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING
 from tfbus.recording.formats._bounds import MAX_MESSAGE
 from tfbus.recording.formats._decoder import ChannelDecoder
 from tfbus.recording.formats._packed import Packed
 from tfbus.recording.formats._raw_transforms import TF_TYPES
 from tfbus.recording.formats._storage import Channel
+from tfbus.rows import NORM_TOLERANCE, ROUNDING
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME
 

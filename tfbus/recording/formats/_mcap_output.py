@@ -12,7 +12,7 @@ from io import FileIO
 from itertools import groupby
 from typing import Any, cast
 
-from tfbus.bus.sample_queue import TimedBatch
+from tfbus.bus.queues import TimedBatch
 from tfbus.errors import InvalidTransformError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.recording.formats._channels import Channels

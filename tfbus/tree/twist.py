@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 from tfbus.errors import PastExtrapolationError
-from tfbus.geometry.rows import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
+from tfbus.rows import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
 from tfbus.stamps import LATEST, SECOND
 from tfbus.tree.forest import Forest
 from tfbus.tree.history import FrameHistory

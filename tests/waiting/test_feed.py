@@ -8,11 +8,9 @@ from hypothesis import strategies as st
 from support.live_trees import live_tree, tree_over
 from support.samples import moving, static
 
-import tfbus
 from tfbus import LATEST, Question, TransformLookupError
 from tfbus.errors import MAY_COME
-from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.waiting_index import Waiter
+from tfbus.waiting.live_tree import LiveTree, Waiter
 
 FRAMES = "abc"
 STAMPS = st.integers(0, 12)
@@ -33,7 +31,7 @@ class Play:
     def __init__(self, keep: float | None, feeds: bool) -> None:
         self.live: LiveTree = live_tree(keep)
         if not feeds:
-            self.live.feed = NoFeed()  # type: ignore[assignment]
+            self.live.feed = None
         self.said: list[object] = []
         self.waiters: list[Waiter] = []
 
@@ -70,13 +68,6 @@ class Play:
             self.live.waiting.remove(self.waiters.pop(number % len(self.waiters)))
 
 
-class NoFeed:
-    """A feed to which nothing is plain."""
-
-    def insert(self, _batch: object) -> bool:
-        return False
-
-
 @given(st.sampled_from([None, 5e-9]), st.lists(STEPS, max_size=40))
 def test_with_and_without_the_feed_the_same_lookups_are_woken_with_the_same_answers(
     keep: float | None, steps: list[tuple[str, ...]]
@@ -95,8 +86,3 @@ def test_with_and_without_the_feed_the_same_lookups_are_woken_with_the_same_answ
         assert first.statistics(0) == second.statistics(0)
         assert [place[:2] for place in first.waiting.limits] == [place[:2] for place in second.waiting.limits]
         assert list(first.waiting.names) == list(second.waiting.names) or name != "remove"
-
-
-def test_the_kernel_that_runs_has_its_own_feed() -> None:
-    module = type(live_tree(None).feed).__module__
-    assert module == ("tfbus._kernel" if tfbus.kernel == "compiled" else "tfbus.waiting._python_feed")

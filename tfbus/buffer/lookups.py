@@ -4,19 +4,22 @@ Whoever inserts the samples hands over the answer. It is given if the tree has n
 of the event loop later; otherwise the lookup asks again, and may park again.
 """
 
+import logging
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Hashable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
+from heapq import heapify, heappop, heappush
+from itertools import count, islice
+from typing import Any, Protocol
 
 import anyio
 import anyio.lowlevel
 
-from tfbus._aio.wake_up import wake_up
-from tfbus.buffer._alarms import Alarms, Cancel, alarms_of
-from tfbus.buffer._hanging_report import REPORT_AFTER, HangingReport
-from tfbus.buffer._local_names import LocalNames
-from tfbus.clock import Clock
+from tfbus._aio.loops import LoopTimer, running_loop, wake_up
+from tfbus.bus.subscribers import SeenKeys
+from tfbus.clock import Clock, SimulatedClock, SystemClock
 from tfbus.errors import (
     MAY_COME,
     BusClosedError,
@@ -26,13 +29,228 @@ from tfbus.errors import (
     TransformLookupError,
     UnknownFrameError,
 )
-from tfbus.frames import is_frame
-from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from_seconds
-from tfbus.tree.lookup import Bounds, answer
-from tfbus.tree.question import Question
-from tfbus.waiting.live_tree import LiveTree
-from tfbus.waiting.waiting_index import Waiter, without_traceback
+from tfbus.frames import Prefix, is_frame
+from tfbus.geometry.stamped import TransformStamped, renamed
+from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_duration, from_seconds, to_seconds
+from tfbus.tree.explanation import Explanation
+from tfbus.tree.history import Edge
+from tfbus.tree.lookup import Bounds, Question, answer
+from tfbus.waiting.live_tree import LiveTree, PendingLookup, Waiter, WaitingIndex, blocking_frames, without_traceback
+
+
+class LocalNames:
+    """Translates questions into the names of the bus, and answers into local names.
+
+    Parameters
+    ----------
+    prefix : Prefix
+    """
+
+    def __init__(self, prefix: Prefix) -> None:
+        self._prefix = prefix
+
+    def on_bus(self, name: str) -> str:
+        """The name of a frame on the bus."""
+        return self._prefix.on_bus(name)
+
+    def question(self, asked: Question) -> Question:
+        """A question with the names of the bus."""
+        fixed = None if asked.fixed is None else self._prefix.on_bus(asked.fixed)
+        return replace(
+            asked, target=self._prefix.on_bus(asked.target), source=self._prefix.on_bus(asked.source), fixed=fixed
+        )
+
+    def answer(self, found: TransformStamped) -> TransformStamped:
+        """An answer with local names."""
+        return renamed(found, self._prefix.local(found.parent), self._prefix.local(found.child))
+
+    def pending(self, found: PendingLookup) -> PendingLookup:
+        """A waiting lookup with the local names of its question; its error keeps the names of the bus."""
+        asked = found.question
+        fixed = None if asked.fixed is None else self._prefix.local(asked.fixed)
+        asked = replace(
+            asked, target=self._prefix.local(asked.target), source=self._prefix.local(asked.source), fixed=fixed
+        )
+        return replace(found, question=asked)
+
+    def edge(self, found: Edge) -> Edge:
+        """An edge with local names."""
+        return replace(found, parent=self._prefix.local(found.parent), child=self._prefix.local(found.child))
+
+    def explanation(self, found: Explanation, target: str, source: str) -> Explanation:
+        """An explanation with local names, target and source as asked; its errors keep the names of the bus."""
+        return replace(
+            found,
+            target=target,
+            source=source,
+            chain=tuple(map(self._prefix.local, found.chain)),
+            half_chains=tuple(tuple(map(self._prefix.local, half)) for half in found.half_chains),
+            edges=tuple(
+                replace(edge, parent=self._prefix.local(edge.parent), child=self._prefix.local(edge.child))
+                for edge in found.edges
+            ),
+        )
+
+
+# Alarms for the waiting lookups of one buffer: calls after a duration, most of which are cancelled before.
+#
+# A cancel scope for each wait would set and remove a timer of the event loop each time. Here all of a buffer share one:
+# it is set for the first alarm, and stays as it is when that is cancelled, because the next one is nearly always later.
+
+
+_CANCELLED_KEPT = 64
+
+
+Cancel = Callable[[], object]
+"""Cancels a call, if it has not been made."""
+
+
+class Alarms(Protocol):
+    """Calls functions after a duration on some clock."""
+
+    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
+        """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
+
+
+def alarms_of(clock: Clock) -> Alarms | None:
+    """Alarms by the clock of a bus; None for a clock of which only the protocol is known."""
+    # Not isinstance: a class derived from a clock may tell the time in another way.
+    if type(clock) is SystemClock:
+        return LoopAlarms()
+    return SimulatedAlarms(clock) if type(clock) is SimulatedClock else None
+
+
+class SimulatedAlarms:
+    """Alarms by a simulated clock, which keeps them with its other timers."""
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self._clock = clock
+
+    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
+        """Call a function after a simulated duration in s, unless it is cancelled; it must not raise."""
+        return self._clock.call_after(seconds, callback).close
+
+
+class LoopAlarms:
+    """Alarms by the time of the event loop that runs, which may be another one later."""
+
+    def __init__(self) -> None:
+        self._heap: _AlarmHeap | None = None
+
+    def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
+        """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
+        loop = running_loop()
+        heap = self._heap
+        if heap is None or heap.timer.loop is not loop:
+            # What waits on another loop is still woken by the heap of that one.
+            heap = self._heap = _AlarmHeap(loop)
+        return heap.add(seconds, callback)
+
+
+class _AlarmHeap:
+    """The alarms on one event loop by their times, with one timer for the first."""
+
+    def __init__(self, loop: Any) -> None:
+        self.timer = LoopTimer(loop, self._ring)
+        self._alarms: list[tuple[float, int]] = []
+        # The callbacks of those that were neither made nor cancelled, by number.
+        self._callbacks: dict[int, Callable[[], object]] = {}
+        self._numbers = count()
+
+    def add(self, seconds: float, callback: Callable[[], object]) -> Cancel:
+        due = self.timer.now() + seconds
+        number = next(self._numbers)
+        callbacks = self._callbacks
+        callbacks[number] = callback
+        if len(self._alarms) > 2 * len(callbacks) + _CANCELLED_KEPT:
+            self._alarms = [alarm for alarm in self._alarms if alarm[1] in callbacks]
+            heapify(self._alarms)
+        heappush(self._alarms, (due, number))
+        if due < self.timer.due:
+            self.timer.set(due)
+        # No function of Python, because nearly every wait cancels its alarms before it gives its answer.
+        return partial(callbacks.pop, number, None)
+
+    def _ring(self) -> None:
+        """Make the calls that are due, and set the timer for the next."""
+        now = self.timer.now()
+        try:
+            while self._alarms and (self._alarms[0][0] <= now or self._alarms[0][1] not in self._callbacks):
+                callback = self._callbacks.pop(heappop(self._alarms)[1], None)
+                if callback is not None:
+                    callback()
+        finally:
+            if self._alarms and self._alarms[0][0] < self.timer.due:
+                self.timer.set(self._alarms[0][0])
+
+
+REPORT_AFTER = 5.0
+"""A lookup that has waited for longer than this, in s, is logged."""
+
+NAMED = 3
+"""The number of lookups that a line names; naming one searches all frames for similar names."""
+
+_LOOKED_AT = 10_000
+
+
+class HangingReport:
+    """Logs the lookups of one buffer that have waited for `REPORT_AFTER`, each cause once.
+
+    Parameters
+    ----------
+    waiting : WaitingIndex
+    clock : Clock
+    """
+
+    def __init__(self, waiting: WaitingIndex, clock: Clock) -> None:
+        self._waiting = waiting
+        self._clock = clock
+        self._told = SeenKeys(_LOOKED_AT)
+        self._last: int | None = None
+
+    def tell(self, question: Question, since: int, blocker: TransformLookupError) -> float:
+        """Log a lookup that has waited for `REPORT_AFTER`, and all others that have, unless a line was logged just now.
+
+        Returns
+        -------
+        float
+            The time, in s, until this is to be called again; infinity if the cause has been told.
+        """
+        if _cause(blocker) in self._told:
+            return math.inf
+        now = self._clock.now()
+        if self._last is not None and 0 <= now - self._last < from_seconds(REPORT_AFTER):
+            return REPORT_AFTER - to_seconds(now - self._last)
+        self._last = now
+        self._told.add(_cause(blocker))
+        named = [PendingLookup(question, since, blocker)]
+        untold = 0
+        for pending in islice(self._waiting.waiting_since(now - from_seconds(REPORT_AFTER)), _LOOKED_AT):
+            if self._told.add(_cause(pending.blocked_by)):
+                if len(named) < NAMED:
+                    named.append(pending)
+                else:
+                    untold += 1
+        log = logging.getLogger("tfbus")
+        if len(named) == 1:
+            log.warning(
+                "a lookup of %r in %r has waited for more than %g s: %s",
+                question.source,
+                question.target,
+                REPORT_AFTER,
+                blocker,
+            )
+        else:
+            lookups = "; ".join(map(str, named))
+            more = f"; and {untold} more, see Buffer.pending()" if untold else ""
+            log.warning(
+                "%d lookups have waited for more than %g s: %s%s", len(named) + untold, REPORT_AFTER, lookups, more
+            )
+        return math.inf
+
+
+def _cause(blocker: TransformLookupError) -> Hashable:
+    return type(blocker), blocking_frames(blocker)
 
 
 class _Wait:

@@ -6,25 +6,258 @@ no answer, the lookup at one stamp is asked, so that both raise the same error.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from tfbus.data import PointCloud
-from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError
-from tfbus.geometry.rows import IDENTITY, Columns, Row, compose, invert
-from tfbus.geometry.transform_array import TransformArray, from_columns, from_rows, move
+from tfbus.errors import DisconnectedError, TransformLookupError
+from tfbus.geometry.transform_array import TransformArray, from_columns, move
+from tfbus.rows import IDENTITY, Columns, Row, compose, invert
 from tfbus.stamps import LATEST, Stamps
-from tfbus.tree._copied_paths import CopiedPath, PathsOverTime, Places, Query, copy_paths
-from tfbus.tree._kernel import ONE_BY_ONE
-from tfbus.tree._plain_columns import plain_columns
-from tfbus.tree._segments import Floats, Segments
-from tfbus.tree.extrapolation import read_stamps_at_many
 from tfbus.tree.forest import Forest
-from tfbus.tree.history import Samples
-from tfbus.tree.lookup import answer, find, find_in_time_travel
-from tfbus.tree.policy import Policy
+from tfbus.tree.history import FrameHistory, Samples
+from tfbus.tree.lookup import Policy, answer, read_stamps_at_many
+from tfbus.tree.path import Path, Step
+from tfbus.which_kernel import kernel
+
+# Interpolation of one edge at many stamps.
+#
+# Each segment between two samples is prepared once, so that a stamp costs one search, one sine and one cosine. If there
+# are fewer stamps than samples, only the segments that are needed are prepared.
+
+
+Floats = npt.NDArray[np.float64]
+
+_STRAIGHT = 1e-9
+"""Replaces an angle that rounds to zero. Its cosine is one to the last digit, so the arc is a straight line."""
+
+
+class Segments:
+    """The segments of one edge, prepared for interpolation at given stamps.
+
+    A segment goes from one sample to the next: ``t(s) = t0 + s v`` and ``q(s) = q0 cos(s w) + p sin(s w)``, with s the
+    ns since its first sample, and p the unit quaternion a right angle away from q0 on the shorter arc to the next
+    rotation. That is slerp with its two sines resolved (Shoemake 1985, section 3.3). The last sample has a segment of
+    its own, which stays where it is, and so has one that is followed by another parent.
+    """
+
+    def __init__(self, samples: Samples, stamps: Stamps) -> None:
+        own_stamps, rows = samples.stamps, samples.rows
+        self._segments: npt.NDArray[np.intp] | None = own_stamps.searchsorted(stamps, "right") - 1
+        self._elapsed = _nanoseconds(own_stamps[self._segments], stamps)
+        first = np.arange(len(own_stamps))
+        if len(stamps) < len(own_stamps):
+            first, self._segments = self._segments, None
+        last = np.minimum(first + 1, len(own_stamps) - 1)
+        if samples.parents is not None:
+            parents = np.array(samples.parents, object)
+            last = np.where(parents[first] == parents[last], last, first)
+        a, b = rows[first].T, rows[last].T
+        duration = _nanoseconds(own_stamps[first], own_stamps[last])
+        duration[first == last] = np.inf
+        dot = (a[3:] * b[3:]).sum(axis=0)
+        cosine = np.minimum(np.abs(dot), 1.0)
+        angle = np.maximum(np.arccos(cosine), _STRAIGHT)
+        sine = np.sin(angle)
+        self._table = np.empty((15, len(first)))
+        self._table[:7] = a
+        self._table[7:10] = (b[:3] - a[:3]) / duration
+        self._table[10:14] = (np.where(dot < 0.0, -b[3:], b[3:]) - cosine * a[3:]) / sine
+        self._table[14] = angle / duration
+
+    def at(self, part: slice) -> Columns:
+        """The transforms at some of the stamps."""
+        segments = self._segments
+        table = self._table[:, part] if segments is None else self._table.take(segments[part], axis=1)
+        elapsed = self._elapsed[part]
+        angle = elapsed * table[14]
+        moved = table[:3] + elapsed * table[7:10]
+        turned = table[3:7] * np.cos(angle) + table[10:14] * np.sin(angle)
+        return (*moved, *turned)
+
+
+def _nanoseconds(begin: Stamps, end: Stamps) -> Floats:
+    """The time between two stamps; exact for differences that exceed a signed 64-bit integer."""
+    return (end - begin).view(np.uint64).astype(np.float64)
+
+
+# Copies of the samples that a lookup at many stamps needs.
+#
+# While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies
+# the samples on them: as blocks of memory, or only those next to a stamp where there are many more samples than
+# stamps. All other work in numpy comes after that, on the copies. The compiled kernel copies nothing: its blocks can
+# be held.
+
+
+Places = slice | npt.NDArray[np.intp]
+"""Indices into the stamps that were asked for."""
+
+
+class Query(NamedTuple):
+    """The question where `source` is, seen from `target`, at many stamps."""
+
+    target: str
+    source: str
+    stamps: Stamps
+
+    def span(self) -> tuple[int, int] | None:
+        """The first and the last stamp, in ns; None if there are none."""
+        return (int(self.stamps.min()), int(self.stamps.max())) if len(self.stamps) else None
+
+
+class CopiedPath(NamedTuple):
+    """A path with copies of the samples on its moving edges, and one row for each run of static edges."""
+
+    up: tuple[Samples | Row, ...]
+    down: tuple[Samples | Row, ...]
+
+    @property
+    def moving(self) -> list[Samples]:
+        """The moving edges, those of `up` first."""
+        return [step for step in (*self.up, *self.down) if isinstance(step, Samples)]
+
+    def covers_all(self, stamps: Stamps) -> bool:
+        """Whether each edge covers every one of the stamps."""
+        low, high = stamps.min(), stamps.max()
+        return all(len(edge.stamps) and edge.stamps[0] <= low and high <= edge.stamps[-1] for edge in self.moving)
+
+    def covered(self, stamps: Stamps) -> npt.NDArray[np.bool_]:
+        """A mask of the stamps that all edges cover, shape (n,)."""
+        covered = np.ones(len(stamps), np.bool_)
+        for samples in self.moving:
+            if not len(samples.stamps):
+                covered[:] = False
+            else:
+                covered &= (samples.stamps[0] <= stamps) & (stamps <= samples.stamps[-1])
+        return covered
+
+
+class PathsOverTime(NamedTuple):
+    """The paths between two frames over some time.
+
+    Attributes
+    ----------
+    changes : list of int
+        The stamps, in ns, at which the path may change.
+    paths : list of (CopiedPath or None)
+        The path before the first change, and the one from each change on; None where the frames are not connected.
+    """
+
+    changes: list[int]
+    paths: list[CopiedPath | None]
+
+    def split(self, stamps: Stamps) -> list[tuple[Places, CopiedPath | None]]:
+        """The places of the stamps that each path answers."""
+        if not self.changes:
+            return [(slice(len(stamps)), self.paths[0])]
+        different = list({id(path): path for path in self.paths}.values())
+        number = np.array([next(i for i, other in enumerate(different) if other is path) for path in self.paths])
+        numbers = number[np.array(self.changes, np.int64).searchsorted(stamps, "right")]
+        return [(np.flatnonzero(numbers == i), path) for i, path in enumerate(different)]
+
+
+def copy_paths(forest: Forest, query: Query, span: tuple[int, int] | None) -> PathsOverTime:
+    """Copy the paths from source to target that hold at the stamps of a query. The caller holds the lock.
+
+    Parameters
+    ----------
+    forest : Forest
+    query : Query
+    span : (int, int) or None
+        The first and the last of its stamps, in ns; None if there are none.
+
+    Raises
+    ------
+    UnknownFrameError
+    """
+    target, source = query.target, query.source
+    forest.check_known(target)
+    forest.check_known(source)
+    if span is None:
+        return PathsOverTime([], [None])
+    low, high = span
+    paths: list[Path | None] = [_path_at(forest, target, source, low)]
+    changes = _changes(forest, target, source, paths[0], low, high)
+    paths += [_path_at(forest, target, source, stamp) for stamp in changes]
+    copies: dict[tuple[tuple[Step, ...], tuple[Step, ...]], CopiedPath] = {}
+    for path in paths:
+        if path is not None and (path.up, path.down) not in copies:
+            up = tuple(_copy(step, query, low, high) for step in path.up)
+            down = tuple(_copy(step, query, low, high) for step in path.down)
+            copies[path.up, path.down] = CopiedPath(up, down)
+    return PathsOverTime(changes, [None if path is None else copies[path.up, path.down] for path in paths])
+
+
+def _changes(forest: Forest, target: str, source: str, path: Path | None, low: int, high: int) -> list[int]:
+    """The stamps after `low`, up to `high`, at which the path may change."""
+    if path is not None and path.permanent and path.root not in forest.frames:
+        return []
+    edges = forest.edges_above(target, source)
+    if not any(edge.mixed for edge in edges):
+        return []
+    # Of two ways round a loop of parents, the one whose samples cover the stamp counts.
+    changes = {stamp for edge in edges for stamp in edge.beginnings()}
+    changes.update(edge.newest + 1 for edge in edges if edge.newest is not None)
+    return sorted(stamp for stamp in changes if low < stamp <= high)
+
+
+def _path_at(forest: Forest, target: str, source: str, at: int) -> Path | None:
+    try:
+        return forest.find_path(target, source, at)
+    except DisconnectedError:
+        return None
+
+
+def _copy(step: Step, query: Query, low: int, high: int) -> Samples | Row:
+    if not isinstance(step, FrameHistory):
+        return step
+    return step.samples_between(low, high, query.stamps)
+
+
+def plain_columns(forest: Forest, queries: Sequence[Query], with_nan: bool) -> list[Floats] | None:
+    """The answers of each query as columns of shape (7, n), with the bits of a lookup at each stamp.
+
+    All are of one moment. The lock is held for no more than taking references to the samples.
+
+    Parameters
+    ----------
+    forest : Forest
+    queries : sequence of Query
+    with_nan : bool
+        Whether a stamp without an answer gives NaN.
+
+    Returns
+    -------
+    list of array, or None
+        None if an answer is not plain, there is none without `with_nan`, or the kernel gives none at many stamps.
+    """
+    if kernel == "python":
+        # Its chains hold nothing, which would be found out after the paths.
+        return None
+    held: list[Any] = []
+    try:
+        with forest.lock:
+            for target, source, _ in queries:
+                path = forest.find_path(target, source, LATEST)
+                samples = path.hold() if path.permanent else None
+                if samples is None:
+                    return None
+                # A stamp that this path does not cover may have an answer on another way round a loop of parents.
+                with_nan = with_nan and path.root not in forest.frames
+                held.append(samples)
+    except TransformLookupError:
+        return None
+    found: list[Floats] = []
+    for samples, (_, _, stamps) in zip(held, queries, strict=True):
+        columns = np.empty((7, len(stamps)))
+        missing = samples.rows(np.ascontiguousarray(stamps), columns)
+        if missing is None or (missing >= 0 and not with_nan):
+            return None
+        found.append(columns)
+    return found
+
 
 _CHUNK = 2048
 
@@ -51,14 +284,6 @@ def lookup_many(
     plain = plain_columns(forest, queries, out_of_range == "nan") if policy is None else None
     if plain is not None:
         return from_columns(plain[0] if len(plain) == 1 else np.stack(compose((*plain[0],), (*plain[1],))))
-    if len(stamps) <= ONE_BY_ONE and policy is None:
-        try:
-            with forest.lock:
-                rows = _rows_one_by_one(forest, target, source, stamps, source_stamps, fixed)
-        except (ExtrapolationError, DisconnectedError):
-            pass
-        else:
-            return from_rows(rows)
 
     def lookup_one(place: int) -> None:
         source_stamp = None if source_stamps is None else int(source_stamps[place])
@@ -111,21 +336,6 @@ def check_out_of_range(value: OutOfRange) -> None:
     """Raise `ValueError` unless the value is ``"raise"`` or ``"nan"``."""
     if value not in ("raise", "nan"):
         raise ValueError(f"out_of_range must be 'raise' or 'nan', not {value!r}")
-
-
-def _rows_one_by_one(
-    forest: Forest, target: str, source: str, stamps: Stamps, source_stamps: Stamps | None, fixed: str | None
-) -> list[Row]:
-    """The rows at a few stamps; errors as for the lookup at one stamp. The caller holds the lock."""
-    path = forest.paths.find(target, source)
-    if path is not None and source_stamps is None:
-        return [path.row_at(at) for at in stamps.tolist()]
-    for name in (target, source) if fixed is None else (target, source, fixed):
-        forest.check_known(name)
-    if source_stamps is None:
-        return [find(forest, target, source, at, None)[1] for at in stamps.tolist()]
-    both = zip(stamps.tolist(), source_stamps.tolist(), strict=True)
-    return [find_in_time_travel(forest, target, source, at, then, fixed, None)[1] for at, then in both]
 
 
 def _answers(

@@ -1,4 +1,4 @@
-"""The kernel in Python: the samples of an edge, the edges of a path, the plain answer and the plain commit.
+"""The kernel in Python: samples, edges and paths, and the plain judgement, commit and answer.
 
 This is the definition. ``tfbus/_kernel.c`` does the same, with the same bits, and runs in its place where it could be
 built. Both hand back whatever is not plain: the caller then decides, and raises what is to be raised.
@@ -11,24 +11,209 @@ are cut off later, many at once, because each cut moves all remaining samples.
 import struct
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from itertools import chain as chained
 from math import acos, sin, sqrt
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.geometry.rows import IDENTITY, Row, compose, invert
-from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps, StampsLike, as_stamps
+from tfbus.rows import IDENTITY, Row, compose, invert
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, Latest, Stamps
+
+
+class Sample:
+    """The fields of a stamped transform; the base of `TransformStamped`."""
+
+    # One slot, because the hot paths read all six fields at once.
+    __slots__ = ("_fields",)
+    _fields: tuple[str, str, int, Row, str, bool]
+
+    @property
+    def parent(self) -> str:
+        """The frame that the transform maps into; the target, in an answer."""
+        return self._fields[0]
+
+    @property
+    def child(self) -> str:
+        """The frame that the transform maps from; the source, in an answer."""
+        return self._fields[1]
+
+    @property
+    def stamp(self) -> int:
+        """Nanoseconds; never `LATEST`."""
+        return self._fields[2]
+
+    @property
+    def _row(self) -> Row:
+        return self._fields[3]
+
+    @property
+    def _square(self) -> float:
+        x, y, z, _, _, _, _ = self._fields[3]
+        return x * x + y * y + z * z
+
+    @property
+    def authority(self) -> str:
+        """The sender; empty in an answer."""
+        return self._fields[4]
+
+    @property
+    def static(self) -> bool:
+        """Whether it holds at every stamp."""
+        return self._fields[5]
+
+
+class Edge:
+    """The part of a frame's newest edge by which its samples are judged.
+
+    Attributes
+    ----------
+    parent : str
+    trusted : str or None
+        The authority whose moving samples under this parent need no judgement; None if there is none.
+    newest : int or None
+        The newest stamp, in ns.
+    """
+
+    __slots__ = ("newest", "parent", "trusted")
+    parent: str
+    trusted: str | None
+    newest: int | None
+
+
+class Judge:
+    """The plain judgement of batches by the newest edges of a bus.
+
+    Parameters
+    ----------
+    edges : dict of str to Edge
+        By child.
+    square : float
+        No translation may have a greater square, in m^2.
+
+    Attributes
+    ----------
+    horizon : int
+        No stamp may be newer, in ns. At first the least stamp.
+    """
+
+    __slots__ = ("_edges", "_square", "horizon")
+
+    def __init__(self, edges: Mapping[str, Edge], square: float) -> None:
+        self._edges = edges
+        self._square = square
+        self.horizon = STAMP_MIN
+
+    def accepts(self, batch: Sequence[Sample]) -> bool:
+        """Whether a whole batch continues known edges; then the newest stamps are noted, else nothing."""
+        edges, square, horizon = self._edges, self._square, self.horizon
+        for sample in batch:
+            parent, child, stamp, row, authority, static = sample._fields
+            if child not in edges:
+                return False
+            known = edges[child]
+            if known.parent != parent or known.trusted != authority or static or stamp > horizon:
+                return False
+            # Three picks take less than an unpacking of all seven. Not `>`, which is false for NaN.
+            x, y, z = row[0], row[1], row[2]
+            if not x * x + y * y + z * z <= square:
+                return False
+        if len(batch) == 1:
+            # Nearly always so, and a second look costs a quarter of the first.
+            if known.newest is None or stamp > known.newest:
+                known.newest = stamp
+            return True
+        for sample in batch:
+            fields = sample._fields
+            known = edges[fields[1]]
+            if known.newest is None or fields[2] > known.newest:
+                known.newest = fields[2]
+        return True
+
+
+Place = tuple[int, int, Any]
+"""The place of a parked lookup in a sorted list: -stamp, -order, and the lookup."""
+
+
+class Parked:
+    """The part of a parked lookup by which it is woken.
+
+    Attributes
+    ----------
+    plain : tuple or None
+        Target, source and stamp of its question, if the kernel may answer it.
+    wake : callable
+        Called once, without arguments, after it was taken out of its line.
+    place : tuple or None
+        Its place in a line, if it has one.
+    answer : TransformStamped or None
+        The answer that whoever woke it has found, if there was one then.
+    version : int
+        That of the paths which had this answer.
+    elsewhere : bool
+        Whether more than its line, and the dict of all that are parked, has to forget it.
+    """
+
+    __slots__ = ("answer", "elsewhere", "place", "plain", "version", "wake")
+    answer: Any
+    elsewhere: bool
+    place: Place | None
+    plain: tuple[str, str, int | Latest | None] | None
+    version: int
+    wake: Callable[[], object]
+
+
+class Line:
+    """The parked lookups under one frame.
+
+    Attributes
+    ----------
+    places : list of (-stamp, -order, Parked)
+        Those that wait until the edge of the frame reaches a stamp (ns), sorted, so that the next due is the last.
+    for_any : dict of Parked to None
+        Those that any sample wakes.
+    limits : list of (-stamp, -order, Parked)
+        Those that a sample beyond a stamp wakes, sorted.
+    """
+
+    __slots__ = ("for_any", "limits", "places")
+
+    def __init__(self) -> None:
+        self.places: list[Place] = []
+        self.for_any: dict[Any, None] = {}
+        self.limits: list[Place] = []
+
+
+def compose_paths(rows: npt.NDArray[np.float64], origins: npt.NDArray[np.int64]) -> None:
+    """Replace each row, which is seen from the place of its origin, by the one that is seen from the first place.
+
+    Parameters
+    ----------
+    rows : contiguous array of shape (n, 7)
+    origins : int64 array of shape (n,)
+        The place of each origin, which comes before; 0 leaves a row as it is.
+
+    Raises
+    ------
+    ValueError
+        If an origin does not come before its row, or there is not one for each.
+    """
+    if len(rows) != len(origins):
+        raise ValueError("each row of seven floats needs an origin before it")
+    composed: list[Row] = list(map(tuple, rows.tolist()))
+    for place, origin in enumerate(origins.tolist()):
+        if origin and not 0 < origin < place:
+            raise ValueError("each row of seven floats needs an origin before it")
+        if origin:
+            composed[place] = compose(composed[origin], composed[place])
+    rows[:] = composed
+
 
 _RECORD = struct.Struct("q7d")
 _SIZE = _RECORD.size
 _FOREVER = 2**64
-ONE_BY_ONE = 40
-"""Up to this many stamps are answered faster one by one than by numpy."""
 _pack = _RECORD.pack
 _unpack = _RECORD.unpack_from
 _unpack_pair = struct.Struct("q7dq7d").unpack_from
@@ -257,7 +442,7 @@ Step = History | Row
 def climb(steps: tuple[Step, ...], at: int) -> Row | None:
     """The first step's child, seen from the last step's parent, at a stamp; None if an edge has no plain answer.
 
-    It composes what each edge interpolates, by the formulas of `tfbus.geometry.rows` and with the same bits. One loop,
+    It composes what each edge interpolates, by the formulas of `tfbus.rows` and with the same bits. One loop,
     because a function call or a small array for each edge would cost more than its arithmetic.
     """
     if not steps:
@@ -325,20 +510,6 @@ def climb(steps: tuple[Step, ...], at: int) -> Row | None:
     return x, y, z, qx, qy, qz, qw
 
 
-class Held(Protocol):
-    """The samples of a chain as they were at one moment."""
-
-    def rows(self, stamps: Stamps, columns: npt.NDArray[Any]) -> int | None:
-        """Fill columns of shape (7, n) with the rows at many stamps, which are those of `Chain.row` bit for bit.
-
-        Returns
-        -------
-        int or None
-            The first place without an answer, where the columns have NaN, or -1 if there is none. None if an answer is
-            not plain; then the columns are of no use.
-        """
-
-
 class Chain:
     """The edges between two frames.
 
@@ -373,11 +544,8 @@ class Chain:
                 common = edge.stamps[-1]
         return common if self._edges else None
 
-    def hold(self) -> Held | None:
-        """The samples of all edges as they are now, for many answers; None if the kernel gives no many answers.
-
-        The one in Python gives none: numpy does, from copies; see `tfbus.tree._lookup_many`.
-        """
+    def hold(self) -> Any:
+        """The samples of all edges as they are now, to be read at many stamps. Here None: numpy reads copies."""
         return None
 
 
@@ -404,7 +572,7 @@ class Paths:
 
     __slots__ = ("_changes", "_kind", "_latest", "_lock", "inserted", "recent")
 
-    def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: type[TransformStamped]) -> None:
+    def __init__(self, lock: AbstractContextManager[Any], latest: Latest, kind: Any) -> None:
         self._lock = lock
         self._latest = latest
         self._kind = kind
@@ -421,7 +589,7 @@ class Paths:
     def version(self, version: int) -> None:
         self._changes = version - self.inserted
 
-    def answer(self, target: str, source: str, at: object) -> TransformStamped | None:
+    def answer(self, target: str, source: str, at: object) -> Any:
         """The answer of a lookup, if it needs nothing but a path of `recent` that covers the stamp; else None."""
         with self._lock:
             by_source = self.recent.get(target)
@@ -439,25 +607,7 @@ class Paths:
         sample._fields = target, source, stamp, row, "", False
         return sample
 
-    def answer_many(self, target: str, source: str, stamps: StampsLike) -> bytes | None:
-        """The answers at many stamps, if they need nothing but a path of `recent` that covers them all; else None.
-
-        Here only a few stamps have an answer; for more there is numpy, see `tfbus.tree._lookup_many`.
-
-        Returns
-        -------
-        bytes or None
-            Seven columns of floats, of shape (7, n), and behind them the stamps as int64.
-        """
-        asked = as_stamps(stamps)
-        with self._lock:
-            chain = self.recent.get(target, {}).get(source) if len(asked) <= ONE_BY_ONE else None
-            rows: Any = [] if chain is None else [chain.row(at) for at in asked.tolist()]
-        if not rows or None in rows:
-            return None
-        return array("d", chained.from_iterable(zip(*rows, strict=True))).tobytes() + asked.tobytes()
-
-    def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Batch) -> bool:
+    def commit(self, frames: Mapping[str, History], readers: Mapping[int, Any], batch: Sequence[Sample]) -> bool:
         """Store a batch if all of it continues its histories and there are no readers to be told; else do nothing.
 
         Here only a batch of one sample is stored.
@@ -472,7 +622,7 @@ class Paths:
         return True
 
 
-def commit(frames: Mapping[str, History], batch: Batch, first: int) -> int:
+def commit(frames: Mapping[str, History], batch: Sequence[Sample], first: int) -> int:
     """Store the samples of a batch from the index `first` on, up to the first that does not continue its history.
 
     Returns

@@ -1,0 +1,291 @@
+"""Waiting for threads that may never end."""
+
+import logging
+import math
+import sys
+import threading
+from collections.abc import Awaitable, Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from time import monotonic
+from typing import Any, cast
+
+import anyio
+import anyio.lowlevel
+import anyio.to_thread
+
+
+def running_loop() -> Any:
+    """The event loop that runs here: that of asyncio, or the token of trio."""
+    # anyio has no public timer; only the loops' own functions set one without a task of the caller.
+    return cast(Any, anyio.lowlevel.current_token().native_token)
+
+
+class LoopTimer:
+    """Calls a function on an event loop at a time by the loop's own clock.
+
+    Parameters
+    ----------
+    loop
+        As `running_loop` gives it.
+    callback : callable
+        Called on the loop; an `Exception` is logged.
+
+    Attributes
+    ----------
+    due : float
+        The time of the next call, in s; infinity if none is set.
+    """
+
+    def __init__(self, loop: Any, callback: Callable[[], object]) -> None:
+        self.loop = loop
+        self.due = math.inf
+        self._callback = callback
+        self._trio = None if hasattr(loop, "call_at") else cast(Any, sys.modules["trio"])
+        self._handle: Any = None
+
+    def now(self) -> float:
+        """The time of the loop, in s. Only the loop that runs has one."""
+        return float(self.loop.time() if self._trio is None else self._trio.current_time())
+
+    def set(self, due: float) -> None:
+        """Call the function at a time, in s, and not at the one that was set before."""
+        self.due = due
+        if self._trio is None:
+            if self._handle is not None:
+                self._handle.cancel()
+            self._handle = self.loop.call_at(due, self._fire)
+        elif self._handle is not None:
+            self._handle.deadline = due
+        else:
+            self._handle = self._trio.CancelScope(deadline=due)
+            self._trio.lowlevel.spawn_system_task(self._sleep, self._handle)
+
+    def _fire(self) -> None:
+        self._handle = None
+        self.due = math.inf
+        try:
+            self._callback()
+        except Exception:
+            # No task would hear of it, and it would end the whole run of trio.
+            logging.getLogger("tfbus").exception("a timer raised")
+
+    async def _sleep(self, scope: Any) -> None:
+        with scope:
+            await cast(Any, self._trio).sleep_forever()
+        self._fire()
+
+
+class LoopWaker:
+    """Calls a function on the event loop soon after any thread has asked for it.
+
+    Requests that come before the call share one call.
+
+    Parameters
+    ----------
+    callback : callable
+        Called on the loop. It must not raise, and must process everything that has been queued.
+
+    Notes
+    -----
+    Queue first, then call `wake`. The waker accepts new requests before it calls `callback`, so a request that comes
+    during the call leads to another call: there may be one call too many, never one too few.
+    """
+
+    def __init__(self, callback: Callable[[], object]) -> None:
+        self._callback = callback
+        self._call_soon: Callable[[Callable[[], object]], object] | None = None
+        self._loop_is_closed: Callable[[], bool] = _never
+        self._requested = False
+
+    @property
+    def bound(self) -> bool:
+        """Whether `bind` was called."""
+        return self._call_soon is not None
+
+    def bind(self) -> None:
+        """Wake the running event loop from now on."""
+        # anyio has no public function for this; only the loops' own functions wake them from a thread.
+        native = cast(Any, anyio.lowlevel.current_token().native_token)
+        self._call_soon = getattr(native, "run_sync_soon", None) or native.call_soon_threadsafe
+        # trio answers each request that it has accepted. An asyncio loop may be closed with requests left.
+        self._loop_is_closed = getattr(native, "is_closed", _never)
+        # An earlier loop may have ended without answering a request.
+        self._requested = False
+
+    def wake(self) -> None:
+        """Have the callback called soon; for any thread.
+
+        Raises
+        ------
+        RuntimeError
+            If the event loop has ended, or `bind` was never called.
+        """
+        if self._call_soon is None:
+            raise RuntimeError("bind the waker on the event loop first")
+        if not self._requested:
+            self._requested = True
+            try:
+                self._call_soon(self._call)
+            except BaseException:
+                self._requested = False
+                raise
+        elif self._loop_is_closed():
+            raise RuntimeError("the event loop has ended before it answered an earlier request")
+
+    def _call(self) -> None:
+        self._requested = False
+        self._callback()
+
+
+def _never() -> bool:
+    return False
+
+
+def wake_up() -> tuple[Awaitable[None], Callable[[], object]]:
+    """A wait of one task on the loop that runs now, to be awaited once, and the function that ends it.
+
+    If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
+    has ended, or the event loop is closed.
+    """
+    loop = running_loop()
+    if hasattr(loop, "create_future"):
+        # No function of Python is then on the way from a publish to the event loop.
+        future = loop.create_future()
+        return future, partial(future.set_result, None)
+    woken = _TrioWakeUp()
+    return woken, woken.end
+
+
+class _TrioWakeUp:
+    """A wait of one task on trio."""
+
+    __slots__ = ("_ended", "_task")
+
+    def __init__(self) -> None:
+        self._task: Any = None
+        self._ended = False
+
+    def end(self) -> None:
+        """End the wait, if it has not ended."""
+        if not self._ended:
+            self._ended = True
+            task, self._task = self._task, None
+            if task is not None:
+                cast(Any, sys.modules["trio"]).lowlevel.reschedule(task)
+
+    def __await__(self) -> Generator[Any, None, None]:
+        if self._ended:
+            return _nothing()
+        lowlevel = cast(Any, sys.modules["trio"]).lowlevel
+        self._task = lowlevel.current_task()
+        return cast(Generator[Any, None, None], lowlevel.wait_task_rescheduled(self._abort).__await__())
+
+    def _abort(self, _raise_cancel: object) -> Any:
+        """End the wait, because trio has cancelled it."""
+        self._task = None
+        self._ended = True
+        return cast(Any, sys.modules["trio"]).lowlevel.Abort.SUCCEEDED
+
+
+def _nothing() -> Generator[Any, None, None]:
+    yield from ()
+
+
+# Waiting until all tasks of the event loop are blocked.
+#
+# trio tells when nothing can go on. asyncio does not: `anyio.wait_all_tasks_blocked` looks at every task, which costs
+# a program of n timed tasks n steps each time that one of them wakes. But whatever goes on there, be it a task or a
+# callback, has been given to the public method ``call_soon`` of the loop, and the loop runs what it has been given
+# first in, first out. So `settling` counts the calls of that method. If nothing has called it between two turns of the
+# task that settles, then all that was given earlier has run, and nothing is left to run.
+
+
+_QUIET_TURNS = 2
+# Who calls `call_soon_threadsafe` on the loop's own thread, or has kept a method, is not counted: a second quiet turn
+# sees what that callback sets off.
+
+_MOST_TURNS = 1_000
+# A cancel scope whose task refuses to end gives the loop a callback every turn, though all tasks are blocked.
+
+
+@contextmanager
+def settling() -> Iterator[Callable[[], Awaitable[None]]]:
+    """A ``with`` that gives an async function which returns when all tasks of the loop are blocked.
+
+    Tasks that wait for sockets, worker threads or the timers of the loop count as blocked. While a task never blocks,
+    the function does not return.
+    """
+    loop = cast(Any, anyio.lowlevel.current_token().native_token)
+    call_soon = getattr(loop, "call_soon", None)
+    if call_soon is None:
+        yield anyio.wait_all_tasks_blocked
+        return
+    calls = call_soon if isinstance(call_soon, _CountedCalls) else _CountedCalls(loop)
+    calls.begin()
+    try:
+        yield calls.settle
+    finally:
+        calls.end()
+
+
+class _CountedCalls:
+    """The method ``call_soon`` of an asyncio loop, with the number of its calls.
+
+    It is in the place of the method while anybody settles. Several that settle on one loop share it.
+    """
+
+    def __init__(self, loop: Any) -> None:
+        self._loop = loop
+        self._call_soon: Callable[..., Any] = loop.call_soon
+        self._of_the_instance = "call_soon" in vars(loop)
+        self._users = 0
+        self._count = 0
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        self._count += 1
+        return self._call_soon(*args, **options)
+
+    def begin(self) -> None:
+        if self._users == 0:
+            self._loop.call_soon = self
+        self._users += 1
+
+    def end(self) -> None:
+        self._users -= 1
+        if self._users > 0:
+            return
+        if self._of_the_instance:
+            self._loop.call_soon = self._call_soon
+        else:
+            del self._loop.call_soon
+
+    async def settle(self) -> None:
+        quiet = 0
+        for _ in range(_MOST_TURNS):
+            before = self._count
+            # The checkpoint is itself one call. A loop that does not count it is never quiet here.
+            self._count -= 1
+            await anyio.lowlevel.checkpoint()
+            quiet = quiet + 1 if self._count == before else 0
+            if quiet == _QUIET_TURNS:
+                return
+        await anyio.wait_all_tasks_blocked()
+
+
+def join_all(threads: Sequence[threading.Thread], seconds: float) -> None:
+    """Wait in this thread for the end of others, but no longer than so many seconds."""
+    deadline = monotonic() + seconds
+    for thread in threads:
+        thread.join(max(0.0, deadline - monotonic()))
+
+
+async def wait_for_all(threads: Sequence[threading.Thread], seconds: float) -> bool:
+    """Wait for the end of threads, also when cancelled, but no longer than so many seconds.
+
+    Returns whether all of them have ended.
+    """
+    with anyio.move_on_after(seconds, shield=True):
+        # With a limit, for a worker of asyncio keeps the interpreter.
+        await anyio.to_thread.run_sync(join_all, threads, seconds, abandon_on_cancel=True)
+    return not any(thread.is_alive() for thread in threads)

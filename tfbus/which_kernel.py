@@ -1,0 +1,128 @@
+"""The choice between the compiled kernel and its twin in Python; whatever has a twin is imported from here.
+
+The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled one runs where
+it was built and can be loaded.
+
+`tfbus._python_kernel` is the definition: ``_kernel.c`` does the same, with the same bits. Shortcuts of publishing exist
+in C only, because in Python they would be no shorter than the ordinary way: `Intake` takes a plain batch, and the
+`Feed` of each buffer stores it and wakes the lookups that waited for it.
+"""
+
+import functools
+import importlib
+import os
+from collections.abc import Callable
+from typing import Any, Final, Literal, TypeVar, cast
+
+from tfbus.stamps import LATEST
+
+Kernel = Literal["compiled", "python"]
+MethodT = TypeVar("MethodT", bound=Callable[..., Any])
+
+
+def _choose(wanted: str | None) -> Kernel:
+    """The kernel that runs.
+
+    Raises
+    ------
+    ImportError
+        If the compiled kernel is asked for and cannot be loaded.
+    ValueError
+        If something else is asked for.
+    """
+    if wanted == "python":
+        return "python"
+    if wanted not in (None, "", "compiled"):
+        raise ValueError(f"TFBUS_KERNEL must be 'python' or 'compiled', not {wanted!r}")
+    try:
+        importlib.import_module("tfbus._kernel")
+    except ImportError:
+        if wanted == "compiled":
+            raise
+        return "python"
+    return "compiled"
+
+
+kernel: Final = _choose(os.environ.get("TFBUS_KERNEL"))
+"""The kernel that runs in this process."""
+
+if kernel == "python":
+    from tfbus._python_kernel import (
+        Chain,
+        Edge,
+        History,
+        Judge,
+        Line,
+        Parked,
+        Paths,
+        Sample,
+        commit,
+        compose_paths,
+    )
+
+    Feed: Any = None
+    Intake: Any = None
+else:
+    from tfbus._kernel import (  # type: ignore[assignment]
+        Chain,
+        Edge,
+        Feed,
+        History,
+        Intake,
+        Judge,
+        Line,
+        Parked,
+        Paths,
+        Sample,
+        commit,
+        compose_paths,
+    )
+
+__all__ = [
+    "Chain",
+    "Edge",
+    "Feed",
+    "History",
+    "Intake",
+    "Judge",
+    "Line",
+    "Parked",
+    "Paths",
+    "Sample",
+    "commit",
+    "compose_paths",
+    "kernel",
+    "plain_first",
+]
+
+
+def plain_first(method: MethodT, many: type | None = None) -> MethodT:
+    """A method that runs only if ``self._paths`` has no plain answer; that answer must be the method's own.
+
+    This is the only place where a question of the synchronous methods is tried for the plain answer. The frame of a
+    method with many keyword arguments takes as long as the answer itself, so the compiled kernel stands before it.
+
+    Parameters
+    ----------
+    method : function
+        ``(self, target, source, at=LATEST, ...)``. Where ``self._paths`` is None, it always runs.
+    many : type, optional
+        The array type of the answers, if `method` takes stamps instead of `at`. Only the compiled kernel has plain
+        answers at many stamps.
+    """
+    if kernel == "compiled":
+        from tfbus._kernel import Method
+
+        return cast(MethodT, Method(method, many))
+    if many is not None:
+        return method
+
+    @functools.wraps(method)
+    def first(self: Any, *args: Any, **options: Any) -> Any:
+        if 2 <= len(args) <= 3 and not options and self._paths is not None:
+            found = self._paths.answer(args[0], args[1], args[2] if len(args) == 3 else LATEST)
+            if found is not None:
+                return found
+        return method(self, *args, **options)
+
+    return cast(MethodT, first)
