@@ -5,7 +5,7 @@ from typing import Any
 import anyio
 import pytest
 
-from tfbus._aio.loops import LoopTimer, running_loop
+from tfbus.buffer.lookups import LoopTimer, running_loop
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

@@ -6,7 +6,7 @@ import anyio.lowlevel
 import pytest
 from support.asking import settle
 
-from tfbus._aio.loops import wake_up
+from tfbus.buffer.lookups import wake_up
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 

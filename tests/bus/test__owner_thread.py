@@ -3,7 +3,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from tfbus.bus.queues import OwnerThread
+from tfbus.bus.bus import OwnerThread
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]
 

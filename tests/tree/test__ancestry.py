@@ -3,7 +3,8 @@ from support.samples import moving, static
 
 from tfbus import TransformStamped
 from tfbus.stamps import STAMP_MIN
-from tfbus.tree.forest import Forest, Loop, edges_above, names_below, past_loop
+from tfbus.tree.cycles import Loop, edges_above, names_below, past_loop
+from tfbus.tree.forest import Forest
 
 
 def forest(*batch: TransformStamped) -> Forest:

@@ -4,7 +4,7 @@ import pytest
 from support.histories import moving_edge
 
 from tfbus import Transform
-from tfbus.tree.path import _GENERATION, Path, PathCache, find_path
+from tfbus.tree.forest import _GENERATION, Path, PathCache, find_path
 
 
 def path() -> Path:

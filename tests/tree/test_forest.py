@@ -8,8 +8,8 @@ import pytest
 from support.samples import moving, static
 
 from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped, TransformTree
-from tfbus.tree.forest import Forest, save_frame
-from tfbus.tree.history import FrameHistory
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import FrameHistory, save_frame
 
 
 def forest(*batch: TransformStamped, window: int | None = None) -> Forest:

@@ -17,8 +17,8 @@ from tfbus import (
 from tfbus.geometry.transform import from_row
 from tfbus.rows import IDENTITY
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tree.forest import Path, find_path, path_at
 from tfbus.tree.history import FrameHistory
-from tfbus.tree.path import Path, find_path, path_at
 
 Frames = dict[str, FrameHistory]
 

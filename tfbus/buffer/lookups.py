@@ -6,18 +6,19 @@ of the event loop later; otherwise the lookup asks again, and may park again.
 
 import logging
 import math
-from collections.abc import Awaitable, Callable, Hashable
+import sys
+from collections.abc import Awaitable, Callable, Generator, Hashable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from heapq import heapify, heappop, heappush
 from itertools import count, islice
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import anyio
 import anyio.lowlevel
+import anyio.to_thread
 
-from tfbus._aio.loops import LoopTimer, running_loop, wake_up
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.clock import Clock, SimulatedClock, SystemClock
 from tfbus.errors import (
@@ -36,6 +37,117 @@ from tfbus.tree.explanation import Explanation
 from tfbus.tree.history import Edge
 from tfbus.tree.lookup import Bounds, Question, answer
 from tfbus.waiting.live_tree import LiveTree, PendingLookup, Waiter, WaitingIndex, blocking_frames, without_traceback
+
+
+def running_loop() -> Any:
+    """The event loop that runs here: that of asyncio, or the token of trio."""
+    # anyio has no public timer; only the loops' own functions set one without a task of the caller.
+    return cast(Any, anyio.lowlevel.current_token().native_token)
+
+
+class LoopTimer:
+    """Calls a function on an event loop at a time by the loop's own clock.
+
+    Parameters
+    ----------
+    loop
+        As `running_loop` gives it.
+    callback : callable
+        Called on the loop; an `Exception` is logged.
+
+    Attributes
+    ----------
+    due : float
+        The time of the next call, in s; infinity if none is set.
+    """
+
+    def __init__(self, loop: Any, callback: Callable[[], object]) -> None:
+        self.loop = loop
+        self.due = math.inf
+        self._callback = callback
+        self._trio = None if hasattr(loop, "call_at") else cast(Any, sys.modules["trio"])
+        self._handle: Any = None
+
+    def now(self) -> float:
+        """The time of the loop, in s. Only the loop that runs has one."""
+        return float(self.loop.time() if self._trio is None else self._trio.current_time())
+
+    def set(self, due: float) -> None:
+        """Call the function at a time, in s, and not at the one that was set before."""
+        self.due = due
+        if self._trio is None:
+            if self._handle is not None:
+                self._handle.cancel()
+            self._handle = self.loop.call_at(due, self._fire)
+        elif self._handle is not None:
+            self._handle.deadline = due
+        else:
+            self._handle = self._trio.CancelScope(deadline=due)
+            self._trio.lowlevel.spawn_system_task(self._sleep, self._handle)
+
+    def _fire(self) -> None:
+        self._handle = None
+        self.due = math.inf
+        try:
+            self._callback()
+        except Exception:
+            # No task would hear of it, and it would end the whole run of trio.
+            logging.getLogger("tfbus").exception("a timer raised")
+
+    async def _sleep(self, scope: Any) -> None:
+        with scope:
+            await cast(Any, self._trio).sleep_forever()
+        self._fire()
+
+
+def wake_up() -> tuple[Awaitable[None], Callable[[], object]]:
+    """A wait of one task on the loop that runs now, to be awaited once, and the function that ends it.
+
+    If it was ended before the task awaits it, there is no checkpoint. The function may raise an `Exception` if the wait
+    has ended, or the event loop is closed.
+    """
+    loop = running_loop()
+    if hasattr(loop, "create_future"):
+        # No function of Python is then on the way from a publish to the event loop.
+        future = loop.create_future()
+        return future, partial(future.set_result, None)
+    woken = _TrioWakeUp()
+    return woken, woken.end
+
+
+class _TrioWakeUp:
+    """A wait of one task on trio."""
+
+    __slots__ = ("_ended", "_task")
+
+    def __init__(self) -> None:
+        self._task: Any = None
+        self._ended = False
+
+    def end(self) -> None:
+        """End the wait, if it has not ended."""
+        if not self._ended:
+            self._ended = True
+            task, self._task = self._task, None
+            if task is not None:
+                cast(Any, sys.modules["trio"]).lowlevel.reschedule(task)
+
+    def __await__(self) -> Generator[Any, None, None]:
+        if self._ended:
+            return _nothing()
+        lowlevel = cast(Any, sys.modules["trio"]).lowlevel
+        self._task = lowlevel.current_task()
+        return cast(Generator[Any, None, None], lowlevel.wait_task_rescheduled(self._abort).__await__())
+
+    def _abort(self, _raise_cancel: object) -> Any:
+        """End the wait, because trio has cancelled it."""
+        self._task = None
+        self._ended = True
+        return cast(Any, sys.modules["trio"]).lowlevel.Abort.SUCCEEDED
+
+
+def _nothing() -> Generator[Any, None, None]:
+    yield from ()
 
 
 class LocalNames:
@@ -341,7 +453,8 @@ class Lookups:
 
     def note_ahead(self, error: ExtrapolationError) -> None:
         """Write into an error by how much the newest stamp of its edge is ahead of the clock."""
-        if error.newest is not None and error.newest > self._newest_plausible():
+        # The clock alone nearly always tells that it is not; how far ahead a stamp may be is asked only then.
+        if error.newest is not None and self._clock.now() < error.newest > self._newest_plausible():
             error.ahead = error.newest - self._clock.now()
 
     def lookup_nowait(self, question: Question) -> TransformStamped:
@@ -382,7 +495,8 @@ class Lookups:
         try:
             return self._lookup_since(last_reset, question)
         except MAY_COME as error:
-            self._check_names(question)
+            if isinstance(error, UnknownFrameError):
+                self._check_names(question)
             blocker = without_traceback(error)
         self._check_thread()
         wait = _Wait(question, self._clock.now(), last_reset, blocker, others)

@@ -5,6 +5,7 @@ every buffer, wakes the lookups that waited for it, then calls the subscribers. 
 nothing can be lost between "sent" and "buffered".
 """
 
+import asyncio
 import logging
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
@@ -12,10 +13,12 @@ from threading import get_ident
 from types import TracebackType
 from typing import Any
 
+import anyio
+
 from tfbus.bus.event_stream import EventStream
 from tfbus.bus.late_buffer import LateBuffer
 from tfbus.bus.ownership import OnConflict, Ownership
-from tfbus.bus.queues import Overflow, OwnerThread, Stream, ThreadPublisher
+from tfbus.bus.queues import Overflow, Stream, ThreadPublisher
 from tfbus.bus.subscribers import Announcer, BatchCallback, FrameCallback, OnceLogger, Subscribers
 from tfbus.bus.topology import Invalid, Plausibility, Topology, as_invalid
 from tfbus.clock import Clock, SystemClock
@@ -28,6 +31,45 @@ from tfbus.statistics import BusStatistics
 from tfbus.tree.forest import LoopingSample
 from tfbus.waiting.live_tree import LiveTree
 from tfbus.which_kernel import Intake
+
+
+class OwnerThread:
+    """The thread that may use a bus: first the one that made it, then that of the first event loop that uses it.
+
+    Attributes
+    ----------
+    thread : int
+        Its identity, as `threading.get_ident` gives it.
+    """
+
+    __slots__ = ("_on_a_loop", "thread")
+
+    def __init__(self) -> None:
+        self.thread = get_ident()
+        self._on_a_loop = _runs_a_loop()
+
+    def check(self) -> None:
+        """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
+        thread = get_ident()
+        if thread == self.thread and self._on_a_loop:
+            return
+        on_a_loop = _runs_a_loop()
+        if thread != self.thread:
+            if self._on_a_loop or not on_a_loop:
+                raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
+            self.thread = thread
+        self._on_a_loop = on_a_loop
+
+
+def _runs_a_loop() -> bool:
+    """Whether this thread runs an event loop. In a bare asyncio callback only asyncio knows."""
+    for probe in (asyncio.get_running_loop, anyio.get_current_task):
+        try:
+            probe()
+        except RuntimeError:
+            continue
+        return True
+    return False
 
 
 class Bus:

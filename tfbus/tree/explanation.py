@@ -12,10 +12,9 @@ from typing import NamedTuple
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
 from tfbus.plain import PlainData
 from tfbus.stamps import LATEST, Latest, format_age, format_duration, format_stamp, to_seconds
-from tfbus.tree.forest import AT_A_TIME, Forest
+from tfbus.tree.forest import AT_A_TIME, Forest, Path
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, Bounds, Extrapolation, Policy, find, read_stamp
-from tfbus.tree.path import Path
 from tfbus.tree.rendering import format_rate
 
 

@@ -32,9 +32,8 @@ from tfbus.stamps import (
     as_stamp,
     from_seconds,
 )
-from tfbus.tree.forest import Forest
+from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory, Samples
-from tfbus.tree.path import Path, Step
 
 # Policies: which stamps a lookup may answer although no two close samples surround them.
 #

@@ -16,10 +16,9 @@ from tfbus.errors import DisconnectedError, TransformLookupError
 from tfbus.geometry.transform_array import TransformArray, from_columns, move
 from tfbus.rows import IDENTITY, Columns, Row, compose, invert
 from tfbus.stamps import LATEST, Stamps
-from tfbus.tree.forest import Forest
+from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory, Samples
 from tfbus.tree.lookup import Policy, answer, read_stamps_at_many
-from tfbus.tree.path import Path, Step
 from tfbus.which_kernel import kernel
 
 # Interpolation of one edge at many stamps.

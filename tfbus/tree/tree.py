@@ -35,8 +35,8 @@ from tfbus.stamps import (
     from_seconds,
 )
 from tfbus.tree.explanation import Explanation, explain
-from tfbus.tree.forest import Forest, SavedFrame, samples_of, save_frame
-from tfbus.tree.history import Edge, FrameHistory, Outcome
+from tfbus.tree.forest import Forest
+from tfbus.tree.history import Edge, FrameHistory, Outcome, SavedFrame, samples_of, save_frame
 from tfbus.tree.lookup import AT_LATEST_ONLY, GO_TOGETHER, Hold, answer, bounds_of, policy_of
 from tfbus.tree.lookup_many import OutOfRange, deskew, lookup_many
 from tfbus.tree.rendering import counted, describe, legend, to_dot, to_html, to_yaml

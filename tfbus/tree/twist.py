@@ -11,10 +11,9 @@ from typing import NamedTuple
 from tfbus.errors import PastExtrapolationError
 from tfbus.rows import IDENTITY, Quaternion, Row, Vector, compose, invert, rotate
 from tfbus.stamps import LATEST, SECOND
-from tfbus.tree.forest import Forest
+from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory
 from tfbus.tree.lookup import At, find
-from tfbus.tree.path import Path, Step
 
 ZERO: Vector = (0.0, 0.0, 0.0)
 

@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable
 
 from tfbus.errors import ClockResetError
 from tfbus.stamps import LATEST
-from tfbus.tree.forest import Forest
-from tfbus.tree.path import Path
+from tfbus.tree.forest import Forest, Path
 
 
 class WatchState:
