@@ -1,7 +1,7 @@
 """The kernel in Python: samples, edges and paths, and the plain judgement, commit and answer.
 
 This is the definition. ``tfbus/_kernel.c`` does the same, with the same bits, and runs in its place where it could be
-built. Both hand back whatever is not plain: the caller then decides, and raises what is to be raised.
+built. Both hand back a case that is not plain: the caller then decides, and raises the errors.
 
 The samples are stored by column: stamps for `bisect`, and one 64-byte record a sample (stamp, translation, rotation),
 from which an interpolation unpacks two neighbours in a single call. Samples older than the horizon do not count. They
@@ -149,9 +149,9 @@ class Parked:
     place : tuple or None
         Its place in a line, if it has one.
     answer : TransformStamped or None
-        The answer that whoever woke it has found, if there was one then.
+        The plain answer that the insertion found when it woke the lookup, if there was one.
     version : int
-        That of the paths which had this answer.
+        The version of the paths that gave this answer.
     elsewhere : bool
         Whether more than its line, and the dict of all that are parked, has to forget it.
     """
@@ -171,11 +171,11 @@ class Line:
     Attributes
     ----------
     places : list of (-stamp, -order, Parked)
-        Those that wait until the edge of the frame reaches a stamp (ns), sorted, so that the next due is the last.
+        The lookups that wait until the edge of the frame reaches a stamp (ns), sorted: the next one due is the last.
     for_any : dict of Parked to None
-        Those that any sample wakes.
+        The lookups that any sample wakes.
     limits : list of (-stamp, -order, Parked)
-        Those that a sample beyond a stamp wakes, sorted.
+        The lookups that a sample beyond a stamp wakes, sorted.
     """
 
     __slots__ = ("for_any", "limits", "places")
@@ -242,7 +242,7 @@ class History:
         Samples with a stamp before this one, in ns, have left the window.
     stamps : array of int
     records : bytearray
-        Those that were cut off are gone; those that have left the window may still be there.
+        Samples that have left the window stay until the next cut.
     """
 
     __slots__ = ("_cut_after", "_keep", "authority", "horizon", "mixed", "parent", "records", "stamps")
@@ -412,7 +412,7 @@ class History:
     def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
         """The memory of the samples from one index to another, which nothing changes while it is held.
 
-        Those that are next to none of the `wanted` stamps (ns) may be left out.
+        Samples that are next to none of the `wanted` stamps (ns) may be left out.
         """
         start = self._start
         begin, end = start + first, min(start + end, len(self.stamps))
@@ -555,7 +555,7 @@ class Paths:
     Parameters
     ----------
     lock : threading.Lock
-        Whoever changes a history or a path holds it.
+        The code that changes a history or a path holds it.
     latest : Latest
     kind : type
         The class of an answer.

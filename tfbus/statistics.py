@@ -21,9 +21,9 @@ class BufferStatistics(PlainData):
     waiting : int
         Lookups that wait now.
     expired_ahead : int
-        Those of the expired samples whose frame had a newest stamp ahead of the clock: see `StampAhead`.
+        The expired samples whose frame had a newest stamp ahead of the clock: see `StampAhead`.
     superseded : int
-        Those of the expired samples that came late, and name another parent than a newer sample that was published
+        The expired samples that came late, and name another parent than a newer sample that was published
         before the buffer joined.
     looped : int
         Samples that formed a loop of parents at a past stamp, as late data can; they are among the samples above.
@@ -48,7 +48,7 @@ class QueueStatistics(PlainData):
     Attributes
     ----------
     kind : str
-        What the queue is for, such as ``"stream"`` or ``"events"``.
+        The purpose of the queue, such as ``"stream"`` or ``"events"``.
     overflow : str
         Its rule for a full queue.
     capacity : int

@@ -1,7 +1,12 @@
 """Lookups that wait: parked under the frames that they lack, and woken by new samples.
 
-Whoever inserts the samples hands over the answer. It is given if the tree has not changed until the task runs, one turn
-of the event loop later; otherwise the lookup asks again, and may park again.
+`Lookups.lookup` is the whole wait. It passes a checkpoint, asks the tree, and if the answer may still come it parks a
+`Waiter` in the live tree (`tfbus.waiting.live_tree` says under which frame) and awaits its wake-up. The insertion that
+unblocks the lookup hands over the answer. The task gives that answer if the tree has not changed until it runs, one
+turn of the event loop later; otherwise it asks again, and may park again on the same deadline.
+
+The end of a wait is an alarm. Alarms share one timer of the event loop, because nearly all are cancelled before they
+ring. A lookup that has waited for 5 s is logged, with all others that have.
 """
 
 import logging
@@ -204,10 +209,9 @@ class LocalNames:
         )
 
 
-# Alarms for the waiting lookups of one buffer: calls after a duration, most of which are cancelled before.
-#
-# A cancel scope for each wait would set and remove a timer of the event loop each time. Here all of a buffer share one:
-# it is set for the first alarm, and stays as it is when that is cancelled, because the next one is nearly always later.
+# Alarms. A cancel scope for each wait would set and remove a timer of the event loop each time. The alarms of a buffer
+# share one timer: it is set for the first alarm, and stays as it is when that alarm is cancelled, because the next one
+# is nearly always later.
 
 
 _CANCELLED_KEPT = 64
@@ -254,7 +258,7 @@ class LoopAlarms:
         loop = running_loop()
         heap = self._heap
         if heap is None or heap.timer.loop is not loop:
-            # What waits on another loop is still woken by the heap of that one.
+            # The heap of another loop still wakes the lookups that wait there.
             heap = self._heap = _AlarmHeap(loop)
         return heap.add(seconds, callback)
 
@@ -265,7 +269,7 @@ class _AlarmHeap:
     def __init__(self, loop: Any) -> None:
         self.timer = LoopTimer(loop, self._ring)
         self._alarms: list[tuple[float, int]] = []
-        # The callbacks of those that were neither made nor cancelled, by number.
+        # The callbacks that are neither made nor cancelled, by number.
         self._callbacks: dict[int, Callable[[], object]] = {}
         self._numbers = count()
 

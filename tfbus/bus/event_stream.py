@@ -115,7 +115,7 @@ class EventQueue:
             key = frozenset((event.authority, event.other))
         elif isinstance(event, (SampleRejected, StampAhead, PastLoop)):
             seen = self._refusals.setdefault(event.frame, SeenKeys(_CLAIMS))
-            key = (type(event), event.authority, _what(event))
+            key = (type(event), event.authority, _deduplication_key(event))
             if len(self._refusals) > _REFUSED_FRAMES:
                 del self._refusals[next(iter(self._refusals))]
         elif isinstance(event, Reparented) and event.frame in self._conflicts:
@@ -129,17 +129,16 @@ class EventQueue:
         return not seen.add(key)
 
 
-def _what(event: SampleRejected | StampAhead | PastLoop) -> str | None:
-    """That of which an event tells once, beside its frame and authority."""
+def _deduplication_key(event: SampleRejected | StampAhead | PastLoop) -> str | None:
+    """The third part of the deduplication key, beside frame and authority."""
     if isinstance(event, SampleRejected):
         return event.reason
     return event.parent if isinstance(event, PastLoop) else None
 
 
-# Finds the moving frames whose newest sample is too old.
-#
-# There is no timer here: the caller asks for changes and for the time of the next one. A frame costs a few steps each
-# time that it may have become stale; a sample costs nothing but while some frame is stale.
+# Staleness: the moving frames whose newest sample is too old. There is no timer here: the caller asks for changes and
+# for the time of the next one. A frame costs a few steps each time that it may have become stale; a sample costs
+# nothing unless some frame is stale.
 
 
 _SPARE = 64

@@ -5,8 +5,15 @@ which the bus has no edge, because it comes from a prefill, is in no loop with t
 holds a newest topology that the bus would refuse.
 
 A buffer that was there from the beginning keeps this by itself, because it gets every accepted sample. A buffer that
-joined late has not seen the newest sample of each frame, and would take a late sample for the newest; and a prefill may
-hold what the bus has never seen. `LateBuffer` leaves such samples out, and removes such frames.
+joined late has not::
+
+    published    c below a at 10,  c below b at 20,  [the buffer joins],  c below a at 15 (late)
+    the bus      c below b: the newest stamp decides
+    the buffer   would take c below a for the newest, because it has seen nothing else
+
+So `LateBuffer` leaves out a late sample that names another parent than the newest edge of the bus, until the buffer has
+seen a sample as new as that edge. A prefill may hold a frame with another newest parent than the bus, or one that
+closes a loop with edges of the bus: `LateBuffer` removes that frame.
 """
 
 from collections.abc import Callable, Mapping
@@ -61,7 +68,7 @@ class LateBuffer:
         return not (self._unseen or self._foreign)
 
     def insert(self, batch: Batch) -> None:
-        """Insert the samples of a batch that the bus has accepted, without those that are superseded."""
+        """Insert the samples of a batch that the bus has accepted, without the superseded ones."""
         wanted = tuple(sample for sample in batch if not self._is_superseded(sample))
         self._live.superseded += len(batch) - len(wanted)
         if self._foreign:

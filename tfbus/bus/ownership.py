@@ -1,4 +1,21 @@
-"""The right to publish a child: by reservation, or by being its first authority if the policy says so."""
+"""The right to publish a child: by reservation, or by being its first authority if the policy says so.
+
+A reservation also keeps the place of a frame. Let ``arm`` reserve ``t`` and put it below ``a``; somebody else cannot
+take ``t``, but can try to hang ``a`` below ``t``::
+
+    arm       t below a
+    intruder  a below t          the two close a loop, and one has to go
+
+Without reservations the sample that closes the loop is refused. Here the intruder's edge goes, whichever came first:
+
+* the intruder comes second: its sample closes the loop and is refused, as always;
+* both are in one batch: `Ownership.intruder` names the intruder's sample, and the bus refuses that one;
+* the intruder was first, when ``t`` had no parent yet: its edge is removed from the bus, with its frame, when ``arm``
+  publishes.
+
+A loop may have several such edges. The one that was published last by somebody who does not own the frame goes first.
+An edge of a frame that its own sender has reserved stays: then the sample of ``arm`` is the wrong one.
+"""
 
 import math
 from collections.abc import Mapping

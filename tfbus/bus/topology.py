@@ -391,7 +391,7 @@ class Topology:
                 self.reject("displaced", error)
                 self._log.warning(("intruder", error.child, error.authority), "removed a frame: %s", error)
                 self._evict(_child(error))
-        # Whoever was told of a removal may have published.
+        # A subscriber that was told of a removal may have published.
         return admit(self._newest, batch, self._named)
 
     def _record(self, sample: TransformStamped) -> None:

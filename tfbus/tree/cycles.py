@@ -1,6 +1,22 @@
-"""Loops of parents.
+"""Loops of parents: among the newest edges, where they are refused, and in the past, where they can only be told.
 
-The newest edges of all frames must form a forest. A batch is judged as a whole, so one batch may turn an edge round.
+The newest edges of all frames must form a forest. `admit` judges a batch as a whole, so one batch may turn an edge
+round: with ``b`` below ``a``, a batch ``b below r, a below b`` is fine, though ``a below b`` alone would close a loop.
+
+A loop in the past can form although no newest edges ever did. Samples may come late, and an edge holds from its sample
+to its next one::
+
+    stamp        10      20      30
+    a below      b       b       r        (published in order)
+    b below      r       r       r
+    late: b below a, at 15
+
+At 30 all is well. At 15 to 20 ``a`` is below ``b`` and ``b`` below ``a``: no way leads to ``r``. To refuse the late
+sample would make answers depend on the order of arrival, so it is stored and announced as an event (`past_loop` finds
+it). A lookup at such a stamp takes the way round the loop whose samples cover the stamp: see
+`tfbus.tree.forest.path_at`.
+
+All walks climb from the frames that are asked for, so their cost depends on the height of the tree, not on its size.
 """
 
 from collections import Counter
@@ -33,7 +49,7 @@ class NewestEdge(Protocol):
 def admit(
     edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped], parents: Container[str]
 ) -> tuple[Batch, list[InvalidTransformError]]:
-    """Split a batch into the samples that close no loop of parents, and the errors of those that do.
+    """Split a batch into the samples that close no loop of parents, and the errors of the others.
 
     Of the samples that close a loop, the last one in the batch is refused, and so on until no loop is left.
 
@@ -103,7 +119,7 @@ def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformS
 
 
 def _possibly_looped(changes: Mapping[str, str], parents: Container[str]) -> list[str]:
-    """The changed children, without those that have no children themselves, and so on."""
+    """The changed children, without the childless ones, then without the ones left childless by that, and so on."""
     children = Counter(changes.values())
     childless = [child for child in changes if child not in parents and child not in children]
     left_out = set(childless)
@@ -170,7 +186,7 @@ def edges_above(frames: Frames, names: Iterable[str]) -> dict[str, FrameHistory]
 
 
 def names_below(frames: Frames, names: Iterable[str], above: set[str]) -> set[str]:
-    """Those of `names` that are in `above`, or below one of these by any parent that a sample in the window names."""
+    """The `names` that are in `above`, or below one of these by any parent that a sample in the window names."""
     asked = set(names)
     children: dict[str, list[str]] = {}
     for child, edge in edges_above(frames, asked).items():

@@ -2,10 +2,17 @@
 
 `Forest` stores samples and finds paths; `tfbus.tree.lookup` and its neighbours answer questions with it. One lock is
 held for one lookup or one batch, so worker threads may read while the loop inserts.
+
+A path climbs from the source to the lowest common ancestor, and from the target to the same frame, so no edge above
+that frame can fail or slow a lookup. Runs of static edges are folded into one row. Paths are cached until the topology
+changes.
+
+The newest edges form no loop, but the edges that hold at an older stamp may (`tfbus.tree.cycles` draws one). Two ways
+then lead round the loop. `path_at` says which of them counts, by what is stored and never by what was asked before.
 """
 
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple, TypeVar
 
@@ -16,22 +23,9 @@ from tfbus.errors import DisconnectedError, ExtrapolationError, FutureExtrapolat
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_stamp
-from tfbus.tree.cycles import Loop, admit, edges_above, names_below, past_loop
+from tfbus.tree.cycles import Frames, Loop, admit, edges_above, names_below, past_loop
 from tfbus.tree.history import FrameHistory, Outcome, SavedFrame, load_frame
 from tfbus.which_kernel import Chain, Paths, commit
-
-# Paths between two frames.
-#
-# A path climbs from the source to the lowest common ancestor and from the target to the same frame, so no edge above
-# that can fail or slow a lookup. Runs of static edges are folded into one row.
-#
-# The newest edges form no loop, but the edges that hold at an older stamp may: late samples can form one, and an edge
-# is followed beyond its samples as well, so that an error can name it. Two ways then lead round the loop. `path_at`
-# says which of them counts, by what is stored and never by what was asked before.
-
-
-Frames = Mapping[str, FrameHistory]
-"""By child."""
 
 Step = FrameHistory | Row
 """A moving edge, or the row of a run of static edges."""
@@ -180,7 +174,7 @@ def find_edges(
 ) -> tuple[list[FrameHistory], list[FrameHistory], str]:
     """The edges of a path, from source and from target up to the common ancestor, and that.
 
-    It reads nothing but parents, so that it may run while another thread inserts; whoever does so has to check whether
+    It reads nothing but parents, so that it may run while another thread inserts; the caller then has to check whether
     the edges still hold.
 
     Both ends climb in turn, so the search stops at most one side's length beyond the common ancestor.
@@ -423,12 +417,6 @@ class KnownFrames:
             self._mentions[parent] -= 1
             if not self._mentions[parent]:
                 del self._mentions[parent]
-
-
-# Walks along all edges of all stamps: the frames above or below some others, and loops of parents at past stamps.
-#
-# All of them climb from the frames that are asked for, so their cost depends on the height of the tree, not on its
-# size.
 
 
 AT_A_TIME = 100
@@ -756,7 +744,7 @@ class Forest:
         return list(edges_above(self.frames, names).values())
 
     def names_below(self, names: Iterable[str], above: set[str]) -> set[str]:
-        """Those of `names` that are in `above`, or below one of these by any parent in the window."""
+        """The `names` that are in `above`, or below one of these by any parent in the window."""
         return names_below(self.frames, names, above)
 
     def read_all(self, read: Callable[[FrameHistory], T]) -> dict[str, T]:

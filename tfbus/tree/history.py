@@ -377,7 +377,7 @@ class FrameHistory(History):
     def samples_between(self, low: int, high: int, wanted: Stamps | None = None) -> Samples:
         """The samples from stamp `low` to `high`, and the next one on either side.
 
-        Those that are next to none of the `wanted` stamps (ns) may be left out.
+        Samples that are next to none of the `wanted` stamps (ns) may be left out.
         """
         first, end = self.between(low, high)
         if wanted is not None and end - first <= _BLOCK * len(wanted):

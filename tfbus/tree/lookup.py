@@ -35,9 +35,8 @@ from tfbus.stamps import (
 from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory, Samples
 
-# Policies: which stamps a lookup may answer although no two close samples surround them.
-#
-# Without a policy nothing is extrapolated, and any two samples are interpolated between, however far apart they are.
+# Policies say which stamps a lookup may answer although no two close samples surround them. Without a policy nothing is
+# extrapolated, and any two samples are interpolated between, however far apart they are.
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,18 @@
 """A forest that a bus fills, with the lookups that wait for it and the watches that follow it.
 
-It knows no event loop: to wake a waiter is to call the function that the waiter brought along.
+A lookup that cannot be answered is parked under the frame that blocks it, and an insertion looks only there:
+
+* under an edge whose newest stamp is too old, in the order of the stamps that the lookups need. The batch that brings
+  an edge to 12.5 s takes all lookups up to 12.5 s off the end of that list, and sees no other;
+* under an unknown frame, or under the roots of two trees: any sample of these frames wakes the lookup.
+
+A lookup also ends when another edge of its path loses the stamp, because the window of that edge has slid on. Each edge
+has a limit: the newest stamp that it may reach until then. A waiter is kept by its first limit in one list for all
+frames, so an insertion costs one comparison while no limit is passed. Once some frame has passed a limit, the waiter is
+kept under each edge that has not, such as one that has stopped.
+
+`LiveTree.insert` pops the waiters that may have an answer now and wakes them, each with its answer if that is plain. To
+wake a waiter is to call the function that it brought along: nothing here knows an event loop, and nothing waits.
 """
 
 import logging
@@ -114,19 +126,6 @@ def _edges(forest: Forest, target: str, source: str, at: int) -> tuple[FrameHist
     return path.moving if path.rival is None else (*path.moving, *path.rival.moving)
 
 
-# An index of the waiting lookups by the frames that block them.
-#
-# A lookup that cannot be answered is parked under the frame that blocks it: an edge whose newest stamp is too old,
-# ordered by the stamp that the lookup needs; an unknown frame; or the roots of two trees. An insertion then finds the
-# lookups that it may have unblocked without looking at the others. Nothing here waits or computes an answer: the
-# inserting code pops the waiters that may have an answer and wakes them, each with its answer if that is plain.
-#
-# A lookup also ends when another edge of its path loses the stamp, because its window has slid on. Each of these edges
-# has a limit: the newest stamp that it may reach until then. A waiter is kept by its first limit in one list for all
-# frames, so an insertion costs one comparison, as long as it is in nobody's future. Once some frame has passed a limit,
-# the waiter is kept under the edges that have not, such as one that has stopped.
-
-
 _NEVER = 2**64
 
 
@@ -158,9 +157,9 @@ class Waiter(Parked):
     Attributes
     ----------
     answer : TransformStamped or None
-        The answer that whoever woke it has found, if there was one then.
+        The plain answer that the insertion found when it woke the lookup, if there was one.
     version : int
-        That of the forest which has this answer.
+        The version of the forest that gave this answer.
     """
 
     __slots__ = (
@@ -250,8 +249,8 @@ class WaitingIndex:
     def __init__(self) -> None:
         self.by_frame: dict[str, Line] = {}
         self.parked: dict[Waiter, None] = {}
-        # Made when it is read, because most waiters are woken by the edge that blocks them: the first ones have their
-        # places in it, and those that were parked since have not.
+        # Brought up to date when it is read, because the blocking edge wakes most waiters. `indexed` marks a waiter
+        # that is in it.
         self._by_name: dict[str, dict[Waiter, None]] = {}
         self.limits: list[Place] = []
         self._passed = STAMP_MIN
@@ -636,7 +635,7 @@ class LiveTree:
         _wake(waiters)
 
     def _limits(self, waiter: Waiter, error: TransformLookupError | None) -> list[tuple[str, int]]:
-        """The limits of a waiter, but for that of the edge that blocks it, whose next samples wake it anyway."""
+        """The limits of all edges except the blocking one, whose next sample wakes the waiter in any case."""
         blocking = error.child if isinstance(error, FutureExtrapolationError) else None
         limits = limits_of(self.forest, waiter.question, blocking)
         for other in waiter.others:

@@ -107,7 +107,7 @@ class WatchIndex:
         self._move(state, frozenset())
 
     def mark(self, frames: Iterable[str]) -> list[WatchState]:
-        """Mark the watches under some frames as outdated; return those that were up to date, to be woken."""
+        """Mark the watches under some frames as outdated; return the ones that were up to date, to be woken."""
         touched: dict[WatchState, None] = {}
         for frame in frames:
             states = self.by_frame.get(frame)
@@ -126,7 +126,7 @@ class WatchIndex:
         return {name for state in asking for name in (state.target, state.source)}
 
     def mark_asking_for(self, frames: set[str]) -> list[WatchState]:
-        """Mark the watches of some frames that have no permanent path; return those that were up to date.
+        """Mark the watches of some frames that have no permanent path; return the ones that were up to date.
 
         Late samples can form a loop at the stamp of an answer. Then an edge beyond the path may open another path.
         """
