@@ -12,9 +12,9 @@ _NAMES_IN = {
     "buffer.buffer": ("Buffer",),
     "buffer.watch": ("Watch",),
     "bus.broadcaster": ("TransformBroadcaster",),
-    "bus.bus": ("Bus",),
+    "bus.bus": ("Bus", "ThreadPublisher"),
     "bus.event_stream": ("EventStream",),
-    "bus.queues": ("Stream", "ThreadPublisher"),
+    "bus.queues": ("Stream",),
     "clock": ("Clock", "SimulatedClock", "SystemClock", "Ticks"),
     "data": (
         "LaserScan",

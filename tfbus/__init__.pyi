@@ -11,9 +11,9 @@ from tfbus.buffer.buffer import Buffer as Buffer
 from tfbus.buffer.watch import Watch as Watch
 from tfbus.bus.broadcaster import TransformBroadcaster as TransformBroadcaster
 from tfbus.bus.bus import Bus as Bus
+from tfbus.bus.bus import ThreadPublisher as ThreadPublisher
 from tfbus.bus.event_stream import EventStream as EventStream
 from tfbus.bus.queues import Stream as Stream
-from tfbus.bus.queues import ThreadPublisher as ThreadPublisher
 from tfbus.clock import Clock as Clock
 from tfbus.clock import SimulatedClock as SimulatedClock
 from tfbus.clock import SystemClock as SystemClock

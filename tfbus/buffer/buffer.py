@@ -109,7 +109,7 @@ class Buffer:
         self._paths = self._forest.paths if named is None else None
         self._tree = tree_of(self._forest, keep, bus.max_translation)
         self._live = LiveTree(self._forest, bus._announce_past_loop)
-        self._lookups = Lookups(self._live, bus.clock, bus._check_thread, bus._newest_plausible, self._local_names)
+        self._lookups = Lookups(self._live, bus, self._local_names)
         bus._attach(self._live)
 
     @property
@@ -414,10 +414,7 @@ class Buffer:
             min_translation,
             min_rotation,
             max_rate,
-            self._live,
             self._lookups,
-            self._clock,
-            self.bus._check_thread,
         )
 
     def explain(

@@ -24,6 +24,7 @@ import anyio
 import anyio.lowlevel
 import anyio.to_thread
 
+from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import SeenKeys
 from tfbus.clock import Clock, SimulatedClock, SystemClock
 from tfbus.errors import (
@@ -420,12 +421,8 @@ class Lookups:
     Parameters
     ----------
     live : LiveTree
-    clock : Clock
-        The clock of timeouts and ages.
-    check_thread : callable
-        Raises unless the calling thread may wait here.
-    newest_plausible : callable
-        Gives the greatest stamp, in ns, that is not ahead of the clock now.
+    bus : Bus
+        Its clock is that of timeouts and ages; it says which thread may wait here.
     local_names : LocalNames, optional
         Translates the answers. Questions, errors and log lines have the names of the bus.
     """
@@ -433,18 +430,15 @@ class Lookups:
     def __init__(
         self,
         live: LiveTree,
-        clock: Clock,
-        check_thread: Callable[[], object],
-        newest_plausible: Callable[[], int],
+        bus: Bus,
         local_names: LocalNames | None = None,
     ) -> None:
-        self._live = live
-        self._clock = clock
-        self._check_thread = check_thread
-        self._newest_plausible = newest_plausible
+        self.live = live
+        self.bus = bus
+        self._clock = bus.clock
         self._local_names = local_names
-        self._report = HangingReport(live.waiting, clock)
-        self._alarms = alarms_of(clock)
+        self._report = HangingReport(live.waiting, bus.clock)
+        self._alarms = alarms_of(bus.clock)
 
     def bounds(self, max_age: float, at: int | Latest, source_at: int | Latest | None) -> Bounds | None:
         """The stamps that count as `LATEST` now; None for any."""
@@ -458,21 +452,21 @@ class Lookups:
     def note_ahead(self, error: ExtrapolationError) -> None:
         """Write into an error by how much the newest stamp of its edge is ahead of the clock."""
         # The clock alone nearly always tells that it is not; how far ahead a stamp may be is asked only then.
-        if error.newest is not None and self._clock.now() < error.newest > self._newest_plausible():
+        if error.newest is not None and self._clock.now() < error.newest > self.bus._newest_plausible():
             error.ahead = error.newest - self._clock.now()
 
     def lookup_nowait(self, question: Question) -> TransformStamped:
         """The answer, or an error at once."""
         bounds = None
         if question.is_plain:
-            plain = self._live.forest.paths.answer(question.target, question.source, question.at)
+            plain = self.live.forest.paths.answer(question.target, question.source, question.at)
             if plain is not None:
                 return plain if self._local_names is None else self._local_names.answer(plain)
         if question.max_age is not None:
             bounds = self.bounds(question.max_age, question.at, question.source_at)
         try:
             found = answer(
-                self._live.forest,
+                self.live.forest,
                 question.target,
                 question.source,
                 question.at,
@@ -494,7 +488,7 @@ class Lookups:
         `others` are questions whose answers are needed as well: an error of one that waiting cannot help is raised.
         """
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
-        last_reset = self._live.last_reset
+        last_reset = self.live.last_reset
         await anyio.lowlevel.checkpoint()
         try:
             return self._lookup_since(last_reset, question)
@@ -502,7 +496,7 @@ class Lookups:
             if isinstance(error, UnknownFrameError):
                 self._check_names(question)
             blocker = without_traceback(error)
-        self._check_thread()
+        self.bus._check_thread()
         wait = _Wait(question, self._clock.now(), last_reset, blocker, others)
         alarms = self._alarms
         if alarms is None:
@@ -512,7 +506,7 @@ class Lookups:
             raise _timed_out(wait, limit) from wait.blocker
         # Here and not in a coroutine of its own, because each would be resumed one by one.
         self._set_alarms(wait, limit, alarms)
-        waiting, paths = self._live.waiting, self._live.forest.paths
+        waiting, paths = self.live.waiting, self.live.forest.paths
         try:
             while True:
                 waiter = self._park(wait)
@@ -555,7 +549,7 @@ class Lookups:
 
     def _park(self, wait: "_Wait") -> Waiter:
         """Park a lookup under what it lacks, with a new wake-up."""
-        live = self._live
+        live = self.live
         if live.end_reason is not None:
             raise BusClosedError(live.end_reason) from wait.blocker
         wait.woken, wait.wake = wake_up()
@@ -596,7 +590,7 @@ class Lookups:
                         try:
                             await wait.woken
                         finally:
-                            self._live.waiting.remove(waiter)
+                            self.live.waiting.remove(waiter)
                         found = self._ask_again(wait)
                 if found is None:
                     pause = min(self.report(wait.question, wait.since, wait.blocker), REPORT_AFTER)
@@ -605,7 +599,7 @@ class Lookups:
 
     def _lookup_since(self, last_reset: ClockResetError | None, question: Question) -> TransformStamped:
         """The answer, or `ClockResetError` if the clock has jumped back after `last_reset`."""
-        latest = self._live.last_reset
+        latest = self.live.last_reset
         if latest is not None and latest is not last_reset:
             raise ClockResetError(before=latest.before, after=latest.after)
         return self.lookup_nowait(question)
@@ -614,7 +608,7 @@ class Lookups:
         """Raise `UnknownFrameError` for a name that can never be that of a frame."""
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
-                raise UnknownFrameError(frame=name, known=self._live.forest.known_frames()) from None
+                raise UnknownFrameError(frame=name, known=self.live.forest.known_frames()) from None
 
 
 def _timed_out(wait: _Wait, limit: float) -> LookupTimeoutError:

@@ -1,20 +1,18 @@
 """Watches: the newest value of a transform, each time that it has changed."""
 
 import math
-from collections.abc import Callable
 from types import TracebackType
 
 import anyio.lowlevel
 
 from tfbus._aio.task_groups import OneReader
 from tfbus.buffer.lookups import REPORT_AFTER, Lookups
-from tfbus.clock import Clock
 from tfbus.errors import MAY_COME, AheadError, ClockResetError, TransformLookupError, UnknownFrameError
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.stamps import SECOND, STAMP_MAX, is_real, to_seconds
 from tfbus.tree.lookup import Question
-from tfbus.waiting.live_tree import LiveTree, Waiter, without_traceback
+from tfbus.waiting.live_tree import Waiter, without_traceback
 from tfbus.waiting.watch_index import WatchState
 
 _NO_ANSWER = (*MAY_COME, AheadError)
@@ -39,11 +37,9 @@ class Watch:
         min_translation: float,
         min_rotation: float,
         max_rate: float | None,
-        live: LiveTree,
         lookups: Lookups,
-        clock: Clock,
-        check_thread: Callable[[], object],
     ) -> None:
+        live = lookups.live
         for name in (question.target, question.source):
             if not is_frame(name):
                 raise UnknownFrameError(frame=name, known=live.forest.known_frames())
@@ -56,8 +52,8 @@ class Watch:
         self._period = _period(max_rate)
         self._live = live
         self._lookups = lookups
-        self._clock = clock
-        self._check_thread = check_thread
+        self._clock = lookups.bus.clock
+        self._check_thread = lookups.bus._check_thread
         self._reader = OneReader()
         self._last: TransformStamped | None = None
         self._last_given_at: int | None = None

@@ -1,8 +1,8 @@
 """The bus: what is published reaches every buffer, stream and subscriber of the process."""
 
 from tfbus.bus.broadcaster import TransformBroadcaster
-from tfbus.bus.bus import Bus
+from tfbus.bus.bus import Bus, ThreadPublisher
 from tfbus.bus.event_stream import EventStream
-from tfbus.bus.queues import Stream, ThreadPublisher
+from tfbus.bus.queues import Stream
 
 __all__ = ["Bus", "EventStream", "Stream", "ThreadPublisher", "TransformBroadcaster"]

@@ -7,6 +7,7 @@ nothing can be lost between "sent" and "buffered".
 
 import asyncio
 import logging
+import threading
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from threading import get_ident
@@ -15,10 +16,11 @@ from typing import Any
 
 import anyio
 
+from tfbus._aio.loops import LoopWaker
 from tfbus.bus.event_stream import EventStream
 from tfbus.bus.late_buffer import LateBuffer
 from tfbus.bus.ownership import OnConflict, Ownership
-from tfbus.bus.queues import Overflow, Stream, ThreadPublisher
+from tfbus.bus.queues import Overflow, SampleQueue, Stream
 from tfbus.bus.subscribers import Announcer, BatchCallback, FrameCallback, OnceLogger, Subscribers
 from tfbus.bus.topology import Invalid, Plausibility, Topology, as_invalid
 from tfbus.clock import Clock, SystemClock
@@ -332,7 +334,7 @@ class Bus:
         self._check_usable()
         return self._topology.reserve(frame, authority)
 
-    def threadsafe(self, capacity: int = 10_000) -> ThreadPublisher:
+    def threadsafe(self, capacity: int = 10_000) -> "ThreadPublisher":
         """A function to publish from other threads: ``with bus.threadsafe() as publish``, entered on the event loop.
 
         ``publish(samples)`` may then be called from any thread. The bus publishes the queued batches with
@@ -344,15 +346,13 @@ class Bus:
         BusClosedError
         """
         self._check_usable()
-        return ThreadPublisher(
-            capacity, self._attach_publisher, self._check_from_thread, self._publish_from_thread, self._threads.remove
-        )
+        return ThreadPublisher(self, capacity)
 
     def _attach(self, buffer: LiveTree) -> None:
         """Give a buffer the latched samples, and from now on all that are published. Called by `Buffer`."""
         self._check_usable()
         latched = tuple(self._topology.latched.values())
-        late = LateBuffer(buffer, self._topology.moving(), self._topology.newest)
+        late = LateBuffer(buffer, self._topology)
         buffer.is_ahead = self._topology.is_ahead
         self._buffers[buffer] = self._samples() - len(latched)
         if latched:
@@ -469,10 +469,6 @@ class Bus:
         if self._closed:
             raise BusClosedError
 
-    def _attach_publisher(self, publisher: ThreadPublisher) -> None:
-        self._check_usable()
-        self._threads.append(publisher)
-
     def _detach_stream(self, stream: Stream) -> None:
         if stream in self._streams:
             self._streams.remove(stream)
@@ -510,9 +506,6 @@ class Bus:
         """A ``with`` for samples whose stamps are of another clock. Called by players."""
         return self._topology.recorded_time()
 
-    def _check_from_thread(self, batch: Batch) -> None:
-        check_translations(batch, self._plausibility.max_translation)
-
     def _well_typed(self, samples: object) -> Batch:
         """The samples in a batch; anything else in it is counted as rejected."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
@@ -522,10 +515,6 @@ class Bus:
                 if not isinstance(thing, TransformStamped):
                     self._topology.reject("not a sample", TypeError(f"expected a TransformStamped, not {thing!r}"))
         return batch
-
-    def _publish_from_thread(self, batch: Batch) -> None:
-        if not self._closed:
-            self.publish(batch, invalid="drop")
 
     def _clock_jumped(self, before: int, after: int) -> None:
         self._topology.clock_jumped()
@@ -552,3 +541,100 @@ class Bus:
 def _take_nothing(_samples: object, _invalid: object) -> bool:
     """Without the compiled kernel every batch goes the ordinary way."""
     return False
+
+
+class ThreadPublisher:
+    """The result of `Bus.threadsafe`: inside its ``with``, a function that any thread may call.
+
+    Samples are queued here and published on the event loop, with one wake-up of the loop for all that has gathered.
+
+    Parameters
+    ----------
+    bus : Bus
+    capacity : int
+        How many moving samples may be pending; beyond that the oldest batches are dropped and counted.
+    """
+
+    def __init__(self, bus: Bus, capacity: int) -> None:
+        self.queue = SampleQueue(capacity, "drop_oldest")
+        self._bus = bus
+        self._lock = threading.Lock()
+        self._waker = LoopWaker(self._drain)
+        self._ended = False
+
+    def __enter__(self) -> "ThreadPublisher":
+        self._waker.bind()
+        try:
+            self._bus._check_usable()
+            self._bus._threads.append(self)
+        except BaseException:
+            self.end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.end()
+        self._drain()
+        self._bus._threads.remove(self)
+
+    def __call__(self, samples: TransformStamped | Iterable[TransformStamped]) -> None:
+        """Hand over one sample or a batch; the order within a thread is kept.
+
+        Raises
+        ------
+        TypeError
+            If something in it is not a `TransformStamped`.
+        InvalidTransformError
+            If a translation is not finite, or longer than the `max_translation` of the bus.
+        BusClosedError
+            If the ``with`` has ended, or the bus or the event loop is closed.
+        RuntimeError
+            If the ``with`` has not begun.
+
+        Notes
+        -----
+        A sample that only the bus can judge, such as one that closes a loop of parents or is ahead of the clock, is
+        dropped and counted there.
+        """
+        batch = as_batch(samples)
+        check_translations(batch, self._bus.max_translation)
+        if not self._waker.bound:
+            raise RuntimeError("enter the `with` of bus.threadsafe() on the event loop first")
+        with self._lock:
+            if self._ended:
+                raise BusClosedError("the bus takes no more samples from this thread: its `with` has ended")
+            self.queue.put(batch)
+        try:
+            self._waker.wake()
+        except RuntimeError as error:
+            self.end()
+            raise BusClosedError("the event loop of the bus has ended") from error
+
+    def end(self) -> None:
+        """Take no more samples."""
+        with self._lock:
+            self._ended = True
+
+    def discard(self) -> None:
+        """Drop the moving samples that were queued before the clock jumped back."""
+        with self._lock:
+            self.queue.discard_moving()
+
+    def forget(self, child: str) -> None:
+        """Drop the queued samples of a removed frame."""
+        with self._lock:
+            self.queue.forget(child)
+
+    def _drain(self) -> None:
+        with self._lock:
+            pending = len(self.queue)
+        # One by one: a batch may make the clock jump, and that discards the rest.
+        for _ in range(pending):
+            with self._lock:
+                batch = self.queue.get()
+            if batch is None:
+                return
+            if not self._bus.closed:
+                self._bus.publish(batch, invalid="drop")

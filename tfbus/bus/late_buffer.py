@@ -16,10 +16,8 @@ seen a sample as new as that edge. A prefill may hold a frame with another newes
 closes a loop with edges of the bus: `LateBuffer` removes that frame.
 """
 
-from collections.abc import Callable, Mapping
-
+from tfbus.bus.topology import Topology
 from tfbus.geometry.stamped import Batch, TransformStamped
-from tfbus.tree.cycles import NewestEdge
 from tfbus.waiting.live_tree import LiveTree
 
 
@@ -30,18 +28,14 @@ class LateBuffer:
     ----------
     live : LiveTree
         The buffer, empty or prefilled. What contradicts the bus is removed from it.
-    moving : mapping of str to NewestEdge
-        The newest edge of each moving child on the bus.
-    newest_edge : callable
-        Gives the newest edge of a child on the bus, or None if it has none.
+    topology : Topology
+        The newest edges of the bus.
     """
 
-    def __init__(
-        self, live: LiveTree, moving: Mapping[str, NewestEdge], newest_edge: Callable[[str], NewestEdge | None]
-    ) -> None:
+    def __init__(self, live: LiveTree, topology: Topology) -> None:
         self._live = live
         self._frames = live.forest.frames
-        self._newest_edge = newest_edge
+        self._newest_edge = newest_edge = topology.newest
         # Frames whose newest sample on the bus the buffer has not seen, with its parent and its stamp in ns.
         self._unseen: dict[str, tuple[str, int]] = {}
         # Frames of the prefill that the bus does not know, or knows only up to an older stamp.
@@ -55,7 +49,7 @@ class LateBuffer:
                 live.remove_frame(child)
             elif edge.newest is not None and history.newest is not None and history.newest > edge.newest:
                 self._foreign.add(child)
-        for child, edge in moving.items():
+        for child, edge in topology.moving().items():
             held = None if child not in self._frames else self._frames[child].newest
             if edge.newest is not None and (held is None or held < edge.newest):
                 self._unseen[child] = edge.parent, edge.newest
