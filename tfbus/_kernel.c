@@ -2069,6 +2069,7 @@ typedef struct Method {
     PyObject_HEAD
     PyObject *function; /* the method in Python */
     PyObject *many;     /* the class of the answers at many stamps; NULL if it asks for one */
+    PyObject *defaults; /* the defaults of its keywords, a dict or None */
     PyObject *(*vectorcall)(struct Method *, PyObject *const *, size_t, PyObject *);
 } Method;
 
@@ -2077,7 +2078,7 @@ typedef struct Method {
 
 static PyObject *method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names);
 
-REFERENCES(method, 2)
+REFERENCES(method, 3)
 
 static PyObject *
 method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
@@ -2090,10 +2091,17 @@ method_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
         PyErr_SetString(PyExc_TypeError, "the answers at many stamps need a class, or None");
         return NULL;
     }
+    PyObject *defaults = PyObject_GetAttrString(function, "__kwdefaults__");
+    if (defaults == NULL) {
+        return NULL;
+    }
     Method *self = (Method *)PyType_GenericAlloc(type, 0);
-    if (self != NULL) {
+    if (self == NULL) {
+        Py_DECREF(defaults);
+    } else {
         Py_INCREF(function);
         self->function = function;
+        self->defaults = defaults;
         self->vectorcall = method_vectorcall;
         Py_XINCREF(many == Py_None ? NULL : many);
         self->many = many == Py_None ? NULL : many;
@@ -2150,15 +2158,29 @@ method_run(const Method *self, PyObject *const *args, Py_ssize_t count, PyObject
     return result;
 }
 
-/* By PEP 590. Plain are only the object, target, source, and the stamp or stamps. */
+/* Whether the named arguments from the index `first` on are the defaults of the method. */
+static int
+method_has_defaults(const Method *self, PyObject *const *named, PyObject *names, Py_ssize_t first)
+{
+    const Py_ssize_t size = names == NULL ? 0 : PyTuple_Size(names);
+    for (Py_ssize_t i = first; i < size; i++) {
+        if (self->defaults == NULL || !PyDict_CheckExact(self->defaults)
+            || PyDict_GetItem(self->defaults, PyTuple_GetItem(names, i)) != named[i]) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+/* By PEP 590. Plain are only the object, target, source, and the stamp or stamps; other arguments are defaults. */
 static PyObject *
 method_vectorcall(Method *self, PyObject *const *args, size_t flagged, PyObject *names)
 {
     const Py_ssize_t count = (Py_ssize_t)(flagged & ~((size_t)1 << (8 * sizeof(size_t) - 1)));
-    const Py_ssize_t named = names == NULL ? 0 : PyTuple_Size(names);
-    const int at_is_named = count == 3 && named == 1 && PyTuple_GetItem(names, 0) == at_string;
-    if ((count == 4 && named == 0) || (self->many == NULL && count == 3 && (named == 0 || at_is_named))) {
-        PyObject *found = method_answer(self, args[0], args[1], args[2], count + named == 4 ? args[3] : NULL);
+    const int at_is_named = count == 3 && names != NULL && PyTuple_Size(names) > 0 && PyTuple_GetItem(names, 0) == at_string;
+    if ((count == 4 || (self->many == NULL && count == 3))
+        && method_has_defaults(self, args + count, names, at_is_named)) {
+        PyObject *found = method_answer(self, args[0], args[1], args[2], count == 4 || at_is_named ? args[3] : NULL);
         if (found != Py_None) {
             return found;
         }

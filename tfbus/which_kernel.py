@@ -118,11 +118,11 @@ def plain_first(method: MethodT, many: type | None = None) -> MethodT:
         return method
 
     @functools.wraps(method)
-    def first(self: Any, *args: Any, **options: Any) -> Any:
-        if 2 <= len(args) <= 3 and not options and self._paths is not None:
-            found = self._paths.answer(args[0], args[1], args[2] if len(args) == 3 else LATEST)
+    def first(self: Any, target: str, source: str, at: Any = LATEST, **options: Any) -> Any:
+        if not options and self._paths is not None:
+            found = self._paths.answer(target, source, at)
             if found is not None:
                 return found
-        return method(self, *args, **options)
+        return method(self, target, source, at, **options)
 
     return cast(MethodT, first)
