@@ -52,7 +52,8 @@ ROOMS: dict[str, tuple[str, ...]] = {
 
 SANS_IO = {*GROUND, "analysis", "geometry", "data", "tf_message", "tree", "waiting"} - {"clock", "_aio"}
 EFFECTS = {"anyio", "asyncio", "sniffio", "socket", "threading", "time", "trio"}
-ALLOWED_EFFECTS = {"tree.forest": {"threading"}}
+# The judge of a bus notices by itself that its comparison with the clock has grown old.
+ALLOWED_EFFECTS = {"tree.forest": {"threading"}, "_python_kernel": {"time"}}
 
 CORE = {"anyio", "numpy", "transforms3d"}
 # The module, or the room, that each extra is for.

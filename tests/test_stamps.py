@@ -2,10 +2,11 @@ import copy
 import math
 import pickle
 from array import array
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta, timezone
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ from tfbus.stamps import (
     format_age,
     format_duration,
     format_stamp,
+    likely_cause,
+    time_between,
 )
 
 HUGE = pytest.param(10**400, id="huge")
@@ -283,6 +286,9 @@ def test_the_text_of_a_stamp_is_exact(stamp: int) -> None:
         (SECOND, "1 s"),
         (2_500_000_000, "2.5 s"),
         (3_600 * SECOND, "3600 s"),
+        (2 * 86_400 * SECOND - 1, "172800 s"),
+        (2 * 86_400 * SECOND, "2 days"),
+        (1_795_560_204 * SECOND, "56.9 years"),
         (-410_000_000, "-410 ms"),
     ],
 )
@@ -293,14 +299,59 @@ def test_the_text_of_a_duration_has_the_fitting_unit(nanoseconds: int, text: str
 @given(st.integers(-(2**64), 2**64))
 def test_the_text_of_a_duration_has_three_correct_digits(nanoseconds: int) -> None:
     number, unit = format_duration(nanoseconds).split(" ")
-    assert abs(Fraction(number) * UNITS[unit] - nanoseconds) <= abs(Fraction(nanoseconds)) * Fraction(5, 1000)
+    size = {**UNITS, "days": DAY, "years": 365 * DAY}[unit]
+    assert abs(Fraction(number) * size - nanoseconds) <= abs(Fraction(nanoseconds)) * Fraction(5, 1000)
 
 
 @pytest.mark.parametrize(
-    ("nanoseconds", "text"), [(-2_500_000_000, "2.5 s ahead"), (-1, "1 ns ahead"), (0, "age 0 ns"), (1, "age 1 ns")]
+    ("age", "text"), [(-2_500_000_000, "2.5 s ahead"), (-1, "1 ns ahead"), (0, "age 0 ns"), (1, "age 1 ns")]
 )
-def test_the_text_of_an_age_says_when_it_is_ahead(nanoseconds: int, text: str) -> None:
-    assert format_age(nanoseconds) == text
+def test_the_text_of_an_age_says_when_it_is_ahead(age: int, text: str) -> None:
+    assert format_age(100, 100 + age) == text
+
+
+WALL = 1_795_560_204 * SECOND
+SIMULATED = 3_617 * SECOND
+
+
+def test_the_text_of_an_age_of_years_names_the_likely_cause() -> None:
+    assert format_age(WALL // SECOND, WALL) == "age 56.9 years, seconds passed as nanoseconds?"
+    assert format_age(WALL, SIMULATED).startswith("56.9 years ahead, these look like two clocks (")
+
+
+@pytest.mark.parametrize(
+    ("stamp", "now", "words"),
+    [
+        (WALL // SECOND - 60, WALL, "seconds passed as nanoseconds?"),
+        (WALL // 10**6, WALL + 3_600 * SECOND, "milliseconds passed as nanoseconds?"),
+        (WALL // 1_000 + 5, WALL, "microseconds passed as nanoseconds?"),
+        (100, 104 * SECOND, "seconds passed as nanoseconds?"),
+        (100_000, 104 * SECOND, "milliseconds passed as nanoseconds?"),
+        (SIMULATED, WALL, "two clocks (simulated time and wall time?)"),
+        (WALL - 12 * 365 * DAY, WALL, "two clocks (simulated time and wall time?)"),
+        (0, WALL, "a stamp that was never set?"),
+    ],
+)
+def test_the_likely_cause_is_named_whichever_of_two_stamps_is_the_wrong_one(stamp: int, now: int, words: str) -> None:
+    assert words in likely_cause(stamp, now)
+    assert likely_cause(now, stamp) == likely_cause(stamp, now)
+
+
+@pytest.mark.parametrize(
+    ("stamp", "now"),
+    [
+        (WALL - 180 * SECOND, WALL),
+        (WALL - 30 * DAY, WALL),
+        (0, SIMULATED),
+        (SECOND // 10, 100 * SECOND),
+        (SECOND, 1_000 * SECOND),
+        (-5, 5),
+        (0, 0),
+        (5, 5),
+    ],
+)
+def test_no_cause_is_named_of_late_data_and_of_two_stamps_of_one_simulation(stamp: int, now: int) -> None:
+    assert likely_cause(stamp, now) == likely_cause(now, stamp) == ""
 
 
 def test_latest_pickles_and_copies_as_itself() -> None:
@@ -343,6 +394,28 @@ def test_any_integers_become_an_array_of_stamps(values: Any) -> None:
     assert found.tolist() == [int(value) for value in values]
 
 
+@pytest.mark.parametrize("unit", ["ns", "s", "ms"])
+def test_a_timedelta64_is_no_stamp_and_no_number_of_seconds(unit: Any) -> None:
+    converts: tuple[Callable[[Any], object], ...] = (as_stamp, from_seconds, lambda value: as_duration(value, "keep"))
+    for convert in converts:
+        with pytest.raises(TypeError):
+            convert(np.timedelta64(5, unit))
+    forms: tuple[Any, ...] = [np.timedelta64(5, unit)], np.array([5], f"m8[{unit}]")
+    for values in forms:
+        with pytest.raises(TypeError, match="a stamp is an int of nanoseconds, not"):
+            as_stamps(values)
+
+
+def test_stamps_with_a_mask_are_refused_if_one_is_masked() -> None:
+    values = np.ma.array([1, 2, 3], mask=[False, True, True])
+    with pytest.raises(ValueError, match="stamps must have no masked values, got 2"):
+        as_stamps(values)
+    with pytest.raises(ValueError, match="stamps must have no masked values, got 1"):
+        as_stamps(cast(Any, [1, np.ma.masked]))
+    assert as_stamps(values[:1]).tolist() == [1]
+    assert as_stamps(values.compressed()).tolist() == [1]
+
+
 def test_an_array_of_stamps_is_not_copied() -> None:
     values = np.arange(5)
     assert as_stamps(values) is values
@@ -379,3 +452,10 @@ def test_one_stamp_beyond_64_bits_among_many_is_a_value_error(values: Any) -> No
 def test_many_stamps_of_another_shape_are_a_value_error(values: Any) -> None:
     with pytest.raises(ValueError, match=r"shape \(n,\), got \("):
         as_stamps(values)
+
+
+@given(st.lists(st.tuples(stamps(), stamps()), min_size=1))
+def test_the_time_between_two_stamps_is_exact_as_long_as_it_fits_64_bits(pairs: list[tuple[int, int]]) -> None:
+    earlier, later = np.array(pairs, np.int64).T
+    exact = [max(-STAMP_MAX, min(end - begin, STAMP_MAX)) for begin, end in pairs]
+    assert time_between(earlier, later).tolist() == exact

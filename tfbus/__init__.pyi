@@ -44,6 +44,7 @@ from tfbus.errors import MissingRecordingError as MissingRecordingError
 from tfbus.errors import PastExtrapolationError as PastExtrapolationError
 from tfbus.errors import RecordingError as RecordingError
 from tfbus.errors import RemoteLookupError as RemoteLookupError
+from tfbus.errors import TooManyFramesError as TooManyFramesError
 from tfbus.errors import TransformError as TransformError
 from tfbus.errors import TransformLookupError as TransformLookupError
 from tfbus.errors import UnknownFrameError as UnknownFrameError
@@ -64,6 +65,7 @@ from tfbus.events import RecordingFailed as RecordingFailed
 from tfbus.events import Reparented as Reparented
 from tfbus.events import SampleRejected as SampleRejected
 from tfbus.events import StampAhead as StampAhead
+from tfbus.events import StampBehind as StampBehind
 from tfbus.events import SubscriberFailed as SubscriberFailed
 from tfbus.geometry.stamped import TransformStamped as TransformStamped
 from tfbus.geometry.transform import Transform as Transform

@@ -20,6 +20,11 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+#ifdef _WIN32
+#include <windows.h>
+#else
+#include <time.h>
+#endif
 
 #if defined(_MSC_VER)
 #pragma fp_contract(off)
@@ -39,6 +44,7 @@ static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
 static PyObject *bound_method; /* types.MethodType */
+static PyObject *array_type;   /* numpy.ndarray */
 
 static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
@@ -167,6 +173,19 @@ read_stamp(PyObject *number, int64_t *stamp)
 {
     long long value = PyLong_AsLongLong(number);
     if (value == -1 && PyErr_Occurred()) {
+        return -1;
+    }
+    *stamp = value;
+    return 0;
+}
+
+/* As `read_stamp`, for a question about stored samples, which may be beyond all stamps: the sum of a stamp and a duration.
+ * Then `*beyond` is the side, 1 or -1, else 0. */
+static int
+read_instant(PyObject *number, int64_t *stamp, int *beyond)
+{
+    const long long value = PyLong_AsLongLongAndOverflow(number, beyond);
+    if (value == -1 && *beyond == 0 && PyErr_Occurred()) {
         return -1;
     }
     *stamp = value;
@@ -719,28 +738,38 @@ history_push_many(History *self, PyObject *const *args, Py_ssize_t nargs)
     Py_RETURN_NONE;
 }
 
+/* The number of samples in the window before an instant. */
+static Py_ssize_t
+history_before(const History *self, int64_t stamp, int beyond)
+{
+    const Py_ssize_t count = self->end - self->start;
+    if (count == 0 || beyond != 0) {
+        return beyond > 0 ? count : 0;
+    }
+    return lower_bound(block_stamps(self->block) + self->start, count, stamp);
+}
+
 static PyObject *
 history_find(History *self, PyObject *number)
 {
     int64_t stamp;
-    if (read_stamp(number, &stamp) < 0) {
+    int beyond;
+    if (read_instant(number, &stamp, &beyond) < 0) {
         return NULL;
     }
-    if (self->block == NULL) {
-        return PyLong_FromLong(0);
-    }
-    return PyLong_FromSsize_t(lower_bound(block_stamps(self->block) + self->start, self->end - self->start, stamp));
+    return PyLong_FromSsize_t(history_before(self, stamp, beyond));
 }
 
 static PyObject *
 history_between(History *self, PyObject *const *args, Py_ssize_t nargs)
 {
     int64_t low, high;
+    int low_beyond, high_beyond;
     if (nargs != 2) {
         PyErr_SetString(PyExc_TypeError, "between takes two stamps");
         return NULL;
     }
-    if (read_stamp(args[0], &low) < 0 || read_stamp(args[1], &high) < 0) {
+    if (read_instant(args[0], &low, &low_beyond) < 0 || read_instant(args[1], &high, &high_beyond) < 0) {
         return NULL;
     }
     const Py_ssize_t count = self->end - self->start;
@@ -748,8 +777,9 @@ history_between(History *self, PyObject *const *args, Py_ssize_t nargs)
         return Py_BuildValue("nn", (Py_ssize_t)0, (Py_ssize_t)0);
     }
     const int64_t *stamps = block_stamps(self->block) + self->start;
-    const Py_ssize_t from_low = lower_bound(stamps, count, low), from_high = lower_bound(stamps, count, high);
-    const int hits = from_low < count && stamps[from_low] == low;
+    const Py_ssize_t from_low = history_before(self, low, low_beyond);
+    const Py_ssize_t from_high = history_before(self, high, high_beyond);
+    const int hits = low_beyond == 0 && from_low < count && stamps[from_low] == low;
     return Py_BuildValue("nn", from_low > 0 && !hits ? from_low - 1 : from_low, from_high < count ? from_high + 1 : count);
 }
 
@@ -1896,7 +1926,9 @@ room_for_rows(PyObject *stamps)
     if (is_list || is_tuple) {
         count = is_list ? PyList_Size(stamps) : PyTuple_Size(stamps);
     } else {
-        if (!PyObject_CheckBuffer(stamps)) {
+        /* Whatever has a mask is for Python to judge. */
+        if (OBJECT(Py_TYPE(stamps)) != array_type
+            && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask"))) {
             return NULL;
         }
         if (PyObject_GetBuffer(stamps, &view, PyBUF_STRIDES | PyBUF_FORMAT) < 0) {
@@ -2253,6 +2285,7 @@ typedef struct {
     PyObject *trusted; /* plain str, or NULL for nobody */
     int64_t newest;
     char has_newest;
+    char late; /* whether old stamps of it were told */
 } Edge;
 
 static PyObject *
@@ -2313,10 +2346,16 @@ static PyGetSetDef edge_getset[] = {
     {NULL}
 };
 
+static PyMemberDef edge_members[] = {
+    {"late", T_BOOL, offsetof(Edge, late), 0, PyDoc_STR("Whether its old stamps were told, so that they are plain.")},
+    {NULL}
+};
+
 static PyType_Slot edge_slots[] = {
     {Py_tp_doc, (void *)PyDoc_STR("The part of a frame's newest edge by which its samples are judged.")},
     {Py_tp_new, PyType_GenericNew},
     {Py_tp_dealloc, edge_dealloc},
+    {Py_tp_members, edge_members},
     {Py_tp_getset, edge_getset},
     {0, NULL}
 };
@@ -2331,10 +2370,30 @@ typedef struct {
     PyObject_HEAD
     PyObject *edges;   /* {child: Edge} */
     double square;     /* m^2 */
-    long long horizon; /* ns */
+    long long earliest, horizon; /* ns */
+    long long until;   /* ns of `elapsed`; the two are out of date then */
+    long long behind;  /* how many stamps were older than the first */
 } Judge;
 
 REFERENCES(judge, 1)
+
+/* A monotonic time in ns, to some milliseconds. The exact one takes a tenth of the time of a publish. */
+static int64_t
+elapsed(void)
+{
+#ifdef _WIN32
+    return (int64_t)GetTickCount64() * 1000000;
+#else
+#ifdef CLOCK_MONOTONIC_COARSE
+    const clockid_t clock = CLOCK_MONOTONIC_COARSE;
+#else
+    const clockid_t clock = CLOCK_MONOTONIC;
+#endif
+    struct timespec now = {0, 0};
+    clock_gettime(clock, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+#endif
+}
 
 static int
 judge_init(Judge *self, PyObject *args, PyObject *kwargs)
@@ -2348,18 +2407,38 @@ judge_init(Judge *self, PyObject *args, PyObject *kwargs)
     judge_clear(OBJECT(self));
     self->edges = edges;
     self->square = square;
-    self->horizon = INT64_MIN;
+    self->earliest = self->horizon = INT64_MIN;
+    self->until = INT64_MAX;
+    self->behind = 0;
     return 0;
 }
 
-/* accepts(batch): whether all samples continue known edges, none is newer than the horizon and no translation longer
- * than the root of `square`; then their stamps are noted, else nothing. */
+/* allow(earliest, horizon, lasting): set both for so many ns of the machine's time; then no batch is plain. */
+static PyObject *
+judge_allow(Judge *self, PyObject *args)
+{
+    long long earliest, horizon, lasting;
+    if (!PyArg_ParseTuple(args, "LLL:allow", &earliest, &horizon, &lasting)) {
+        return NULL;
+    }
+    self->earliest = earliest;
+    self->horizon = horizon;
+    const int64_t now = elapsed();
+    self->until = lasting < INT64_MAX - now ? now + lasting : INT64_MAX;
+    Py_RETURN_NONE;
+}
+
+/* accepts(batch): whether all samples continue known edges, none is newer than `horizon`, older than `earliest` unless
+ * its edge is late, and no translation longer than the root of `square`; then their stamps are noted, else nothing. */
 static PyObject *
 judge_accepts(Judge *self, PyObject *batch)
 {
     if (!PyTuple_CheckExact(batch)) {
         PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
         return NULL;
+    }
+    if (self->until != INT64_MAX && elapsed() >= self->until) {
+        Py_RETURN_FALSE;
     }
     const Py_ssize_t size = PyTuple_Size(batch);
     Edge *few[FEW], **edges = few;
@@ -2385,7 +2464,8 @@ judge_accepts(Judge *self, PyObject *batch)
         }
         edges[judged] = (Edge *)known;
         if (!same_string(sample->parent, edges[judged]->parent)
-            || !same_string(sample->authority, edges[judged]->trusted)) {
+            || !same_string(sample->authority, edges[judged]->trusted)
+            || (sample->stamp < self->earliest && !edges[judged]->late)) {
             break;
         }
     }
@@ -2396,6 +2476,7 @@ judge_accepts(Judge *self, PyObject *batch)
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
         }
+        self->behind += stamp < self->earliest;
     }
     if (edges != few) {
         PyMem_Free(edges);
@@ -2409,10 +2490,14 @@ judge_accepts(Judge *self, PyObject *batch)
 static PyMethodDef judge_methods[] = {
     {"accepts", (PyCFunction)judge_accepts, METH_O,
      PyDoc_STR("accepts(batch): whether the whole batch is plain; then its stamps are noted.")},
+    {"allow", (PyCFunction)judge_allow, METH_VARARGS,
+     PyDoc_STR("allow(earliest, horizon, lasting): set both for so many ns of the machine's time.")},
     {NULL}
 };
 
 static PyMemberDef judge_members[] = {
+    {"behind", T_LONGLONG, offsetof(Judge, behind), 0, PyDoc_STR("How many stamps were older than the first bound.")},
+    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("No stamp but of late edges may be older, in ns.")},
     {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("No stamp may be newer, in ns.")},
     {NULL}
 };
@@ -3035,6 +3120,15 @@ add_type(PyObject *module, const char *name, PyType_Spec *spec, PyTypeObject **t
     return PyModule_AddObjectRef(module, name, (PyObject *)*type);
 }
 
+static PyObject *
+imported(const char *module, const char *name)
+{
+    PyObject *found = PyImport_ImportModule(module);
+    PyObject *value = found == NULL ? NULL : PyObject_GetAttrString(found, name);
+    Py_XDECREF(found);
+    return value;
+}
+
 static int
 module_exec(PyObject *module)
 {
@@ -3053,13 +3147,9 @@ module_exec(PyObject *module)
             return -1;
         }
     }
-    if (bound_method == NULL) {
-        PyObject *types = PyImport_ImportModule("types");
-        bound_method = types == NULL ? NULL : PyObject_GetAttrString(types, "MethodType");
-        Py_XDECREF(types);
-        if (bound_method == NULL) {
-            return -1;
-        }
+    if ((bound_method == NULL && (bound_method = imported("types", "MethodType")) == NULL)
+        || (array_type == NULL && (array_type = imported("numpy", "ndarray")) == NULL)) {
+        return -1;
     }
     if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
         || add_type(module, "Block", &block_spec, &BlockType) < 0

@@ -9,10 +9,11 @@ are cut off later, many at once, because each cut moves all remaining samples.
 """
 
 import struct
+import time
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from math import acos, sin, sqrt
 from typing import Any
 
@@ -75,12 +76,15 @@ class Edge:
         The authority whose moving samples under this parent need no judgement; None if there is none.
     newest : int or None
         The newest stamp, in ns.
+    late : bool
+        Whether it was told that its stamps are behind the clock, so that they need no judgement.
     """
 
-    __slots__ = ("newest", "parent", "trusted")
+    __slots__ = ("late", "newest", "parent", "trusted")
     parent: str
     trusted: str | None
     newest: int | None
+    late: bool
 
 
 class Judge:
@@ -95,20 +99,31 @@ class Judge:
 
     Attributes
     ----------
-    horizon : int
-        No stamp may be newer, in ns. At first the least stamp.
+    earliest, horizon : int
+        No stamp may be older, but of late edges, or newer, in ns. At first both are the least stamp.
+    behind : int
+        Number of stamps that were older.
     """
 
-    __slots__ = ("_edges", "_square", "horizon")
+    __slots__ = ("_edges", "_square", "_until", "behind", "earliest", "horizon")
 
     def __init__(self, edges: Mapping[str, Edge], square: float) -> None:
         self._edges = edges
         self._square = square
-        self.horizon = STAMP_MIN
+        self.earliest = self.horizon = STAMP_MIN
+        self._until = STAMP_MAX
+        self.behind = 0
+
+    def allow(self, earliest: int, horizon: int, lasting: int, /) -> None:
+        """Set `earliest` and `horizon` for so many ns of the machine's time; then no batch is plain."""
+        self.earliest, self.horizon = earliest, horizon
+        self._until = min(time.monotonic_ns() + lasting, STAMP_MAX)
 
     def accepts(self, batch: Sequence[Sample]) -> bool:
         """Whether a whole batch continues known edges; then the newest stamps are noted, else nothing."""
-        edges, square, horizon = self._edges, self._square, self.horizon
+        if self._until != STAMP_MAX and time.monotonic_ns() >= self._until:
+            return False
+        edges, square, earliest, horizon = self._edges, self._square, self.earliest, self.horizon
         for sample in batch:
             parent, child, stamp, row, authority, static = sample._fields
             if child not in edges:
@@ -116,18 +131,22 @@ class Judge:
             known = edges[child]
             if known.parent != parent or known.trusted != authority or static or stamp > horizon:
                 return False
+            if stamp < earliest and not known.late:
+                return False
             # Three picks take less than an unpacking of all seven. Not `>`, which is false for NaN.
             x, y, z = row[0], row[1], row[2]
             if not x * x + y * y + z * z <= square:
                 return False
         if len(batch) == 1:
             # Nearly always so, and a second look costs a quarter of the first.
+            self.behind += stamp < earliest
             if known.newest is None or stamp > known.newest:
                 known.newest = stamp
             return True
         for sample in batch:
             fields = sample._fields
             known = edges[fields[1]]
+            self.behind += fields[2] < earliest
             if known.newest is None or fields[2] > known.newest:
                 known.newest = fields[2]
         return True
@@ -270,9 +289,8 @@ class History:
     def keep(self, keep: int | None) -> None:
         self._cut()
         self._keep = _FOREVER if keep is None else keep
-        if self.stamps:
-            self.horizon = self.stamps[-1] - self._keep
-            self._cut()
+        self._settle()
+        self._cut()
 
     @property
     def count(self) -> int:
@@ -304,22 +322,20 @@ class History:
         # Spelt out, because `*row` would build a list of the arguments first.
         x, y, z, qx, qy, qz, qw = row
         record = _pack(stamp, x, y, z, qx, qy, qz, qw)
-        # No call before the last of the three, so that Ctrl-C cannot come between them.
         self.records += record
+        try:
+            stamps.append(stamp)
+        except BaseException:
+            self._settle()
+            raise
         self.horizon = horizon
-        stamps.append(stamp)
         if stamp > self._cut_after:
             self._cut()
         return True
 
     def push(self, stamp: int, row: Row) -> None:
         """Store a sample that is newer than all others."""
-        record = _pack(stamp, *row)
-        self.records += record
-        self.stamps.append(stamp)
-        self.horizon = stamp - self._keep
-        if stamp > self._cut_after:
-            self._cut()
+        self._add(_pack(stamp, *row), array("q", (stamp,)).tobytes())
 
     def push_many(self, stamps: Stamps, rows: npt.NDArray[np.float64]) -> None:
         """Store samples that are newer than all others, from contiguous arrays of shape (n,) and (n, 7).
@@ -338,11 +354,7 @@ class History:
         records = np.empty((len(stamps), 8))
         records[:, 0] = stamps.view(np.float64)
         records[:, 1:] = rows
-        self.records += records.data.cast("B")
-        self.stamps.frombytes(stamps.tobytes())
-        self.horizon = self.stamps[-1] - self._keep
-        if self.stamps[-1] > self._cut_after:
-            self._cut()
+        self._add(records.data.cast("B"), stamps.tobytes())
 
     def put(self, index: int, stamp: int, row: Row) -> None:
         """Store a sample before the one at an index, or in its place if it has the same stamp."""
@@ -351,7 +363,12 @@ class History:
         replaces = self.stamps[at] == stamp
         self.records[at * _SIZE : (at + replaces) * _SIZE] = record
         if not replaces:
-            self.stamps.insert(at, stamp)
+            try:
+                self.stamps.insert(at, stamp)
+            except BaseException:
+                if len(self.records) > len(self.stamps) * _SIZE:
+                    del self.records[at * _SIZE : (at + 1) * _SIZE]
+                raise
 
     def find(self, stamp: int) -> int:
         """The index of the first sample that is not before a stamp; `count` if there is none."""
@@ -363,8 +380,7 @@ class History:
 
         Where there is no such sample, the first sample and the end of all.
         """
-        stamps = self.stamps
-        start = self._start
+        stamps, start = self.stamps, self._start
         first = bisect_right(stamps, low, start) - 1
         end = bisect_left(stamps, high, start) + 1
         return max(first - start, 0), min(end, len(stamps)) - start
@@ -384,10 +400,8 @@ class History:
         IndexError
             If there is no sample with this index.
         """
-        at = self._start + index
-        if index < 0 or at >= len(self.stamps):
-            raise IndexError("no sample has this index")
-        stamp, x, y, z, qx, qy, qz, qw = _unpack(self.records, at * _SIZE)
+        stamp = self.stamp(index)
+        _, x, y, z, qx, qy, qz, qw = _unpack(self.records, (self._start + index) * _SIZE)
         return stamp, (x, y, z, qx, qy, qz, qw)
 
     def row(self, at: int) -> Row | None:
@@ -396,17 +410,15 @@ class History:
 
     def clear(self) -> None:
         """Forget all samples."""
-        del self.stamps[:]
-        del self.records[:]
+        self.stamps, self.records = array("q"), bytearray()
         self.horizon = STAMP_MIN
         self._cut_after = STAMP_MIN
 
     def take(self, other: "History") -> None:
         """Hold a copy of the samples in the window of another history."""
         start = other._start
-        self.stamps = other.stamps[start:]
-        self.records = other.records[start * _SIZE :]
-        self.horizon = self.stamps[-1] - self._keep if self.stamps else STAMP_MIN
+        self.stamps, self.records = other.stamps[start:], other.records[start * _SIZE :]
+        self._settle()
         self._cut_after = other._cut_after
 
     def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
@@ -426,11 +438,27 @@ class History:
         rows = np.frombuffer(self.records, np.uint8).reshape(-1, _SIZE)[places]
         return own, 0, rows, 0, 8, len(places)
 
+    def _add(self, records: bytes | memoryview, stamps: bytes) -> None:
+        """Store samples that are newer than all others, from the memory of both."""
+        self.records += records
+        try:
+            self.stamps.frombytes(stamps)
+        finally:
+            self._settle()
+        if self.stamps[-1] > self._cut_after:
+            self._cut()
+
+    def _settle(self) -> None:
+        """Have no more records than stamps, even if no memory or Ctrl-C came between, and the horizon of the newest."""
+        del self.records[len(self.stamps) * _SIZE :]
+        self.horizon = self.stamps[-1] - self._keep if self.stamps else STAMP_MIN
+
     def _cut(self) -> None:
         """Cut off the samples that have left the window, and not again before 1/16 of it has passed."""
         start = self._start
-        del self.stamps[:start]
-        del self.records[: start * _SIZE]
+        # Without memory the samples count as before, and the next one tries again.
+        with suppress(MemoryError):
+            self.stamps, self.records = self.stamps[start:], self.records[start * _SIZE :]
         if self.stamps:
             self._cut_after = self.stamps[0] + self._keep + self._keep // 16
 

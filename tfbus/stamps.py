@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 from numbers import Real
-from typing import Any, Final, SupportsIndex, TypeAlias, overload
+from typing import Any, Final, SupportsIndex, TypeAlias, cast, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -32,8 +32,9 @@ Stamps = npt.NDArray[np.int64]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _DAY = 86_400 * SECOND
+_YEAR = 365 * _DAY
 _UNITS = {
-    "Y": 365 * _DAY,
+    "Y": _YEAR,
     "M": 28 * _DAY,
     "W": 7 * _DAY,
     "D": _DAY,
@@ -165,7 +166,7 @@ def as_stamps(values: StampsLike) -> Stamps:
     TypeError
         If a value has another type. The usual mistake is a float of seconds: convert it with `from_seconds`.
     ValueError
-        If the shape is not (n,), or a value is one that `as_stamp` refuses.
+        If the shape is not (n,), a value is masked, or one that `as_stamp` refuses.
     """
     if isinstance(values, (list, tuple)):
         if set(map(type, values)) == {int}:
@@ -174,16 +175,53 @@ def as_stamps(values: StampsLike) -> Stamps:
             except OverflowError:
                 pass
         # numpy would convert a bool beside an int to an int, and all integers beside a float to floats.
-        array = np.asarray(values, object)
+        array = as_array(values, "stamps", object)
     else:
-        array = np.asarray(values)
+        array = as_array(values, "stamps")
     if array.ndim != 1:
         raise ValueError(f"stamps must have shape (n,), got {array.shape}")
     if array.dtype.kind == "M":
         return _from_dates(array)
+    if array.dtype.kind == "m":
+        raise TypeError(
+            "a stamp is an int of nanoseconds, not a timedelta64: add it to the instant that it counts from"
+        )
     if array.dtype.kind not in "iu" or array.dtype == np.uint64:
         return np.array([as_stamp(value) for value in array.tolist()], np.int64)
     return array.astype(np.int64, copy=False)
+
+
+def as_array(values: object, name: str, dtype: npt.DTypeLike | None = None) -> npt.NDArray[Any]:
+    """The array that `numpy.asarray` makes of values, which loses no mask.
+
+    Raises
+    ------
+    ValueError
+        If a value is masked. The message has `name`.
+    """
+    if type(values) is not np.ndarray:
+        parts = values if isinstance(values, (list, tuple)) else (values,)
+        masks = (np.ma.getmaskarray(part) for part in parts if isinstance(part, np.ma.MaskedArray))
+        masked = sum(int(mask.sum()) for mask in masks)
+        if masked:
+            raise ValueError(
+                f"{name} must have no masked values, got {masked}: leave these out, or use .filled(numpy.nan) where a "
+                "missing number is NaN"
+            )
+    return np.asarray(cast(Any, values), dtype)
+
+
+def time_between(earlier: Stamps, later: Stamps) -> Stamps:
+    """The time from one stamp to another, elementwise, in ns; the longest that 64 bits hold where it is longer still.
+
+    It is negative where `later` is the earlier one. The limit is 292 years.
+    """
+    time: Stamps = later - earlier
+    # The difference of two stamps has overflowed if its sign is not the one that their order demands.
+    wrong = (time < 0) != (later < earlier)
+    if wrong.any():
+        time = np.where(wrong, np.where(later < earlier, -STAMP_MAX, STAMP_MAX), time)
+    return time.clip(-STAMP_MAX)
 
 
 def _from_date(date: datetime | np.datetime64) -> int:
@@ -223,20 +261,23 @@ def as_duration(seconds: float, name: str) -> float:
     TypeError
         If it is not a real number. The message has `name`, the name of the argument, and the value.
     ValueError
-        If it is negative or NaN.
+        If it is negative or NaN, or an integer beyond all floats.
     """
     if not is_real(seconds):
         raise TypeError(f"{name} must be a number of seconds, not {seconds!r}")
     if not seconds >= 0:
         raise ValueError(f"{name} must not be negative, got {seconds!r}")
-    return float(seconds)
+    try:
+        return float(seconds)
+    except OverflowError:
+        raise ValueError(f"{name} must be a number of seconds that a float can hold") from None
 
 
 def is_real(value: object) -> bool:
-    """Whether `value` is a real number of any type, including those of numpy, and not a ``bool``."""
+    """Whether `value` is a real number of any type, those of numpy too; ``bool`` and ``timedelta64`` are none."""
     kind = type(value)
     # Nearly always one of these; the check of the abstract class takes ten times as long.
-    return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, bool))
+    return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, (bool, np.timedelta64)))
 
 
 def format_stamp(stamp: int) -> str:
@@ -248,8 +289,11 @@ def format_stamp(stamp: int) -> str:
 
 
 def format_duration(nanoseconds: int) -> str:
-    """The text of a duration with about three digits: ``410 ms``, ``1 ns``, ``2.5 s``."""
+    """The text of a duration with about three digits: ``410 ms``, ``1 ns``, ``2.5 s``, ``56.9 years``."""
     size = abs(nanoseconds)
+    for unit, name in ((_YEAR, "years"), (_DAY, "days")):
+        if size >= 2 * unit:
+            return f"{nanoseconds / unit:.3g} {name}"
     for unit, name in ((SECOND, "s"), (1_000_000, "ms"), (1_000, "us")):
         if size >= unit:
             digits = f"{nanoseconds / unit:.0f}" if size >= 100 * unit else f"{nanoseconds / unit:.3g}"
@@ -257,8 +301,34 @@ def format_duration(nanoseconds: int) -> str:
     return f"{nanoseconds} ns"
 
 
-def format_age(nanoseconds: int) -> str:
-    """The text of an age: ``age 410 ms``; or ``2.5 s ahead``, if it is negative."""
-    if nanoseconds < 0:
-        return f"{format_duration(-nanoseconds)} ahead"
-    return f"age {format_duration(nanoseconds)}"
+def format_age(stamp: int, now: int) -> str:
+    """The text of the age of a stamp at `now`, with the likely cause if it is far off; both are in ns.
+
+    It is ``age 410 ms``, or ``2.5 s ahead`` if the stamp is ahead, or ``age 56.9 years, seconds passed as
+    nanoseconds?``.
+    """
+    age = f"{format_duration(stamp - now)} ahead" if stamp > now else f"age {format_duration(now - stamp)}"
+    cause = likely_cause(stamp, now)
+    return f"{age}, {cause}" if cause else age
+
+
+def likely_cause(stamp: int, other: int) -> str:
+    """The likely cause, in words, if two stamps (ns) that should be near each other are far apart; else empty.
+
+    Examples
+    --------
+    >>> likely_cause(1_700_000_000, 1_700_000_000_000_000_000)
+    'seconds passed as nanoseconds?'
+    >>> likely_cause(3_617 * SECOND, 1_700_000_000 * SECOND)
+    'these look like two clocks (simulated time and wall time?)'
+    """
+    small, large = sorted((stamp, other), key=abs)
+    is_far = abs(large - small) > _YEAR
+    # A stamp of simulated time may well be a thousandth of another one, unless it is so early.
+    if small != 0 and (is_far or abs(small) < 1_000_000):
+        for name, unit in (("seconds", SECOND), ("milliseconds", 1_000_000), ("microseconds", 1_000)):
+            if abs(large - small * unit) <= min(_DAY, abs(large) // 10):
+                return f"{name} passed as nanoseconds?"
+    if not is_far:
+        return ""
+    return "these look like two clocks (simulated time and wall time?)" if small else "a stamp that was never set?"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 PAGE = Path(__file__).parents[2] / "demos" / "guide" / "limits.md"
-UNITS = {"": 1, "bytes": 1, "KiB": 2**10, "MiB": 2**20, "s": 1}
+UNITS = {"": 1, "levels": 1, "bytes": 1, "KiB": 2**10, "MiB": 2**20, "s": 1}
 ROWS = re.findall(r"^\| (?!what \|)(.+?) \| ([\d,.e]+) ?(\w*) \|", PAGE.read_text(), re.MULTILINE)
 BOUNDS = {
     "geometry.bounds": "MAX_TRANSLATION",
@@ -17,8 +17,8 @@ BOUNDS = {
     "bus._event_queue": "_REFUSED_FRAMES _CLAIMS",
     "buffer._hanging_report": "REPORT_AFTER NAMED",
     "buffer.buffer": "_DESCRIBED",
-    "errors": "LOOKED_AT",
-    "tree.cycles": "_SHOWN",
+    "errors": "MOST_NAMES LONGEST_NAME LOOKED_AT SHOWN_FRAMES",
+    "tree.cycles": "_SENDERS",
     "analysis.arrivals": "MAX_SAMPLES",
     "cli.commands.query": "MAX_ROWS",
     "tf_message": "MAX_NAME",
@@ -36,11 +36,11 @@ BOUNDS = {
     "links._asker": "MOST_OPEN",
     "links.zenoh._session": "MOST_QUESTIONS",
     "links.zenoh._keys": "LONGEST_NAME",
-    "links._remote_lookup": "MAX_BYTES",
+    "links._remote_lookup": "MAX_BYTES MAX_DEPTH",
     "links.zenoh.buffer_server": "LONGEST_WAIT",
-    "links.ros._carrier": "MAX_SIZE MOST_TRANSFORMS",
-    "links.rosbridge._carrier": "MOST_QUEUED SILENCE",
-    "links.rosbridge._protocol": "QUEUE",
+    "links.ros._carrier": "MAX_SIZE MAX_OTHER_SIZE AT_ONCE PART MOST_TRANSFORMS",
+    "links.rosbridge._carrier": "MOST_QUEUED SILENCE MOST_SAID",
+    "links.rosbridge._protocol": "MAX_VALUE MOST_TRANSFORMS QUEUE",
     "links.dds._carrier": "_DEPTH",
     "links.ros.settings": "_LAST_DOMAIN",
     "view._controls": "CAPACITY",

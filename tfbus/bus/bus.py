@@ -7,12 +7,14 @@ nothing can be lost between "sent" and "buffered".
 
 import asyncio
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, suppress
 from threading import get_ident
 from types import TracebackType
 from typing import Any
+from weakref import WeakSet
 
 import anyio
 
@@ -22,9 +24,9 @@ from tfbus.bus.late_buffer import LateBuffer
 from tfbus.bus.ownership import OnConflict, Ownership
 from tfbus.bus.queues import Overflow, SampleQueue, Stream
 from tfbus.bus.subscribers import Announcer, BatchCallback, FrameCallback, OnceLogger, Subscribers
-from tfbus.bus.topology import Invalid, Plausibility, Topology, as_invalid
-from tfbus.clock import Clock, SystemClock
-from tfbus.errors import BusClosedError, UnknownFrameError
+from tfbus.bus.topology import Invalid, Plausibility, Topology, as_invalid, as_max_frames
+from tfbus.clock import Clock, SimulatedClock, SystemClock
+from tfbus.errors import BusClosedError, UnknownFrameError, loop_text
 from tfbus.events import ClockReset, Event, PastLoop
 from tfbus.geometry.stamped import MAX_TRANSLATION, Batch, TransformStamped, as_batch, check_translations
 from tfbus.registration import Registration
@@ -38,29 +40,77 @@ from tfbus.which_kernel import Intake
 class OwnerThread:
     """The thread that may use a bus: first the one that made it, then that of the first event loop that uses it.
 
+    `fork` copies the thread that calls it, and no other. A child has a copy of a bus, but neither the event loop nor
+    the threads of the links, recorders and servers on it: a sample that it published would reach nobody. So such a bus
+    belongs to no thread of the child. A bus without any of these is a plain object, and the child may use its copy.
+
+    Parameters
+    ----------
+    intake : Intake or None
+        The intake of the bus, which takes batches from this thread only.
+
     Attributes
     ----------
     thread : int
-        Its identity, as `threading.get_ident` gives it.
+        Its identity, as `threading.get_ident` gives it; 0 for none.
+    entered : WeakSet
+        The links, recorders and the like that were entered on the bus and work in threads or on the loop of this
+        process.
     """
 
-    __slots__ = ("_on_a_loop", "thread")
+    __slots__ = ("__weakref__", "_intake", "_left_behind", "_on_a_loop", "entered", "thread")
 
-    def __init__(self) -> None:
-        self.thread = get_ident()
+    def __init__(self, intake: Any) -> None:
+        self._intake = intake
+        self._set(get_ident())
         self._on_a_loop = _runs_a_loop()
+        self._left_behind = ""
+        self.entered: WeakSet[object] = WeakSet()
+        _OWNERS.add(self)
 
     def check(self) -> None:
         """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
         thread = get_ident()
         if thread == self.thread and self._on_a_loop:
             return
+        self.check_process()
         on_a_loop = _runs_a_loop()
         if thread != self.thread:
             if self._on_a_loop or not on_a_loop:
                 raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
-            self.thread = thread
+            self._set(thread)
         self._on_a_loop = on_a_loop
+
+    def check_process(self) -> None:
+        """Raise `RuntimeError` in a child of `fork`, which has the bus without the links and threads on it."""
+        if self._left_behind:
+            raise RuntimeError(
+                f"this process was forked, and fork has not copied what works for the bus, {self._left_behind}: "
+                "make a bus in the child, or start the child with the method 'spawn' of multiprocessing"
+            )
+
+    def leave_behind(self) -> None:
+        """Belong to no thread of this process, which was forked, if anything was entered on the bus."""
+        if self.entered:
+            self._left_behind = " and ".join(sorted({type(thing).__name__ for thing in self.entered}))
+            self._set(0)
+
+    def _set(self, thread: int) -> None:
+        self.thread = thread
+        if self._intake is not None:
+            self._intake.thread = thread
+
+
+_OWNERS: WeakSet[OwnerThread] = WeakSet()
+
+
+def _leave_behind() -> None:
+    for owner in tuple(_OWNERS):
+        owner.leave_behind()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_behind)
 
 
 def _runs_a_loop() -> bool:
@@ -92,9 +142,17 @@ class Bus:
         `StampAhead`, logged once for each authority and frame, and counted. None for any distance: for a bus that
         carries recorded time. A `Player` needs no None, and a `SimulatedClock` that nobody has set yet (at 0, without a
         jump) has no stamp ahead of it.
+    max_behind : float or None
+        How far, in s, the stamp of a moving sample may be behind the clock. One that is further behind is accepted, but
+        announced as `StampBehind`, logged once for each authority and frame, and counted; so is one that expires in a
+        buffer. None for any distance, and for no word of what expires.
     reject_ahead : bool
         Whether a sample that is further ahead is refused. Otherwise it is accepted; until the clock has reached it,
         right samples of its frame are older than the newest, and expire if they are older than a buffer's window.
+    max_frames : int or None
+        The greatest number of frames, children and parents of the newest edges, for a bus on which strangers publish. A
+        sample that names a new one beyond it is refused. A frame that is removed gives its place back, and so does a
+        parent without children. None for any number.
 
     Raises
     ------
@@ -105,7 +163,8 @@ class Bus:
     -----
     A bus may be made before an event loop runs. It belongs to the thread that made it, until an event loop in another
     thread uses it first; a loop has a claim on it once it has awaited a lookup, read a stream or entered `threadsafe`.
-    Other threads publish through `threadsafe`.
+    Other threads publish through `threadsafe`. A child made by ``fork`` may use its copy of a bus only if no link,
+    recorder, view, server or `threadsafe` was entered on it: they work in the parent.
 
     Examples
     --------
@@ -122,17 +181,23 @@ class Bus:
         *,
         max_translation: float = MAX_TRANSLATION,
         max_ahead: float | None = 1.0,
+        max_behind: float | None = 10.0,
         reject_ahead: bool = False,
+        max_frames: int | None = None,
     ) -> None:
         self.clock: Clock = SystemClock() if clock is None else clock
-        self._owner = OwnerThread()
         self._closed = False
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._events: list[EventStream] = []
         self._announcer = Announcer(self.clock.now, self._events)
-        self._plausibility = Plausibility(self.clock, max_translation, max_ahead, reject_ahead)
+        self._plausibility = Plausibility(self.clock, max_translation, max_ahead, reject_ahead, max_behind)
         self._topology = Topology(
-            self._log, Ownership(on_conflict), self._plausibility, self._announcer, self._remove_if_known
+            self._log,
+            Ownership(on_conflict),
+            self._plausibility,
+            self._announcer,
+            self._remove_if_known,
+            as_max_frames(max_frames),
         )
         self._subscribers = Subscribers(self._log, self._announcer)
         self._buffers: dict[LiveTree, int] = {}
@@ -145,12 +210,17 @@ class Bus:
         if Intake is not None:
             listeners = self._subscribers.callbacks, self._streams, self._events, self._late
             self._intake = Intake(self._topology.judge, TransformStamped, listeners)
-            self._intake.thread = self._owner.thread
             self._take = self._intake.take
+        self._owner = OwnerThread(self._intake)
         self._resets = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
+        # Links, recorders and the like; a child made by `fork` has them no more.
+        self._entered = self._owner.entered
         self._jumps = self.clock.on_jump(self._clock_jumped)
+        self._moves: Registration | None = None
+        if isinstance(self.clock, SimulatedClock):
+            self._moves = self.clock.on_move(self._topology.clock_moved)
 
     @property
     def closed(self) -> bool:
@@ -161,6 +231,11 @@ class Bus:
     def max_translation(self) -> float:
         """The greatest magnitude of a translation, in m."""
         return self._plausibility.max_translation
+
+    @property
+    def max_frames(self) -> int | None:
+        """The greatest number of frames; None for any number."""
+        return self._topology.max_frames
 
     def publish(self, samples: TransformStamped | Iterable[TransformStamped], invalid: Invalid = "raise") -> None:
         """Send one sample, or a batch that is seen all or not at all.
@@ -181,12 +256,15 @@ class Bus:
             If a sample would close a loop of parents, its child is reserved for another authority, or comes from
             another one with ``on_conflict="reject"``; if its translation is not finite or longer than
             `max_translation`; with ``reject_ahead=True``, if its stamp is ahead of the clock. Nothing is stored.
+        TooManyFramesError
+            If the bus would have more than `max_frames` frames; an `InvalidTransformError`. Nothing is stored.
         TypeError
             If something in it is not a `TransformStamped`.
         BusClosedError
             If the bus is closed.
         RuntimeError
-            If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
+            If this is not the bus's thread, or this process was forked and has the bus without its links; if
+            subscribers that publish have queued more than 1,000 batches.
         """
         # Nearly always samples only continue known edges, and the buffers are all that hears of them.
         taken = self._take(samples, invalid)
@@ -228,8 +306,6 @@ class Bus:
         The first event loop to use a bus that another thread has made takes it over.
         """
         self._owner.check()
-        if self._intake is not None:
-            self._intake.thread = self._owner.thread
 
     def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
@@ -305,7 +381,7 @@ class Bus:
     def _announce_past_loop(self, found: LoopingSample) -> None:
         """Log and announce a loop of parents at a past stamp. Called by buffers, which alone have the history."""
         sample, (at, loop) = found
-        frames = " -> ".join(loop)
+        frames = loop_text(loop)
         key = ("past loop", sample.child, sample.parent, sample.authority)
         self._log.warning(
             key, "the frames %s form a loop at %s, with late data of %r", frames, format_stamp(at), sample.authority
@@ -353,7 +429,7 @@ class Bus:
         self._check_usable()
         latched = tuple(self._topology.latched.values())
         late = LateBuffer(buffer, self._topology)
-        buffer.is_ahead = self._topology.is_ahead
+        buffer.tell_expired = self._topology.expired
         self._buffers[buffer] = self._samples() - len(latched)
         if latched:
             late.insert(latched)
@@ -380,10 +456,9 @@ class Bus:
             If neither the bus nor a buffer knows the frame.
         """
         self._check_usable()
-        if frame not in self._topology and not any(frame in buffer.forest.names for buffer in self._buffers):
-            names = self._topology.names()
-            if frame not in names:
-                raise UnknownFrameError(frame=frame, known=tuple(names))
+        on_bus = frame in self._topology or frame in self._topology.names
+        if not on_bus and not any(frame in buffer.forest.names for buffer in self._buffers):
+            raise UnknownFrameError(frame=frame, known=self._topology.names.some())
         self._topology.remove(frame)
         self._subscribers.forget(frame)
         for publisher in self._threads:
@@ -415,6 +490,7 @@ class Bus:
                 *(events.queue.statistics() for events in self._events),
             ),
             ahead=self._topology.ahead,
+            behind=self._topology.judge.behind,
         )
 
     def __repr__(self) -> str:
@@ -436,6 +512,8 @@ class Bus:
         if self._intake is not None:
             self._intake.open = False
         self._jumps.close()
+        if self._moves is not None:
+            self._moves.close()
         for publisher in self._threads:
             publisher.end()
             publisher.discard()
@@ -506,6 +584,10 @@ class Bus:
         """A ``with`` for samples whose stamps are of another clock. Called by players."""
         return self._topology.recorded_time()
 
+    def _kept_samples(self) -> AbstractContextManager[None]:
+        """A ``with`` for samples that were kept for those who join later, and may be old. Called by links."""
+        return self._topology.kept_samples()
+
     def _well_typed(self, samples: object) -> Batch:
         """The samples in a batch; anything else in it is counted as rejected."""
         things = tuple(samples) if isinstance(samples, Iterable) else (samples,)
@@ -517,7 +599,7 @@ class Bus:
         return batch
 
     def _clock_jumped(self, before: int, after: int) -> None:
-        self._topology.clock_jumped()
+        self._topology.clock_moved(after)
         if after >= before:
             for events in self._events:
                 events.wake()
@@ -566,6 +648,7 @@ class ThreadPublisher:
         self._waker.bind()
         try:
             self._bus._check_usable()
+            self._bus._entered.add(self)
             self._bus._threads.append(self)
         except BaseException:
             self.end()
@@ -577,6 +660,7 @@ class ThreadPublisher:
     ) -> None:
         self.end()
         self._drain()
+        self._bus._entered.discard(self)
         self._bus._threads.remove(self)
 
     def __call__(self, samples: TransformStamped | Iterable[TransformStamped]) -> None:
@@ -599,6 +683,7 @@ class ThreadPublisher:
         dropped and counted there.
         """
         batch = as_batch(samples)
+        self._bus._owner.check_process()
         check_translations(batch, self._bus.max_translation)
         if not self._waker.bound:
             raise RuntimeError("enter the `with` of bus.threadsafe() on the event loop first")

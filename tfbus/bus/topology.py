@@ -7,14 +7,14 @@ of a bad edge at once.
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from copy import copy
 from typing import Literal, get_args
 
 from tfbus.bus.ownership import Ownership
 from tfbus.bus.subscribers import Announcer, OnceLogger
 from tfbus.clock import Clock, SimulatedClock
-from tfbus.errors import InvalidTransformError
+from tfbus.errors import InvalidTransformError, TooManyFramesError
 from tfbus.events import (
     AuthorityConflict,
     FrameAdded,
@@ -23,11 +23,23 @@ from tfbus.events import (
     Reparented,
     SampleRejected,
     StampAhead,
+    StampBehind,
+    how_far_behind,
 )
 from tfbus.geometry.stamped import Batch, TransformStamped, as_max_translation, is_within, not_physical
 from tfbus.registration import Registration
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, format_duration, format_stamp, from_seconds
-from tfbus.tree.cycles import NewestEdge, admit
+from tfbus.stamps import (
+    SECOND,
+    STAMP_MAX,
+    STAMP_MIN,
+    as_duration,
+    format_duration,
+    format_stamp,
+    from_seconds,
+    likely_cause,
+)
+from tfbus.tree.cycles import NewestEdge, admit, changed_parents
+from tfbus.tree.known_frames import KnownFrames
 from tfbus.which_kernel import Edge, Judge
 
 
@@ -43,62 +55,87 @@ class Plausibility:
         How far a stamp may be ahead of the clock, in s; None for any distance.
     reject_ahead : bool
         Whether samples that are further ahead are refused.
+    max_behind : float or None
+        How far the stamp of a moving sample may be behind the clock, in s; None for any distance.
 
     Raises
     ------
     TypeError, ValueError
-        If `max_translation` is not greater than zero and at most 1e100, `max_ahead` is not a duration, or
-        `reject_ahead` comes without a `max_ahead`.
+        If `max_translation` is not greater than zero and at most 1e100, `max_ahead` or `max_behind` is not a duration,
+        or `reject_ahead` comes without a `max_ahead`.
 
     Attributes
     ----------
     max_translation : float
     rejects_ahead : bool
-    clock_jumped : bool
-        Whether a jump of the clock was announced. Until then a `SimulatedClock` at 0 counts as one that nobody has set.
+    lasting : int
+        How long the plausible stamps may be used without looking at the clock, in ns; a simulated one tells its moves.
     """
 
-    def __init__(self, clock: Clock, max_translation: float, max_ahead: float | None, reject_ahead: bool) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        max_translation: float,
+        max_ahead: float | None,
+        reject_ahead: bool,
+        max_behind: float | None = None,
+    ) -> None:
         self.max_translation = as_max_translation(max_translation)
-        seconds = math.inf if max_ahead is None else as_duration(max_ahead, "max_ahead")
-        self._max_ahead = None if seconds == math.inf else from_seconds(seconds)
+        self._max_ahead = _as_bound(max_ahead, "max_ahead")
+        self._max_behind = _as_bound(max_behind, "max_behind")
         if reject_ahead and self._max_ahead is None:
             raise ValueError("reject_ahead needs a max_ahead: without one, no stamp is ahead of the clock")
         self.rejects_ahead = reject_ahead
         self._clock = clock
-        self._simulated = isinstance(clock, SimulatedClock)
+        self.lasting = STAMP_MAX if isinstance(clock, SimulatedClock) else SECOND // 10
         self._recorded = 0
-        self.clock_jumped = False
-
-    @property
-    def clock_is_set(self) -> bool:
-        """Whether the clock has a time that stamps can be compared with."""
-        return not self._simulated or self.clock_jumped or self._clock.now() != 0
+        self._kept = 0
 
     def newest_plausible(self) -> int:
         """The greatest stamp, in ns, that is not ahead of the clock now; `STAMP_MAX` if none is."""
-        if self._max_ahead is None or self._recorded or not self.clock_is_set:
+        if self._max_ahead is None or not self._compares:
             return STAMP_MAX
         return min(self._clock.now() + self._max_ahead, STAMP_MAX)
 
+    def oldest_plausible(self) -> int:
+        """The least stamp, in ns, that is not behind the clock now; `STAMP_MIN` if none is."""
+        if self._max_behind is None or self._kept or not self._compares:
+            return STAMP_MIN
+        return max(self._clock.now() - self._max_behind, STAMP_MIN)
+
+    @property
+    def _compares(self) -> bool:
+        """Whether stamps are of the clock, and it has a time."""
+        return not self._recorded and bool(getattr(self._clock, "is_set", True))
+
     @contextmanager
     def recorded_time(self) -> Iterator[None]:
-        """A ``with`` for samples whose stamps are of another clock; none of them is ahead."""
+        """A ``with`` for samples whose stamps are of another clock; none of them is ahead or behind."""
         self._recorded += 1
         try:
             yield
         finally:
             self._recorded -= 1
 
-    def split(self, batch: Batch) -> tuple[Batch, list[InvalidTransformError], Batch]:
-        """The samples of a batch that may go on, the errors of the others, and the samples that are ahead, in order.
+    @contextmanager
+    def kept_samples(self) -> Iterator[None]:
+        """A ``with`` for samples that were kept for those who join later; none of them is behind."""
+        self._kept += 1
+        try:
+            yield
+        finally:
+            self._kept -= 1
 
-        A static sample is never ahead, because it holds at every stamp.
+    def split(self, batch: Batch) -> tuple[Batch, list[InvalidTransformError], Batch, Batch]:
+        """The samples of a batch that may go on, the errors of the others, and those that are ahead, and behind.
+
+        All are in order. A static sample is never ahead or behind, because it holds at every stamp.
         """
-        newest = self.newest_plausible()
+        newest, oldest = self.newest_plausible(), self.oldest_plausible()
         allowed: list[TransformStamped] = []
         refused: list[InvalidTransformError] = []
         ahead: list[TransformStamped] = []
+        behind: list[TransformStamped] = []
         for sample in batch:
             _, _, stamp, _, _, static = sample._fields
             if not is_within(sample, self.max_translation):
@@ -109,16 +146,19 @@ class Plausibility:
                 if self.rejects_ahead:
                     refused.append(self._too_far_ahead(sample))
                     continue
+            elif stamp < oldest and not static:
+                behind.append(sample)
             allowed.append(sample)
-        return tuple(allowed), refused, tuple(ahead)
+        return tuple(allowed), refused, tuple(ahead), tuple(behind)
 
     def _too_far_ahead(self, sample: TransformStamped) -> InvalidTransformError:
         parent, child, stamp, _, authority, _ = sample._fields
         assert self._max_ahead is not None
-        ahead, bound = format_duration(stamp - self._clock.now()), format_duration(self._max_ahead)
+        now = self._clock.now()
+        ahead, bound, cause = format_duration(stamp - now), format_duration(self._max_ahead), likely_cause(stamp, now)
         return InvalidTransformError(
             f"frame {child!r}: the stamp {format_stamp(stamp)} from {authority!r} is {ahead} ahead of the clock "
-            f"(at most {bound})",
+            f"(at most {bound}){cause and f': {cause}'}",
             reason="ahead",
             parent=parent,
             child=child,
@@ -126,7 +166,11 @@ class Plausibility:
         )
 
 
-_FORMER_PARENTS = 1_000
+def _as_bound(seconds: float | None, name: str) -> int | None:
+    """A bound in ns; None for any distance."""
+    duration = math.inf if seconds is None else as_duration(seconds, name)
+    return None if duration == math.inf else from_seconds(duration)
+
 
 Invalid = Literal["raise", "drop"]
 
@@ -136,6 +180,15 @@ def as_invalid(invalid: Invalid) -> Invalid:
     if invalid not in get_args(Invalid):
         raise ValueError(f"invalid must be 'raise' or 'drop', not {invalid!r}")
     return invalid
+
+
+def as_max_frames(value: int | None) -> int | None:
+    """The argument `max_frames`; `TypeError` or `ValueError` if it is no number of frames, nor None."""
+    if isinstance(value, bool) or not isinstance(value, int | None):
+        raise TypeError(f"max_frames must be an int or None, not {value!r}")
+    if value is not None and value < 2:
+        raise ValueError(f"max_frames must be at least 2, a parent and a child, got {value}")
+    return value
 
 
 class _Edge(Edge):
@@ -154,6 +207,7 @@ class _Edge(Edge):
         self.authority = authority
         self.last = authority
         self.trusted = None
+        self.late = False
         self.since = since
 
 
@@ -171,9 +225,13 @@ class Topology:
         Announces changes and refusals.
     evict : callable
         Removes a frame from the bus and all buffers.
+    max_frames : int or None
+        The greatest number of frames that the newest edges may name; None for any number.
 
     Attributes
     ----------
+    names : KnownFrames
+        The frames that the newest edges name.
     latched : dict of str to TransformStamped
         The static sample of each static child.
     rejected : Counter
@@ -183,7 +241,8 @@ class Topology:
     ahead : int
         Accepted samples that were ahead of the clock.
     judge : Judge
-        Records the samples of a batch if all continue known edges; else `accept` has to look.
+        Records the samples of a batch if all continue known edges; else `accept` has to look. It counts the accepted
+        samples that were behind the clock.
     """
 
     def __init__(
@@ -193,18 +252,19 @@ class Topology:
         plausibility: Plausibility,
         announcer: Announcer,
         evict: Callable[[str], object],
+        max_frames: int | None = None,
     ) -> None:
         self._log = log
         self._ownership = ownership
         self._plausibility = plausibility
         self._announcer = announcer
         self._evict = evict
+        self.max_frames = max_frames
         self._parents = 0
         self._newest: dict[str, _Edge] = {}
-        # No stamp up to its horizon is ahead of the clock, which only goes forward between two calls of `clock_jumped`.
+        self.names = KnownFrames()
+        # It compares stamps with the clock of at most a tenth of a second ago, or of the last move of a simulated one.
         self.judge = Judge(self._newest, plausibility.max_translation**2)
-        # Every parent of a newest edge, and some that were one.
-        self._named: set[str] = set()
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
         self.reparented = 0
@@ -217,10 +277,6 @@ class Topology:
 
     def __contains__(self, child: object) -> bool:
         return child in self._newest or (isinstance(child, str) and self._ownership.remembers(child))
-
-    def names(self) -> set[str]:
-        """Every frame that an edge names."""
-        return {*self._newest, *(known.parent for known in self._newest.values())}
 
     def newest(self, child: str) -> NewestEdge | None:
         """The newest edge of a child, if it has one."""
@@ -246,12 +302,26 @@ class Topology:
             if known.newest is not None and known.newest > newest
         ]
 
-    def is_ahead(self, child: str, newest: int, authority: str) -> bool:
-        """Whether a child's newest stamp (ns) is ahead of the clock, so that right samples expire; then it is told."""
-        if newest <= self._plausibility.newest_plausible():
-            return False
-        self._tell_ahead(child, newest, authority)
-        return True
+    def known_behind(self) -> list[StampBehind]:
+        """An event for each child that was told to be behind the clock, and whose newest sample is so still."""
+        now, oldest = self._announcer.now(), self._plausibility.oldest_plausible()
+        return [
+            StampBehind(now, child, known.newest, None, known.authority)
+            for child, known in self._newest.items()
+            if known.late and known.newest is not None and known.newest < oldest
+        ]
+
+    def expired(self, sample: TransformStamped, newest: int, authority: str) -> bool:
+        """Tell that a sample has expired in a buffer, by the newest stamp (ns) of its child, which is of an authority.
+
+        Returns whether that stamp is ahead of the clock, so that right samples expire.
+        """
+        if newest > self._plausibility.newest_plausible():
+            self._tell_ahead(sample.child, newest, authority)
+            return True
+        if self._plausibility.oldest_plausible() != STAMP_MIN:
+            self._tell_behind(sample, newest)
+        return False
 
     def accept(self, batch: Batch, invalid: Invalid, judged: bool = False) -> Batch:
         """Judge a batch, record the samples that may be committed, and return them.
@@ -281,7 +351,10 @@ class Topology:
         """Forget a child and its first authority."""
         self.latched.pop(child, None)
         self._ownership.forget(child)
-        if self._newest.pop(child, None) is not None and self._announcer.has_listeners:
+        if self._newest.pop(child, None) is None:
+            return
+        self.names.remove(child)
+        if self._announcer.has_listeners:
             self._announcer.announce(FrameRemoved(self._announcer.now(), child))
 
     def clear_moving(self) -> None:
@@ -289,6 +362,7 @@ class Topology:
         self._ownership.remember({child: known for child, known in self._newest.items() if not known.static})
         for child in self.moving():
             del self._newest[child]
+            self.names.remove(child)
 
     def reject(self, reason: str, error: Exception) -> None:
         """Count and announce a sample that was refused."""
@@ -303,36 +377,50 @@ class Topology:
 
     @contextmanager
     def recorded_time(self) -> Iterator[None]:
-        """A ``with`` for samples whose stamps are of another clock; none of them is ahead."""
+        """A ``with`` for samples whose stamps are of another clock; none of them is ahead or behind."""
+        with self._at_the_clock(self._plausibility.recorded_time()):
+            yield
+
+    @contextmanager
+    def kept_samples(self) -> Iterator[None]:
+        """A ``with`` for samples that were kept for those who join later; none of them is behind."""
+        with self._at_the_clock(self._plausibility.kept_samples()):
+            yield
+
+    @contextmanager
+    def _at_the_clock(self, other_rules: AbstractContextManager[None]) -> Iterator[None]:
+        """A ``with`` in which the judge goes by other rules."""
         try:
-            with self._plausibility.recorded_time():
+            with other_rules:
+                self._look_at_clock()
                 yield
         finally:
-            self.judge.horizon = STAMP_MIN
+            self._look_at_clock()
 
-    def clock_jumped(self) -> None:
-        """Note that a jump of the clock was announced."""
-        self._plausibility.clock_jumped = True
-        self.judge.horizon = STAMP_MIN
+    def clock_moved(self, _stamp: int) -> None:
+        """Note that a clock that is not the machine's has moved."""
+        self._look_at_clock()
+
+    def _look_at_clock(self) -> None:
+        """Let the judge compare stamps with the time that it is now."""
+        plausibility = self._plausibility
+        self.judge.allow(plausibility.oldest_plausible(), plausibility.newest_plausible(), plausibility.lasting)
 
     def _accepts_now(self, batch: Batch) -> bool:
         """Whether the judge accepts a batch by the time that it is now."""
-        judge, horizon = self.judge, self._plausibility.newest_plausible()
-        later, judge.horizon = horizon > judge.horizon, horizon
-        accepted = later and judge.accepts(batch)
-        if not self._plausibility.clock_is_set:
-            # Nothing tells when a clock that nobody has set is advanced for the first time.
-            judge.horizon = STAMP_MIN
-        return accepted
+        self._look_at_clock()
+        return self.judge.accepts(batch)
 
     def _judge(self, batch: Batch, invalid: Invalid) -> Batch:
-        batch, refused, ahead = self._plausibility.split(batch)
+        batch, refused, ahead, behind = self._plausibility.split(batch)
         if self._ownership.restricts:
             batch, unowned = self._ownership.split(batch, self._newest)
             refused += unowned
-        if len(self._named) > 2 * len(self._newest) + _FORMER_PARENTS:
-            self._named = {known.parent for known in self._newest.values()}
-        accepted, looped = admit(self._newest, batch, self._named)
+        accepted, looped = admit(self._newest, batch, self.names.parents)
+        if self.max_frames is not None and not self._fits(accepted, self.max_frames):
+            batch, homeless = self._find_places(batch, self.max_frames)
+            refused += homeless
+            accepted, looped = admit(self._newest, batch, self.names.parents)
         if looped and self._ownership.reserves and not (refused and invalid == "raise"):
             accepted, looped = self._defend(batch, refused, invalid)
         refused += looped
@@ -345,17 +433,56 @@ class Topology:
         if refused and invalid == "raise":
             raise refused[0]
         for error in refused:
-            self._log.warning((error.reason, error.child, error.authority), "dropped a sample: %s", error)
+            # Strangers may try any number of names.
+            cause = () if isinstance(error, TooManyFramesError) else (error.child, error.authority)
+            self._log.warning((error.reason, *cause), "dropped a sample: %s", error)
         for sample in accepted:
-            self._named.add(sample.parent)
             self._record(sample)
-        if ahead and not rejects_ahead:
+        if behind or (ahead and not rejects_ahead):
             stored = set(map(id, accepted))
-            for sample in ahead:
+            for sample in () if rejects_ahead else ahead:
                 if id(sample) in stored:
                     self.ahead += 1
                     self._tell_ahead(sample.child, sample.stamp, sample.authority)
+            for sample in behind:
+                if id(sample) in stored:
+                    self.judge.behind += 1
+                    self._tell_behind(sample)
+                    self._newest[sample.child].late = True
         return accepted
+
+    def _fits(self, batch: Batch, max_frames: int) -> bool:
+        """Whether the bus has places for the frames of a batch, which may give up some as it takes others."""
+        # No sample names more than two new frames.
+        if len(self.names) + 2 * len(batch) <= max_frames:
+            return True
+        if self._ownership.reserves:
+            # Some of it may yet be refused, and then would give up nothing.
+            return False
+        return self.names.count_after(changed_parents(self._newest, batch)) <= max_frames
+
+    def _find_places(self, batch: Batch, max_frames: int) -> tuple[Batch, list[InvalidTransformError]]:
+        """The samples of a batch whose frames find a place that is free by now, and the errors of the others."""
+        before = len(self.names)
+        allowed: list[TransformStamped] = []
+        refused: list[InvalidTransformError] = []
+        taken: set[str] = set()
+        for sample in batch:
+            new = {frame for frame in (sample.parent, sample.child) if frame not in taken and frame not in self.names}
+            if new and before + len(taken) + len(new) > max_frames:
+                refused.append(
+                    TooManyFramesError(
+                        frames=before,
+                        max_frames=max_frames,
+                        parent=sample.parent,
+                        child=sample.child,
+                        authority=sample.authority,
+                    )
+                )
+            else:
+                taken |= new
+                allowed.append(sample)
+        return tuple(allowed), refused
 
     def _defend(
         self,
@@ -374,7 +501,7 @@ class Topology:
         """
         edges = dict(self._newest)
         removed: list[InvalidTransformError] = []
-        _, looped = admit(edges, batch, self._named)
+        _, looped = admit(edges, batch, self.names.parents)
         while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
             rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
             if len(rest) < len(batch):
@@ -384,7 +511,7 @@ class Topology:
             else:
                 del edges[_child(intruder)]
                 removed.append(intruder)
-            _, looped = admit(edges, batch, self._named)
+            _, looped = admit(edges, batch, self.names.parents)
         if invalid == "drop" or not (looped or refused):
             for error in removed:
                 # Its samples were accepted, so they are not counted as the others that are refused.
@@ -392,7 +519,7 @@ class Topology:
                 self._log.warning(("intruder", error.child, error.authority), "removed a frame: %s", error)
                 self._evict(_child(error))
         # A subscriber that was told of a removal may have published.
-        return admit(self._newest, batch, self._named)
+        return admit(self._newest, batch, self.names.parents)
 
     def _record(self, sample: TransformStamped) -> None:
         parent, child, stamp, _, authority, static = sample._fields
@@ -401,12 +528,14 @@ class Topology:
         if known is None:
             self._parents += 1
             known = self._newest[child] = _Edge(parent, static, authority, self._parents)
+            self.names.update(child, (parent,))
             if announcer.has_listeners:
                 announcer.announce(FrameAdded(announcer.now(), child, parent, authority, static))
         if known.last != authority:
             if self._ownership.reserved_for(child) is None:
                 self._conflict(child, authority, known.last)
             known.last = authority
+            known.late = False
         if known.static != static:
             self.kind_changes += 1
             kind = "static" if static else "moving"
@@ -419,6 +548,7 @@ class Topology:
             known.authority = authority
             if known.parent != parent:
                 self._reparent(child, parent, known.parent, authority)
+                self.names.update(child, (parent,))
                 self._parents += 1
                 known.parent, known.since = parent, self._parents
         known.trusted = None if static or known.authority != authority else authority
@@ -429,16 +559,32 @@ class Topology:
 
     def _tell_ahead(self, child: str, newest: int, authority: str) -> None:
         now = self._announcer.now()
-        ahead = format_duration(newest - now)
+        cause = likely_cause(newest, now)
         self._log.warning(
             ("ahead", child, authority),
-            "frame %r has a sample from %r that is %s ahead of the clock: right samples are older, and expire",
+            "frame %r has a sample from %r that is %s ahead of the clock: right samples are older, and expire%s",
             child,
             authority,
-            ahead,
+            format_duration(newest - now),
+            cause and f"; {cause}",
         )
         if self._announcer.has_listeners:
             self._announcer.announce(StampAhead(now, child, newest, authority))
+
+    def _tell_behind(self, sample: TransformStamped, newest: int | None = None) -> None:
+        """Tell of a sample that is behind the clock, or has expired by the newest stamp (ns) of its child."""
+        _, child, stamp, _, authority, _ = sample._fields
+        now = self._announcer.now()
+        self._log.warning(
+            ("behind", child, authority),
+            "frame %r has a sample from %r that is %s: %s",
+            child,
+            authority,
+            how_far_behind(stamp, now, newest),
+            likely_cause(stamp, now) or "it is late, or the clock of its sender is behind or stands still",
+        )
+        if self._announcer.has_listeners:
+            self._announcer.announce(StampBehind(now, child, stamp, newest, authority))
 
     def _conflict(self, child: str, authority: str, other: str) -> None:
         self.conflicts += 1

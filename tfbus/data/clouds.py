@@ -12,7 +12,7 @@ from tfbus.data.dispatch import CopiedByFields, as_points, check_header, do_tran
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform_array import read_only
 from tfbus.plain import PlainData
-from tfbus.stamps import Latest, as_stamps
+from tfbus.stamps import Latest, as_array, as_stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +70,7 @@ class PointCloud(CopiedByFields, PlainData):
 def _column(name: object, values: npt.ArrayLike, length: int) -> npt.NDArray[Any]:
     if not isinstance(name, str):
         raise TypeError(f"the name of a field must be a str, not {name!r}")
-    column = np.asarray(values)
+    column = as_array(values, f"field {name!r}")
     if column.shape[:1] != (length,):
         raise ValueError(f"field {name!r} must have shape ({length}, ...), one for each point, got {column.shape}")
     return read_only(column)

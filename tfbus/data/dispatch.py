@@ -14,7 +14,7 @@ from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.rows import Vector
-from tfbus.stamps import LATEST, Latest, as_stamp
+from tfbus.stamps import LATEST, Latest, as_array, as_stamp
 
 
 def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
@@ -24,8 +24,10 @@ def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
     ------
     TypeError
         If they are not numbers. The message names `name` and the dtype.
+    ValueError
+        If one is masked.
     """
-    array = np.asarray(value)
+    array = as_array(value, name)
     if array.dtype.kind in "iu":
         return array.astype(np.float64)
     if array.dtype.kind != "f":

@@ -20,7 +20,7 @@ from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchSt
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
 from tfbus.rows import Vector
-from tfbus.stamps import LATEST, SECOND, Latest
+from tfbus.stamps import LATEST, SECOND, Latest, as_array
 
 _MISSING = object()
 
@@ -317,7 +317,7 @@ def _pose(pose: Transform) -> dict[str, Any]:
 
 def _read_scan(message: object, frame: str, stamp: int) -> LaserScan:
     values = dict(zip(_SCAN, numbers(message, _SCAN), strict=True))
-    ranges, intensities = np.asarray(get(message, "ranges")), np.asarray(get(message, "intensities"))
+    ranges, intensities = (as_array(get(message, name), name) for name in ("ranges", "intensities"))
     return LaserScan(frame, stamp, ranges, intensities=intensities, **values)
 
 
@@ -367,7 +367,7 @@ def _read_pose(message: object, frame: str, stamp: int) -> PoseStamped | PoseWit
     pose = get(message, "pose")
     if not has(pose, "covariance"):
         return PoseStamped(frame, stamp, _transform(pose, "position", "orientation"))
-    covariance = np.array(get(pose, "covariance"), np.float64)
+    covariance = as_array(get(pose, "covariance"), "covariance", np.float64)
     return PoseWithCovarianceStamped(frame, stamp, _transform(get(pose, "pose"), "position", "orientation"), covariance)
 
 

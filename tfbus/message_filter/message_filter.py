@@ -40,6 +40,7 @@ from tfbus.registration import Registration
 from tfbus.rows import IDENTITY
 from tfbus.stamps import LATEST, STAMP_MAX, Latest, as_duration, as_stamp, from_seconds
 from tfbus.tree.lookup import Question
+from tfbus.tree.tree import forest_of
 
 MessageT = TypeVar("MessageT")
 
@@ -321,7 +322,7 @@ class Targets(Generic[AnswerT]):
             raise ValueError("there must be at least one target")
         for name in names:
             if not is_frame(name):
-                raise UnknownFrameError(frame=name, known=self._buffer.tree.frames())
+                raise UnknownFrameError(frame=name, known=forest_of(self._buffer.tree).some_frames())
         return names
 
 
@@ -593,7 +594,8 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         named = is_frame(frame)
         self._arrived += 1
         if not named:
-            self._drops.drop(message, "unknown frame", UnknownFrameError(frame=frame, known=self.buffer.tree.frames()))
+            known = forest_of(self.buffer.tree).some_frames()
+            self._drops.drop(message, "unknown frame", UnknownFrameError(frame=frame, known=known))
             return
         answer: AnswerT | None = None
         blocker: TransformLookupError | None = None

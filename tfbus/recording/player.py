@@ -290,7 +290,7 @@ class Player:
                 return
             if self._paused:
                 # A step of the user goes to the message.
-                step = max(0, stamp - clock.now())
+                step = max(0, min(stamp - clock.now(), from_seconds(_MAX_STEP)))
             await clock.advance(to_seconds(step))
             if self._seek_target is not None or clock.now() >= stamp:
                 return
@@ -313,7 +313,7 @@ class Player:
 
     def _publish(self, message: RecordedMessage) -> None:
         self.position = message.received
-        self.messages += 1
+        self.messages += not message.is_report
         self.bad.update(error.reason for error in message.errors)
         if not message.batch:
             return

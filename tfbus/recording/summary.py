@@ -17,7 +17,7 @@ from tfbus.recording.load import Problems, sound_samples
 from tfbus.recording.message import RecordedMessage
 from tfbus.recording.recording import RecordedTopic, Recording
 from tfbus.recording.spread import Spread
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, time_between
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +214,9 @@ class _Counts:
 
     def add_messages(self, messages: Iterable[RecordedMessage]) -> None:
         """Count messages one by one."""
-        for received, batch, errors in messages:
-            self.messages += 1
+        for message in messages:
+            received, batch, errors = message
+            self.messages += not message.is_report
             if errors:
                 self.problems.note(errors)
             self._add_batch(received, sound_samples(self.frames, batch, self.named, self.problems))
@@ -274,7 +275,7 @@ class _Frame:
         stamps = columns.stamps
         sent.moving += len(stamps)
         sent.stamps.frombytes(stamps.tobytes())
-        sent.delays.add(columns.received - stamps)
+        sent.delays.add(time_between(stamps, columns.received))
         newest = int(stamps.max())
         if self.newest is None or newest >= self.newest:
             self.newest, self.authority = newest, columns.authority

@@ -23,11 +23,11 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-from tfbus.errors import InvalidTransformError
+from tfbus.errors import InvalidTransformError, loop_text
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.tree.history import FrameHistory
 
-_SHOWN = 10
+_SENDERS = 5
 
 
 class NewestEdge(Protocol):
@@ -64,7 +64,7 @@ def admit(
     """
     accepted: Sequence[TransformStamped] = batch
     refused: list[InvalidTransformError] = []
-    while loops := _find_loops(edges, changes := _changed_parents(edges, accepted), parents):
+    while loops := _find_loops(edges, changes := changed_parents(edges, accepted), parents):
         loop_of = {frame: loop for loop in loops for frame in loop}
         kept: list[TransformStamped] = []
         for sample in reversed(accepted):
@@ -82,13 +82,12 @@ def admit(
 def _cycle(edges: Mapping[str, NewestEdge], sample: TransformStamped, loop: tuple[str, ...]) -> InvalidTransformError:
     start = loop.index(sample.child)
     circle = (*loop[start:], *loop[: start + 1])
-    shown = (
-        circle if len(circle) <= _SHOWN else (*circle[: _SHOWN - 2], f"({len(circle) - _SHOWN + 1} more)", circle[-1])
-    )
     others = sorted({edges[frame].authority for frame in loop if frame in edges and frame != sample.child} - {""})
+    named = " and ".join(map(repr, others[:_SENDERS]))
+    more = f" and {len(others) - _SENDERS} more" if len(others) > _SENDERS else ""
     return InvalidTransformError(
-        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {' -> '.join(shown)}"
-        + (f", with edges from {' and '.join(map(repr, others))}" if others else ""),
+        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {loop_text(circle)}"
+        + (f", with edges from {named}{more}" if others else ""),
         reason="cycle",
         parent=sample.parent,
         child=sample.child,
@@ -101,7 +100,7 @@ def _parent(edge: NewestEdge | None) -> str | None:
     return None if edge is None or (edge.newest is None and not edge.static) else edge.parent
 
 
-def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
+def changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
     """The new parent of each child whose newest parent the batch changes."""
     parents: dict[str, str] = {}
     stamps: dict[str, int | None] = {}

@@ -12,7 +12,7 @@ then lead round the loop. `path_at` says which of them counts, by what is stored
 """
 
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from typing import Any, NamedTuple, TypeVar
 
@@ -25,6 +25,7 @@ from tfbus.rows import IDENTITY, Row, compose, invert
 from tfbus.stamps import LATEST, STAMP_MAX, STAMP_MIN, Latest, as_stamp
 from tfbus.tree.cycles import Frames, Loop, admit, edges_above, names_below, past_loop
 from tfbus.tree.history import FrameHistory, Outcome, SavedFrame, load_frame
+from tfbus.tree.known_frames import KnownFrames
 from tfbus.which_kernel import Chain, Paths, commit
 
 Step = FrameHistory | Row
@@ -361,64 +362,6 @@ class PathCache(Paths):
         self._count = 0
 
 
-class KnownFrames:
-    """Counts the samples that name each frame, so that a frame is forgotten with the last sample that names it."""
-
-    __slots__ = ("_mentions", "_parents_of", "_sorted")
-
-    def __init__(self) -> None:
-        self._parents_of: dict[str, tuple[str, ...]] = {}
-        self._mentions: dict[str, int] = {}
-        self._sorted: tuple[str, ...] | None = None
-
-    def __contains__(self, frame: object) -> bool:
-        return frame in self._parents_of or frame in self._mentions
-
-    def __iter__(self) -> Iterator[str]:
-        """The names in alphabetical order, sorted only now: most errors that hold them never look at them."""
-        return iter(self.sorted())
-
-    @property
-    def parents(self) -> Collection[str]:
-        """The frames that a sample names as a parent."""
-        return self._mentions.keys()
-
-    def update(self, child: str, parents: tuple[str, ...]) -> None:
-        """Note that the samples of `child` name exactly these parents."""
-        before = self._parents_of.get(child)
-        if before == parents:
-            return
-        for parent in parents:
-            self._mentions[parent] = self._mentions.get(parent, 0) + 1
-        self._forget_mentions(before or ())
-        self._parents_of[child] = parents
-        self._sorted = None
-
-    def remove(self, child: str) -> None:
-        """Note that no sample of `child` is left."""
-        self._forget_mentions(self._parents_of.pop(child))
-        self._sorted = None
-
-    def sorted(self) -> tuple[str, ...]:
-        """All names in alphabetical order."""
-        if self._sorted is None:
-            self._sorted = tuple(sorted({*self._parents_of, *self._mentions}))
-        return self._sorted
-
-    def copy(self) -> "KnownFrames":
-        """An independent copy."""
-        twin = KnownFrames()
-        twin._parents_of = self._parents_of.copy()
-        twin._mentions = self._mentions.copy()
-        return twin
-
-    def _forget_mentions(self, parents: tuple[str, ...]) -> None:
-        for parent in parents:
-            self._mentions[parent] -= 1
-            if not self._mentions[parent]:
-                del self._mentions[parent]
-
-
 AT_A_TIME = 100
 """The number of frames that are read before the lock is released, for questions about all of them."""
 
@@ -439,8 +382,8 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
-    themselves. The caller of every other method holds it.
+    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `some_frames`, `read_all`, `copy` and `copy_within`
+    take the lock themselves. The caller of every other method holds it.
 
     Parameters
     ----------
@@ -468,8 +411,8 @@ class Forest:
         Samples since `forget_changes` that are part of a loop of parents at a past stamp.
     readers : dict
         The frames that have changed, for each `read_all` that goes on.
-    expired_frames : list of str
-        The frame of each sample that expired since `forget_changes`.
+    expired_samples : list of TransformStamped
+        The samples that expired since `forget_changes`.
     replaced, expired : int
         Number of samples that had each of these outcomes.
     looped : int
@@ -490,7 +433,7 @@ class Forest:
         self.looping: list[LoopingSample] = []
         self._suspects: list[TransformStamped] = []
         self.readers: dict[int, set[str]] = {}
-        self.expired_frames: list[str] = []
+        self.expired_samples: list[TransformStamped] = []
         self.replaced = 0
         self.expired = 0
         self.looped = 0
@@ -614,7 +557,7 @@ class Forest:
             self.replaced += 1
         else:
             self.expired += 1
-            self.expired_frames.append(child)
+            self.expired_samples.append(sample)
         return outcome
 
     def remove(self, frame: str) -> None:
@@ -646,21 +589,22 @@ class Forest:
 
         The samples of a whole batch are judged after the last, because one batch may turn an edge round.
         """
-        for sample in self._suspects:
+        # Taken before they are judged, so that an error leaves none to be judged again and again.
+        suspects, self._suspects = self._suspects, []
+        for sample in suspects:
             child = sample.child
             if child in self.frames:
                 loop = past_loop(self.frames, child, STAMP_MIN if sample.static else sample.stamp)
                 if loop is not None:
                     self.looping.append(LoopingSample(sample, loop))
                     self.looped += 1
-        self._suspects.clear()
 
     def forget_changes(self) -> None:
-        """Empty `changed`, `new_parents`, `looping` and `expired_frames`."""
+        """Empty `changed`, `new_parents`, `looping` and `expired_samples`."""
         self.changed.clear()
         self.new_parents.clear()
         self.looping.clear()
-        self.expired_frames.clear()
+        self.expired_samples.clear()
 
     def forget_paths(self) -> None:
         """Empty `paths` and `changing_paths`."""
@@ -732,12 +676,17 @@ class Forest:
         with self.lock:
             return self.names.sorted()
 
+    def some_frames(self) -> tuple[str, ...]:
+        """The frames that an error about an unknown one keeps; see `KnownFrames.some`. Takes the lock."""
+        with self.lock:
+            return self.names.some()
+
     def check_known(self, frame: str) -> None:
         """Raise `UnknownFrameError` unless a sample names the frame, `TypeError` unless it is a string."""
         if frame not in self.names:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
-            raise UnknownFrameError(frame=frame, known=self.names)
+            raise UnknownFrameError(frame=frame, known=self.names.some())
 
     def edges_above(self, *names: str) -> list[FrameHistory]:
         """The edges of some frames and of all above them, by any parent that a sample in the window names."""
