@@ -24,6 +24,7 @@ from tfbus.stamps import (
     format_age,
     format_duration,
     format_stamp,
+    time_between,
 )
 
 HUGE = pytest.param(10**400, id="huge")
@@ -379,3 +380,10 @@ def test_one_stamp_beyond_64_bits_among_many_is_a_value_error(values: Any) -> No
 def test_many_stamps_of_another_shape_are_a_value_error(values: Any) -> None:
     with pytest.raises(ValueError, match=r"shape \(n,\), got \("):
         as_stamps(values)
+
+
+@given(st.lists(st.tuples(stamps(), stamps()), min_size=1))
+def test_the_time_between_two_stamps_is_exact_as_long_as_it_fits_64_bits(pairs: list[tuple[int, int]]) -> None:
+    earlier, later = np.array(pairs, np.int64).T
+    exact = [max(-STAMP_MAX, min(end - begin, STAMP_MAX)) for begin, end in pairs]
+    assert time_between(earlier, later).tolist() == exact

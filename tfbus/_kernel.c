@@ -173,6 +173,19 @@ read_stamp(PyObject *number, int64_t *stamp)
     return 0;
 }
 
+/* As `read_stamp`, for a question about stored samples, which may be beyond all stamps: the sum of a stamp and a duration.
+ * Then `*beyond` is the side, 1 or -1, else 0. */
+static int
+read_instant(PyObject *number, int64_t *stamp, int *beyond)
+{
+    const long long value = PyLong_AsLongLongAndOverflow(number, beyond);
+    if (value == -1 && *beyond == 0 && PyErr_Occurred()) {
+        return -1;
+    }
+    *stamp = value;
+    return 0;
+}
+
 /* A plain str, so that comparing and hashing it runs no Python code; a new reference. */
 static PyObject *
 plain_string(PyObject *value)
@@ -719,28 +732,38 @@ history_push_many(History *self, PyObject *const *args, Py_ssize_t nargs)
     Py_RETURN_NONE;
 }
 
+/* The number of samples in the window before an instant. */
+static Py_ssize_t
+history_before(const History *self, int64_t stamp, int beyond)
+{
+    const Py_ssize_t count = self->end - self->start;
+    if (count == 0 || beyond != 0) {
+        return beyond > 0 ? count : 0;
+    }
+    return lower_bound(block_stamps(self->block) + self->start, count, stamp);
+}
+
 static PyObject *
 history_find(History *self, PyObject *number)
 {
     int64_t stamp;
-    if (read_stamp(number, &stamp) < 0) {
+    int beyond;
+    if (read_instant(number, &stamp, &beyond) < 0) {
         return NULL;
     }
-    if (self->block == NULL) {
-        return PyLong_FromLong(0);
-    }
-    return PyLong_FromSsize_t(lower_bound(block_stamps(self->block) + self->start, self->end - self->start, stamp));
+    return PyLong_FromSsize_t(history_before(self, stamp, beyond));
 }
 
 static PyObject *
 history_between(History *self, PyObject *const *args, Py_ssize_t nargs)
 {
     int64_t low, high;
+    int low_beyond, high_beyond;
     if (nargs != 2) {
         PyErr_SetString(PyExc_TypeError, "between takes two stamps");
         return NULL;
     }
-    if (read_stamp(args[0], &low) < 0 || read_stamp(args[1], &high) < 0) {
+    if (read_instant(args[0], &low, &low_beyond) < 0 || read_instant(args[1], &high, &high_beyond) < 0) {
         return NULL;
     }
     const Py_ssize_t count = self->end - self->start;
@@ -748,8 +771,9 @@ history_between(History *self, PyObject *const *args, Py_ssize_t nargs)
         return Py_BuildValue("nn", (Py_ssize_t)0, (Py_ssize_t)0);
     }
     const int64_t *stamps = block_stamps(self->block) + self->start;
-    const Py_ssize_t from_low = lower_bound(stamps, count, low), from_high = lower_bound(stamps, count, high);
-    const int hits = from_low < count && stamps[from_low] == low;
+    const Py_ssize_t from_low = history_before(self, low, low_beyond);
+    const Py_ssize_t from_high = history_before(self, high, high_beyond);
+    const int hits = low_beyond == 0 && from_low < count && stamps[from_low] == low;
     return Py_BuildValue("nn", from_low > 0 && !hits ? from_low - 1 : from_low, from_high < count ? from_high + 1 : count);
 }
 

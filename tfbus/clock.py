@@ -264,7 +264,8 @@ class SimulatedClock:
         """Move the clock forward by a duration in s, and run the timed tasks that become due.
 
         All tasks run until they are blocked. Then the clock moves to the next due timer, fires it, and all tasks run
-        again, and so on. A task that never blocks keeps `advance` from returning.
+        again, and so on. A task that never blocks keeps `advance` from returning. The stamps end with the greatest that
+        64 bits hold, where the clock stays; sleeps of a duration go on.
 
         Raises
         ------
@@ -314,7 +315,7 @@ class SimulatedClock:
 
     def _move_to(self, elapsed: int) -> None:
         if elapsed > self._elapsed:
-            self._now += elapsed - self._elapsed
+            self._now = min(self._now + elapsed - self._elapsed, STAMP_MAX)
             self._elapsed = elapsed
             if self._listeners:
                 self._tell_move()

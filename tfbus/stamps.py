@@ -186,6 +186,19 @@ def as_stamps(values: StampsLike) -> Stamps:
     return array.astype(np.int64, copy=False)
 
 
+def time_between(earlier: Stamps, later: Stamps) -> Stamps:
+    """The time from one stamp to another, elementwise, in ns; the longest that 64 bits hold where it is longer still.
+
+    It is negative where `later` is the earlier one. The limit is 292 years.
+    """
+    time = later - earlier
+    # The difference of two stamps has overflowed if its sign is not the one that their order demands.
+    wrong = (time < 0) != (later < earlier)
+    if wrong.any():
+        time = np.where(wrong, np.where(later < earlier, -STAMP_MAX, STAMP_MAX), time)
+    return np.maximum(time, -STAMP_MAX)
+
+
 def _from_date(date: datetime | np.datetime64) -> int:
     # A Timestamp of pandas has nanoseconds, which its methods as a datetime cut off.
     exact = getattr(date, "to_datetime64", None)

@@ -9,6 +9,7 @@ from support.samples import moving, static, tree_of
 
 from tfbus import SECOND, DisconnectedError, Transform, TransformStamped, TransformTree
 from tfbus.analysis import compare
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MS = SECOND // 1_000
 
@@ -81,6 +82,11 @@ def test_poses_are_compared_with_the_nearest_in_time_within_the_limit() -> None:
     assert both[1].absolute.stamps.tolist() == [stamp * MS for stamp in (8, 95, 195, 300)]
     assert both[0].absolute.translation.tolist() == both[1].absolute.translation.tolist() == [0.0, 0.0, 1.0, 2.0]
     assert compare(wanted, found, "map", "base", max_difference=0.0).poses == 1
+
+
+def test_poses_that_are_centuries_apart_do_not_belong_together() -> None:
+    with pytest.raises(ValueError, match="no pose of 'base' in 'map' is at the same stamp within 0.01 s"):
+        compare(tree([(STAMP_MIN, Transform())]), tree([(STAMP_MAX, Transform())]), "map", "base")
 
 
 def test_the_densest_edge_gives_the_stamps() -> None:

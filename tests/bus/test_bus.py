@@ -29,6 +29,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.bus._ownership import OnConflict
+from tfbus.stamps import STAMP_MAX
 from tfbus.waiting.waiting_index import Waiter
 
 pytestmark = pytest.mark.anyio
@@ -46,6 +47,17 @@ def test_a_published_sample_is_buffered_at_once_without_an_event_loop() -> None:
     bus.publish(moving("map", "a", 1, 3.0))
     for buffer in buffers:
         assert buffer.lookup_nowait("map", "a", 1).transform.translation == (3.0, 0.0, 0.0)
+
+
+def test_frames_turned_round_at_the_last_stamp_leave_the_bus_as_it_was() -> None:
+    bus = Bus(max_ahead=None)
+    buffer = Buffer(bus, keep=None)
+    bus.publish([moving("b", "a", 0), moving("c", "a", STAMP_MAX)])
+    bus.publish(moving("a", "b", STAMP_MAX, 2.0))
+    assert buffer.lookup_nowait("c", "b", STAMP_MAX).transform.translation == (2.0, 0.0, 0.0)
+    for number in range(3):
+        bus.publish(moving("map", f"new{number}", 7, 3.0))
+        assert buffer.lookup_nowait("map", f"new{number}", 7).transform.translation == (3.0, 0.0, 0.0)
 
 
 def test_one_sample_a_list_and_a_generator_can_be_published() -> None:

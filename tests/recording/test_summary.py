@@ -15,6 +15,7 @@ from tfbus import TransformStamped
 from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
 from tfbus.recording.formats import _mcap_reading
 from tfbus.recording.formats._mcap_output import McapOutput
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 SECOND = 1_000_000_000
 MS = 1_000_000
@@ -61,6 +62,21 @@ def test_a_single_moving_sample_has_no_rate(tmp_path: Path) -> None:
     frame = frame_in(tmp_path, [moving("a", "b", 7)])
     assert (frame.oldest, frame.newest, frame.span, frame.rate, frame.longest_gap) == (7, 7, 0.0, None, None)
     assert frame.kind == "moving"
+
+
+def test_stamps_that_are_centuries_apart_are_summarised() -> None:
+    messages = [
+        RecordedMessage(received, (moving("map", "base", stamp),))
+        for received, stamp in ((STAMP_MAX, STAMP_MIN), (0, 0), (0, STAMP_MAX))
+    ]
+    with open_recording(SMALL) as recording:
+        (frame,) = summarise(recording, messages).frames
+    assert (frame.moving, frame.oldest, frame.newest) == (3, STAMP_MIN, STAMP_MAX)
+    assert frame.period is not None
+    assert frame.delay is not None
+    # Half of 2^64 - 1 ns; the longest time that is told is 2^63 - 1 ns.
+    assert frame.period.mean == pytest.approx(9.223372036854775e9)
+    assert (frame.longest_gap, frame.delay.max) == (pytest.approx(9.223372036854775e9),) * 2
 
 
 def test_order_and_repetition_of_stamps_change_neither_gap_nor_rate(tmp_path: Path) -> None:

@@ -28,11 +28,12 @@ def error_of(error: BaseException) -> object:
 class World:
     """A bus on one kernel, with some buffers and with lookups that wait."""
 
-    def __init__(self, kernel: str, rng: random.Random) -> None:
+    def __init__(self, kernel: str, rng: random.Random, limits: float) -> None:
         self.tfbus = tfbus_on(kernel)
         # The modules of a second copy have no names.
         self.waiter = self.tfbus.Buffer.__init__.__globals__["LiveTree"].park.__globals__["Waiter"]
         self.rng = rng
+        self.limits = limits
         self.now = 1_000
         self.clock = self.tfbus.SimulatedClock(self.now)
         options: dict[str, Any] = {"max_ahead": None} if rng.random() < 0.5 else {"max_ahead": 1e-6}
@@ -61,7 +62,7 @@ class World:
 
     def stamp(self) -> int:
         rng = self.rng
-        if rng.random() < 0.01:
+        if rng.random() < self.limits:
             return rng.choice(LIMITS)
         return self.now + rng.randrange(-400, 3) if rng.random() < 0.2 else self.now
 
@@ -193,6 +194,31 @@ class World:
         except tfbus.TransformLookupError:
             pass
 
+    def ask_closely(self) -> None:
+        """Questions that Python answers on both kernels, by what the kernel has stored."""
+        rng, question, stamp = self.rng, self.question(), self.stamp()
+        tree, target, source, at = self.rng.choice(self.buffers).tree, question.target, question.source, question.at
+        durations = (0.0, 1e-9, 1e-6, 4e9, 9.2e9, math.inf)
+        policy = {
+            "tolerance": rng.choice(durations),
+            "max_gap": rng.choice((None, *durations)),
+            "extrapolate": self.tfbus.Hold(rng.choice(durations)),
+        }
+        stamps = [self.stamp() for _ in range(3)]
+        # The names of the frames are those of the buffer.
+        self.say(lambda: tree.lookup(target, source, at, **policy).stamp)
+        self.say(lambda: tree.lookup(target, source, at, source_at=stamp, fixed=rng.choice(FRAMES)).stamp)
+        self.say(lambda: tree.lookup_many(target, source, stamps, out_of_range="nan", **policy).valid.tolist())
+        self.say(lambda: str(tree.explain(target, source, at, **policy)))
+        self.say(lambda: tree.twist(target, source, at).stamp)
+        self.say(lambda: [around and around.stamp for around in tree.samples_around(source, stamp)])
+        self.say(lambda: (tree.describe(), tree.to_yaml(), tree.to_dot(), tree.parent(source, at)))
+        self.say(lambda: self.forget(tree.copy(), stamp))
+
+    def forget(self, tree: Any, stamp: int) -> object:
+        tree.forget_before(stamp)
+        return [(edge.child, edge.oldest, edge.newest, edge.rate) for edge in tree.edges()]
+
     def cancel(self) -> None:
         if self.parked:
             live, waiter = self.rng.choice(self.parked)
@@ -205,6 +231,8 @@ class World:
         rng = self.rng
         common = (self.publish, self.publish, self.step_each_edge, self.step_each_edge, self.park, self.look_up)
         rare = (self.remove, self.move_clock, self.add_buffer, self.close_buffer, self.listen, self.cancel, self.copy)
+        if self.limits > 0.1:
+            common = (*common, self.ask_closely)
         rng.choice(common if rng.random() < 0.9 else rare)()
 
     def state(self) -> object:
@@ -235,8 +263,8 @@ class World:
         return edges, trees, repr(self.bus.statistics())
 
 
-def run(seed: int, steps: int) -> None:
-    ours, theirs = (World(kernel, random.Random(seed)) for kernel in ("compiled", "python"))
+def run(seed: int, steps: int, limits: float = 0.01) -> None:
+    ours, theirs = (World(kernel, random.Random(seed), limits) for kernel in ("compiled", "python"))
     for number in range(steps):
         ours.step()
         theirs.step()
@@ -244,6 +272,9 @@ def run(seed: int, steps: int) -> None:
         assert ours.state() == theirs.state(), (seed, number)
         ours.said.clear()
         theirs.said.clear()
+    for world in (ours, theirs):
+        # It raises if one of the buffers does.
+        world.bus.publish(world.tfbus.TransformStamped("map", "new", 7, world.tfbus.Transform((1.0, 0.0, 0.0))))
     ours.close()
     theirs.close()
     assert ours.said == theirs.said, seed
@@ -255,3 +286,11 @@ def run(seed: int, steps: int) -> None:
 def test_random_traffic_does_the_same_on_both_kernels(first: int) -> None:
     for seed in range(first, first + 5):
         run(seed, 250)
+
+
+@needs_both
+@pytest.mark.thorough
+@pytest.mark.parametrize("first", range(10_000, 10_020, 5))
+def test_traffic_at_the_first_and_the_last_stamps_does_the_same_on_both_kernels(first: int) -> None:
+    for seed in range(first, first + 5):
+        run(seed, 150, limits=0.5)

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from tfbus.analysis.finding import Finding
 from tfbus.analysis.limits import Limits
-from tfbus.stamps import SECOND, STAMP_MAX, to_seconds
+from tfbus.stamps import SECOND, STAMP_MAX, time_between, to_seconds
 
 _OUTLIER = 20.0
 """The least speed of a jump, as a multiple of the median speed of its frame."""
@@ -70,9 +70,9 @@ class MovingSamples:
         if self.received is None:
             return
         newest = np.maximum.accumulate(self.stamps)
-        back = newest - self.stamps
+        back = time_between(self.stamps, newest)
         yield from self._at("stamps go back", back > 0, self.stamps, back / SECOND, "s", "older than one before")
-        ahead = (self.stamps - self.received) / SECOND
+        ahead = time_between(self.received, self.stamps) / SECOND
         yield from self._at("ahead", ahead > limits.ahead, self.stamps, ahead, "s", "stamped ahead of its arrival")
 
     def _jumps(

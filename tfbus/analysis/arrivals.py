@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from tfbus.geometry.stamped import Batch
-from tfbus.stamps import SECOND, from_seconds
+from tfbus.stamps import SECOND, from_seconds, time_between
 
 MAX_SAMPLES: Final = 20_000
 """The number of samples of a frame and sender that are kept; older ones are left out of a window that has more."""
@@ -110,8 +110,8 @@ class _Received:
             unknown = (None, None, None, None, None, None)
             return Arrival(frame, self.parent, authority, self.static, 0, *unknown, late=0, lost=0)
         arrived, stamps = np.array(self.times, np.int64).T
-        delays = np.sort(arrived - stamps) / SECOND
-        periods = np.diff(arrived) / SECOND
+        delays = np.sort(time_between(stamps, arrived)) / SECOND
+        periods = time_between(arrived[:-1], arrived[1:]) / SECOND
         several = count > 1 and arrived[-1] > arrived[0]
         return Arrival(
             frame,
@@ -119,14 +119,14 @@ class _Received:
             authority,
             self.static,
             count,
-            rate=float((count - 1) * SECOND / (arrived[-1] - arrived[0])) if several else None,
+            rate=(count - 1) * SECOND / (int(arrived[-1]) - int(arrived[0])) if several else None,
             delay_mean=float(delays.mean()),
             delay_p99=float(delays[-(-99 * count // 100) - 1]),
             delay_max=float(delays[-1]),
             jitter=float(periods.std()) if count > 1 else None,
             longest_gap=max(float(periods.max(initial=0.0)), (now - int(arrived[-1])) / SECOND),
             late=int(np.count_nonzero(stamps[1:] < np.maximum.accumulate(stamps)[:-1])),
-            lost=_lost(np.diff(np.unique(stamps))),
+            lost=_lost(time_between((different := np.unique(stamps))[:-1], different[1:])),
         )
 
 

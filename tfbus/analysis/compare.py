@@ -9,7 +9,7 @@ import numpy.typing as npt
 from tfbus.analysis.alignment import Alignment
 from tfbus.analysis.pose_errors import PoseErrors
 from tfbus.geometry.rows import Columns, compose, invert
-from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds
+from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds, time_between
 from tfbus.tree.tree import TransformTree, forest_of
 
 _Rows = npt.NDArray[np.float64]
@@ -147,8 +147,9 @@ def _nearest(short: _Stamps, long: _Stamps, limit: int) -> tuple[npt.NDArray[np.
         best = np.zeros(len(short), np.intp)
     else:
         # Of two that are equally near, the earlier one.
-        best = np.where(long[after] - short < short - long[after - 1], after, after - 1)
-    near = np.flatnonzero(np.abs(long[best] - short) <= limit)
+        nearer = time_between(short, long[after]) < time_between(long[after - 1], short)
+        best = np.where(nearer, after, after - 1)
+    near = np.flatnonzero(np.abs(time_between(short, long[best])) <= limit)
     return near, best[near]
 
 

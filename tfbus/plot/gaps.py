@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from tfbus.plot._style import COLOURS, new_figure
 from tfbus.plot.reception import Floats, Reception
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, time_between
 
 GAP = 3.0
 """A pause is a gap if it is longer than so many times the usual period of its frame."""
@@ -71,7 +71,7 @@ def spans_heard(frame: Reception) -> list[tuple[int, int]]:
     times = np.sort(frame.received)
     if not len(times):
         return []
-    pauses = np.diff(times)
+    pauses = time_between(times[:-1], times[1:])
     usual = float(np.median(pauses)) if len(pauses) else 0.0
     breaks = np.flatnonzero(pauses > GAP * usual)
     begins = times[np.concatenate(([0], breaks + 1))]

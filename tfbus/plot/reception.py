@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.recording.message import RecordedMessage
-from tfbus.stamps import SECOND, Stamps
+from tfbus.stamps import SECOND, Stamps, time_between
 
 Floats = npt.NDArray[np.float64]
 
@@ -35,12 +35,13 @@ class Reception:
     @property
     def periods(self) -> Floats:
         """The times between two successive stamps, in s, shape (m - 1,) for m different stamps."""
-        return np.diff(np.unique(self.stamps)).astype(np.float64) / SECOND
+        stamps = np.unique(self.stamps)
+        return time_between(stamps[:-1], stamps[1:]).astype(np.float64) / SECOND
 
     @property
     def delays(self) -> Floats:
         """The time from each stamp to its arrival, in s, shape (n,)."""
-        return (self.received - self.stamps).astype(np.float64) / SECOND
+        return time_between(self.stamps, self.received).astype(np.float64) / SECOND
 
 
 def read_reception(messages: Iterable[RecordedMessage]) -> dict[str, Reception]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.stamps import SECOND, Stamps
+from tfbus.stamps import SECOND, Stamps, time_between
 from tfbus.tree.tree import TransformTree
 
 Floats = npt.NDArray[np.float64]
@@ -65,7 +65,7 @@ def read_series(tree: TransformTree, target: str, source: str, samples: int = SA
     start, end = (first, last) if newest.static else _common_span(tree, target, source, newest.stamp)
     stamps = start + ((end - start) * np.arange(samples, dtype=object) // (samples - 1)).astype(np.int64)
     found = tree.lookup_many(target, source, stamps, out_of_range="nan")
-    seconds = (stamps - first).astype(np.float64) / SECOND
+    seconds = time_between(np.full_like(stamps, first), stamps).astype(np.float64) / SECOND
     return Series(target, source, stamps, seconds, found.translations, np.degrees(found.as_rpy()), newest.static)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.recording.spread import Spread
-from tfbus.stamps import SECOND, to_seconds
+from tfbus.stamps import SECOND, STAMP_MAX, to_seconds
 
 _GROWTH: Final = math.log(1.01)
 _SINGLE: Final = 1_000
@@ -40,8 +40,8 @@ class Durations:
         return whole
 
     def add_one(self, duration: int) -> None:
-        """Count a duration in ns."""
-        self._single.append(duration)
+        """Count a duration in ns; one that does not fit 64 bits as the longest that does."""
+        self._single.append(max(-STAMP_MAX, min(duration, STAMP_MAX)))
         if len(self._single) >= _SINGLE:
             self._count_single()
 

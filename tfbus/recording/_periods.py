@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from tfbus.recording._durations import Durations
 from tfbus.recording.spread import Spread
-from tfbus.stamps import SECOND, to_seconds
+from tfbus.stamps import SECOND, time_between, to_seconds
 
 _AT_ONCE: Final = 50_000
 """So many stamps are merged at once, roughly."""
@@ -64,7 +64,8 @@ class Periods:
         if not len(stamps):
             return before
         self._different += len(stamps)
-        periods = np.diff(stamps) if before is None else np.diff(stamps, prepend=np.int64(before))
+        ends = stamps if before is None else np.concatenate(([np.int64(before)], stamps))
+        periods = time_between(ends[:-1], ends[1:])
         if len(periods):
             self._durations.add(periods)
         return int(stamps[-1])

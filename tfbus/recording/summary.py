@@ -17,7 +17,7 @@ from tfbus.recording.load import Problems, sound_samples
 from tfbus.recording.message import RecordedMessage
 from tfbus.recording.recording import RecordedTopic, Recording
 from tfbus.recording.spread import Spread
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, time_between
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +274,7 @@ class _Frame:
         stamps = columns.stamps
         sent.moving += len(stamps)
         sent.stamps.frombytes(stamps.tobytes())
-        sent.delays.add(columns.received - stamps)
+        sent.delays.add(time_between(stamps, columns.received))
         newest = int(stamps.max())
         if self.newest is None or newest >= self.newest:
             self.newest, self.authority = newest, columns.authority

@@ -250,14 +250,15 @@ class Forest:
 
         The samples of a whole batch are judged after the last, because one batch may turn an edge round.
         """
-        for sample in self._suspects:
+        # Taken before they are judged, so that an error leaves none to be judged again and again.
+        suspects, self._suspects = self._suspects, []
+        for sample in suspects:
             child = sample.child
             if child in self.frames:
                 loop = past_loop(self.frames, child, STAMP_MIN if sample.static else sample.stamp)
                 if loop is not None:
                     self.looping.append(LoopingSample(sample, loop))
                     self.looped += 1
-        self._suspects.clear()
 
     def forget_changes(self) -> None:
         """Empty `changed`, `new_parents`, `looping` and `expired_frames`."""
