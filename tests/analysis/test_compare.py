@@ -85,7 +85,7 @@ def test_poses_are_compared_with_the_nearest_in_time_within_the_limit() -> None:
 
 
 def test_poses_that_are_centuries_apart_do_not_belong_together() -> None:
-    with pytest.raises(ValueError, match="no pose of 'base' in 'map' is at the same stamp within 0.01 s"):
+    with pytest.raises(ValueError, match="no pose of 'base' in 'map' is at the same stamp"):
         compare(tree([(STAMP_MIN, Transform())]), tree([(STAMP_MAX, Transform())]), "map", "base")
 
 

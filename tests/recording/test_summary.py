@@ -66,7 +66,7 @@ def test_a_single_moving_sample_has_no_rate(tmp_path: Path) -> None:
 
 def test_stamps_that_are_centuries_apart_are_summarised() -> None:
     messages = [
-        RecordedMessage(received, (moving("map", "base", stamp),))
+        RecordedMessage(received, (moving("map", "base", stamp),), ())
         for received, stamp in ((STAMP_MAX, STAMP_MIN), (0, 0), (0, STAMP_MAX))
     ]
     with open_recording(SMALL) as recording:
