@@ -25,19 +25,37 @@ can be pickled and copied, with their cause. Arguments of the wrong type raise `
 """
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from heapq import nlargest
+from itertools import islice
 from typing import Any, Self, TypeVar, get_type_hints
 
 from tfbus.plain import from_fields, from_plain, to_plain
 from tfbus.stamps import Latest, format_duration, format_stamp
 
-LOOKED_AT = 30
+MOST_NAMES = 5_000
+"""The number of known names that an error about an unknown one keeps."""
+
+LONGEST_NAME = 64
+"""The length of a name, in letters, beyond which it is similar to no other; the time of a comparison is quadratic."""
+
+LOOKED_AT = 10
 """The number of known names that are compared in full with an unknown one; a comparison takes tens of microseconds."""
+
+SHOWN_FRAMES = 10
+"""The number of frames of a loop that a text names."""
 
 
 AnyError = TypeVar("AnyError", bound="TransformError")
+
+
+def loop_text(frames: Sequence[str]) -> str:
+    """The frames of a loop of parents in words, the first one repeated at the end; of a long loop, some."""
+    shown = frames
+    if len(frames) > SHOWN_FRAMES:
+        shown = (*frames[: SHOWN_FRAMES - 2], f"({len(frames) - SHOWN_FRAMES + 1} more)", frames[-1])
+    return " -> ".join(shown)
 
 
 def pip_install(extras: str) -> str:
@@ -134,22 +152,23 @@ class UnknownFrameError(TransformLookupError):
     frame : str
         The unknown frame.
     close_matches : tuple of str
-        Known frames with a similar name, the most similar first; computed when first read, from the frames that are
-        known then.
+        Frames with a similar name, the most similar first: of those that were known when the error was raised, or of
+        some, if they were many. Computed when first read.
     """
 
     frame: str
-    _known: Iterable[str] = ()
+    _known: tuple[str, ...] = ()
 
     def __init__(self, *, frame: str, known: Iterable[str] = ()) -> None:
         super().__init__()
         self.frame = frame
-        self._known = known
+        # The same tuple for all errors of a tree, until its frames change.
+        self._known = tuple(islice(known, MOST_NAMES)) if type(known) is not tuple else known[:MOST_NAMES]
 
     @cached_property
     def close_matches(self) -> tuple[str, ...]:
         """Known frames with a similar name, the most similar first."""
-        return _close_matches(self.frame.lstrip("/"), tuple(self._known))
+        return _close_matches(self.frame.lstrip("/"), self._known)
 
     def _why(self) -> str:
         hint = " or ".join(repr(name) for name in self.close_matches)
@@ -169,13 +188,18 @@ class UnknownFrameError(TransformLookupError):
 @lru_cache(maxsize=128)
 def _close_matches(frame: str, known: tuple[str, ...]) -> tuple[str, ...]:
     length = len(frame)
+    if length > LONGEST_NAME:
+        return ()
     size = 1 + length // 8
     parts = [frame[i : i + size] for i in range(0, length, size)]
 
     def likeness(name: str) -> int:
         return 2 * sum(map(name.__contains__, parts)) - abs(len(name) - length)
 
-    candidates = known if len(known) <= LOOKED_AT else nlargest(LOOKED_AT, known, likeness)
+    short = [name for name in known if len(name) <= LONGEST_NAME]
+    # A comparison of long names takes up to 2 ms.
+    most = max(3, min(LOOKED_AT, 10_000 // max(length, 1) ** 2))
+    candidates = short if len(short) <= most else nlargest(most, short, likeness)
     return tuple(difflib.get_close_matches(frame, candidates))
 
 
@@ -210,17 +234,20 @@ class DisconnectedError(TransformLookupError):
         stamp: int | None = None,
         loop: tuple[str, ...] = (),
     ) -> None:
-        when = "" if stamp is None else f" at {format_stamp(stamp)}"
-        if loop:
-            why = f"the frames {' -> '.join(loop)} form a loop{when}"
-        else:
-            why = f"they are in different trees{when}, with roots {roots[0]!r} and {roots[1]!r}"
-        super().__init__(f"no path from {source!r} to {target!r}: {why}")
+        super().__init__()
         self.target = target
         self.source = source
         self.roots = roots
         self.stamp = stamp
         self.loop = loop
+
+    def _why(self) -> str:
+        when = "" if self.stamp is None else f" at {format_stamp(self.stamp)}"
+        if self.loop:
+            why = f"the frames {loop_text(self.loop)} form a loop{when}"
+        else:
+            why = f"they are in different trees{when}, with roots {self.roots[0]!r} and {self.roots[1]!r}"
+        return f"no path from {self.source!r} to {self.target!r}: {why}"
 
 
 class ExtrapolationError(TransformLookupError):

@@ -7,7 +7,7 @@ and so do `FrameStale` and `FrameLive`. After a `ClockReset` the first sample of
 
 from dataclasses import dataclass, field
 
-from tfbus.errors import TransformError
+from tfbus.errors import TransformError, loop_text
 from tfbus.plain import PlainData
 from tfbus.stamps import format_duration, format_stamp
 
@@ -139,7 +139,7 @@ class PastLoop(PlainData):
     loop: tuple[str, ...]
 
     def __str__(self) -> str:
-        frames = " -> ".join(self.loop)
+        frames = loop_text(self.loop)
         return _line(
             self.stamp,
             f"the frames {frames} form a loop at {format_stamp(self.at)}, with late data of {self.authority!r}",

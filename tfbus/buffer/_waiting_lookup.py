@@ -278,7 +278,7 @@ class Lookups:
         """Raise `UnknownFrameError` for a name that can never be that of a frame."""
         for name in (question.target, question.source, question.fixed):
             if name is not None and not is_frame(name):
-                raise UnknownFrameError(frame=name, known=self._live.forest.known_frames()) from None
+                raise UnknownFrameError(frame=name, known=self._live.forest.some_frames()) from None
 
 
 def _timed_out(wait: _Wait, limit: float) -> LookupTimeoutError:

@@ -48,7 +48,7 @@ class Watch:
     ) -> None:
         for name in (question.target, question.source):
             if not is_frame(name):
-                raise UnknownFrameError(frame=name, known=live.forest.known_frames())
+                raise UnknownFrameError(frame=name, known=live.forest.some_frames())
         if question.max_age is not None:
             lookups.bounds(question.max_age, question.at, question.source_at)
         self.skipped = 0

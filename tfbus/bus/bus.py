@@ -25,7 +25,7 @@ from tfbus.bus.sample_queue import Overflow
 from tfbus.bus.stream import Stream
 from tfbus.bus.thread_publisher import ThreadPublisher
 from tfbus.clock import Clock, SystemClock
-from tfbus.errors import BusClosedError, UnknownFrameError
+from tfbus.errors import BusClosedError, UnknownFrameError, loop_text
 from tfbus.events import ClockReset, Event, PastLoop
 from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
 from tfbus.geometry.stamped import Batch, TransformStamped, as_batch
@@ -261,7 +261,7 @@ class Bus:
     def _announce_past_loop(self, found: LoopingSample) -> None:
         """Log and announce a loop of parents at a past stamp. Called by buffers, which alone have the history."""
         sample, (at, loop) = found
-        frames = " -> ".join(loop)
+        frames = loop_text(loop)
         key = ("past loop", sample.child, sample.parent, sample.authority)
         self._log.warning(
             key, "the frames %s form a loop at %s, with late data of %r", frames, format_stamp(at), sample.authority

@@ -10,6 +10,7 @@ from tfbus.geometry.rows import IDENTITY
 from tfbus.geometry.stamped import answer_of
 from tfbus.stamps import STAMP_MAX, Latest, as_duration, from_seconds
 from tfbus.tree.question import Question
+from tfbus.tree.tree import forest_of
 
 AnswerT = TypeVar("AnswerT")
 
@@ -106,5 +107,5 @@ class Targets(Generic[AnswerT]):
             raise ValueError("there must be at least one target")
         for name in names:
             if not is_frame(name):
-                raise UnknownFrameError(frame=name, known=self._buffer.tree.frames())
+                raise UnknownFrameError(frame=name, known=forest_of(self._buffer.tree).some_frames())
         return names

@@ -28,6 +28,7 @@ from tfbus.message_filter._message_queue import MessageQueue, Order, PendingMess
 from tfbus.message_filter._targets import Targets
 from tfbus.registration import Registration
 from tfbus.stamps import LATEST, Latest, as_duration, as_stamp
+from tfbus.tree.tree import forest_of
 
 MessageT = TypeVar("MessageT")
 AnswerT = TypeVar("AnswerT")
@@ -300,7 +301,8 @@ class MessageFilter(Generic[MessageT, AnswerT]):
         named = is_frame(frame)
         self._arrived += 1
         if not named:
-            self._drops.drop(message, "unknown frame", UnknownFrameError(frame=frame, known=self.buffer.tree.frames()))
+            known = forest_of(self.buffer.tree).some_frames()
+            self._drops.drop(message, "unknown frame", UnknownFrameError(frame=frame, known=known))
             return
         answer: AnswerT | None = None
         blocker: TransformLookupError | None = None

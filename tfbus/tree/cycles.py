@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from typing import Protocol
 
-from tfbus.errors import InvalidTransformError
+from tfbus.errors import InvalidTransformError, loop_text
 from tfbus.geometry.stamped import Batch, TransformStamped
 
-_SHOWN = 10
+_SENDERS = 5
 
 
 class NewestEdge(Protocol):
@@ -65,13 +65,12 @@ def admit(
 def _cycle(edges: Mapping[str, NewestEdge], sample: TransformStamped, loop: tuple[str, ...]) -> InvalidTransformError:
     start = loop.index(sample.child)
     circle = (*loop[start:], *loop[: start + 1])
-    shown = (
-        circle if len(circle) <= _SHOWN else (*circle[: _SHOWN - 2], f"({len(circle) - _SHOWN + 1} more)", circle[-1])
-    )
     others = sorted({edges[frame].authority for frame in loop if frame in edges and frame != sample.child} - {""})
+    named = " and ".join(map(repr, others[:_SENDERS]))
+    more = f" and {len(others) - _SENDERS} more" if len(others) > _SENDERS else ""
     return InvalidTransformError(
-        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {' -> '.join(shown)}"
-        + (f", with edges from {' and '.join(map(repr, others))}" if others else ""),
+        f"the edge {sample.parent!r} -> {sample.child!r} would close a loop of parents: {loop_text(circle)}"
+        + (f", with edges from {named}{more}" if others else ""),
         reason="cycle",
         parent=sample.parent,
         child=sample.child,

@@ -43,7 +43,7 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `read_all`, `copy` and `copy_within` take the lock
+    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `some_frames`, `read_all`, `copy` and `copy_within` take the lock
     themselves. The caller of every other method holds it.
 
     Parameters
@@ -337,12 +337,17 @@ class Forest:
         with self.lock:
             return self.names.sorted()
 
+    def some_frames(self) -> tuple[str, ...]:
+        """The frames that an error about an unknown one keeps; see `KnownFrames.some`. Takes the lock."""
+        with self.lock:
+            return self.names.some()
+
     def check_known(self, frame: str) -> None:
         """Raise `UnknownFrameError` unless a sample names the frame, `TypeError` unless it is a string."""
         if frame not in self.names:
             if not isinstance(frame, str):
                 raise TypeError(f"a frame name must be a str, not {frame!r}")
-            raise UnknownFrameError(frame=frame, known=self.names)
+            raise UnknownFrameError(frame=frame, known=self.names.some())
 
     def edges_above(self, *names: str) -> list[FrameHistory]:
         """The edges of some frames and of all above them, by any parent that a sample in the window names."""
