@@ -34,7 +34,7 @@ from typing import Any, Self, TypeVar, get_type_hints
 from tfbus.plain import from_fields, from_plain, to_plain
 from tfbus.stamps import Latest, format_duration, format_stamp
 
-MOST_NAMES = 5_000
+MOST_NAMES = 2_000
 """The number of known names that an error about an unknown one keeps."""
 
 LONGEST_NAME = 64

@@ -43,8 +43,8 @@ class LoopingSample(NamedTuple):
 class Forest:
     """The histories of all frames that have a parent.
 
-    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `some_frames`, `read_all`, `copy` and `copy_within` take the lock
-    themselves. The caller of every other method holds it.
+    `insert`, `commit`, `remove`, `clear`, `search`, `known_frames`, `some_frames`, `read_all`, `copy` and `copy_within`
+    take the lock themselves. The caller of every other method holds it.
 
     Parameters
     ----------
