@@ -51,6 +51,7 @@ _NAMES_IN = {
         "PastExtrapolationError",
         "RecordingError",
         "RemoteLookupError",
+        "TooManyFramesError",
         "TransformError",
         "TransformLookupError",
         "UnknownFrameError",

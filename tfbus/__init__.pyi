@@ -44,6 +44,7 @@ from tfbus.errors import MissingRecordingError as MissingRecordingError
 from tfbus.errors import PastExtrapolationError as PastExtrapolationError
 from tfbus.errors import RecordingError as RecordingError
 from tfbus.errors import RemoteLookupError as RemoteLookupError
+from tfbus.errors import TooManyFramesError as TooManyFramesError
 from tfbus.errors import TransformError as TransformError
 from tfbus.errors import TransformLookupError as TransformLookupError
 from tfbus.errors import UnknownFrameError as UnknownFrameError

@@ -14,6 +14,7 @@
             LookupTimeoutError (TimeoutError)  __cause__ is the last lookup error
             RemoteLookupError                  .domain .robot .reason .detail
         InvalidTransformError (ValueError)     .reason .parent .child .authority .loop .owner
+            TooManyFramesError                 .frames .max_frames
         InvalidRobotError (ValueError)         .element
         RecordingError (ValueError)            .path .reason
             MissingRecordingError (FileNotFoundError)
@@ -493,6 +494,33 @@ class InvalidTransformError(TransformError, ValueError):
         self.authority = authority
         self.loop = loop
         self.owner = owner
+
+
+class TooManyFramesError(InvalidTransformError):
+    """A sample names new frames for which the bus has no place; nothing was stored.
+
+    Attributes
+    ----------
+    frames : int
+        The number of frames on the bus.
+    max_frames : int
+        The greatest number that it takes.
+    """
+
+    frames: int
+    max_frames: int
+
+    def __init__(self, *, frames: int, max_frames: int, parent: str, child: str, authority: str) -> None:
+        super().__init__(
+            f"the edge {parent!r} -> {child!r} from {authority!r} names a new frame, but the bus has {frames:,} frames "
+            f"and takes {max_frames:,}: remove frames that are gone, or make the bus with a greater max_frames",
+            reason="too many frames",
+            parent=parent,
+            child=child,
+            authority=authority,
+        )
+        self.frames = frames
+        self.max_frames = max_frames
 
 
 class InvalidRobotError(TransformError, ValueError):

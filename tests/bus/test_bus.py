@@ -4,12 +4,15 @@ import tracemalloc
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import asdict
 from functools import partial
+from typing import Any
 
 import anyio
 import anyio.to_thread
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
-from support.samples import moving, static
+from support.samples import any_samples, moving, newest_samples, static
 
 from tfbus import (
     Buffer,
@@ -24,6 +27,7 @@ from tfbus import (
     Question,
     SimulatedClock,
     SystemClock,
+    TooManyFramesError,
     TransformBroadcaster,
     TransformStamped,
     UnknownFrameError,
@@ -58,6 +62,86 @@ def test_frames_turned_round_at_the_last_stamp_leave_the_bus_as_it_was() -> None
     for number in range(3):
         bus.publish(moving("map", f"new{number}", 7, 3.0))
         assert buffer.lookup_nowait("map", f"new{number}", 7).transform.translation == (3.0, 0.0, 0.0)
+
+
+def names_on(buffer: Buffer) -> list[str]:
+    return buffer.tree.frames()
+
+
+def test_a_frame_beyond_the_greatest_number_is_refused_with_its_whole_batch() -> None:
+    bus = Bus(max_frames=3)
+    buffer = Buffer(bus)
+    bus.publish([moving("map", "a", 1), moving("map", "b", 1)])
+    with pytest.raises(TooManyFramesError, match="names a new frame, but the bus has 3 frames and takes 3") as caught:
+        bus.publish([moving("map", "a", 2), moving("map", "c", 2, authority="page")])
+    error = caught.value
+    assert (error.frames, error.max_frames, error.reason) == (3, 3, "too many frames")
+    assert (error.parent, error.child, error.authority) == ("map", "c", "page")
+    assert names_on(buffer) == ["a", "b", "map"]
+    assert buffer.lookup_nowait("map", "a").stamp == 1
+    assert bus.statistics().rejected == {"too many frames": 1}
+    # Known frames go on, under any of the known parents.
+    bus.publish([moving("map", "a", 3), moving("a", "b", 3), static("map", "a", stamp=4)])
+    assert bus.max_frames == 3
+
+
+def test_dropping_leaves_out_the_frames_without_a_place_and_logs_them_once(caplog: pytest.LogCaptureFixture) -> None:
+    bus = Bus(max_frames=3)
+    buffer = Buffer(bus)
+    for number in range(100):
+        bus.publish([moving("map", "a", number), moving("map", f"x{number}", number, authority=str(number))], "drop")
+    assert names_on(buffer) == ["a", "map", "x0"]
+    assert buffer.lookup_nowait("map", "a").stamp == 99
+    assert bus.statistics().rejected == {"too many frames": 99}
+    assert len([message for message in caplog.messages if "dropped" in message]) == 1
+
+
+def test_a_frame_that_is_gone_gives_its_place_back() -> None:
+    bus = Bus(SimulatedClock(100), max_frames=3)
+    buffer = Buffer(bus)
+    bus.publish([moving("map", "a", 1), static("map", "b")])
+    bus.remove_frame("a")
+    bus.publish(moving("map", "c", 1))
+    # The parent that nothing hangs under any more goes, and another one comes.
+    bus.publish([moving("odom", "c", 2), static("odom", "b")])
+    with pytest.raises(TooManyFramesError):
+        bus.publish(moving("odom", "d", 2))
+    assert isinstance(bus.clock, SimulatedClock)
+    bus.clock.set(10)
+    bus.publish(moving("odom", "d", 2))
+    assert names_on(buffer) == ["b", "c", "d", "odom"]
+
+
+@given(st.lists(st.lists(any_samples("abcdef", last=3), min_size=1, max_size=4), max_size=12), st.integers(2, 6))
+def test_there_are_never_more_frames_and_none_is_refused_that_has_a_place(
+    batches: list[list[TransformStamped]], most: int
+) -> None:
+    with Bus(max_frames=most) as bus:
+        stored: list[TransformStamped] = []
+        bus.subscribe(stored.extend)
+        for batch in batches:
+            before = newest_samples(stored)
+            try:
+                bus.publish(batch)
+            except TooManyFramesError as error:
+                assert len(names_in(newest_samples([*stored, *batch]))) > most
+                assert error.frames == len(names_in(before))
+                bus.publish(batch, invalid="drop")
+            except InvalidTransformError:
+                bus.publish(batch, invalid="drop")
+            assert len(names_in(newest_samples(stored))) <= most
+
+
+def names_in(newest: dict[str, TransformStamped]) -> set[str]:
+    return {*newest, *(sample.parent for sample in newest.values())}
+
+
+@pytest.mark.parametrize(
+    ("most", "kind"), [(1, ValueError), (0, ValueError), (True, TypeError), (3.0, TypeError), ("3", TypeError)]
+)
+def test_the_greatest_number_of_frames_is_an_int_of_at_least_two(most: Any, kind: type[Exception]) -> None:
+    with pytest.raises(kind, match="max_frames must be"):
+        Bus(max_frames=most)
 
 
 def test_one_sample_a_list_and_a_generator_can_be_published() -> None:

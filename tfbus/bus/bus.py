@@ -54,6 +54,10 @@ class Bus:
         `StampAhead`, logged once for each authority and frame, and counted. None for any distance: for a bus that
         carries recorded time. A `Player` needs no None, and a `SimulatedClock` that nobody has set yet (at 0, without a
         jump) has no stamp ahead of it.
+    max_frames : int or None
+        The greatest number of frames, children and parents of the newest edges, for a bus on which strangers publish. A
+        sample that names a new one beyond it is refused. A frame that is removed gives its place back, and so does a
+        parent without children. None for any number.
     reject_ahead : bool
         Whether a sample that is further ahead is refused. Otherwise it is accepted; until the clock has reached it,
         right samples of its frame are older than the newest, and expire if they are older than a buffer's window.
@@ -85,6 +89,7 @@ class Bus:
         max_translation: float = MAX_TRANSLATION,
         max_ahead: float | None = 1.0,
         reject_ahead: bool = False,
+        max_frames: int | None = None,
     ) -> None:
         self.clock: Clock = SystemClock() if clock is None else clock
         self._owner = OwnerThread()
@@ -94,7 +99,12 @@ class Bus:
         self._announcer = Announcer(self.clock.now, self._events)
         self._plausibility = Plausibility(self.clock, max_translation, max_ahead, reject_ahead)
         self._topology = Topology(
-            self._log, Ownership(on_conflict), self._plausibility, self._announcer, self._remove_if_known
+            self._log,
+            Ownership(on_conflict),
+            self._plausibility,
+            self._announcer,
+            self._remove_if_known,
+            None if max_frames is None else _as_max_frames(max_frames),
         )
         self._subscribers = Subscribers(self._log, self._announcer)
         self._buffers: dict[LiveTree, int] = {}
@@ -120,6 +130,11 @@ class Bus:
         """The greatest magnitude of a translation, in m."""
         return self._plausibility.max_translation
 
+    @property
+    def max_frames(self) -> int | None:
+        """The greatest number of frames; None for any number."""
+        return self._topology.max_frames
+
     def publish(self, samples: TransformStamped | Iterable[TransformStamped], invalid: Invalid = "raise") -> None:
         """Send one sample, or a batch that is seen all or not at all.
 
@@ -139,6 +154,8 @@ class Bus:
             If a sample would close a loop of parents, its child is reserved for another authority, or comes from
             another one with ``on_conflict="reject"``; if its translation is not finite or longer than
             `max_translation`; with ``reject_ahead=True``, if its stamp is ahead of the clock. Nothing is stored.
+        TooManyFramesError
+            If the bus would have more than `max_frames` frames; an `InvalidTransformError`. Nothing is stored.
         TypeError
             If something in it is not a `TransformStamped`.
         BusClosedError
@@ -339,9 +356,8 @@ class Bus:
         """
         self._check_usable()
         if frame not in self._topology and not any(frame in buffer.forest.names for buffer in self._buffers):
-            names = self._topology.names()
-            if frame not in names:
-                raise UnknownFrameError(frame=frame, known=tuple(names))
+            if not self._topology.is_named(frame):
+                raise UnknownFrameError(frame=frame, known=self._topology.names())
         self._topology.remove(frame)
         self._subscribers.forget(frame)
         for publisher in self._threads:
@@ -498,3 +514,11 @@ class Bus:
             buffer.reset(before, after)
         for late in self._late.values():
             late.clear_moving()
+
+
+def _as_max_frames(value: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"max_frames must be an int or None, not {value!r}")
+    if value < 2:
+        raise ValueError(f"max_frames must be at least 2, a parent and a child, got {value}")
+    return value

@@ -47,7 +47,7 @@ def admit(
     """
     accepted: Sequence[TransformStamped] = batch
     refused: list[InvalidTransformError] = []
-    while loops := _find_loops(edges, changes := _changed_parents(edges, accepted), parents):
+    while loops := _find_loops(edges, changes := changed_parents(edges, accepted), parents):
         loop_of = {frame: loop for loop in loops for frame in loop}
         kept: list[TransformStamped] = []
         for sample in reversed(accepted):
@@ -83,7 +83,7 @@ def _parent(edge: NewestEdge | None) -> str | None:
     return None if edge is None or (edge.newest is None and not edge.static) else edge.parent
 
 
-def _changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
+def changed_parents(edges: Mapping[str, NewestEdge], batch: Sequence[TransformStamped]) -> dict[str, str]:
     """The new parent of each child whose newest parent the batch changes."""
     parents: dict[str, str] = {}
     stamps: dict[str, int | None] = {}
