@@ -128,8 +128,8 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
     ),
     (
         TooManyFramesError(frames=1_000, max_frames=1_000, parent="map", child="x", authority="page"),
-        "the edge 'map' -> 'x' from 'page' names a new frame, but the bus has 1,000 frames and takes 1,000: remove frames "
-        "that are gone, or make the bus with a greater max_frames",
+        "the edge 'map' -> 'x' from 'page' names a new frame, but the bus has 1,000 frames and takes 1,000: remove "
+        "frames that are gone, or make the bus with a greater max_frames",
     ),
     (
         InvalidRobotError("parent link 'arm' is not there", element='<joint name="elbow">'),

@@ -355,9 +355,9 @@ class Bus:
             If neither the bus nor a buffer knows the frame.
         """
         self._check_usable()
-        if frame not in self._topology and not any(frame in buffer.forest.names for buffer in self._buffers):
-            if not self._topology.is_named(frame):
-                raise UnknownFrameError(frame=frame, known=self._topology.names())
+        on_bus = frame in self._topology or self._topology.is_named(frame)
+        if not on_bus and not any(frame in buffer.forest.names for buffer in self._buffers):
+            raise UnknownFrameError(frame=frame, known=self._topology.names())
         self._topology.remove(frame)
         self._subscribers.forget(frame)
         for publisher in self._threads:
