@@ -344,6 +344,26 @@ def test_any_integers_become_an_array_of_stamps(values: Any) -> None:
     assert found.tolist() == [int(value) for value in values]
 
 
+@pytest.mark.parametrize("unit", ["ns", "s", "ms"])
+def test_a_timedelta64_is_no_stamp_and_no_number_of_seconds(unit: Any) -> None:
+    for convert in (as_stamp, from_seconds, lambda value: as_duration(value, "keep")):
+        with pytest.raises(TypeError):
+            convert(np.timedelta64(5, unit))
+    for values in ([np.timedelta64(5, unit)], np.array([5], f"m8[{unit}]")):
+        with pytest.raises(TypeError, match="a stamp is an int of nanoseconds, not"):
+            as_stamps(values)
+
+
+def test_stamps_with_a_mask_are_refused_if_one_is_masked() -> None:
+    values = np.ma.array([1, 2, 3], mask=[False, True, True])  # type: ignore[no-untyped-call]
+    with pytest.raises(ValueError, match="stamps must have no masked values, got 2"):
+        as_stamps(values)
+    with pytest.raises(ValueError, match="stamps must have no masked values, got 1"):
+        as_stamps([1, np.ma.masked])
+    assert as_stamps(values[:1]).tolist() == [1]
+    assert as_stamps(values.compressed()).tolist() == [1]
+
+
 def test_an_array_of_stamps_is_not_copied() -> None:
     values = np.arange(5)
     assert as_stamps(values) is values

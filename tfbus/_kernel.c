@@ -39,6 +39,7 @@ static PyTypeObject *SampleType, *BlockType, *HistoryType, *ChainType, *HeldType
 static PyTypeObject *JudgeType, *ParkedType, *LineType, *FeedType, *IntakeType, *MethodType;
 static PyObject *empty_string, *raise_string, *drop_string, *at_string, *paths_string, *memory_string;
 static PyObject *bound_method; /* types.MethodType */
+static PyObject *array_type;   /* numpy.ndarray */
 
 static const double identity[WIDTH] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0};
 
@@ -1920,7 +1921,9 @@ room_for_rows(PyObject *stamps)
     if (is_list || is_tuple) {
         count = is_list ? PyList_Size(stamps) : PyTuple_Size(stamps);
     } else {
-        if (!PyObject_CheckBuffer(stamps)) {
+        /* Whatever has a mask is for Python to judge. */
+        if (OBJECT(Py_TYPE(stamps)) != array_type
+            && (!PyObject_CheckBuffer(stamps) || PyObject_HasAttrString(stamps, "mask"))) {
             return NULL;
         }
         if (PyObject_GetBuffer(stamps, &view, PyBUF_STRIDES | PyBUF_FORMAT) < 0) {
@@ -3033,6 +3036,15 @@ add_type(PyObject *module, const char *name, PyType_Spec *spec, PyTypeObject **t
     return PyModule_AddObjectRef(module, name, (PyObject *)*type);
 }
 
+static PyObject *
+imported(const char *module, const char *name)
+{
+    PyObject *found = PyImport_ImportModule(module);
+    PyObject *value = found == NULL ? NULL : PyObject_GetAttrString(found, name);
+    Py_XDECREF(found);
+    return value;
+}
+
 static int
 module_exec(PyObject *module)
 {
@@ -3051,13 +3063,9 @@ module_exec(PyObject *module)
             return -1;
         }
     }
-    if (bound_method == NULL) {
-        PyObject *types = PyImport_ImportModule("types");
-        bound_method = types == NULL ? NULL : PyObject_GetAttrString(types, "MethodType");
-        Py_XDECREF(types);
-        if (bound_method == NULL) {
-            return -1;
-        }
+    if ((bound_method == NULL && (bound_method = imported("types", "MethodType")) == NULL)
+        || (array_type == NULL && (array_type = imported("numpy", "ndarray")) == NULL)) {
+        return -1;
     }
     if (add_type(module, "Sample", &sample_spec, &SampleType) < 0
         || add_type(module, "Block", &block_spec, &BlockType) < 0

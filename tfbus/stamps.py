@@ -165,7 +165,7 @@ def as_stamps(values: StampsLike) -> Stamps:
     TypeError
         If a value has another type. The usual mistake is a float of seconds: convert it with `from_seconds`.
     ValueError
-        If the shape is not (n,), or a value is one that `as_stamp` refuses.
+        If the shape is not (n,), a value is masked, or one that `as_stamp` refuses.
     """
     if isinstance(values, (list, tuple)):
         if set(map(type, values)) == {int}:
@@ -174,16 +174,41 @@ def as_stamps(values: StampsLike) -> Stamps:
             except OverflowError:
                 pass
         # numpy would convert a bool beside an int to an int, and all integers beside a float to floats.
-        array = np.asarray(values, object)
+        array = as_array(values, "stamps", object)
     else:
-        array = np.asarray(values)
+        array = as_array(values, "stamps")
     if array.ndim != 1:
         raise ValueError(f"stamps must have shape (n,), got {array.shape}")
     if array.dtype.kind == "M":
         return _from_dates(array)
+    if array.dtype.kind == "m":
+        raise TypeError(
+            "a stamp is an int of nanoseconds, not a timedelta64: add the times to the instant they count from"
+        )
     if array.dtype.kind not in "iu" or array.dtype == np.uint64:
         return np.array([as_stamp(value) for value in array.tolist()], np.int64)
     return array.astype(np.int64, copy=False)
+
+
+def as_array(values: npt.ArrayLike, name: str, dtype: npt.DTypeLike = None) -> npt.NDArray[Any]:
+    """The array that `numpy.asarray` makes of values, which loses no mask.
+
+    Raises
+    ------
+    ValueError
+        If a value is masked. The message has `name`.
+    """
+    kind = type(values)
+    if kind is not np.ndarray:
+        parts: Any = values if kind is list or kind is tuple else (values,)
+        masks = (np.ma.getmaskarray(part) for part in parts if isinstance(part, np.ma.MaskedArray))
+        masked = sum(int(mask.sum()) for mask in masks)
+        if masked:
+            raise ValueError(
+                f"{name} must have no masked values, got {masked}: leave these out, or use .filled(numpy.nan) where a "
+                "missing number is NaN"
+            )
+    return np.asarray(values, dtype)
 
 
 def time_between(earlier: Stamps, later: Stamps) -> Stamps:
@@ -246,10 +271,10 @@ def as_duration(seconds: float, name: str) -> float:
 
 
 def is_real(value: object) -> bool:
-    """Whether `value` is a real number of any type, including those of numpy, and not a ``bool``."""
+    """Whether `value` is a real number of any type, those of numpy too; ``bool`` and ``timedelta64`` are none."""
     kind = type(value)
     # Nearly always one of these; the check of the abstract class takes ten times as long.
-    return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, bool))
+    return kind is float or kind is int or (isinstance(value, Real) and not isinstance(value, (bool, np.timedelta64)))
 
 
 def format_stamp(stamp: int) -> str:

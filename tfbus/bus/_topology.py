@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import copy
-from itertools import chain
 from typing import Literal, get_args
 
 from tfbus.bus._announcer import Announcer
@@ -30,6 +29,7 @@ from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
 from tfbus.stamps import STAMP_MIN, format_duration
 from tfbus.tree.cycles import NewestEdge, admit, changed_parents
+from tfbus.tree.known_frames import KnownFrames
 
 Invalid = Literal["raise", "drop"]
 
@@ -79,6 +79,8 @@ class Topology:
 
     Attributes
     ----------
+    names : KnownFrames
+        The frames that the newest edges name.
     latched : dict of str to TransformStamped
         The static sample of each static child.
     rejected : Counter
@@ -108,11 +110,9 @@ class Topology:
         self.max_frames = max_frames
         self._parents = 0
         self._newest: dict[str, _Edge] = {}
+        self.names = KnownFrames()
         # No stamp up to its horizon is ahead of the clock, which only goes forward between two calls of `clock_jumped`.
         self.judge = Judge(self._newest, plausibility.max_translation**2)
-        # Every parent of a newest edge, and of how many; those without an edge of their own.
-        self._children: dict[str, int] = {}
-        self._roots: set[str] = set()
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
         self.reparented = 0
@@ -125,19 +125,6 @@ class Topology:
 
     def __contains__(self, child: object) -> bool:
         return child in self._newest or (isinstance(child, str) and self._ownership.remembers(child))
-
-    def names(self) -> Iterator[str]:
-        """Every frame that an edge names."""
-        return chain(self._roots, self._newest)
-
-    @property
-    def frames(self) -> int:
-        """The number of frames that an edge names."""
-        return len(self._newest) + len(self._roots)
-
-    def is_named(self, frame: object) -> bool:
-        """Whether an edge names a frame."""
-        return frame in self._newest or frame in self._roots
 
     def newest(self, child: str) -> NewestEdge | None:
         """The newest edge of a child, if it has one."""
@@ -196,14 +183,18 @@ class Topology:
         """Forget a child and its first authority."""
         self.latched.pop(child, None)
         self._ownership.forget(child)
-        if self._take_off(child) and self._announcer.has_listeners:
+        if self._newest.pop(child, None) is None:
+            return
+        self.names.remove(child)
+        if self._announcer.has_listeners:
             self._announcer.announce(FrameRemoved(self._announcer.now(), child))
 
     def clear_moving(self) -> None:
         """Forget every moving child, but keep the right of its first authority."""
         self._ownership.remember({child: known for child, known in self._newest.items() if not known.static})
         for child in self.moving():
-            self._take_off(child)
+            del self._newest[child]
+            self.names.remove(child)
 
     def reject(self, reason: str, error: Exception) -> None:
         """Count and announce a sample that was refused."""
@@ -245,11 +236,11 @@ class Topology:
         if self._ownership.restricts:
             batch, unowned = self._ownership.split(batch, self._newest)
             refused += unowned
-        accepted, looped = admit(self._newest, batch, self._children)
+        accepted, looped = admit(self._newest, batch, self.names.parents)
         if self.max_frames is not None and not self._fits(accepted, self.max_frames):
             batch, homeless = self._find_places(batch, self.max_frames)
             refused += homeless
-            accepted, looped = admit(self._newest, batch, self._children)
+            accepted, looped = admit(self._newest, batch, self.names.parents)
         if looped and self._ownership.reserves and not (refused and invalid == "raise"):
             accepted, looped = self._defend(batch, refused, invalid)
         refused += looped
@@ -278,19 +269,21 @@ class Topology:
     def _fits(self, batch: Batch, max_frames: int) -> bool:
         """Whether the bus has places for the frames of a batch, which may give up some as it takes others."""
         # No sample names more than two new frames.
-        if self.frames + 2 * len(batch) <= max_frames:
+        if len(self.names) + 2 * len(batch) <= max_frames:
             return True
         # Some of it may yet be refused where frames are reserved, and then would give up nothing.
-        return not self._ownership.reserves and self._frames_after(batch) <= max_frames
+        return (
+            not self._ownership.reserves and self.names.count_after(changed_parents(self._newest, batch)) <= max_frames
+        )
 
     def _find_places(self, batch: Batch, max_frames: int) -> tuple[Batch, list[InvalidTransformError]]:
         """The samples of a batch whose frames find a place that is free by now, and the errors of the others."""
-        before = self.frames
+        before = len(self.names)
         allowed: list[TransformStamped] = []
         refused: list[InvalidTransformError] = []
         taken: set[str] = set()
         for sample in batch:
-            new = {frame for frame in (sample.parent, sample.child) if frame not in taken and not self.is_named(frame)}
+            new = {frame for frame in (sample.parent, sample.child) if frame not in taken and frame not in self.names}
             if new and before + len(taken) + len(new) > max_frames:
                 refused.append(
                     TooManyFramesError(
@@ -305,42 +298,6 @@ class Topology:
                 taken |= new
                 allowed.append(sample)
         return tuple(allowed), refused
-
-    def _frames_after(self, batch: Batch) -> int:
-        """The number of frames that the newest edges name after a batch."""
-        changes = changed_parents(self._newest, batch)
-        new = [child for child in changes if child not in self._newest]
-        children = Counter(changes.values())
-        children.subtract(self._newest[child].parent for child in changes if child in self._newest)
-        roots = len(self._roots) - sum(child in self._roots for child in new)
-        for parent, more in children.items():
-            if parent not in self._newest and parent not in changes:
-                count = self._children.get(parent, 0)
-                roots += (count + more > 0) - (count > 0)
-        return len(self._newest) + len(new) + roots
-
-    def _hang_under(self, parent: str) -> None:
-        """Note one more edge from a parent; its child is among the newest edges."""
-        self._children[parent] = self._children.get(parent, 0) + 1
-        if parent not in self._newest:
-            self._roots.add(parent)
-
-    def _let_go(self, parent: str) -> None:
-        """Note one edge less from a parent."""
-        self._children[parent] -= 1
-        if not self._children[parent]:
-            del self._children[parent]
-            self._roots.discard(parent)
-
-    def _take_off(self, child: str) -> bool:
-        """Forget the newest edge of a child; returns whether there was one."""
-        known = self._newest.pop(child, None)
-        if known is None:
-            return False
-        if child in self._children:
-            self._roots.add(child)
-        self._let_go(known.parent)
-        return True
 
     def _defend(
         self,
@@ -359,7 +316,7 @@ class Topology:
         """
         edges = dict(self._newest)
         removed: list[InvalidTransformError] = []
-        _, looped = admit(edges, batch, self._children)
+        _, looped = admit(edges, batch, self.names.parents)
         while intruder := next(filter(None, (self._ownership.intruder(error, edges, batch) for error in looped)), None):
             rest = tuple(sample for sample in batch if not _is_edge(sample, intruder))
             if len(rest) < len(batch):
@@ -369,7 +326,7 @@ class Topology:
             else:
                 del edges[_child(intruder)]
                 removed.append(intruder)
-            _, looped = admit(edges, batch, self._children)
+            _, looped = admit(edges, batch, self.names.parents)
         if invalid == "drop" or not (looped or refused):
             for error in removed:
                 # Its samples were accepted, so they are not counted as the others that are refused.
@@ -377,7 +334,7 @@ class Topology:
                 self._log.warning(("intruder", error.child, error.authority), "removed a frame: %s", error)
                 self._evict(_child(error))
         # Whoever was told of a removal may have published.
-        return admit(self._newest, batch, self._children)
+        return admit(self._newest, batch, self.names.parents)
 
     def _record(self, sample: TransformStamped) -> None:
         parent, child, stamp, _, authority, static = sample._fields
@@ -386,8 +343,7 @@ class Topology:
         if known is None:
             self._parents += 1
             known = self._newest[child] = _Edge(parent, static, authority, self._parents)
-            self._roots.discard(child)
-            self._hang_under(parent)
+            self.names.update(child, (parent,))
             if announcer.has_listeners:
                 announcer.announce(FrameAdded(announcer.now(), child, parent, authority, static))
         if known.last != authority:
@@ -406,8 +362,7 @@ class Topology:
             known.authority = authority
             if known.parent != parent:
                 self._reparent(child, parent, known.parent, authority)
-                self._hang_under(parent)
-                self._let_go(known.parent)
+                self.names.update(child, (parent,))
                 self._parents += 1
                 known.parent, known.since = parent, self._parents
         known.trusted = None if static or known.authority != authority else authority

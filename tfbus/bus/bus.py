@@ -18,7 +18,7 @@ from tfbus.bus._owner_thread import OwnerThread
 from tfbus.bus._ownership import OnConflict, Ownership
 from tfbus.bus._plausibility import Plausibility
 from tfbus.bus._subscribers import BatchCallback, FrameCallback, Subscribers
-from tfbus.bus._topology import Invalid, Topology, as_invalid
+from tfbus.bus._topology import Invalid, Topology, as_invalid, as_max_frames
 from tfbus.bus.event_stream import EventStream
 from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import Overflow
@@ -104,7 +104,7 @@ class Bus:
             self._plausibility,
             self._announcer,
             self._remove_if_known,
-            None if max_frames is None else _as_max_frames(max_frames),
+            as_max_frames(max_frames),
         )
         self._subscribers = Subscribers(self._log, self._announcer)
         self._buffers: dict[LiveTree, int] = {}
@@ -355,9 +355,9 @@ class Bus:
             If neither the bus nor a buffer knows the frame.
         """
         self._check_usable()
-        on_bus = frame in self._topology or self._topology.is_named(frame)
+        on_bus = frame in self._topology or frame in self._topology.names
         if not on_bus and not any(frame in buffer.forest.names for buffer in self._buffers):
-            raise UnknownFrameError(frame=frame, known=self._topology.names())
+            raise UnknownFrameError(frame=frame, known=self._topology.names.some())
         self._topology.remove(frame)
         self._subscribers.forget(frame)
         for publisher in self._threads:
@@ -514,11 +514,3 @@ class Bus:
             buffer.reset(before, after)
         for late in self._late.values():
             late.clear_moving()
-
-
-def _as_max_frames(value: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"max_frames must be an int or None, not {value!r}")
-    if value < 2:
-        raise ValueError(f"max_frames must be at least 2, a parent and a child, got {value}")
-    return value

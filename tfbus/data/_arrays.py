@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tfbus.stamps import as_array
+
 
 def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
     """An array of floats: an array of floats is not copied, integers become float64.
@@ -16,8 +18,10 @@ def as_floats(value: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
     ------
     TypeError
         If they are not numbers. The message names `name` and the dtype.
+    ValueError
+        If one is masked.
     """
-    array = np.asarray(value)
+    array = as_array(value, name)
     if array.dtype.kind in "iu":
         return array.astype(np.float64)
     if array.dtype.kind != "f":

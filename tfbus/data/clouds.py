@@ -14,7 +14,7 @@ from tfbus.data.dispatch import do_transform, moved_header
 from tfbus.geometry.read_only import read_only
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.plain import PlainData
-from tfbus.stamps import Latest, as_stamps
+from tfbus.stamps import Latest, as_array, as_stamps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +72,7 @@ class PointCloud(CopiedByFields, PlainData):
 def _column(name: object, values: npt.ArrayLike, length: int) -> npt.NDArray[Any]:
     if not isinstance(name, str):
         raise TypeError(f"the name of a field must be a str, not {name!r}")
-    column = np.asarray(values)
+    column = as_array(values, f"field {name!r}")
     if column.shape[:1] != (length,):
         raise ValueError(f"field {name!r} must have shape ({length}, ...), one for each point, got {column.shape}")
     return read_only(column)

@@ -18,7 +18,7 @@ from tfbus.data.spatial import PoseWithCovarianceStamped, TwistStamped, WrenchSt
 from tfbus.geometry.rows import Vector
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
-from tfbus.stamps import LATEST, SECOND, Latest
+from tfbus.stamps import LATEST, SECOND, Latest, as_array
 
 _Writer = Callable[[Any], dict[str, Any]]
 _SCAN = ("angle_min", "angle_max", "angle_increment", "time_increment", "scan_time", "range_min", "range_max")
@@ -147,7 +147,7 @@ def _pose(pose: Transform) -> dict[str, Any]:
 
 def _read_scan(message: object, frame: str, stamp: int) -> LaserScan:
     values = dict(zip(_SCAN, numbers(message, _SCAN), strict=True))
-    ranges, intensities = np.asarray(get(message, "ranges")), np.asarray(get(message, "intensities"))
+    ranges, intensities = (as_array(get(message, name), name) for name in ("ranges", "intensities"))
     return LaserScan(frame, stamp, ranges, intensities=intensities, **values)
 
 
@@ -197,7 +197,7 @@ def _read_pose(message: object, frame: str, stamp: int) -> PoseStamped | PoseWit
     pose = get(message, "pose")
     if not has(pose, "covariance"):
         return PoseStamped(frame, stamp, _transform(pose, "position", "orientation"))
-    covariance = np.array(get(pose, "covariance"), np.float64)
+    covariance = as_array(get(pose, "covariance"), "covariance", np.float64)
     return PoseWithCovarianceStamped(frame, stamp, _transform(get(pose, "pose"), "position", "orientation"), covariance)
 
 

@@ -12,7 +12,7 @@ from tfbus.data._header import check_header
 from tfbus.data.clouds import PointCloud
 from tfbus.geometry.read_only import read_only
 from tfbus.plain import PlainData
-from tfbus.stamps import SECOND, Latest, as_stamp, from_seconds, is_real
+from tfbus.stamps import SECOND, Latest, as_array, as_stamp, from_seconds, is_real
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,7 @@ class LaserScan(CopiedByFields, PlainData):
         object.__setattr__(self, "ranges", ranges)
         self._check_numbers(last=max(0, len(ranges) - 1))
         if self.intensities is not None:
-            intensities = read_only(np.asarray(self.intensities))
+            intensities = read_only(as_array(self.intensities, "intensities"))
             if intensities.shape not in ((0,), ranges.shape):
                 raise ValueError(f"intensities must have shape {ranges.shape}, as the ranges, got {intensities.shape}")
             object.__setattr__(self, "intensities", intensities if intensities.size else None)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import InvalidTransformError
+from tfbus.stamps import as_array
 
 Vector: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -159,6 +160,8 @@ def as_floats(value: object, length: int, name: str) -> tuple[float, ...]:
     if len(value) != length or (isinstance(value, np.ndarray) and value.ndim != 1):
         shape = getattr(value, "shape", (len(value),))
         raise InvalidTransformError(f"{name} must be {length} numbers, got shape {shape}", reason="wrong length")
+    if isinstance(value, np.ndarray):
+        value = as_array(value, name)
     try:
         finite = all(map(math.isfinite, value))
     except OverflowError:

@@ -33,6 +33,7 @@ from tfbus.geometry.rows import (
     rotate,
 )
 from tfbus.plain import from_fields
+from tfbus.stamps import as_array
 
 
 class Transform:
@@ -103,7 +104,7 @@ class Transform:
         """
         from transforms3d.quaternions import mat2quat
 
-        m = np.asarray(matrix, dtype=np.float64)
+        m = as_array(matrix, "matrix", np.float64)
         if m.shape != (4, 4):
             raise InvalidTransformError(f"matrix must have shape (4, 4), got {m.shape}", reason="wrong length")
         if not np.isfinite(m).all():
@@ -259,6 +260,7 @@ class Transform:
             return float(tx + rx), float(ty + ry), float(tz + rz)
         from transforms3d.quaternions import quat2mat
 
+        points = as_array(points, "points")
         if points.ndim == 0 or points.shape[-1] != 3:
             raise ValueError(f"points must have shape (..., 3), got {points.shape}")
         dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(np.float64)

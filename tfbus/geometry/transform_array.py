@@ -16,7 +16,7 @@ from tfbus.errors import InvalidTransformError
 from tfbus.geometry.read_only import locked
 from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Columns, Row, compose, invert, rotate
 from tfbus.geometry.transform import Transform, from_row
-from tfbus.stamps import StampsLike, as_stamps, format_stamp
+from tfbus.stamps import StampsLike, as_array, as_stamps, format_stamp
 
 _RECORD = 8 * 8
 """The bytes of a transform and its stamp."""
@@ -67,8 +67,8 @@ class TransformArray:
     _memory: bytes
 
     def __init__(self, translations: npt.ArrayLike, rotations: npt.ArrayLike, stamps: StampsLike | None = None) -> None:
-        moves = np.asarray(translations, np.float64)
-        turns = np.asarray(rotations, np.float64)
+        moves = as_array(translations, "translations", np.float64)
+        turns = as_array(rotations, "rotations", np.float64)
         if moves.ndim != 2 or moves.shape[1] != 3 or turns.shape != (len(moves), 4):
             raise InvalidTransformError(
                 f"translations and rotations must have shapes (n, 3) and (n, 4), got {moves.shape} and {turns.shape}",
@@ -241,7 +241,7 @@ class TransformArray:
         ValueError
             If the shape is another. The message has the shape.
         """
-        array = np.asarray(points)
+        array = as_array(points, "points")
         if array.shape != (len(self), 3):
             raise ValueError(f"points must have shape ({len(self)}, 3), one for each transform, got {array.shape}")
         dtype = array.dtype if np.issubdtype(array.dtype, np.floating) else np.dtype(np.float64)

@@ -16,11 +16,11 @@ from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import STAMP_MIN, Latest, as_stamp
 from tfbus.tree._ancestry import Loop, edges_above, names_below, past_loop
 from tfbus.tree._kernel import commit
-from tfbus.tree._known_frames import KnownFrames
 from tfbus.tree._path_cache import PathCache
 from tfbus.tree._saved_frames import SavedFrame, load_frame
 from tfbus.tree.cycles import admit
 from tfbus.tree.history import FrameHistory, Outcome
+from tfbus.tree.known_frames import KnownFrames
 from tfbus.tree.path import Path, find_edges, find_path, path_at
 
 AT_A_TIME = 100

@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.tree._known_frames import KnownFrames
+from tfbus.tree.known_frames import KnownFrames
 
 FRAMES = ("a", "b", "c", "d")
 Change = tuple[str, tuple[str, ...]]
@@ -30,6 +30,7 @@ def test_a_frame_is_known_as_long_as_a_sample_names_it(history: list[Change]) ->
         apply(names, named, change)
         known = set(named).union(*named.values())
         assert names.sorted() == tuple(sorted(known))
+        assert len(names) == len(known)
         assert {frame for frame in FRAMES if frame in names} == known
 
 
@@ -46,3 +47,24 @@ def test_a_copy_is_independent(history: list[Change], more: list[Change]) -> Non
         apply(twin, named, change)
     assert {frame for frame in FRAMES if frame in names} == set(known)
     assert twin.sorted() == tuple(sorted(set(named).union(*named.values())))
+
+
+@given(changes(), st.dictionaries(st.sampled_from(FRAMES), st.sampled_from("abcdxy")))
+def test_the_number_of_names_after_a_change_is_foretold(history: list[Change], parents: dict[str, str]) -> None:
+    names = KnownFrames()
+    named: dict[str, tuple[str, ...]] = {}
+    for change in history:
+        apply(names, named, change)
+    foretold = names.count_after(parents)
+    for child, parent in parents.items():
+        names.update(child, (parent,))
+    assert foretold == len(names) == len(names.sorted())
+
+
+@given(changes())
+def test_an_error_gets_each_name_once(history: list[Change]) -> None:
+    names = KnownFrames()
+    named: dict[str, tuple[str, ...]] = {}
+    for change in history:
+        apply(names, named, change)
+        assert sorted(names.some()) == list(names.sorted())
