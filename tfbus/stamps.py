@@ -183,7 +183,7 @@ def as_stamps(values: StampsLike) -> Stamps:
         return _from_dates(array)
     if array.dtype.kind == "m":
         raise TypeError(
-            "a stamp is an int of nanoseconds, not a timedelta64: add the times to the instant they count from"
+            "a stamp is an int of nanoseconds, not a timedelta64: add it to the instant that it counts from"
         )
     if array.dtype.kind not in "iu" or array.dtype == np.uint64:
         return np.array([as_stamp(value) for value in array.tolist()], np.int64)

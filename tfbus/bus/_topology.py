@@ -41,6 +41,15 @@ def as_invalid(invalid: Invalid) -> Invalid:
     return invalid
 
 
+def as_max_frames(value: int | None) -> int | None:
+    """The argument `max_frames`; `TypeError` or `ValueError` if it is no number of frames, nor None."""
+    if isinstance(value, bool) or not isinstance(value, int | None):
+        raise TypeError(f"max_frames must be an int or None, not {value!r}")
+    if value is not None and value < 2:
+        raise ValueError(f"max_frames must be at least 2, a parent and a child, got {value}")
+    return value
+
+
 class _Edge(Edge):
     """The newest edge of one child, and the authority of its newest sample.
 
@@ -271,10 +280,10 @@ class Topology:
         # No sample names more than two new frames.
         if len(self.names) + 2 * len(batch) <= max_frames:
             return True
-        # Some of it may yet be refused where frames are reserved, and then would give up nothing.
-        return (
-            not self._ownership.reserves and self.names.count_after(changed_parents(self._newest, batch)) <= max_frames
-        )
+        if self._ownership.reserves:
+            # Some of it may yet be refused, and then would give up nothing.
+            return False
+        return self.names.count_after(changed_parents(self._newest, batch)) <= max_frames
 
     def _find_places(self, batch: Batch, max_frames: int) -> tuple[Batch, list[InvalidTransformError]]:
         """The samples of a batch whose frames find a place that is free by now, and the errors of the others."""
