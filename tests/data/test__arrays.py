@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.samples import moving, tree_of
 from support.stamped_data import ANSWER, HOLDERS, ONE_OF_EACH, SCAN, VALUES, arrays_of, contents, name_of
 
-from tfbus import LaserScan, PointCloud, Polygon, PoseWithCovarianceStamped, Transform, do_transform
+from tfbus import LaserScan, PointCloud, Polygon, PoseWithCovarianceStamped, Transform, TransformArray, do_transform
 
 COPIES = [
     pytest.param(copy.copy, id="copy"),
@@ -145,3 +146,42 @@ def test_points_of_another_dtype_are_refused_with_the_dtype(build: Any, wrong: A
 def test_a_scan_is_copied_and_pickled_with_its_keyword_only_fields() -> None:
     scan = replace(SCAN, angle_min=-0.5, time_increment=0.001, range_max=30.0)
     assert contents(pickle.loads(pickle.dumps(scan))) == contents(scan)
+
+
+MASKED: Any = np.ma.array(np.ones((2, 3)), mask=[[False, True, False], [False] * 3])  # type: ignore[no-untyped-call]
+DOORS: dict[str, Callable[[Any], object]] = {
+    "points of a cloud": lambda masked: PointCloud("lidar", 5, masked),
+    "rows of points": lambda masked: PointCloud("lidar", 5, [masked[0], masked[1]]),
+    "a field": lambda masked: PointCloud("lidar", 5, np.ones((2, 3)), fields={"rgb": masked}),
+    "stamps of points": lambda masked: PointCloud("lidar", 5, np.ones((3, 3)), masked[0].astype(np.int64)),
+    "corners": lambda masked: Polygon("lidar", 5, masked),
+    "ranges": lambda masked: LaserScan("lidar", 5, masked[0], angle_min=0.0, angle_increment=0.1),
+    "intensities": lambda masked: LaserScan(
+        "lidar", 5, np.ones(3), angle_min=0.0, angle_increment=0.1, intensities=masked[0]
+    ),
+    "points that are moved": lambda masked: Transform().apply(masked),
+    "points that are moved one by one": lambda masked: TransformArray(np.zeros((2, 3)), [[0, 0, 0, 1]] * 2).apply(
+        masked
+    ),
+    "translations": lambda masked: TransformArray(masked, [[0, 0, 0, 1]] * 2),
+    "a translation": lambda masked: Transform(masked[0]),
+    "a matrix": lambda masked: Transform.from_matrix(np.ma.vstack((masked, masked))),
+    "stamps": lambda masked: tree_of(moving("a", "b", 1)).lookup_many("a", "b", masked[0].astype(np.int64)),
+    "stamps of the source": lambda masked: tree_of(moving("a", "b", 1)).lookup_many(
+        "a", "b", [1] * 3, source_at=masked[0].astype(np.int64), fixed="a"
+    ),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_a_masked_value_is_refused_wherever_arrays_come_in(door: str) -> None:
+    with pytest.raises(ValueError, match=r"must have no masked values, got [12]: leave these out, or use .filled"):
+        DOORS[door](MASKED)
+
+
+def test_an_array_with_a_mask_and_no_masked_value_is_like_any_other() -> None:
+    whole: Any = np.ma.array(np.ones((2, 3)), mask=False)  # type: ignore[no-untyped-call]
+    assert type(PointCloud("lidar", 5, whole).points) is np.ndarray
+    assert Transform((1.0, 0.0, 0.0)).apply(whole).tolist() == [[2.0, 1.0, 1.0]] * 2
+    stamps = whole[0].astype(np.int64)
+    assert tree_of(moving("a", "b", 1, 7.0)).lookup_many("a", "b", stamps).translations[:, 0].tolist() == [7.0] * 3
