@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.both_kernels import tfbus_on
 from support.samples import moving, static
 
 import tfbus
@@ -210,6 +211,42 @@ def test_a_change_is_made_whole_or_not_at_all_and_no_waiter_is_lost(name: str, w
         assert [buffer.lookup_nowait("map", "b").stamp for buffer in scene.buffers] == [10**11] * 2
 
     assert sweep(CHANGES[name], fresh, check, plain="publish" in name) > (0 if name != "cancel" else -1)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_twin_stores_a_sample_whole_or_not_at_all(late: bool) -> None:
+    twin = tfbus_on("python")
+    failures = 0
+
+    def at(stamp: int) -> Any:
+        return twin.TransformStamped("map", "a", stamp, twin.Transform((float(stamp**2), 0.0, 0.0)))
+
+    # Of so many samples, some do not fit into the memory of those before, and some make others leave the window.
+    for count in range(1, 40):
+        quiet = 0
+        for number in range(MOST):
+            bus = twin.Bus()
+            buffer = twin.Buffer(bus, keep=5e-8)
+            for index in range(count):
+                bus.publish(at(2 * index))
+            newest = 2 * count - 2
+            sample = at(newest - 1 if late else newest + 2)
+            failed = False
+            try:
+                with no_memory(number, number + 1):
+                    bus.publish(sample)
+            except NO_MEMORY:
+                failed = True
+            assert buffer.lookup_nowait("map", "a").stamp in (newest, newest + 2)
+            bus.publish(at(newest + 4))
+            assert buffer.lookup_nowait("map", "a").stamp == newest + 4
+            for stamp in [*range(max(0, newest - 46), newest + 1, 2), newest + 4]:
+                assert buffer.lookup_nowait("map", "a", stamp).transform.translation[0] == stamp**2
+            failures += failed
+            quiet = 0 if failed else quiet + 1
+            if quiet == QUIET:
+                break
+    assert failures > 0
 
 
 def test_no_failed_allocation_leaks_a_reference() -> None:

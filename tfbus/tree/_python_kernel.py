@@ -119,10 +119,13 @@ class History:
         # Spelt out, because `*row` would build a list of the arguments first.
         x, y, z, qx, qy, qz, qw = row
         record = _pack(stamp, x, y, z, qx, qy, qz, qw)
-        # No call before the last of the three, so that Ctrl-C cannot come between them.
         self.records += record
+        try:
+            stamps.append(stamp)
+        except BaseException:
+            self._drop_surplus()
+            raise
         self.horizon = horizon
-        stamps.append(stamp)
         if stamp > self._cut_after:
             self._cut()
         return True
@@ -131,7 +134,11 @@ class History:
         """Store a sample that is newer than all others."""
         record = _pack(stamp, *row)
         self.records += record
-        self.stamps.append(stamp)
+        try:
+            self.stamps.append(stamp)
+        except BaseException:
+            self._drop_surplus()
+            raise
         self.horizon = stamp - self._keep
         if stamp > self._cut_after:
             self._cut()
@@ -153,8 +160,13 @@ class History:
         records = np.empty((len(stamps), 8))
         records[:, 0] = stamps.view(np.float64)
         records[:, 1:] = rows
+        own = stamps.tobytes()
         self.records += records.data.cast("B")
-        self.stamps.frombytes(stamps.tobytes())
+        try:
+            self.stamps.frombytes(own)
+        except BaseException:
+            self._drop_surplus()
+            raise
         self.horizon = self.stamps[-1] - self._keep
         if self.stamps[-1] > self._cut_after:
             self._cut()
@@ -166,7 +178,12 @@ class History:
         replaces = self.stamps[at] == stamp
         self.records[at * _SIZE : (at + replaces) * _SIZE] = record
         if not replaces:
-            self.stamps.insert(at, stamp)
+            try:
+                self.stamps.insert(at, stamp)
+            except BaseException:
+                if len(self.records) > len(self.stamps) * _SIZE:
+                    del self.records[at * _SIZE : (at + 1) * _SIZE]
+                raise
 
     def find(self, stamp: int) -> int:
         """The index of the first sample that is not before a stamp; `count` if there is none."""
@@ -211,16 +228,14 @@ class History:
 
     def clear(self) -> None:
         """Forget all samples."""
-        del self.stamps[:]
-        del self.records[:]
+        self.stamps, self.records = array("q"), bytearray()
         self.horizon = STAMP_MIN
         self._cut_after = STAMP_MIN
 
     def take(self, other: "History") -> None:
         """Hold a copy of the samples in the window of another history."""
         start = other._start
-        self.stamps = other.stamps[start:]
-        self.records = other.records[start * _SIZE :]
+        self.stamps, self.records = other.stamps[start:], other.records[start * _SIZE :]
         self.horizon = self.stamps[-1] - self._keep if self.stamps else STAMP_MIN
         self._cut_after = other._cut_after
 
@@ -241,11 +256,20 @@ class History:
         rows = np.frombuffer(self.records, np.uint8).reshape(-1, _SIZE)[places]
         return own, 0, rows, 0, 8, len(places)
 
+    def _drop_surplus(self) -> None:
+        """Have no more records than stamps, after an error between the two: no memory, or Ctrl-C."""
+        del self.records[len(self.stamps) * _SIZE :]
+        if self.stamps:
+            self.horizon = self.stamps[-1] - self._keep
+
     def _cut(self) -> None:
         """Cut off the samples that have left the window, and not again before 1/16 of it has passed."""
         start = self._start
-        del self.stamps[:start]
-        del self.records[: start * _SIZE]
+        try:
+            self.stamps, self.records = self.stamps[start:], self.records[start * _SIZE :]
+        except MemoryError:
+            # The samples count as before; the next one tries again.
+            return
         if self.stamps:
             self._cut_after = self.stamps[0] + self._keep + self._keep // 16
 
