@@ -2,10 +2,11 @@ import copy
 import math
 import pickle
 from array import array
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta, timezone
 from decimal import Decimal
 from fractions import Fraction
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -346,20 +347,22 @@ def test_any_integers_become_an_array_of_stamps(values: Any) -> None:
 
 @pytest.mark.parametrize("unit", ["ns", "s", "ms"])
 def test_a_timedelta64_is_no_stamp_and_no_number_of_seconds(unit: Any) -> None:
-    for convert in (as_stamp, from_seconds, lambda value: as_duration(value, "keep")):
+    converts: tuple[Callable[[Any], object], ...] = (as_stamp, from_seconds, lambda value: as_duration(value, "keep"))
+    for convert in converts:
         with pytest.raises(TypeError):
             convert(np.timedelta64(5, unit))
-    for values in ([np.timedelta64(5, unit)], np.array([5], f"m8[{unit}]")):
+    forms: tuple[Any, ...] = [np.timedelta64(5, unit)], np.array([5], f"m8[{unit}]")
+    for values in forms:
         with pytest.raises(TypeError, match="a stamp is an int of nanoseconds, not"):
             as_stamps(values)
 
 
 def test_stamps_with_a_mask_are_refused_if_one_is_masked() -> None:
-    values = np.ma.array([1, 2, 3], mask=[False, True, True])  # type: ignore[no-untyped-call]
+    values = np.ma.array([1, 2, 3], mask=[False, True, True])
     with pytest.raises(ValueError, match="stamps must have no masked values, got 2"):
         as_stamps(values)
     with pytest.raises(ValueError, match="stamps must have no masked values, got 1"):
-        as_stamps([1, np.ma.masked])
+        as_stamps(cast(Any, [1, np.ma.masked]))
     assert as_stamps(values[:1]).tolist() == [1]
     assert as_stamps(values.compressed()).tolist() == [1]
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 from numbers import Real
-from typing import Any, Final, SupportsIndex, TypeAlias, overload
+from typing import Any, Final, SupportsIndex, TypeAlias, cast, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -190,7 +190,7 @@ def as_stamps(values: StampsLike) -> Stamps:
     return array.astype(np.int64, copy=False)
 
 
-def as_array(values: npt.ArrayLike, name: str, dtype: npt.DTypeLike = None) -> npt.NDArray[Any]:
+def as_array(values: object, name: str, dtype: npt.DTypeLike | None = None) -> npt.NDArray[Any]:
     """The array that `numpy.asarray` makes of values, which loses no mask.
 
     Raises
@@ -198,9 +198,8 @@ def as_array(values: npt.ArrayLike, name: str, dtype: npt.DTypeLike = None) -> n
     ValueError
         If a value is masked. The message has `name`.
     """
-    kind = type(values)
-    if kind is not np.ndarray:
-        parts: Any = values if kind is list or kind is tuple else (values,)
+    if type(values) is not np.ndarray:
+        parts = values if isinstance(values, (list, tuple)) else (values,)
         masks = (np.ma.getmaskarray(part) for part in parts if isinstance(part, np.ma.MaskedArray))
         masked = sum(int(mask.sum()) for mask in masks)
         if masked:
@@ -208,7 +207,7 @@ def as_array(values: npt.ArrayLike, name: str, dtype: npt.DTypeLike = None) -> n
                 f"{name} must have no masked values, got {masked}: leave these out, or use .filled(numpy.nan) where a "
                 "missing number is NaN"
             )
-    return np.asarray(values, dtype)
+    return np.asarray(cast(Any, values), dtype)
 
 
 def time_between(earlier: Stamps, later: Stamps) -> Stamps:
@@ -216,12 +215,12 @@ def time_between(earlier: Stamps, later: Stamps) -> Stamps:
 
     It is negative where `later` is the earlier one. The limit is 292 years.
     """
-    time = later - earlier
+    time: Stamps = later - earlier
     # The difference of two stamps has overflowed if its sign is not the one that their order demands.
     wrong = (time < 0) != (later < earlier)
     if wrong.any():
         time = np.where(wrong, np.where(later < earlier, -STAMP_MAX, STAMP_MAX), time)
-    return np.maximum(time, -STAMP_MAX)
+    return time.clip(-STAMP_MAX)
 
 
 def _from_date(date: datetime | np.datetime64) -> int:

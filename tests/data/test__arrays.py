@@ -3,7 +3,7 @@ import json
 import pickle
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -148,10 +148,10 @@ def test_a_scan_is_copied_and_pickled_with_its_keyword_only_fields() -> None:
     assert contents(pickle.loads(pickle.dumps(scan))) == contents(scan)
 
 
-MASKED: Any = np.ma.array(np.ones((2, 3)), mask=[[False, True, False], [False] * 3])  # type: ignore[no-untyped-call]
+MASKED: Any = np.ma.array(np.ones((2, 3)), mask=[[False, True, False], [False] * 3])
 DOORS: dict[str, Callable[[Any], object]] = {
     "points of a cloud": lambda masked: PointCloud("lidar", 5, masked),
-    "rows of points": lambda masked: PointCloud("lidar", 5, [masked[0], masked[1]]),
+    "rows of points": lambda masked: PointCloud("lidar", 5, cast(Any, [masked[0], masked[1]])),
     "a field": lambda masked: PointCloud("lidar", 5, np.ones((2, 3)), fields={"rgb": masked}),
     "stamps of points": lambda masked: PointCloud("lidar", 5, np.ones((3, 3)), masked[0].astype(np.int64)),
     "corners": lambda masked: Polygon("lidar", 5, masked),
@@ -180,7 +180,7 @@ def test_a_masked_value_is_refused_wherever_arrays_come_in(door: str) -> None:
 
 
 def test_an_array_with_a_mask_and_no_masked_value_is_like_any_other() -> None:
-    whole: Any = np.ma.array(np.ones((2, 3)), mask=False)  # type: ignore[no-untyped-call]
+    whole: Any = np.ma.array(np.ones((2, 3)), mask=False)
     assert type(PointCloud("lidar", 5, whole).points) is np.ndarray
     assert Transform((1.0, 0.0, 0.0)).apply(whole).tolist() == [[2.0, 1.0, 1.0]] * 2
     stamps = whole[0].astype(np.int64)

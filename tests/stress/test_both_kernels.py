@@ -229,7 +229,14 @@ class World:
 
     def step(self) -> None:
         rng = self.rng
-        common = (self.publish, self.publish, self.step_each_edge, self.step_each_edge, self.park, self.look_up)
+        common: tuple[Callable[[], None], ...] = (
+            self.publish,
+            self.publish,
+            self.step_each_edge,
+            self.step_each_edge,
+            self.park,
+            self.look_up,
+        )
         rare = (self.remove, self.move_clock, self.add_buffer, self.close_buffer, self.listen, self.cancel, self.copy)
         if self.limits > 0.1:
             common = (*common, self.ask_closely)
