@@ -21,9 +21,12 @@ from tfbus import (
     SimulatedClock,
     SystemClock,
     Ticks,
+    Transform,
+    TransformStamped,
     from_seconds,
     to_seconds,
 )
+from tfbus.stamps import STAMP_MAX
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 
@@ -41,6 +44,21 @@ async def test_simulated_time_stands_still_until_it_is_advanced() -> None:
     assert clock.now() == 7
     await clock.advance(2.5)
     assert clock.now() == 7 + 2_500_000_000
+
+
+async def test_simulated_time_stays_at_the_last_stamp_and_sleeps_go_on() -> None:
+    clock = SimulatedClock(start=STAMP_MAX - 1)
+    slept = []
+
+    async def sleep() -> None:
+        await clock.sleep(2.0)
+        slept.append(clock.now())
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(sleep)
+        await clock.advance(3.0)
+    assert slept == [STAMP_MAX]
+    TransformStamped("map", "base", clock.now(), Transform())
 
 
 async def test_a_sleeper_wakes_at_its_own_time_during_an_advance() -> None:

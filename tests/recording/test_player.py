@@ -36,6 +36,7 @@ from tfbus.bus.sample_queue import TimedBatch
 from tfbus.geometry.stamped import Batch
 from tfbus.recording import Player, Recorder, load
 from tfbus.recording.formats._mcap_output import McapOutput
+from tfbus.stamps import STAMP_MAX
 
 pytestmark = pytest.mark.anyio
 
@@ -877,6 +878,19 @@ class Steered:
             while len(self.heard) < count:  # noqa: ASYNC110 - on the real clock
                 await anyio.sleep(0.001)
         return self.heard
+
+
+async def test_a_step_may_go_to_the_last_stamp(tmp_path: Path) -> None:
+    path = write_mcap(
+        tmp_path / "run.mcap",
+        [(time, "/tf", [moving("map", "base", number)]) for number, time in enumerate((0, STAMP_MAX))],
+    )
+    with Bus(SimulatedClock()) as bus:
+        player = Player(bus, path)
+        for _ in range(2):
+            player.step()
+        await player.play()
+        assert (player.position, player.played, bus.clock.now()) == (STAMP_MAX, 2, STAMP_MAX)
 
 
 @pytest.mark.every_loop

@@ -17,7 +17,7 @@ from tfbus.recording._read_ahead import ReadAhead
 from tfbus.recording._selection import Selection, Topics
 from tfbus.recording.message import RecordedMessage
 from tfbus.recording.recording import Recording, open_recording
-from tfbus.stamps import STAMP_MAX, as_stamp, from_seconds, is_real, to_seconds
+from tfbus.stamps import as_stamp, from_seconds, is_real, to_seconds
 
 _BLOCKS_AHEAD = 2
 _STEP = 0.02
@@ -290,7 +290,7 @@ class Player:
                 return
             if self._paused:
                 # A step of the user goes to the message.
-                step = max(0, min(stamp - clock.now(), STAMP_MAX))
+                step = max(0, min(stamp - clock.now(), from_seconds(_MAX_STEP)))
             await clock.advance(to_seconds(step))
             if self._seek_target is not None or clock.now() >= stamp:
                 return
