@@ -12,7 +12,7 @@ import struct
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from itertools import chain as chained
 from math import acos, sin, sqrt
 from typing import Any, Protocol
@@ -85,9 +85,8 @@ class History:
     def keep(self, keep: int | None) -> None:
         self._cut()
         self._keep = _FOREVER if keep is None else keep
-        if self.stamps:
-            self.horizon = self.stamps[-1] - self._keep
-            self._cut()
+        self._settle()
+        self._cut()
 
     @property
     def count(self) -> int:
@@ -123,7 +122,7 @@ class History:
         try:
             stamps.append(stamp)
         except BaseException:
-            self._drop_surplus()
+            self._settle()
             raise
         self.horizon = horizon
         if stamp > self._cut_after:
@@ -132,16 +131,7 @@ class History:
 
     def push(self, stamp: int, row: Row) -> None:
         """Store a sample that is newer than all others."""
-        record = _pack(stamp, *row)
-        self.records += record
-        try:
-            self.stamps.append(stamp)
-        except BaseException:
-            self._drop_surplus()
-            raise
-        self.horizon = stamp - self._keep
-        if stamp > self._cut_after:
-            self._cut()
+        self._add(_pack(stamp, *row), array("q", (stamp,)).tobytes())
 
     def push_many(self, stamps: Stamps, rows: npt.NDArray[np.float64]) -> None:
         """Store samples that are newer than all others, from contiguous arrays of shape (n,) and (n, 7).
@@ -160,16 +150,7 @@ class History:
         records = np.empty((len(stamps), 8))
         records[:, 0] = stamps.view(np.float64)
         records[:, 1:] = rows
-        own = stamps.tobytes()
-        self.records += records.data.cast("B")
-        try:
-            self.stamps.frombytes(own)
-        except BaseException:
-            self._drop_surplus()
-            raise
-        self.horizon = self.stamps[-1] - self._keep
-        if self.stamps[-1] > self._cut_after:
-            self._cut()
+        self._add(records.data.cast("B"), stamps.tobytes())
 
     def put(self, index: int, stamp: int, row: Row) -> None:
         """Store a sample before the one at an index, or in its place if it has the same stamp."""
@@ -195,8 +176,7 @@ class History:
 
         Where there is no such sample, the first sample and the end of all.
         """
-        stamps = self.stamps
-        start = self._start
+        stamps, start = self.stamps, self._start
         first = bisect_right(stamps, low, start) - 1
         end = bisect_left(stamps, high, start) + 1
         return max(first - start, 0), min(end, len(stamps)) - start
@@ -216,10 +196,8 @@ class History:
         IndexError
             If there is no sample with this index.
         """
-        at = self._start + index
-        if index < 0 or at >= len(self.stamps):
-            raise IndexError("no sample has this index")
-        stamp, x, y, z, qx, qy, qz, qw = _unpack(self.records, at * _SIZE)
+        stamp = self.stamp(index)
+        _, x, y, z, qx, qy, qz, qw = _unpack(self.records, (self._start + index) * _SIZE)
         return stamp, (x, y, z, qx, qy, qz, qw)
 
     def row(self, at: int) -> Row | None:
@@ -236,7 +214,7 @@ class History:
         """Hold a copy of the samples in the window of another history."""
         start = other._start
         self.stamps, self.records = other.stamps[start:], other.records[start * _SIZE :]
-        self.horizon = self.stamps[-1] - self._keep if self.stamps else STAMP_MIN
+        self._settle()
         self._cut_after = other._cut_after
 
     def columns(self, first: int, end: int, wanted: Stamps | None = None) -> Columns:
@@ -256,20 +234,27 @@ class History:
         rows = np.frombuffer(self.records, np.uint8).reshape(-1, _SIZE)[places]
         return own, 0, rows, 0, 8, len(places)
 
-    def _drop_surplus(self) -> None:
-        """Have no more records than stamps, after an error between the two: no memory, or Ctrl-C."""
+    def _add(self, records: bytes | memoryview, stamps: bytes) -> None:
+        """Store samples that are newer than all others, from the memory of both."""
+        self.records += records
+        try:
+            self.stamps.frombytes(stamps)
+        finally:
+            self._settle()
+        if self.stamps[-1] > self._cut_after:
+            self._cut()
+
+    def _settle(self) -> None:
+        """Have no more records than stamps, even if no memory or Ctrl-C came between, and the horizon of the newest."""
         del self.records[len(self.stamps) * _SIZE :]
-        if self.stamps:
-            self.horizon = self.stamps[-1] - self._keep
+        self.horizon = self.stamps[-1] - self._keep if self.stamps else STAMP_MIN
 
     def _cut(self) -> None:
         """Cut off the samples that have left the window, and not again before 1/16 of it has passed."""
         start = self._start
-        try:
+        # Without memory the samples count as before, and the next one tries again.
+        with suppress(MemoryError):
             self.stamps, self.records = self.stamps[start:], self.records[start * _SIZE :]
-        except MemoryError:
-            # The samples count as before; the next one tries again.
-            return
         if self.stamps:
             self._cut_after = self.stamps[0] + self._keep + self._keep // 16
 
