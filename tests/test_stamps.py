@@ -283,6 +283,9 @@ def test_the_text_of_a_stamp_is_exact(stamp: int) -> None:
         (SECOND, "1 s"),
         (2_500_000_000, "2.5 s"),
         (3_600 * SECOND, "3600 s"),
+        (2 * 86_400 * SECOND - 1, "172800 s"),
+        (2 * 86_400 * SECOND, "2 days"),
+        (1_795_560_204 * SECOND, "56.9 years"),
         (-410_000_000, "-410 ms"),
     ],
 )

@@ -20,6 +20,11 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+#ifdef _WIN32
+#include <windows.h>
+#else
+#include <time.h>
+#endif
 
 #if defined(_MSC_VER)
 #pragma fp_contract(off)
@@ -2309,10 +2314,31 @@ typedef struct {
     PyObject_HEAD
     PyObject *edges;   /* {child: Edge} */
     double square;     /* m^2 */
-    long long horizon; /* ns */
+    long long earliest, horizon; /* ns */
+    long long until;   /* ns of `elapsed`; the two are out of date then */
 } Judge;
 
 REFERENCES(judge, 1)
+
+#define BOUNDS_LAST 100000000 /* ns */
+
+/* A monotonic time in ns, to some milliseconds. The exact one takes a tenth of the time of a publish. */
+static int64_t
+elapsed(void)
+{
+#ifdef _WIN32
+    return (int64_t)GetTickCount64() * 1000000;
+#else
+#ifdef CLOCK_MONOTONIC_COARSE
+    const clockid_t clock = CLOCK_MONOTONIC_COARSE;
+#else
+    const clockid_t clock = CLOCK_MONOTONIC;
+#endif
+    struct timespec now = {0, 0};
+    clock_gettime(clock, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+#endif
+}
 
 static int
 judge_init(Judge *self, PyObject *args, PyObject *kwargs)
@@ -2326,18 +2352,36 @@ judge_init(Judge *self, PyObject *args, PyObject *kwargs)
     judge_clear(OBJECT(self));
     self->edges = edges;
     self->square = square;
-    self->horizon = INT64_MIN;
+    self->earliest = self->horizon = INT64_MIN;
+    self->until = INT64_MAX;
     return 0;
 }
 
-/* accepts(batch): whether all samples continue known edges, none is newer than the horizon and no translation longer
- * than the root of `square`; then their stamps are noted, else nothing. */
+/* allow(earliest, horizon): set both; they hold for a tenth of a second. */
+static PyObject *
+judge_allow(Judge *self, PyObject *args)
+{
+    long long earliest, horizon;
+    if (!PyArg_ParseTuple(args, "LL:allow", &earliest, &horizon)) {
+        return NULL;
+    }
+    self->earliest = earliest;
+    self->horizon = horizon;
+    self->until = elapsed() + BOUNDS_LAST;
+    Py_RETURN_NONE;
+}
+
+/* accepts(batch): whether all samples continue known edges, none is older than `earliest` or newer than `horizon`, and
+ * no translation longer than the root of `square`; then their stamps are noted, else nothing. */
 static PyObject *
 judge_accepts(Judge *self, PyObject *batch)
 {
     if (!PyTuple_CheckExact(batch)) {
         PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
         return NULL;
+    }
+    if (elapsed() >= self->until) {
+        Py_RETURN_FALSE;
     }
     const Py_ssize_t size = PyTuple_Size(batch);
     Edge *few[FEW], **edges = few;
@@ -2349,7 +2393,7 @@ judge_accepts(Judge *self, PyObject *batch)
         PyObject *item = PyTuple_GetItem(batch, judged);
         const Sample *sample = (const Sample *)item;
         if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static
-            || sample->stamp > self->horizon) {
+            || sample->stamp > self->horizon || sample->stamp < self->earliest) {
             break;
         }
         const double *row = sample->row;
@@ -2387,10 +2431,13 @@ judge_accepts(Judge *self, PyObject *batch)
 static PyMethodDef judge_methods[] = {
     {"accepts", (PyCFunction)judge_accepts, METH_O,
      PyDoc_STR("accepts(batch): whether the whole batch is plain; then its stamps are noted.")},
+    {"allow", (PyCFunction)judge_allow, METH_VARARGS,
+     PyDoc_STR("allow(earliest, horizon): set both; they hold for a tenth of a second.")},
     {NULL}
 };
 
 static PyMemberDef judge_members[] = {
+    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("No stamp may be older, in ns.")},
     {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("No stamp may be newer, in ns.")},
     {NULL}
 };

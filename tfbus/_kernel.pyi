@@ -86,9 +86,11 @@ class Edge:
     newest: int | None
 
 class Judge:
+    earliest: int
     horizon: int
     def __init__(self, edges: Mapping[str, Edge], square: float, /) -> None: ...
     def accepts(self, batch: tuple[Sample, ...], /) -> bool: ...
+    def allow(self, earliest: int, horizon: int, /) -> None: ...
 
 class Parked:
     answer: Any

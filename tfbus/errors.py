@@ -31,7 +31,7 @@ from heapq import nlargest
 from typing import Any, Self, TypeVar, get_type_hints
 
 from tfbus.plain import from_fields, from_plain, to_plain
-from tfbus.stamps import Latest, format_duration, format_stamp
+from tfbus.stamps import Latest, format_duration, format_stamp, likely_cause
 
 LOOKED_AT = 30
 """The number of known names that are compared in full with an unknown one; a comparison takes tens of microseconds."""
@@ -282,6 +282,9 @@ class ExtrapolationError(TransformLookupError):
         if self.ahead:
             ahead = format_duration(self.ahead)
             sender += f"; its newest stamp is {ahead} ahead of the clock, and right samples expire"
+        if self.newest is not None and not isinstance(self.stamp, Latest):
+            cause = likely_cause(self.stamp, self.newest)
+            sender += f": {cause}" if cause else ""
         return f"frame {self.child!r}: asked for {self._asked()}, {self._gap()}{sender}"
 
 

@@ -18,6 +18,7 @@ from tfbus.events import (
     Reparented,
     SampleRejected,
     StampAhead,
+    StampBehind,
 )
 from tfbus.statistics import QueueStatistics
 
@@ -30,8 +31,8 @@ class EventQueue:
 
     A conflict of authorities is given once for each frame and pair of them. From then on a new parent or kind of that
     frame is given once for each authority that claims it. A rejected sample is given once for each frame, authority and
-    reason; a stamp ahead of the clock, for each frame and authority; and a loop of parents in the past, for each frame,
-    authority and parent. All of this begins anew when the frame is removed or added, and when the clock jumps back.
+    reason; a stamp ahead of the clock, or behind it, for each frame and authority; and a loop of parents in the past,
+    for each frame, authority and parent. All of this begins anew when the frame is removed or added, and when the clock jumps back.
 
     If one authority moves a frame to and fro, every move is an event, because that may be intended. If the queue is
     full, such a frame pushes out its own events and no others.
@@ -105,7 +106,7 @@ class EventQueue:
         if isinstance(event, AuthorityConflict):
             seen = self._conflicts.setdefault(event.frame, SeenKeys(_CLAIMS))
             key = frozenset((event.authority, event.other))
-        elif isinstance(event, (SampleRejected, StampAhead, PastLoop)):
+        elif isinstance(event, (SampleRejected, StampAhead, StampBehind, PastLoop)):
             seen = self._refusals.setdefault(event.frame, SeenKeys(_CLAIMS))
             key = (type(event), event.authority, _what(event))
             if len(self._refusals) > _REFUSED_FRAMES:
@@ -121,7 +122,7 @@ class EventQueue:
         return not seen.add(key)
 
 
-def _what(event: SampleRejected | StampAhead | PastLoop) -> str | None:
+def _what(event: SampleRejected | StampAhead | StampBehind | PastLoop) -> str | None:
     """That of which an event tells once, beside its frame and authority."""
     if isinstance(event, SampleRejected):
         return event.reason

@@ -1,9 +1,14 @@
 """The plain judgement of a batch, in Python: the definition of what ``tfbus/_kernel.c`` does in its place."""
 
+import time
 from collections.abc import Mapping
+from typing import Final
 
 from tfbus.geometry.stamped import Batch
-from tfbus.stamps import STAMP_MIN
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+
+_BOUNDS_LAST: Final = 100_000_000
+"""ns."""
 
 
 class Edge:
@@ -36,26 +41,34 @@ class Judge:
 
     Attributes
     ----------
-    horizon : int
-        No stamp may be newer, in ns. At first the least stamp.
+    earliest, horizon : int
+        No stamp may be older or newer, in ns. At first both are the least stamp.
     """
 
-    __slots__ = ("_edges", "_square", "horizon")
+    __slots__ = ("_edges", "_square", "_until", "earliest", "horizon")
 
     def __init__(self, edges: Mapping[str, Edge], square: float) -> None:
         self._edges = edges
         self._square = square
-        self.horizon = STAMP_MIN
+        self.earliest = self.horizon = STAMP_MIN
+        self._until = STAMP_MAX
+
+    def allow(self, earliest: int, horizon: int, /) -> None:
+        """Set `earliest` and `horizon`; they hold for a tenth of a second."""
+        self.earliest, self.horizon = earliest, horizon
+        self._until = time.monotonic_ns() + _BOUNDS_LAST
 
     def accepts(self, batch: Batch) -> bool:
         """Whether a whole batch continues known edges; then the newest stamps are noted, else nothing."""
-        edges, square, horizon = self._edges, self._square, self.horizon
+        if time.monotonic_ns() >= self._until:
+            return False
+        edges, square, earliest, horizon = self._edges, self._square, self.earliest, self.horizon
         for sample in batch:
             parent, child, stamp, row, authority, static = sample._fields
             if child not in edges:
                 return False
             known = edges[child]
-            if known.parent != parent or known.trusted != authority or static or stamp > horizon:
+            if known.parent != parent or known.trusted != authority or static or not earliest <= stamp <= horizon:
                 return False
             # Three picks take less than an unpacking of all seven. Not `>`, which is false for NaN.
             x, y, z = row[0], row[1], row[2]
