@@ -33,6 +33,15 @@ def judge(kernel: Any, edges: dict[str, Any], batch: Any, horizon: int, square: 
     return accepted
 
 
+@on_both
+@pytest.mark.parametrize(("stamp", "plain"), [(11, False), (12, True), (14, True), (15, False)])
+def test_the_bounds_of_stamps_are_inclusive(kernel: Any, stamp: int, plain: bool) -> None:
+    judge = kernel.Judge(edges(kernel), 81.0)
+    judge.allow(12, 14)
+    assert (judge.earliest, judge.horizon) == (12, 14)
+    assert judge.accepts((sample(kernel, stamp=stamp),)) is plain
+
+
 def sample(kernel: ModuleType, **changes: Any) -> Any:
     fields: dict[str, Any] = {"parent": "map", "child": "a", "stamp": 20, "x": 1.0, "authority": "me", "static": False}
     fields.update(changes)
@@ -109,6 +118,8 @@ def test_wrong_arguments_raise() -> None:
         lambda: judge(kernel, {}, [], 0, 0.0),
         lambda: judge(kernel, {}, (), "0", 0.0),  # type: ignore[arg-type]
         lambda: judge(kernel, {}, (), 0, "0"),  # type: ignore[arg-type]
+        lambda: kernel.Judge({}, 0.0).allow(0, "1"),
+        lambda: kernel.Judge({}, 0.0).allow(0),
         lambda: kernel.Judge([], 0.0),
         lambda: kernel.Judge({}),
         lambda: kernel.Judge(edges={}, square=0.0),

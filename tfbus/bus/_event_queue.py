@@ -32,7 +32,8 @@ class EventQueue:
     A conflict of authorities is given once for each frame and pair of them. From then on a new parent or kind of that
     frame is given once for each authority that claims it. A rejected sample is given once for each frame, authority and
     reason; a stamp ahead of the clock, or behind it, for each frame and authority; and a loop of parents in the past,
-    for each frame, authority and parent. All of this begins anew when the frame is removed or added, and when the clock jumps back.
+    for each frame, authority and parent. All of this begins anew when the frame is removed or added, and when the clock
+    jumps back.
 
     If one authority moves a frame to and fro, every move is an event, because that may be intended. If the queue is
     full, such a frame pushes out its own events and no others.

@@ -15,7 +15,7 @@ from tfbus.clock import Clock, SystemClock
 from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import format_age, to_seconds
+from tfbus.stamps import format_age, likely_cause, to_seconds
 from tfbus.waiting.waiting_index import blocking_frames
 
 _Cause = tuple[type[BaseException], tuple[str, ...]]
