@@ -2236,6 +2236,7 @@ typedef struct {
     PyObject *trusted; /* plain str, or NULL for nobody */
     int64_t newest;
     char has_newest;
+    char late; /* whether old stamps of it were told */
 } Edge;
 
 static PyObject *
@@ -2296,10 +2297,16 @@ static PyGetSetDef edge_getset[] = {
     {NULL}
 };
 
+static PyMemberDef edge_members[] = {
+    {"late", T_BOOL, offsetof(Edge, late), 0, PyDoc_STR("Whether its old stamps were told, so that they are plain.")},
+    {NULL}
+};
+
 static PyType_Slot edge_slots[] = {
     {Py_tp_doc, (void *)PyDoc_STR("The part of a frame's newest edge by which its samples are judged.")},
     {Py_tp_new, PyType_GenericNew},
     {Py_tp_dealloc, edge_dealloc},
+    {Py_tp_members, edge_members},
     {Py_tp_getset, edge_getset},
     {0, NULL}
 };
@@ -2316,11 +2323,10 @@ typedef struct {
     double square;     /* m^2 */
     long long earliest, horizon; /* ns */
     long long until;   /* ns of `elapsed`; the two are out of date then */
+    long long behind;  /* how many stamps were older than the first */
 } Judge;
 
 REFERENCES(judge, 1)
-
-#define BOUNDS_LAST 100000000 /* ns */
 
 /* A monotonic time in ns, to some milliseconds. The exact one takes a tenth of the time of a publish. */
 static int64_t
@@ -2354,25 +2360,27 @@ judge_init(Judge *self, PyObject *args, PyObject *kwargs)
     self->square = square;
     self->earliest = self->horizon = INT64_MIN;
     self->until = INT64_MAX;
+    self->behind = 0;
     return 0;
 }
 
-/* allow(earliest, horizon): set both; they hold for a tenth of a second. */
+/* allow(earliest, horizon, lasting): set both for so many ns of the machine's time; then no batch is plain. */
 static PyObject *
 judge_allow(Judge *self, PyObject *args)
 {
-    long long earliest, horizon;
-    if (!PyArg_ParseTuple(args, "LL:allow", &earliest, &horizon)) {
+    long long earliest, horizon, lasting;
+    if (!PyArg_ParseTuple(args, "LLL:allow", &earliest, &horizon, &lasting)) {
         return NULL;
     }
     self->earliest = earliest;
     self->horizon = horizon;
-    self->until = elapsed() + BOUNDS_LAST;
+    const int64_t now = elapsed();
+    self->until = lasting < INT64_MAX - now ? now + lasting : INT64_MAX;
     Py_RETURN_NONE;
 }
 
-/* accepts(batch): whether all samples continue known edges, none is older than `earliest` or newer than `horizon`, and
- * no translation longer than the root of `square`; then their stamps are noted, else nothing. */
+/* accepts(batch): whether all samples continue known edges, none is newer than `horizon`, older than `earliest` unless
+ * its edge is late, and no translation longer than the root of `square`; then their stamps are noted, else nothing. */
 static PyObject *
 judge_accepts(Judge *self, PyObject *batch)
 {
@@ -2380,7 +2388,7 @@ judge_accepts(Judge *self, PyObject *batch)
         PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
         return NULL;
     }
-    if (elapsed() >= self->until) {
+    if (self->until != INT64_MAX && elapsed() >= self->until) {
         Py_RETURN_FALSE;
     }
     const Py_ssize_t size = PyTuple_Size(batch);
@@ -2393,7 +2401,7 @@ judge_accepts(Judge *self, PyObject *batch)
         PyObject *item = PyTuple_GetItem(batch, judged);
         const Sample *sample = (const Sample *)item;
         if (!PyObject_TypeCheck(item, SampleType) || sample->authority == NULL || sample->is_static
-            || sample->stamp > self->horizon || sample->stamp < self->earliest) {
+            || sample->stamp > self->horizon) {
             break;
         }
         const double *row = sample->row;
@@ -2407,7 +2415,8 @@ judge_accepts(Judge *self, PyObject *batch)
         }
         edges[judged] = (Edge *)known;
         if (!same_string(sample->parent, edges[judged]->parent)
-            || !same_string(sample->authority, edges[judged]->trusted)) {
+            || !same_string(sample->authority, edges[judged]->trusted)
+            || (sample->stamp < self->earliest && !edges[judged]->late)) {
             break;
         }
     }
@@ -2418,6 +2427,7 @@ judge_accepts(Judge *self, PyObject *batch)
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
         }
+        self->behind += stamp < self->earliest;
     }
     if (edges != few) {
         PyMem_Free(edges);
@@ -2432,12 +2442,13 @@ static PyMethodDef judge_methods[] = {
     {"accepts", (PyCFunction)judge_accepts, METH_O,
      PyDoc_STR("accepts(batch): whether the whole batch is plain; then its stamps are noted.")},
     {"allow", (PyCFunction)judge_allow, METH_VARARGS,
-     PyDoc_STR("allow(earliest, horizon): set both; they hold for a tenth of a second.")},
+     PyDoc_STR("allow(earliest, horizon, lasting): set both for so many ns of the machine's time.")},
     {NULL}
 };
 
 static PyMemberDef judge_members[] = {
-    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("No stamp may be older, in ns.")},
+    {"behind", T_LONGLONG, offsetof(Judge, behind), 0, PyDoc_STR("How many stamps were older than the first bound.")},
+    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("No stamp but of late edges may be older, in ns.")},
     {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("No stamp may be newer, in ns.")},
     {NULL}
 };

@@ -43,8 +43,9 @@ class EventQueue:
     capacity : int
         How many events may be pending, at least one; those of `known` and of `put_staleness` do not count,
         and are never dropped.
-    known : iterable of FrameAdded or StampAhead
-        An event for each frame that has a parent at the beginning, and for each of them that is ahead of the clock.
+    known : iterable of FrameAdded, StampAhead or StampBehind
+        An event for each frame that has a parent at the beginning, and for each of them that is ahead of the clock, or
+        behind it.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class EventQueue:
         Number of events lost to the capacity.
     """
 
-    def __init__(self, capacity: int, known: Iterable[FrameAdded | StampAhead] = ()) -> None:
+    def __init__(self, capacity: int, known: Iterable[FrameAdded | StampAhead | StampBehind] = ()) -> None:
         check_capacity(capacity)
         self.capacity = capacity
         self.dropped = 0

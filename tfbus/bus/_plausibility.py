@@ -4,11 +4,12 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from tfbus.clock import Clock
+from tfbus.clock import Clock, SimulatedClock
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.bounds import as_max_translation, is_within, not_physical
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.stamps import (
+    SECOND,
     STAMP_MAX,
     STAMP_MIN,
     as_duration,
@@ -44,6 +45,8 @@ class Plausibility:
     ----------
     max_translation : float
     rejects_ahead : bool
+    lasting : int
+        How long the plausible stamps may be used without looking at the clock, in ns; a simulated one tells its moves.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class Plausibility:
             raise ValueError("reject_ahead needs a max_ahead: without one, no stamp is ahead of the clock")
         self.rejects_ahead = reject_ahead
         self._clock = clock
+        self.lasting = STAMP_MAX if isinstance(clock, SimulatedClock) else SECOND // 10
         self._recorded = 0
         self._kept = 0
 

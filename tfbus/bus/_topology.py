@@ -60,6 +60,7 @@ class _Edge(Edge):
         self.authority = authority
         self.last = authority
         self.trusted = None
+        self.late = False
         self.since = since
 
 
@@ -86,10 +87,11 @@ class Topology:
         Samples that were refused, by reason.
     reparented, kind_changes, conflicts : int
         Number of samples that gave a child another newest parent, another kind, or another authority than before.
-    ahead, behind : int
-        Accepted samples that were ahead of the clock, and behind it.
+    ahead : int
+        Accepted samples that were ahead of the clock.
     judge : Judge
-        Records the samples of a batch if all continue known edges; else `accept` has to look.
+        Records the samples of a batch if all continue known edges; else `accept` has to look. It counts the accepted
+        samples that were behind the clock.
     """
 
     def __init__(
@@ -107,7 +109,7 @@ class Topology:
         self._evict = evict
         self._parents = 0
         self._newest: dict[str, _Edge] = {}
-        # It compares stamps with the clock of at most a tenth of a second ago.
+        # It compares stamps with the clock of at most a tenth of a second ago, or of the last move of a simulated one.
         self.judge = Judge(self._newest, plausibility.max_translation**2)
         # Every parent of a newest edge, and some that were one.
         self._named: set[str] = set()
@@ -117,7 +119,6 @@ class Topology:
         self.kind_changes = 0
         self.conflicts = 0
         self.ahead = 0
-        self.behind = 0
 
     def __len__(self) -> int:
         return len(self._newest)
@@ -151,6 +152,15 @@ class Topology:
             StampAhead(now, child, known.newest, known.authority)
             for child, known in self._newest.items()
             if known.newest is not None and known.newest > newest
+        ]
+
+    def known_behind(self) -> list[StampBehind]:
+        """An event for each child that was told to be behind the clock, and whose newest sample is so still."""
+        now, oldest = self._announcer.now(), self._plausibility.oldest_plausible()
+        return [
+            StampBehind(now, child, known.newest, None, known.authority)
+            for child, known in self._newest.items()
+            if known.late and known.newest is not None and known.newest < oldest
         ]
 
     def expired(self, sample: TransformStamped, newest: int, authority: str) -> bool:
@@ -240,7 +250,7 @@ class Topology:
     def _look_at_clock(self) -> None:
         """Let the judge compare stamps with the time that it is now."""
         plausibility = self._plausibility
-        self.judge.allow(plausibility.oldest_plausible(), plausibility.newest_plausible())
+        self.judge.allow(plausibility.oldest_plausible(), plausibility.newest_plausible(), plausibility.lasting)
 
     def _accepts_now(self, batch: Batch) -> bool:
         """Whether the judge accepts a batch by the time that it is now."""
@@ -279,8 +289,9 @@ class Topology:
                     self._tell_ahead(sample.child, sample.stamp, sample.authority)
             for sample in behind:
                 if id(sample) in stored:
-                    self.behind += 1
+                    self.judge.behind += 1
                     self._tell_behind(sample)
+                    self._newest[sample.child].late = True
         return accepted
 
     def _defend(
@@ -333,6 +344,7 @@ class Topology:
             if self._ownership.reserved_for(child) is None:
                 self._conflict(child, authority, known.last)
             known.last = authority
+            known.late = False
         if known.static != static:
             self.kind_changes += 1
             kind = "static" if static else "moving"

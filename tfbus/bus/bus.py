@@ -380,7 +380,7 @@ class Bus:
                 *(events.queue.statistics() for events in self._events),
             ),
             ahead=self._topology.ahead,
-            behind=self._topology.behind,
+            behind=self._topology.judge.behind,
         )
 
     def __repr__(self) -> str:
