@@ -302,11 +302,9 @@ class SimulatedClock:
         """Jump to a stamp, in ns.
 
         Sleeps of a duration are not changed. `sleep_until` ends if the stamp is reached, and raises `ClockResetError`
-        after a jump back. The first time of a clock that nobody has set is no jump back, whatever it is.
+        after a jump back.
         """
         before, after = self._now, as_stamp(stamp)
-        if not self._is_set:
-            before = min(before, after)
         self._now, self._is_set = after, True
         error = ClockResetError(before=before, after=after) if after < before else None
         for sleeper in self._stamp_sleepers:

@@ -273,7 +273,7 @@ def format_age(stamp: int, now: int) -> str:
 
 
 def likely_cause(stamp: int, other: int) -> str:
-    """Why two stamps (ns) that should be near each other are not, in words; empty if nothing is likely.
+    """The likely cause, in words, if two stamps (ns) that should be near each other are far apart; else empty.
 
     Examples
     --------
