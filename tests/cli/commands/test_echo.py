@@ -2,6 +2,7 @@ import json
 import signal
 import subprocess
 from collections.abc import Sequence
+from typing import Any
 
 import anyio
 import anyio.to_thread
@@ -12,6 +13,7 @@ from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, Transform, TransformStamped, from_seconds
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.commands.echo import describe, to_json
 from tfbus.links.zenoh import BufferServer
 
@@ -101,6 +103,27 @@ def test_a_static_transform_is_printed_again_and_again(tfbus: Command) -> None:
 
     done = tfbus.on_domain(publish, "echo", "laser", "base_link")
     assert done.stdout.splitlines()[::5] == ["At any time: 'base_link' in 'laser'"] * 3
+
+
+@pytest.mark.parametrize(("option", "ages"), [((), ["age not known", "age 50 ms"]), (("--json",), [None, 0.05])])
+def test_no_age_is_shown_and_nothing_is_told_before_the_time_of_a_simulation_is_heard(
+    tfbus: Command, option: tuple[str, ...], ages: list[Any]
+) -> None:
+    clock = ReplayClock()
+
+    async def publish(bus: Bus) -> None:
+        bus.publish(moving("map", "base", 100 * SECOND))
+        await anyio.sleep(0.05)
+        clock.hear(100 * SECOND + SECOND // 20)
+        await anyio.sleep(0.1)
+
+    done = tfbus.on_domain(publish, "echo", "map", "base", "--rate", "50", *option, clock=clock)
+    shown = done.stdout.splitlines()
+    if option:
+        found = [json.loads(line)["age"] for line in shown]
+    else:
+        found = [line.partition(" s, ")[2].partition(":")[0] for line in shown if line.startswith("At")]
+    assert ([found[0], found[-1]], done.stderr) == (ages, "")
 
 
 @pytest.mark.thorough
