@@ -313,8 +313,8 @@ SIMULATED = 3_617 * SECOND
 
 
 def test_the_text_of_an_age_of_years_names_the_likely_cause() -> None:
-    assert format_age(WALL // SECOND, WALL) == "age 56.9 years (seconds passed as nanoseconds?)"
-    assert format_age(WALL, SIMULATED).startswith("56.9 years ahead (these look like two clocks (")
+    assert format_age(WALL // SECOND, WALL) == "age 56.9 years, seconds passed as nanoseconds?"
+    assert format_age(WALL, SIMULATED).startswith("56.9 years ahead, these look like two clocks (")
 
 
 @pytest.mark.parametrize(

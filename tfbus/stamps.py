@@ -264,12 +264,12 @@ def format_duration(nanoseconds: int) -> str:
 def format_age(stamp: int, now: int) -> str:
     """The text of the age of a stamp at `now`, with the likely cause if it is far off; both are in ns.
 
-    It is ``age 410 ms``, or ``2.5 s ahead`` if the stamp is ahead, or ``age 56.9 years (seconds passed as
-    nanoseconds?)``.
+    It is ``age 410 ms``, or ``2.5 s ahead`` if the stamp is ahead, or ``age 56.9 years, seconds passed as
+    nanoseconds?``.
     """
     age = f"{format_duration(stamp - now)} ahead" if stamp > now else f"age {format_duration(now - stamp)}"
     cause = likely_cause(stamp, now)
-    return f"{age} ({cause})" if cause else age
+    return f"{age}, {cause}" if cause else age
 
 
 def likely_cause(stamp: int, other: int) -> str:

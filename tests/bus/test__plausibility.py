@@ -412,6 +412,19 @@ def test_a_clock_that_nobody_has_set_and_a_bus_without_a_bound_have_no_stamp_ahe
     assert bus.statistics().ahead == 0
 
 
+def test_the_log_line_and_the_error_of_a_stamp_years_ahead_name_the_likely_cause(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    cause = "these look like two clocks (simulated time and wall time?)"
+    bus_at(3617 * SECOND).publish(moving("map", "base", WALL))
+    assert caplog.messages == [
+        "frame 'base' has a sample from '' that is 56.9 years ahead of the clock: right samples are older, and expire; "
+        + cause
+    ]
+    with pytest.raises(InvalidTransformError, match=re.escape(f"ahead of the clock (at most 1 s): {cause}")):
+        bus_at(3617 * SECOND, reject_ahead=True).publish(moving("map", "base", WALL))
+
+
 async def test_a_simulated_clock_counts_from_its_first_move() -> None:
     advanced, jumped = SimulatedClock(), SimulatedClock()
     buses = [Bus(advanced), Bus(jumped)]

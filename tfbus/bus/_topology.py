@@ -374,7 +374,7 @@ class Topology:
             child,
             authority,
             format_duration(newest - now),
-            cause and f" ({cause})",
+            cause and f"; {cause}",
         )
         if self._announcer.has_listeners:
             self._announcer.announce(StampAhead(now, child, newest, authority))

@@ -57,7 +57,7 @@ class Bus:
     max_behind : float or None
         How far, in s, the stamp of a moving sample may be behind the clock. One that is further behind is accepted, but
         announced as `StampBehind`, logged once for each authority and frame, and counted; so is one that expires in a
-        buffer. None for any distance, as for `max_ahead`.
+        buffer. None for any distance, and for no word of what expires.
     reject_ahead : bool
         Whether a sample that is further ahead is refused. Otherwise it is accepted; until the clock has reached it,
         right samples of its frame are older than the newest, and expire if they are older than a buffer's window.
