@@ -25,6 +25,7 @@ from tfbus import (
     Reparented,
     SampleRejected,
     StampAhead,
+    StampBehind,
     SubscriberFailed,
 )
 
@@ -60,6 +61,14 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     (
         StampAhead(AT, "base", AT + 3600 * SECOND, "peer"),
         "frame 'base' has a sample 3600 s ahead of the clock, from 'peer'",
+    ),
+    (
+        StampBehind(AT, "base", 12, None, "peer"),
+        "frame 'base' has a sample 12.5 s behind the clock, from 'peer': seconds passed as nanoseconds?",
+    ),
+    (
+        StampBehind(AT, "base", 0, 11 * SECOND, "peer"),
+        "frame 'base' has a sample 11 s older than the newest, and has expired, from 'peer'",
     ),
     (ClockReset(AT, 90 * SECOND), "the clock jumped back from 90.000 s"),
     (SubscriberFailed(AT, "print", OSError("full")), "the subscriber print raised OSError('full')"),

@@ -132,18 +132,6 @@ def foreign_imports(module: str) -> set[str]:
     return {name.partition(".")[0] for name in imports(module)} - {"tfbus"}
 
 
-def code_lines(module: str) -> int:
-    """The number of lines without docstrings, comments and blank lines."""
-    docstrings: set[int] = set()
-    for node in ast.walk(parsed(module)):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and node.body:
-            first = node.body[0]
-            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
-                docstrings.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
-    lines = enumerate(SOURCES[module].read_text(encoding="utf-8").splitlines(), 1)
-    return sum(1 for number, line in lines if number not in docstrings and line.strip() and line.strip()[0] != "#")
-
-
 def test_every_module_is_in_a_room_of_the_plan_and_the_plan_has_at_most_25_rooms() -> None:
     assert {room_of(module) for module in MODULES} == set(ROOMS)
     assert len(ROOMS.keys() - {"__init__", "__main__"}) <= 25
@@ -195,11 +183,6 @@ def test_a_module_imports_nothing_beyond_the_dependencies_but_the_extras_of_its_
 
 def test_no_import_hides_behind_type_checking() -> None:
     assert [module for module in MODULES if "TYPE_CHECKING" in SOURCES[module].read_text(encoding="utf-8")] == []
-
-
-def test_no_module_has_more_than_300_lines_of_code() -> None:
-    long = [module for module in MODULES if SOURCES[module].read_text(encoding="utf-8").count("\n") > 300]
-    assert [module for module in long if code_lines(module) > 300] == []
 
 
 def options_of_dataclasses(module: str) -> Iterator[tuple[str, dict[str, object]]]:

@@ -74,6 +74,7 @@ _NAMES_IN = {
         "Reparented",
         "SampleRejected",
         "StampAhead",
+        "StampBehind",
         "SubscriberFailed",
     ),
     "geometry.stamped": ("TransformStamped",),

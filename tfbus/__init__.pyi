@@ -65,6 +65,7 @@ from tfbus.events import RecordingFailed as RecordingFailed
 from tfbus.events import Reparented as Reparented
 from tfbus.events import SampleRejected as SampleRejected
 from tfbus.events import StampAhead as StampAhead
+from tfbus.events import StampBehind as StampBehind
 from tfbus.events import SubscriberFailed as SubscriberFailed
 from tfbus.geometry.stamped import TransformStamped as TransformStamped
 from tfbus.geometry.transform import Transform as Transform

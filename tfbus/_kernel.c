@@ -20,6 +20,11 @@
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
+#ifdef _WIN32
+#include <windows.h>
+#else
+#include <time.h>
+#endif
 
 #if defined(_MSC_VER)
 #pragma fp_contract(off)
@@ -2258,6 +2263,7 @@ typedef struct {
     PyObject *trusted; /* plain str, or NULL for nobody */
     int64_t newest;
     char has_newest;
+    char late; /* whether old stamps of it were told */
 } Edge;
 
 static PyObject *
@@ -2318,10 +2324,16 @@ static PyGetSetDef edge_getset[] = {
     {NULL}
 };
 
+static PyMemberDef edge_members[] = {
+    {"late", T_BOOL, offsetof(Edge, late), 0, PyDoc_STR("Whether its old stamps were told, so that they are plain.")},
+    {NULL}
+};
+
 static PyType_Slot edge_slots[] = {
     {Py_tp_doc, (void *)PyDoc_STR("The part of a frame's newest edge by which its samples are judged.")},
     {Py_tp_new, PyType_GenericNew},
     {Py_tp_dealloc, edge_dealloc},
+    {Py_tp_members, edge_members},
     {Py_tp_getset, edge_getset},
     {0, NULL}
 };
@@ -2336,10 +2348,30 @@ typedef struct {
     PyObject_HEAD
     PyObject *edges;   /* {child: Edge} */
     double square;     /* m^2 */
-    long long horizon; /* ns */
+    long long earliest, horizon; /* ns */
+    long long until;   /* ns of `elapsed`; the two are out of date then */
+    long long behind;  /* how many stamps were older than the first */
 } Judge;
 
 REFERENCES(judge, 1)
+
+/* A monotonic time in ns, to some milliseconds. The exact one takes a tenth of the time of a publish. */
+static int64_t
+elapsed(void)
+{
+#ifdef _WIN32
+    return (int64_t)GetTickCount64() * 1000000;
+#else
+#ifdef CLOCK_MONOTONIC_COARSE
+    const clockid_t clock = CLOCK_MONOTONIC_COARSE;
+#else
+    const clockid_t clock = CLOCK_MONOTONIC;
+#endif
+    struct timespec now = {0, 0};
+    clock_gettime(clock, &now);
+    return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
+#endif
+}
 
 static int
 judge_init(Judge *self, PyObject *args, PyObject *kwargs)
@@ -2353,18 +2385,38 @@ judge_init(Judge *self, PyObject *args, PyObject *kwargs)
     judge_clear(OBJECT(self));
     self->edges = edges;
     self->square = square;
-    self->horizon = INT64_MIN;
+    self->earliest = self->horizon = INT64_MIN;
+    self->until = INT64_MAX;
+    self->behind = 0;
     return 0;
 }
 
-/* accepts(batch): whether all samples continue known edges, none is newer than the horizon and no translation longer
- * than the root of `square`; then their stamps are noted, else nothing. */
+/* allow(earliest, horizon, lasting): set both for so many ns of the machine's time; then no batch is plain. */
+static PyObject *
+judge_allow(Judge *self, PyObject *args)
+{
+    long long earliest, horizon, lasting;
+    if (!PyArg_ParseTuple(args, "LLL:allow", &earliest, &horizon, &lasting)) {
+        return NULL;
+    }
+    self->earliest = earliest;
+    self->horizon = horizon;
+    const int64_t now = elapsed();
+    self->until = lasting < INT64_MAX - now ? now + lasting : INT64_MAX;
+    Py_RETURN_NONE;
+}
+
+/* accepts(batch): whether all samples continue known edges, none is newer than `horizon`, older than `earliest` unless
+ * its edge is late, and no translation longer than the root of `square`; then their stamps are noted, else nothing. */
 static PyObject *
 judge_accepts(Judge *self, PyObject *batch)
 {
     if (!PyTuple_CheckExact(batch)) {
         PyErr_SetString(PyExc_TypeError, "a batch is a tuple of samples");
         return NULL;
+    }
+    if (self->until != INT64_MAX && elapsed() >= self->until) {
+        Py_RETURN_FALSE;
     }
     const Py_ssize_t size = PyTuple_Size(batch);
     Edge *few[FEW], **edges = few;
@@ -2390,7 +2442,8 @@ judge_accepts(Judge *self, PyObject *batch)
         }
         edges[judged] = (Edge *)known;
         if (!same_string(sample->parent, edges[judged]->parent)
-            || !same_string(sample->authority, edges[judged]->trusted)) {
+            || !same_string(sample->authority, edges[judged]->trusted)
+            || (sample->stamp < self->earliest && !edges[judged]->late)) {
             break;
         }
     }
@@ -2401,6 +2454,7 @@ judge_accepts(Judge *self, PyObject *batch)
             edges[i]->newest = stamp;
             edges[i]->has_newest = 1;
         }
+        self->behind += stamp < self->earliest;
     }
     if (edges != few) {
         PyMem_Free(edges);
@@ -2414,10 +2468,14 @@ judge_accepts(Judge *self, PyObject *batch)
 static PyMethodDef judge_methods[] = {
     {"accepts", (PyCFunction)judge_accepts, METH_O,
      PyDoc_STR("accepts(batch): whether the whole batch is plain; then its stamps are noted.")},
+    {"allow", (PyCFunction)judge_allow, METH_VARARGS,
+     PyDoc_STR("allow(earliest, horizon, lasting): set both for so many ns of the machine's time.")},
     {NULL}
 };
 
 static PyMemberDef judge_members[] = {
+    {"behind", T_LONGLONG, offsetof(Judge, behind), 0, PyDoc_STR("How many stamps were older than the first bound.")},
+    {"earliest", T_LONGLONG, offsetof(Judge, earliest), 0, PyDoc_STR("No stamp but of late edges may be older, in ns.")},
     {"horizon", T_LONGLONG, offsetof(Judge, horizon), 0, PyDoc_STR("No stamp may be newer, in ns.")},
     {NULL}
 };

@@ -84,11 +84,15 @@ class Edge:
     parent: str
     trusted: str | None
     newest: int | None
+    late: bool
 
 class Judge:
+    behind: int
+    earliest: int
     horizon: int
     def __init__(self, edges: Mapping[str, Edge], square: float, /) -> None: ...
     def accepts(self, batch: tuple[Sample, ...], /) -> bool: ...
+    def allow(self, earliest: int, horizon: int, lasting: int, /) -> None: ...
 
 class Parked:
     answer: Any

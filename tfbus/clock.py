@@ -77,6 +77,8 @@ class Clock(Protocol):
     A buffer sets one timer of the event loop for all its waiting lookups on a `SystemClock`, and on a `SimulatedClock`
     uses its method ``call_after``. On any other clock, a class derived from these included, each wait has its
     `move_on_after`.
+
+    A clock that has no time at first may have a property ``is_set``: until it is true, a bus compares no stamp with it.
     """
 
     def now(self) -> int:
@@ -168,6 +170,7 @@ class SimulatedClock:
 
     def __init__(self, start: int = 0) -> None:
         self._now = as_stamp(start)
+        self._is_set = self._now != 0
         self._elapsed = 0
         self._timers: list[_Timer] = []
         self._stamp_sleepers: dict[_StampSleeper, None] = {}
@@ -179,6 +182,11 @@ class SimulatedClock:
     def now(self) -> int:
         """The current simulated stamp, in ns."""
         return self._now
+
+    @property
+    def is_set(self) -> bool:
+        """Whether the clock has a time: it was made with a stamp other than 0, was set, or has advanced."""
+        return self._is_set
 
     async def sleep(self, seconds: float) -> None:
         """Sleep for a simulated duration in s; zero passes a checkpoint."""
@@ -298,7 +306,7 @@ class SimulatedClock:
         after a jump back.
         """
         before, after = self._now, as_stamp(stamp)
-        self._now = after
+        self._now, self._is_set = after, True
         error = ClockResetError(before=before, after=after) if after < before else None
         for sleeper in self._stamp_sleepers:
             if sleeper.event.is_set():
@@ -315,6 +323,7 @@ class SimulatedClock:
 
     def _move_to(self, elapsed: int) -> None:
         if elapsed > self._elapsed:
+            self._is_set = True
             self._now = min(self._now + elapsed - self._elapsed, STAMP_MAX)
             self._elapsed = elapsed
             if self._listeners:

@@ -33,7 +33,7 @@ from itertools import islice
 from typing import Any, Self, TypeVar, get_type_hints
 
 from tfbus.plain import from_fields, from_plain, to_plain
-from tfbus.stamps import Latest, format_duration, format_stamp
+from tfbus.stamps import Latest, format_duration, format_stamp, likely_cause
 
 MOST_NAMES = 2_000
 """The number of known names that an error about an unknown one keeps."""
@@ -310,6 +310,9 @@ class ExtrapolationError(TransformLookupError):
         if self.ahead:
             ahead = format_duration(self.ahead)
             sender += f"; its newest stamp is {ahead} ahead of the clock, and right samples expire"
+        if self.newest is not None and not isinstance(self.stamp, Latest):
+            cause = likely_cause(self.stamp, self.newest)
+            sender += f": {cause}" if cause else ""
         return f"frame {self.child!r}: asked for {self._asked()}, {self._gap()}{sender}"
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from tfbus.errors import TransformError, loop_text
 from tfbus.plain import PlainData
-from tfbus.stamps import format_duration, format_stamp
+from tfbus.stamps import format_duration, format_stamp, likely_cause
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,10 +219,55 @@ class StampAhead(PlainData):
     authority: str
 
     def __str__(self) -> str:
-        ahead = format_duration(self.newest - self.stamp)
+        ahead, cause = format_duration(self.newest - self.stamp), likely_cause(self.newest, self.stamp)
         return _line(
-            self.stamp, f"frame {self.frame!r} has a sample {ahead} ahead of the clock, from {self.authority!r}"
+            self.stamp,
+            f"frame {self.frame!r} has a sample {ahead} ahead of the clock, from {self.authority!r}"
+            f"{cause and f': {cause}'}",
         )
+
+
+@dataclass(frozen=True, slots=True)
+class StampBehind(PlainData):
+    """A sample of a frame is behind the clock by more than the `max_behind` of the bus, or has expired in a buffer.
+
+    An event stream gives it once for each frame and authority, until the frame is removed or added or the clock jumps
+    back. It does not tell of static samples, of recorded ones, and of the newest ones of before that a link brings when
+    it joins. No sample is behind a `SimulatedClock` that nobody has set.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the event, in ns.
+    frame, authority : str
+        The frame, and the sender of the sample.
+    at : int
+        The stamp of the sample, in ns.
+    newest : int or None
+        The newest stamp of the frame, in ns, if the sample has expired because it is older than the window before that.
+        None if it is behind the clock.
+    """
+
+    stamp: int
+    frame: str
+    at: int
+    newest: int | None
+    authority: str
+
+    def __str__(self) -> str:
+        cause = likely_cause(self.at, self.stamp)
+        return _line(
+            self.stamp,
+            f"frame {self.frame!r} has a sample {how_far_behind(self.at, self.stamp, self.newest)}, "
+            f"from {self.authority!r}{cause and f': {cause}'}",
+        )
+
+
+def how_far_behind(at: int, now: int, newest: int | None) -> str:
+    """The distance of a stamp from the clock, or from the newest stamp by which it has expired, as text; all in ns."""
+    if newest is None:
+        return f"{format_duration(now - at)} behind the clock"
+    return f"{format_duration(newest - at)} older than the newest, and has expired"
 
 
 @dataclass(frozen=True, slots=True)
@@ -383,6 +428,7 @@ Event = (
     | FrameStale
     | FrameLive
     | StampAhead
+    | StampBehind
     | ClockReset
     | SubscriberFailed
     | PeerJoined

@@ -32,8 +32,9 @@ Stamps = npt.NDArray[np.int64]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _DAY = 86_400 * SECOND
+_YEAR = 365 * _DAY
 _UNITS = {
-    "Y": 365 * _DAY,
+    "Y": _YEAR,
     "M": 28 * _DAY,
     "W": 7 * _DAY,
     "D": _DAY,
@@ -285,8 +286,11 @@ def format_stamp(stamp: int) -> str:
 
 
 def format_duration(nanoseconds: int) -> str:
-    """The text of a duration with about three digits: ``410 ms``, ``1 ns``, ``2.5 s``."""
+    """The text of a duration with about three digits: ``410 ms``, ``1 ns``, ``2.5 s``, ``56.9 years``."""
     size = abs(nanoseconds)
+    for unit, name in ((_YEAR, "years"), (_DAY, "days")):
+        if size >= 2 * unit:
+            return f"{nanoseconds / unit:.3g} {name}"
     for unit, name in ((SECOND, "s"), (1_000_000, "ms"), (1_000, "us")):
         if size >= unit:
             digits = f"{nanoseconds / unit:.0f}" if size >= 100 * unit else f"{nanoseconds / unit:.3g}"
@@ -294,8 +298,34 @@ def format_duration(nanoseconds: int) -> str:
     return f"{nanoseconds} ns"
 
 
-def format_age(nanoseconds: int) -> str:
-    """The text of an age: ``age 410 ms``; or ``2.5 s ahead``, if it is negative."""
-    if nanoseconds < 0:
-        return f"{format_duration(-nanoseconds)} ahead"
-    return f"age {format_duration(nanoseconds)}"
+def format_age(stamp: int, now: int) -> str:
+    """The text of the age of a stamp at `now`, with the likely cause if it is far off; both are in ns.
+
+    It is ``age 410 ms``, or ``2.5 s ahead`` if the stamp is ahead, or ``age 56.9 years, seconds passed as
+    nanoseconds?``.
+    """
+    age = f"{format_duration(stamp - now)} ahead" if stamp > now else f"age {format_duration(now - stamp)}"
+    cause = likely_cause(stamp, now)
+    return f"{age}, {cause}" if cause else age
+
+
+def likely_cause(stamp: int, other: int) -> str:
+    """The likely cause, in words, if two stamps (ns) that should be near each other are far apart; else empty.
+
+    Examples
+    --------
+    >>> likely_cause(1_700_000_000, 1_700_000_000_000_000_000)
+    'seconds passed as nanoseconds?'
+    >>> likely_cause(3_617 * SECOND, 1_700_000_000 * SECOND)
+    'these look like two clocks (simulated time and wall time?)'
+    """
+    small, large = sorted((stamp, other), key=abs)
+    is_far = abs(large - small) > _YEAR
+    # A stamp of simulated time may well be a thousandth of another one, unless it is so early.
+    if small != 0 and (is_far or abs(small) < 1_000_000):
+        for name, unit in (("seconds", SECOND), ("milliseconds", 1_000_000), ("microseconds", 1_000)):
+            if abs(large - small * unit) <= min(_DAY, abs(large) // 10):
+                return f"{name} passed as nanoseconds?"
+    if not is_far:
+        return ""
+    return "these look like two clocks (simulated time and wall time?)" if small else "a stamp that was never set?"

@@ -97,6 +97,8 @@ class BusStatistics(PlainData):
     queues : tuple of QueueStatistics
     ahead : int
         Accepted samples whose stamps were more than `max_ahead` ahead of the clock.
+    behind : int
+        Accepted samples whose stamps were more than `max_behind` behind the clock: see `StampBehind`.
     """
 
     samples: int
@@ -110,6 +112,7 @@ class BusStatistics(PlainData):
     buffers: tuple[BufferStatistics, ...]
     queues: tuple[QueueStatistics, ...]
     ahead: int = 0
+    behind: int = 0
 
 
 @dataclass(frozen=True, slots=True)

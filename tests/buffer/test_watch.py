@@ -604,17 +604,17 @@ async def test_a_long_wait_for_the_first_answer_is_logged_once_for_each_cause(ca
     clock, bus, buffer = make()
     with caplog.at_level(logging.WARNING, "tfbus"), buffer.watch("map", "bse") as changes:
         async with anyio.create_task_group() as tasks:
-            bus.publish(moving("map", "base", 1))
+            bus.publish(static("map", "base"))
             Asked(tasks, changes.__anext__)
             await clock.advance(4.9)
             assert caplog.messages == []
             for _ in range(4):
                 await clock.advance(2.0)
                 bus.remove_frame("base")
-                bus.publish(moving("map", "base", 1))
+                bus.publish(static("map", "base"))
             (message,) = caplog.messages
             assert "'bse' in 'map' has waited for more than 5 s: frame 'bse' is not known" in message
-            bus.publish(moving("sea", "bse", 1))
+            bus.publish(static("sea", "bse"))
             await settle()
             assert "different trees" in caplog.messages[1]
             tasks.cancel_scope.cancel()

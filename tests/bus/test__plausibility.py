@@ -1,7 +1,8 @@
-"""Translations that are too long, and stamps that are ahead of the clock."""
+"""Translations that are too long, and stamps that are ahead of the clock or behind it."""
 
 import logging
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from tfbus import (
     AheadError,
     Buffer,
     Bus,
+    FutureExtrapolationError,
     Hold,
     InvalidTransformError,
     PastExtrapolationError,
@@ -21,6 +23,7 @@ from tfbus import (
     SampleRejected,
     SimulatedClock,
     StampAhead,
+    StampBehind,
     SystemClock,
     Transform,
     TransformStamped,
@@ -183,16 +186,24 @@ def test_what_expires_because_of_a_stamp_ahead_says_so() -> None:
     assert "3600 s ahead  " in buffer.describe()
 
 
-def test_an_ordinary_late_sample_expires_without_a_word_about_the_clock(caplog: pytest.LogCaptureFixture) -> None:
-    bus = bus_at()
+def test_a_sample_that_is_late_by_less_than_a_window_is_silent_and_one_that_expires_is_told(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    bus = bus_at(max_behind=60.0)
     buffer = Buffer(bus)
+    bus.publish([moving("map", "base", NOW), moving("map", "base", NOW - 10 * SECOND)])
+    assert (bus.statistics().buffers[0].expired, caplog.records) == (0, [])
     bus.publish([moving("map", "base", NOW), moving("map", "base", NOW - 20 * SECOND)])
     (counted,) = bus.statistics().buffers
     assert (counted.expired, counted.expired_ahead) == (1, 0)
     with pytest.raises(PastExtrapolationError) as caught:
         buffer.lookup_nowait("map", "base", NOW - 20 * SECOND)
     assert caught.value.ahead == 0
-    assert caplog.records == []
+    assert [record.getMessage() for record in caplog.records] == [
+        "frame 'base' has a sample from '' that is 20 s older than the newest, and has expired: it is late, or the "
+        "clock of its sender is behind or stands still"
+    ]
+    assert bus.statistics().behind == 0
 
 
 class SteppedClock(SystemClock):
@@ -255,12 +266,163 @@ async def test_an_awaited_lookup_of_an_answer_ahead_fails_at_once_and_a_watch_wa
             assert (await anext(changes)).stamp == NOW + 5 * SECOND
 
 
+# Stamps behind
+
+WALL = 1_795_560_204 * SECOND
+LATE = "it is late, or the clock of its sender is behind or stands still"
+
+
+def told(bus: Bus, *samples: TransformStamped) -> list[StampBehind]:
+    """The events of samples behind the clock that these samples make, published one by one."""
+    with bus.events() as events:
+        for sample in samples:
+            bus.publish(sample)
+        found = [events.queue.get() for _ in range(len(events.queue))]
+    return [event for event in found if isinstance(event, StampBehind)]
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+@pytest.mark.parametrize(
+    ("stamp", "words"),
+    [
+        (WALL // SECOND, "56.9 years behind the clock: seconds passed as nanoseconds?"),
+        (WALL // 1_000_000, "56.9 years behind the clock: milliseconds passed as nanoseconds?"),
+        (WALL // 1_000, "56.9 years behind the clock: microseconds passed as nanoseconds?"),
+        (3617 * SECOND, "56.9 years behind the clock: these look like two clocks (simulated time and wall time?)"),
+        (0, "56.9 years behind the clock: a stamp that was never set?"),
+        (WALL - 180 * SECOND, f"180 s behind the clock: {LATE}"),
+    ],
+)
+def test_stamps_behind_the_clock_are_announced_logged_once_with_the_likely_cause_and_counted(
+    caplog: pytest.LogCaptureFixture, stamp: int, words: str, quiet: bool
+) -> None:
+    bus = bus_at(WALL)
+    buffer = Buffer(bus)
+    bus.publish(moving("map", "base", WALL, authority="odometry"))
+    late = [moving("map", "base", stamp + k, authority="driver") for k in range(5)]
+    if quiet:
+        for sample in late:
+            bus.publish(sample)
+    else:
+        assert told(bus, *late) == [StampBehind(WALL, "base", stamp, None, "driver")]
+    (counted,) = bus.statistics().buffers
+    assert (bus.statistics().behind, counted.expired) == (5, 5)
+    assert [record.getMessage() for record in caplog.records if "authorities" not in record.getMessage()] == [
+        f"frame 'base' has a sample from 'driver' that is {words}"
+    ]
+    assert buffer.lookup_nowait("map", "base").stamp == WALL
+
+
+@pytest.mark.parametrize("beyond", [0, 1])
+def test_a_stamp_is_behind_only_beyond_the_bound(beyond: int) -> None:
+    bus = bus_at(max_behind=2.0)
+    bus.publish(moving("map", "base", NOW - 2 * SECOND - beyond))
+    assert bus.statistics().behind == beyond
+
+
+async def test_a_clock_that_stands_still_and_a_message_that_comes_late_are_noticed_on_a_quiet_bus() -> None:
+    clock = SimulatedClock(NOW)
+    bus = Bus(clock)
+    bus.publish(moving("map", "stopped", NOW))
+    bus.publish(moving("map", "late", NOW))
+    for _ in range(10):
+        await clock.advance(1.0)
+        assert told(bus, moving("map", "stopped", NOW)) == []
+    await clock.advance(1.0)
+    assert [event.at for event in told(bus, moving("map", "stopped", NOW))] == [NOW]
+    await clock.advance(180.0)
+    last = told(bus, moving("map", "late", NOW + 1))[-1]
+    assert (last.frame, last.at, bus.statistics().behind) == ("late", NOW + 1, 2)
+
+
+def test_a_stream_of_events_that_is_opened_later_hears_of_what_is_still_behind() -> None:
+    bus = bus_at()
+    bus.publish([moving("map", "late", 0, authority="driver"), moving("map", "was late", 0)])
+    bus.publish([moving("map", "late", 5, authority="driver"), moving("map", "was late", NOW)])
+    assert told(bus, moving("map", "late", 9, authority="driver")) == [StampBehind(NOW, "late", 5, None, "driver")]
+    assert told(bus, moving("map", "was late", 9, authority="other")) == [
+        StampBehind(NOW, "late", 9, None, "driver"),
+        StampBehind(NOW, "was late", 9, None, "other"),
+    ]
+    assert bus.statistics().behind == 5
+
+
+def test_late_data_of_a_robot_and_a_short_history_are_silent(caplog: pytest.LogCaptureFixture) -> None:
+    bus = bus_at()
+    Buffer(bus)
+    for late in (0, SECOND // 5, 5 * SECOND):
+        bus.publish([moving("map", f"late by {late}", NOW - late + k) for k in range(100)])
+    bus.publish(static("base", "lidar", stamp=0))
+    assert (caplog.records, bus.statistics().behind, bus.statistics().buffers[0].expired) == ([], 0, 0)
+
+
+def test_what_expires_in_a_short_buffer_is_told_and_its_counters_agree(caplog: pytest.LogCaptureFixture) -> None:
+    bus = bus_at()
+    Buffer(bus, keep=1.0)
+    bus.publish(moving("map", "base", NOW, authority="fast"))
+    events = told(bus, *[moving("map", "base", NOW - 3 * SECOND + k, authority="slow") for k in range(4)])
+    assert events == [StampBehind(NOW, "base", NOW - 3 * SECOND, NOW, "slow")]
+    assert (bus.statistics().behind, bus.statistics().buffers[0].expired) == (0, 4)
+    assert sum("has expired" in record.getMessage() for record in caplog.records) == 1
+
+
+def test_recorded_and_kept_samples_and_a_bus_without_a_bound_tell_of_none_behind(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    for bus in (bus_at(WALL), bus_at(WALL, max_behind=None)):
+        Buffer(bus)
+        with bus._recorded_time():
+            bus.publish([moving("map", "a", WALL - HOUR), moving("map", "a", WALL - 2 * HOUR)])
+        with bus._kept_samples():
+            bus.publish([moving("map", "b", WALL - HOUR), moving("map", "b", WALL - 2 * HOUR)])
+    bus.publish([moving("map", "c", 0), moving("map", "a", 0)])
+    assert (caplog.records, bus.statistics().behind) == ([], 0)
+
+
+async def test_nothing_is_behind_a_simulated_clock_before_its_first_time(caplog: pytest.LogCaptureFixture) -> None:
+    clock = SimulatedClock()
+    bus = Bus(clock)
+    Buffer(bus)
+    for stamp in (WALL, 3617 * SECOND, -HOUR):
+        bus.publish(moving("map", "base", stamp))
+    assert (caplog.records, bus.statistics().behind) == ([], 0)
+    clock.set(WALL)
+    bus.publish(moving("map", "base", 3617 * SECOND))
+    assert bus.statistics().behind == 1
+
+
+def test_the_errors_of_a_lookup_between_two_clocks_say_so() -> None:
+    tree = TransformTree()
+    tree.insert(moving("map", "base", 3617 * SECOND))
+    with pytest.raises(FutureExtrapolationError) as caught:
+        tree.lookup("map", "base", 1_691_424_773 * SECOND)
+    assert str(caught.value) == (
+        "frame 'base': asked for 1691424773.000 s, newest sample is 3617.000 s (53.6 years short): these look like two "
+        "clocks (simulated time and wall time?)"
+    )
+    with pytest.raises(PastExtrapolationError, match=re.escape("too early): seconds passed as nanoseconds?")):
+        tree.lookup("map", "base", 3617)
+
+
 @pytest.mark.parametrize("clock", [SimulatedClock(), SystemClock()])
 def test_a_clock_that_nobody_has_set_and_a_bus_without_a_bound_have_no_stamp_ahead(clock: Any) -> None:
     bus = Bus(clock) if isinstance(clock, SimulatedClock) else Bus(clock, max_ahead=None)
     for k in range(3):
         bus.publish(moving("map", "base", STAMP_MAX - 10 + k))
     assert bus.statistics().ahead == 0
+
+
+def test_the_log_line_and_the_error_of_a_stamp_years_ahead_name_the_likely_cause(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    cause = "these look like two clocks (simulated time and wall time?)"
+    bus_at(3617 * SECOND).publish(moving("map", "base", WALL))
+    assert caplog.messages == [
+        "frame 'base' has a sample from '' that is 56.9 years ahead of the clock: right samples are older, and expire; "
+        + cause
+    ]
+    with pytest.raises(InvalidTransformError, match=re.escape(f"ahead of the clock (at most 1 s): {cause}")):
+        bus_at(3617 * SECOND, reject_ahead=True).publish(moving("map", "base", WALL))
 
 
 async def test_a_simulated_clock_counts_from_its_first_move() -> None:
@@ -298,6 +460,8 @@ def test_a_static_sample_and_recorded_time_are_never_ahead(caplog: pytest.LogCap
     ("options", "kind"),
     [
         ({"max_ahead": -1.0}, ValueError),
+        ({"max_behind": -1.0}, ValueError),
+        ({"max_behind": "1"}, TypeError),
         ({"max_ahead": "1"}, TypeError),
         ({"max_ahead": None, "reject_ahead": True}, ValueError),
         ({"max_translation": 0.0}, ValueError),

@@ -33,6 +33,41 @@ def judge(kernel: Any, edges: dict[str, Any], batch: Any, horizon: int, square: 
     return accepted
 
 
+@on_both
+@pytest.mark.parametrize(("stamp", "plain"), [(11, False), (12, True), (14, True), (15, False)])
+def test_the_bounds_of_stamps_are_inclusive(kernel: Any, stamp: int, plain: bool) -> None:
+    known = edges(kernel)
+    known["a"].late = False
+    judge = kernel.Judge(known, 81.0)
+    judge.allow(12, 14, STAMP_MAX)
+    assert (judge.earliest, judge.horizon) == (12, 14)
+    assert judge.accepts((sample(kernel, stamp=stamp),)) is plain
+    assert judge.behind == 0
+
+
+@on_both
+def test_old_stamps_of_a_late_edge_are_plain_and_counted(kernel: Any) -> None:
+    known = edges(kernel)
+    known["a"].late = True
+    known["b"].late = False
+    judge = kernel.Judge(known, 81.0)
+    judge.allow(15, 30, STAMP_MAX)
+    late = sample(kernel, stamp=12)
+    assert judge.accepts((late,))
+    assert judge.accepts((late, sample(kernel, stamp=15), sample(kernel, child="b", stamp=15), late))
+    assert not judge.accepts((late, sample(kernel, child="b", stamp=14)))
+    assert judge.behind == 3
+
+
+@on_both
+def test_no_batch_is_plain_once_the_bounds_are_out_of_date(kernel: Any) -> None:
+    judge = kernel.Judge(edges(kernel), 81.0)
+    judge.allow(STAMP_MIN, STAMP_MAX, 0)
+    assert not judge.accepts((sample(kernel),))
+    judge.allow(STAMP_MIN, STAMP_MAX, STAMP_MAX)
+    assert judge.accepts((sample(kernel),))
+
+
 def sample(kernel: ModuleType, **changes: Any) -> Any:
     fields: dict[str, Any] = {"parent": "map", "child": "a", "stamp": 20, "x": 1.0, "authority": "me", "static": False}
     fields.update(changes)
@@ -109,6 +144,8 @@ def test_wrong_arguments_raise() -> None:
         lambda: judge(kernel, {}, [], 0, 0.0),
         lambda: judge(kernel, {}, (), "0", 0.0),  # type: ignore[arg-type]
         lambda: judge(kernel, {}, (), 0, "0"),  # type: ignore[arg-type]
+        lambda: kernel.Judge({}, 0.0).allow(0, "1", 0),
+        lambda: kernel.Judge({}, 0.0).allow(0, 1),
         lambda: kernel.Judge([], 0.0),
         lambda: kernel.Judge({}),
         lambda: kernel.Judge(edges={}, square=0.0),

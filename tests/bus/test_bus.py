@@ -667,6 +667,7 @@ def test_statistics_count_everything_on_the_bus() -> None:
                 {"kind": "stream", "overflow": "conflate", "capacity": 7, "pending": 2, "dropped": 0, "conflated": 0},
             ),
             "ahead": 0,
+            "behind": 0,
         }
     buffer.close()
     assert bus.statistics().buffers == ()

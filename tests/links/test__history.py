@@ -93,6 +93,18 @@ def test_who_joins_late_has_the_last_seconds_with_stamps_parents_and_authorities
         assert [sample.child for sample in s.heard if sample.static] == ["lidar"]
 
 
+def test_the_past_is_not_told_as_late_data_and_what_comes_live_is() -> None:
+    with scene() as s:
+        s.publish(*[moving("map", "base", second * SECOND) for second in range(10)])
+        s.join()
+        s.deliver()
+        assert stamps_of(s.heard, "base") == [4, 5, 6, 7, 8, 9]
+        assert s.late.statistics().behind == 0
+        s.publish(moving("map", "base", 10 * SECOND))
+        s.deliver()
+        assert s.late.statistics().behind == 1
+
+
 @pytest.mark.parametrize("keeps", [(2.0, 8.0), (8.0, 2.0)])
 def test_the_past_is_that_of_the_buffer_which_holds_most_of_it(keeps: tuple[float, float]) -> None:
     with scene(60.0, keeps[0]) as s, Buffer(s.source, keeps[1]), Buffer(s.source, 4.0):

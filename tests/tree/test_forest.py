@@ -44,13 +44,13 @@ def test_a_commit_counts_each_sample_of_a_batch_by_its_outcome() -> None:
     assert not known.commit(mixed)
     assert known.version > version
     assert (known.inserted, known.replaced, known.expired) == (3 + 5 + 2, 3, 1)
-    assert known.expired_frames == ["b"]
+    assert [sample.child for sample in known.expired_samples] == ["b"]
     assert known.insert((moving("a", "b", 17), moving("a", "b", 17), moving("a", "b", 3))) == [
         Outcome.INSERTED,
         Outcome.REPLACED,
         Outcome.EXPIRED,
     ]
-    assert (known.inserted, known.replaced, known.expired, known.expired_frames) == (11, 4, 2, [])
+    assert (known.inserted, known.replaced, known.expired, known.expired_samples) == (11, 4, 2, [])
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_no_change_is_recorded_any_longer_once_it_is_forgotten_or_was_inserted_w
     known = forest(moving("a", "b", 0), window=5)
 
     def changes() -> list[int]:
-        return [len(each) for each in (known.changed, known.new_parents, known.looping, known.expired_frames)]
+        return [len(each) for each in (known.changed, known.new_parents, known.looping, known.expired_samples)]
 
     batch = (moving("a", "b", 8), moving("z", "b", 9), moving("a", "b", 1), moving("b", "z", 9), moving("b", "z", 8))
     known.commit(batch)

@@ -393,7 +393,7 @@ def test_a_frame_far_ahead_wakes_no_waiter_whose_own_edges_have_only_come_to_the
 
 def test_an_expired_sample_of_a_frame_that_is_static_by_the_end_of_its_batch_is_not_ahead() -> None:
     live = live_tree(10e-9)
-    live.is_ahead = lambda _child, newest, _authority: newest > 0
+    live.tell_expired = lambda _sample, newest, _authority: newest > 0
     live.insert((moving("map", "a", 100), moving("map", "b", 100)))
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "b")))
     assert (live.statistics(5).expired, live.expired_ahead) == (2, 1)

@@ -18,6 +18,7 @@ from tfbus.events import (
     Reparented,
     SampleRejected,
     StampAhead,
+    StampBehind,
 )
 from tfbus.statistics import QueueStatistics
 
@@ -30,8 +31,9 @@ class EventQueue:
 
     A conflict of authorities is given once for each frame and pair of them. From then on a new parent or kind of that
     frame is given once for each authority that claims it. A rejected sample is given once for each frame, authority and
-    reason; a stamp ahead of the clock, for each frame and authority; and a loop of parents in the past, for each frame,
-    authority and parent. All of this begins anew when the frame is removed or added, and when the clock jumps back.
+    reason; a stamp ahead of the clock, or behind it, for each frame and authority; and a loop of parents in the past,
+    for each frame, authority and parent. All of this begins anew when the frame is removed or added, and when the clock
+    jumps back.
 
     If one authority moves a frame to and fro, every move is an event, because that may be intended. If the queue is
     full, such a frame pushes out its own events and no others.
@@ -41,8 +43,9 @@ class EventQueue:
     capacity : int
         How many events may be pending, at least one; those of `known` and of `put_staleness` do not count,
         and are never dropped.
-    known : iterable of FrameAdded or StampAhead
-        An event for each frame that has a parent at the beginning, and for each of them that is ahead of the clock.
+    known : iterable of FrameAdded, StampAhead or StampBehind
+        An event for each frame that has a parent at the beginning, and for each of them that is ahead of the clock, or
+        behind it.
 
     Attributes
     ----------
@@ -50,7 +53,7 @@ class EventQueue:
         Number of events lost to the capacity.
     """
 
-    def __init__(self, capacity: int, known: Iterable[FrameAdded | StampAhead] = ()) -> None:
+    def __init__(self, capacity: int, known: Iterable[FrameAdded | StampAhead | StampBehind] = ()) -> None:
         check_capacity(capacity)
         self.capacity = capacity
         self.dropped = 0
@@ -105,7 +108,7 @@ class EventQueue:
         if isinstance(event, AuthorityConflict):
             seen = self._conflicts.setdefault(event.frame, SeenKeys(_CLAIMS))
             key = frozenset((event.authority, event.other))
-        elif isinstance(event, (SampleRejected, StampAhead, PastLoop)):
+        elif isinstance(event, (SampleRejected, StampAhead, StampBehind, PastLoop)):
             seen = self._refusals.setdefault(event.frame, SeenKeys(_CLAIMS))
             key = (type(event), event.authority, _what(event))
             if len(self._refusals) > _REFUSED_FRAMES:
@@ -121,7 +124,7 @@ class EventQueue:
         return not seen.add(key)
 
 
-def _what(event: SampleRejected | StampAhead | PastLoop) -> str | None:
+def _what(event: SampleRejected | StampAhead | StampBehind | PastLoop) -> str | None:
     """That of which an event tells once, beside its frame and authority."""
     if isinstance(event, SampleRejected):
         return event.reason

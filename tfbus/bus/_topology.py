@@ -6,7 +6,7 @@ of a bad edge at once.
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from copy import copy
 from typing import Literal, get_args
 
@@ -24,10 +24,12 @@ from tfbus.events import (
     Reparented,
     SampleRejected,
     StampAhead,
+    StampBehind,
+    how_far_behind,
 )
 from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
-from tfbus.stamps import STAMP_MIN, format_duration
+from tfbus.stamps import STAMP_MIN, format_duration, likely_cause
 from tfbus.tree.cycles import NewestEdge, admit, changed_parents
 from tfbus.tree.known_frames import KnownFrames
 
@@ -66,6 +68,7 @@ class _Edge(Edge):
         self.authority = authority
         self.last = authority
         self.trusted = None
+        self.late = False
         self.since = since
 
 
@@ -99,7 +102,8 @@ class Topology:
     ahead : int
         Accepted samples that were ahead of the clock.
     judge : Judge
-        Records the samples of a batch if all continue known edges; else `accept` has to look.
+        Records the samples of a batch if all continue known edges; else `accept` has to look. It counts the accepted
+        samples that were behind the clock.
     """
 
     def __init__(
@@ -120,7 +124,7 @@ class Topology:
         self._parents = 0
         self._newest: dict[str, _Edge] = {}
         self.names = KnownFrames()
-        # No stamp up to its horizon is ahead of the clock, which only goes forward between two calls of `clock_jumped`.
+        # It compares stamps with the clock of at most a tenth of a second ago, or of the last move of a simulated one.
         self.judge = Judge(self._newest, plausibility.max_translation**2)
         self.latched: dict[str, TransformStamped] = {}
         self.rejected: Counter[str] = Counter()
@@ -159,12 +163,26 @@ class Topology:
             if known.newest is not None and known.newest > newest
         ]
 
-    def is_ahead(self, child: str, newest: int, authority: str) -> bool:
-        """Whether a child's newest stamp (ns) is ahead of the clock, so that right samples expire; then it is told."""
-        if newest <= self._plausibility.newest_plausible():
-            return False
-        self._tell_ahead(child, newest, authority)
-        return True
+    def known_behind(self) -> list[StampBehind]:
+        """An event for each child that was told to be behind the clock, and whose newest sample is so still."""
+        now, oldest = self._announcer.now(), self._plausibility.oldest_plausible()
+        return [
+            StampBehind(now, child, known.newest, None, known.authority)
+            for child, known in self._newest.items()
+            if known.late and known.newest is not None and known.newest < oldest
+        ]
+
+    def expired(self, sample: TransformStamped, newest: int, authority: str) -> bool:
+        """Tell that a sample has expired in a buffer, by the newest stamp (ns) of its child, which is of an authority.
+
+        Returns whether that stamp is ahead of the clock, so that right samples expire.
+        """
+        if newest > self._plausibility.newest_plausible():
+            self._tell_ahead(sample.child, newest, authority)
+            return True
+        if self._plausibility.oldest_plausible() != STAMP_MIN:
+            self._tell_behind(sample, newest)
+        return False
 
     def accept(self, batch: Batch, invalid: Invalid) -> Batch:
         """Judge a batch, record the samples that may be committed, and return them.
@@ -218,30 +236,42 @@ class Topology:
 
     @contextmanager
     def recorded_time(self) -> Iterator[None]:
-        """A ``with`` for samples whose stamps are of another clock; none of them is ahead."""
+        """A ``with`` for samples whose stamps are of another clock; none of them is ahead or behind."""
+        with self._at_the_clock(self._plausibility.recorded_time()):
+            yield
+
+    @contextmanager
+    def kept_samples(self) -> Iterator[None]:
+        """A ``with`` for samples that were kept for those who join later; none of them is behind."""
+        with self._at_the_clock(self._plausibility.kept_samples()):
+            yield
+
+    @contextmanager
+    def _at_the_clock(self, other_rules: AbstractContextManager[None]) -> Iterator[None]:
+        """A ``with`` in which the judge goes by other rules."""
         try:
-            with self._plausibility.recorded_time():
+            with other_rules:
+                self._look_at_clock()
                 yield
         finally:
-            self.judge.horizon = STAMP_MIN
+            self._look_at_clock()
 
-    def clock_jumped(self) -> None:
-        """Note that a jump of the clock was announced."""
-        self._plausibility.clock_jumped = True
-        self.judge.horizon = STAMP_MIN
+    def clock_moved(self, _stamp: int) -> None:
+        """Note that a clock that is not the machine's has moved."""
+        self._look_at_clock()
+
+    def _look_at_clock(self) -> None:
+        """Let the judge compare stamps with the time that it is now."""
+        plausibility = self._plausibility
+        self.judge.allow(plausibility.oldest_plausible(), plausibility.newest_plausible(), plausibility.lasting)
 
     def _accepts_now(self, batch: Batch) -> bool:
         """Whether the judge accepts a batch by the time that it is now."""
-        judge, horizon = self.judge, self._plausibility.newest_plausible()
-        later, judge.horizon = horizon > judge.horizon, horizon
-        accepted = later and judge.accepts(batch)
-        if not self._plausibility.clock_is_set:
-            # Nothing tells when a clock that nobody has set is advanced for the first time.
-            judge.horizon = STAMP_MIN
-        return accepted
+        self._look_at_clock()
+        return self.judge.accepts(batch)
 
     def _judge(self, batch: Batch, invalid: Invalid) -> Batch:
-        batch, refused, ahead = self._plausibility.split(batch)
+        batch, refused, ahead, behind = self._plausibility.split(batch)
         if self._ownership.restricts:
             batch, unowned = self._ownership.split(batch, self._newest)
             refused += unowned
@@ -267,12 +297,17 @@ class Topology:
             self._log.warning((error.reason, *cause), "dropped a sample: %s", error)
         for sample in accepted:
             self._record(sample)
-        if ahead and not rejects_ahead:
+        if behind or (ahead and not rejects_ahead):
             stored = set(map(id, accepted))
-            for sample in ahead:
+            for sample in () if rejects_ahead else ahead:
                 if id(sample) in stored:
                     self.ahead += 1
                     self._tell_ahead(sample.child, sample.stamp, sample.authority)
+            for sample in behind:
+                if id(sample) in stored:
+                    self.judge.behind += 1
+                    self._tell_behind(sample)
+                    self._newest[sample.child].late = True
         return accepted
 
     def _fits(self, batch: Batch, max_frames: int) -> bool:
@@ -359,6 +394,7 @@ class Topology:
             if self._ownership.reserved_for(child) is None:
                 self._conflict(child, authority, known.last)
             known.last = authority
+            known.late = False
         if known.static != static:
             self.kind_changes += 1
             kind = "static" if static else "moving"
@@ -382,16 +418,32 @@ class Topology:
 
     def _tell_ahead(self, child: str, newest: int, authority: str) -> None:
         now = self._announcer.now()
-        ahead = format_duration(newest - now)
+        cause = likely_cause(newest, now)
         self._log.warning(
             ("ahead", child, authority),
-            "frame %r has a sample from %r that is %s ahead of the clock: right samples are older, and expire",
+            "frame %r has a sample from %r that is %s ahead of the clock: right samples are older, and expire%s",
             child,
             authority,
-            ahead,
+            format_duration(newest - now),
+            cause and f"; {cause}",
         )
         if self._announcer.has_listeners:
             self._announcer.announce(StampAhead(now, child, newest, authority))
+
+    def _tell_behind(self, sample: TransformStamped, newest: int | None = None) -> None:
+        """Tell of a sample that is behind the clock, or has expired by the newest stamp (ns) of its child."""
+        _, child, stamp, _, authority, _ = sample._fields
+        now = self._announcer.now()
+        self._log.warning(
+            ("behind", child, authority),
+            "frame %r has a sample from %r that is %s: %s",
+            child,
+            authority,
+            how_far_behind(stamp, now, newest),
+            likely_cause(stamp, now) or "it is late, or the clock of its sender is behind or stands still",
+        )
+        if self._announcer.has_listeners:
+            self._announcer.announce(StampBehind(now, child, stamp, newest, authority))
 
     def _conflict(self, child: str, authority: str, other: str) -> None:
         self.conflicts += 1

@@ -24,7 +24,7 @@ from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import Overflow
 from tfbus.bus.stream import Stream
 from tfbus.bus.thread_publisher import ThreadPublisher
-from tfbus.clock import Clock, SystemClock
+from tfbus.clock import Clock, SimulatedClock, SystemClock
 from tfbus.errors import BusClosedError, UnknownFrameError, loop_text
 from tfbus.events import ClockReset, Event, PastLoop
 from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
@@ -54,13 +54,17 @@ class Bus:
         `StampAhead`, logged once for each authority and frame, and counted. None for any distance: for a bus that
         carries recorded time. A `Player` needs no None, and a `SimulatedClock` that nobody has set yet (at 0, without a
         jump) has no stamp ahead of it.
+    max_behind : float or None
+        How far, in s, the stamp of a moving sample may be behind the clock. One that is further behind is accepted, but
+        announced as `StampBehind`, logged once for each authority and frame, and counted; so is one that expires in a
+        buffer. None for any distance, and for no word of what expires.
+    reject_ahead : bool
+        Whether a sample that is further ahead is refused. Otherwise it is accepted; until the clock has reached it,
+        right samples of its frame are older than the newest, and expire if they are older than a buffer's window.
     max_frames : int or None
         The greatest number of frames, children and parents of the newest edges, for a bus on which strangers publish. A
         sample that names a new one beyond it is refused. A frame that is removed gives its place back, and so does a
         parent without children. None for any number.
-    reject_ahead : bool
-        Whether a sample that is further ahead is refused. Otherwise it is accepted; until the clock has reached it,
-        right samples of its frame are older than the newest, and expire if they are older than a buffer's window.
 
     Raises
     ------
@@ -88,6 +92,7 @@ class Bus:
         *,
         max_translation: float = MAX_TRANSLATION,
         max_ahead: float | None = 1.0,
+        max_behind: float | None = 10.0,
         reject_ahead: bool = False,
         max_frames: int | None = None,
     ) -> None:
@@ -97,7 +102,7 @@ class Bus:
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._events: list[EventStream] = []
         self._announcer = Announcer(self.clock.now, self._events)
-        self._plausibility = Plausibility(self.clock, max_translation, max_ahead, reject_ahead)
+        self._plausibility = Plausibility(self.clock, max_translation, max_ahead, reject_ahead, max_behind)
         self._topology = Topology(
             self._log,
             Ownership(on_conflict),
@@ -119,6 +124,9 @@ class Bus:
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
         self._jumps = self.clock.on_jump(self._clock_jumped)
+        self._moves: Registration | None = None
+        if isinstance(self.clock, SimulatedClock):
+            self._moves = self.clock.on_move(self._topology.clock_moved)
 
     @property
     def closed(self) -> bool:
@@ -328,7 +336,7 @@ class Bus:
         self._check_usable()
         latched = tuple(self._topology.latched.values())
         late = LateBuffer(buffer, self._topology.moving(), self._topology.newest)
-        buffer.is_ahead = self._topology.is_ahead
+        buffer.tell_expired = self._topology.expired
         self._buffers[buffer] = self._intake.samples - len(latched)
         if latched:
             late.insert(latched)
@@ -388,6 +396,7 @@ class Bus:
                 *(events.queue.statistics() for events in self._events),
             ),
             ahead=self._topology.ahead,
+            behind=self._topology.judge.behind,
         )
 
     def __repr__(self) -> str:
@@ -408,6 +417,8 @@ class Bus:
         self._closed = True
         self._intake.open = False
         self._jumps.close()
+        if self._moves is not None:
+            self._moves.close()
         for publisher in self._threads:
             publisher.end()
             publisher.discard()
@@ -477,6 +488,10 @@ class Bus:
         """A ``with`` for samples whose stamps are of another clock. Called by players."""
         return self._topology.recorded_time()
 
+    def _kept_samples(self) -> AbstractContextManager[None]:
+        """A ``with`` for samples that were kept for those who join later, and may be old. Called by links."""
+        return self._topology.kept_samples()
+
     def _check_from_thread(self, batch: Batch) -> None:
         check_translations(batch, self._plausibility.max_translation)
 
@@ -495,7 +510,7 @@ class Bus:
             self.publish(batch, invalid="drop")
 
     def _clock_jumped(self, before: int, after: int) -> None:
-        self._topology.clock_jumped()
+        self._topology.clock_moved(after)
         if after >= before:
             for events in self._events:
                 events.wake()

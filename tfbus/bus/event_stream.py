@@ -31,7 +31,7 @@ class EventStream(OneReaderStream[Event]):
     ) -> None:
         super().__init__(check_thread, detach)
         known = topology.known()
-        self.queue = EventQueue(capacity, [*known, *topology.known_ahead()])
+        self.queue = EventQueue(capacity, [*known, *topology.known_ahead(), *topology.known_behind()])
         self._staleness: Staleness | None = None
         if stale_after is not None and as_duration(stale_after, "stale_after") != math.inf:
             self._staleness = Staleness(from_seconds(stale_after), topology.newest)

@@ -1,6 +1,7 @@
 """The inbox of a link: it publishes on the bus what peers have sent, within the limits of each peer."""
 
 from collections.abc import Collection, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 from tfbus.bus.bus import Bus
@@ -215,7 +216,8 @@ class Inbox:
             else:
                 received.append((Provenance(batch.origin, batch.sequence, self._outbox, peer, live), samples))
         if received:
-            published, refused = self._relay.publish(received, self._max_frames)
+            with nullcontext() if live else self._bus._kept_samples():
+                published, refused = self._relay.publish(received, self._max_frames)
         self.samples += published
         self.duplicates += count - published - refused
         if refused:

@@ -136,7 +136,7 @@ def _cells(edge: ExplainedEdge, now: int | None, below: bool) -> list[str]:
     """The cells of one edge's line of text."""
     age = ""
     if edge.newest is not None and now is not None:
-        age = format_age(now - edge.newest)
+        age = format_age(edge.newest, now)
     return [
         "!" if edge.error is not None else " ",
         f"{edge.parent} <- {edge.child}" if below else f"{edge.child} -> {edge.parent}",

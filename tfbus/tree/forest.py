@@ -72,8 +72,8 @@ class Forest:
         Samples since `forget_changes` that are part of a loop of parents at a past stamp.
     readers : dict
         The frames that have changed, for each `read_all` that goes on.
-    expired_frames : list of str
-        The frame of each sample that expired since `forget_changes`.
+    expired_samples : list of TransformStamped
+        The samples that expired since `forget_changes`.
     replaced, expired : int
         Number of samples that had each of these outcomes.
     looped : int
@@ -94,7 +94,7 @@ class Forest:
         self.looping: list[LoopingSample] = []
         self._suspects: list[TransformStamped] = []
         self.readers: dict[int, set[str]] = {}
-        self.expired_frames: list[str] = []
+        self.expired_samples: list[TransformStamped] = []
         self.replaced = 0
         self.expired = 0
         self.looped = 0
@@ -218,7 +218,7 @@ class Forest:
             self.replaced += 1
         else:
             self.expired += 1
-            self.expired_frames.append(child)
+            self.expired_samples.append(sample)
         return outcome
 
     def remove(self, frame: str) -> None:
@@ -261,11 +261,11 @@ class Forest:
                     self.looped += 1
 
     def forget_changes(self) -> None:
-        """Empty `changed`, `new_parents`, `looping` and `expired_frames`."""
+        """Empty `changed`, `new_parents`, `looping` and `expired_samples`."""
         self.changed.clear()
         self.new_parents.clear()
         self.looping.clear()
-        self.expired_frames.clear()
+        self.expired_samples.clear()
 
     def forget_paths(self) -> None:
         """Empty `paths` and `changing_paths`."""

@@ -41,7 +41,7 @@ def facts(edge: Edge, now: int) -> dict[str, str]:
     """The rate, age, span and authority of an edge as texts, as far as the edge has them."""
     known = {"rate": _rate(edge)}
     if edge.oldest is not None and edge.newest is not None:
-        known["age"] = format_age(now - edge.newest)
+        known["age"] = format_age(edge.newest, now)
         known["span"] = f"span {format_duration(edge.newest - edge.oldest)}"
     if edge.authority:
         known["authority"] = f"from {edge.authority!r}"

@@ -64,7 +64,7 @@ def _edge_facts(edge: Edge | None, now: int, delay: float | None) -> dict[str, s
         return {"parent": "none, it is a root"}
     known = {"parent": edge.parent, "rate": format_rate(edge.static, edge.newest, edge.rate)}
     if edge.newest is not None:
-        known["age"] = format_age(now - edge.newest).removeprefix("age ")
+        known["age"] = format_age(edge.newest, now).removeprefix("age ")
     if delay is not None:
         known["delay"] = format_duration(round(delay * SECOND))
     return {**known, "authority": edge.authority or "not known"}

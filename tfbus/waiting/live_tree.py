@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Iterable
 
 from tfbus.errors import ClockResetError, FutureExtrapolationError, TransformLookupError, UnknownFrameError
-from tfbus.geometry.stamped import Batch
+from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.registration import Registration
 from tfbus.statistics import BufferStatistics
 from tfbus.tree.forest import Forest, LoopingSample
@@ -36,8 +36,9 @@ class LiveTree:
         The reason why no more samples will come; None while they may.
     last_reset : ClockResetError or None
         The last jump back of the clock; a new object for each.
-    is_ahead : callable
-        Says whether the newest stamp of a frame, in ns, from an authority is ahead of the clock. The bus sets it.
+    tell_expired : callable
+        Called with a sample that has expired, the newest stamp of its frame, in ns, and the authority of that. Returns
+        whether that stamp is ahead of the clock. The bus sets it.
     expired_ahead, superseded : int
         As in `BufferStatistics`; the bus counts the superseded ones.
     feed : Feed
@@ -51,7 +52,7 @@ class LiveTree:
         self.watching = WatchIndex()
         self.end_reason: str | None = None
         self.last_reset: ClockResetError | None = None
-        self.is_ahead: Callable[[str, int, str], bool] = lambda _child, _newest, _authority: False
+        self.tell_expired: Callable[[TransformStamped, int, str], bool] = lambda _sample, _newest, _authority: False
         self.expired_ahead = 0
         self.superseded = 0
         self._waiters = self.waiting.by_frame
@@ -92,10 +93,10 @@ class LiveTree:
         if self._watches:
             _wake(self.watching.mark([sample.child for sample in batch]))
         if not plain:
-            for frame in self.forest.expired_frames:
-                history = self.forest.frames.get(frame)
+            for sample in self.forest.expired_samples:
+                history = self.forest.frames.get(sample.child)
                 if history is not None and history.newest is not None:
-                    self.expired_ahead += self.is_ahead(frame, history.newest, history.authority)
+                    self.expired_ahead += self.tell_expired(sample, history.newest, history.authority)
             self._wake_for_new_topology()
 
     def park(self, waiter: Waiter, error: TransformLookupError) -> None:

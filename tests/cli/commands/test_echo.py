@@ -12,6 +12,7 @@ from support.programs import PATIENCE, TFBUS, free_address, start_tfbus
 from support.samples import moving, static
 
 from tfbus import SECOND, Buffer, Bus, Transform, TransformStamped, from_seconds
+from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.commands.echo import describe, to_json
 from tfbus.links.zenoh import BufferServer
 
@@ -101,6 +102,30 @@ def test_a_static_transform_is_printed_again_and_again(tfbus: Command) -> None:
 
     done = tfbus.on_domain(publish, "echo", "laser", "base_link")
     assert done.stdout.splitlines()[::5] == ["At any time: 'base_link' in 'laser'"] * 3
+
+
+@pytest.mark.parametrize("heard", [False, True])
+@pytest.mark.parametrize("option", [(), ("--json",)])
+def test_no_age_is_shown_and_nothing_is_told_before_the_time_of_a_simulation_is_heard(
+    tfbus: Command, option: tuple[str, ...], heard: bool
+) -> None:
+    clock = ReplayClock()
+    if heard:
+        clock.hear(100 * SECOND + SECOND // 20)
+
+    async def publish(bus: Bus) -> None:
+        for _ in range(20):
+            bus.publish(moving("map", "base", 100 * SECOND))
+            await anyio.sleep(0.01)
+
+    done = tfbus.on_domain(publish, "echo", "map", "base", "--rate", "50", *option, clock=clock)
+    if option:
+        ages = {json.loads(line)["age"] for line in done.stdout.splitlines()}
+        assert ages == {0.05 if heard else None}
+    else:
+        lines = {line for line in done.stdout.splitlines() if line.startswith("At")}
+        assert lines == {f"At 100.000000000 s, {'age 50 ms' if heard else 'age not known'}: 'base' in 'map'"}
+    assert "behind" not in done.stderr
 
 
 @pytest.mark.thorough

@@ -1,5 +1,6 @@
 import os
 import signal
+import time
 from pathlib import Path
 
 import anyio
@@ -44,7 +45,8 @@ def test_it_records_what_is_published_until_a_signal_comes(
     tmp_path: Path, tfbus: Command, backend: str, number: signal.Signals, status: int
 ) -> None:
     path = tmp_path / "run.mcap"
-    latched, laser = static("base_link", "camera", authority="me"), moving("base_link", "laser", 1, authority="driver")
+    latched = static("base_link", "camera", authority="me")
+    laser = moving("base_link", "laser", time.time_ns(), authority="driver")
 
     async def publish(bus: Bus) -> None:
         bus.publish(latched)

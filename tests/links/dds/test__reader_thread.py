@@ -117,7 +117,7 @@ from tfbus.links.dds import DdsLink
 
 async def main():
     number = int(sys.argv[1])
-    with Bus() as near, Bus() as far:
+    with Bus(max_behind=None) as near, Bus(max_behind=None) as far:
         async with DdsLink(near, number) as here, DdsLink(far, number) as there:
             for stamp in range(4_000):
                 near.publish(TransformStamped("map", "near", stamp, Transform()))

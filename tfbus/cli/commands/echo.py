@@ -15,7 +15,7 @@ from tfbus.clock import Clock, SystemClock
 from tfbus.errors import MAY_COME, ClockResetError, InvalidTransformError, TransformLookupError
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.stamps import format_duration, to_seconds
+from tfbus.stamps import format_age, likely_cause, to_seconds
 from tfbus.waiting.waiting_index import blocking_frames
 
 _Cause = tuple[type[BaseException], tuple[str, ...]]
@@ -64,7 +64,7 @@ def echo(
     except InvalidTransformError as error:
         raise UsageError(str(error)) from None
 
-    def show(transform: TransformStamped, now: int) -> str:
+    def show(transform: TransformStamped, now: int | None) -> str:
         return to_json(transform, now) if as_json else describe(transform, now, terminal_width())
 
     async def print_transforms(bus: Bus) -> None:
@@ -88,7 +88,7 @@ async def _print_from(
     source: str,
     rate: float,
     max_age: float,
-    show: Callable[[TransformStamped, int], str],
+    show: Callable[[TransformStamped, int | None], str],
 ) -> None:
     reported: _Cause | None = None
     async for _ in clock.ticks(rate):
@@ -105,11 +105,17 @@ async def _print_from(
             continue
         else:
             reported = None
-            print_now(show(transform, clock.now()))
+            print_now(show(transform, _now_for(transform.stamp, clock)))
 
 
-def to_json(sample: TransformStamped, now: int) -> str:
-    """The sample as one line of JSON; its age is counted from `now`, in ns."""
+def _now_for(stamp: int, clock: Clock) -> int | None:
+    """The time to count the age of a stamp from, in ns; None while the time of a simulation may yet come."""
+    now = clock.now()
+    return None if isinstance(clock, ReplayClock) and not clock.is_set and likely_cause(stamp, now) else now
+
+
+def to_json(sample: TransformStamped, now: int | None) -> str:
+    """The sample as one line of JSON; its age is counted from `now`, in ns, if that is known."""
     return json.dumps(
         {
             "target": sample.parent,
@@ -118,16 +124,15 @@ def to_json(sample: TransformStamped, now: int) -> str:
             "translation": sample.transform.translation,
             "rotation": sample.transform.rotation,
             "static": sample.static,
-            "age": None if sample.static else to_seconds(now - sample.stamp),
+            "age": None if sample.static or now is None else to_seconds(now - sample.stamp),
         }
     )
 
 
-def describe(sample: TransformStamped, now: int, width: int | None = None) -> str:
+def describe(sample: TransformStamped, now: int | None, width: int | None = None) -> str:
     """The sample in the format of ``tf2_echo``, with both frames and the age at `now`, in ns; lines fit the width."""
-    when = (
-        "any time" if sample.static else f"{format_seconds(sample.stamp)} s, age {format_duration(now - sample.stamp)}"
-    )
+    age = "age not known" if now is None else format_age(sample.stamp, now)
+    when = "any time" if sample.static else f"{format_seconds(sample.stamp)} s, {age}"
     angles = sample.transform.as_rpy()
     facts = (
         (f"At {when}:", f"{sample.child!r} in {sample.parent!r}"),
