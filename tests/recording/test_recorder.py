@@ -217,7 +217,9 @@ async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(tmp_path:
                 await recorder.flush()
                 assert (recorder.statistics().samples, recorder.statistics().queue.pending) == (number, 0)
                 with open_recording(path) as recording:
-                    assert len(list(recording.messages())) == number
+                    *messages, unfinished = recording.messages()
+                    assert len(messages) == number
+                    assert [error.reason for error in unfinished.errors] == ["unfinished"]
                     assert not recording.finished
         await recorder.flush()
 
@@ -232,7 +234,8 @@ async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(tmp_path: Pa
             await recorder.flush()
             assert recorder.statistics().queue.pending == 0
             with open_recording(path) as recording:
-                assert sum(map(len, recording.blocks())) == 5_120
+                # And the report that the file is not finished.
+                assert sum(map(len, recording.blocks())) == 5_120 + 1
 
 
 @pytest.fixture

@@ -91,8 +91,6 @@ def _check_file(
     file: Path, topics: TopicOptions, limits: Limits, since: Instant | None, until: Instant | None
 ) -> list[Finding]:
     with topics.open(file) as recording, progress(recording.count, "reading") as advance:
-        if not recording.finished:
-            warn(f"{file} was not finished by its writer: this is what can be read")
         start = recording.start
         first = None if since is None else since.stamp(start)
         last = None if until is None else until.stamp(start)

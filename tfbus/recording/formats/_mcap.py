@@ -32,7 +32,7 @@ from tfbus.recording.formats._mcap_records import (
     split_message,
 )
 from tfbus.recording.formats._packed import Packed, Stored, batches
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message, select, shortfalls
+from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, index_missing, lost_message, select, shortfalls
 from tfbus.stamps import STAMP_MAX
 
 _FOOTER = struct.Struct("<BQQQI8s")
@@ -123,6 +123,8 @@ class McapStorage:
             now = stored[0]
             yield stored
         yield from self._reports(reading, now, None if since is not None or until is not None else read)
+        if not self.finished and (until is None or self.end is None or until >= self.end):
+            yield index_missing(now, read, reading.finished_once)
 
     def packed(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[Stored]:
         """The messages of `messages`, many at once."""

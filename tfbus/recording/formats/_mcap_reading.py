@@ -78,6 +78,8 @@ class McapReading:
         Messages on channels that the file does not describe.
     contradictions : set of int
         Numbers of channels and schemas that are described in two ways.
+    finished_once : bool
+        Whether a reading in sequence has come to the end of the data, which a writer marks before its index.
     """
 
     def __init__(self, source: McapSource, wanted: Wanted) -> None:
@@ -86,6 +88,7 @@ class McapReading:
         self._counts: Counter[int] = Counter()
         self.unknown = 0
         self.contradictions: set[int] = set()
+        self.finished_once = False
 
     def by_index(self, low: int, high: int) -> Iterator[list[StoredMessage]]:
         """The messages of all chunks that overlap the range, in the order of their log times."""
@@ -137,12 +140,11 @@ class McapReading:
     def in_sequence(self, low: int) -> Iterator[list[StoredMessage]]:
         """All messages in the order of the file, up to its end; damage before `low` is reported at `low`."""
         now = low
-        summary = False
         try:
             for offset, opcode, content in self._source.records_from(len(MAGIC)):
                 # Behind the data, schemas and channels come again, and these copies may be the damaged part.
-                summary = summary or opcode == Opcode.DATA_END
-                if summary and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
+                self.finished_once = self.finished_once or opcode == Opcode.DATA_END
+                if self.finished_once and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
                     continue
                 try:
                     found = self._in_record(opcode, content)

@@ -36,7 +36,7 @@ from tfbus.recording.formats._bag_records import (
 )
 from tfbus.recording.formats._bounds import MAX_INDEX
 from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message, select, shortfalls
+from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, index_missing, lost_message, select, shortfalls
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MAGIC: Final = b"#ROSBAG V"
@@ -91,6 +91,7 @@ class Ros1Storage:
             self._chunks: list[_Chunk] = []
             self._damage: list[str] = []
             self._contradictions: set[int] = set()
+            self._finished_once = False
             self._counted: Counter[int] | None = None
             self.finished = self._read_index()
             if not self.finished:
@@ -189,6 +190,8 @@ class Ros1Storage:
                     {channel: promised[number] for number, channel in self._numbered.items() if wanted(channel)},
                     read,
                 )
+        if not self.finished and (until is None or until >= (self.end or 0)):
+            yield index_missing(now, read, self._finished_once)
 
     def _may_be_wanted(self, number: int, wanted: Wanted) -> bool:
         channel = self._numbered.get(number)
@@ -201,6 +204,8 @@ class Ros1Storage:
         try:
             header = read_record(self._file, len(_VERSION))
             at = number_in(header.fields, b"index_pos", 8)
+            # A writer leaves nothing there until it has written all chunks.
+            self._finished_once = at != 0
             missing = [number_in(header.fields, name) for name in (b"conn_count", b"chunk_count")]
             if header.kind == BAG_HEADER and header.end <= at <= self._size and self._size - at <= MAX_INDEX:
                 while at < self._size:

@@ -51,6 +51,24 @@ def lost_message(received: int, detail: str) -> StoredMessage:
     return received, MalformedMessageError("damaged", detail), b""
 
 
+def index_missing(received: int, read: Counter[Channel], finished_once: bool) -> StoredMessage:
+    """The report of a file without the index that its writer puts at its end.
+
+    Parameters
+    ----------
+    received : int
+        The log time of the report, in ns.
+    read : Counter of Channel
+        The number of messages that were read of each channel.
+    finished_once : bool
+        Whether the file shows that there was an index.
+    """
+    count = sum(number for channel, number in read.items() if isinstance(channel, Channel))
+    why = "was finished once and is cut or damaged" if finished_once else "is cut, or its writer did not finish it"
+    detail = f"the file {why}: {count:,} messages were read, and its index is missing"
+    return received, MalformedMessageError("unfinished", detail), b""
+
+
 _log_time = itemgetter(0)
 _channel = itemgetter(1)
 
@@ -143,7 +161,8 @@ class Storage(Protocol):
     def messages(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[StoredMessage]:
         """Iterate over the messages of some channels from one log time to another, inclusive, in their order.
 
-        An iteration without limits ends with a report of what the file promises and does not have.
+        An iteration without limits ends with a report of what the file promises and does not have. One that reaches the
+        end of a file without its index ends with `index_missing`.
         """
         ...
 
