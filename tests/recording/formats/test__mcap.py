@@ -48,9 +48,7 @@ def damage(path: Path, part: bytes) -> None:
 def in_blocks(path: Path, since: int | None = None, until: int | None = None) -> list[RecordedMessage]:
     """All messages of a recording, as they are in its blocks, without the report that its index is missing."""
     with open_recording(path) as recording:
-        return without_unfinished(
-            message for block in recording.blocks(since, until) for message in block.messages()
-        )
+        return without_unfinished(message for block in recording.blocks(since, until) for message in block.messages())
 
 
 def errors_in(messages: list[RecordedMessage]) -> list[str]:

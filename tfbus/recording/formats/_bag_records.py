@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import IO, Final, NamedTuple
 
 from tfbus.recording.formats._bounds import MAX_CHUNK, MAX_CHUNK_MESSAGES, MAX_INDEX
+from tfbus.recording.formats._storage import in_words
 from tfbus.recording.formats._unfold import unfold
 from tfbus.stamps import SECOND
 
@@ -215,7 +216,7 @@ def split_chunk(data: bytes) -> Content:
             if len(messages) > MAX_CHUNK_MESSAGES:
                 raise ValueError(f"it has more than {MAX_CHUNK_MESSAGES:,} messages, which is the bound")
     except DAMAGE as error:
-        return content._replace(damage=str(error) or "a record is damaged")
+        return content._replace(damage=in_words(error))
     return content
 
 

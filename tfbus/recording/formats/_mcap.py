@@ -32,7 +32,15 @@ from tfbus.recording.formats._mcap_records import (
     split_message,
 )
 from tfbus.recording.formats._packed import Packed, Stored, batches
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, index_missing, lost_message, select, shortfalls
+from tfbus.recording.formats._storage import (
+    Channel,
+    StoredMessage,
+    Wanted,
+    index_missing,
+    lost_message,
+    select,
+    shortfalls,
+)
 from tfbus.stamps import STAMP_MAX
 
 _FOOTER = struct.Struct("<BQQQI8s")

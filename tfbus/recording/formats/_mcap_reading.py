@@ -21,7 +21,7 @@ from tfbus.recording.formats._mcap_records import (
     split_message,
 )
 from tfbus.recording.formats._packed import Stored
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message
+from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, in_words, lost_message
 
 _KINDS: Final[dict[int, str]] = {
     Opcode.CHUNK: "chunk",
@@ -149,7 +149,9 @@ class McapReading:
                 try:
                     found = self._in_record(opcode, content)
                 except DAMAGE as error:
-                    found = [lost_message(now, f"the {_KINDS.get(opcode, 'record')} at byte {offset}: {error}")]
+                    found = [
+                        lost_message(now, f"the {_KINDS.get(opcode, 'record')} at byte {offset}: {in_words(error)}")
+                    ]
                 if found:
                     now = max(now, found[-1][0])
                     yield found

@@ -36,7 +36,16 @@ from tfbus.recording.formats._bag_records import (
 )
 from tfbus.recording.formats._bounds import MAX_INDEX
 from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, index_missing, lost_message, select, shortfalls
+from tfbus.recording.formats._storage import (
+    Channel,
+    StoredMessage,
+    Wanted,
+    in_words,
+    index_missing,
+    lost_message,
+    select,
+    shortfalls,
+)
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MAGIC: Final = b"#ROSBAG V"
@@ -254,11 +263,11 @@ class Ros1Storage:
                     # As every file that was cut, it ends inside of a record.
                     cause = error
                     break
-                self._damage.append(f"nothing can be read from byte {at} to byte {following}: {error}")
+                self._damage.append(f"nothing can be read from byte {at} to byte {following}: {in_words(error)}")
                 at = following
         if self._chunks:
             return
-        why = next(iter(self._damage), None) if cause is None or isinstance(cause, CutOffError) else cause
+        why = next(iter(self._damage), None) if cause is None or isinstance(cause, CutOffError) else in_words(cause)
         if why is not None:
             raise RecordingError(f"it cannot be read as a bag of ROS 1: {why}", path=str(self._path), reason="damaged")
         raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
@@ -313,7 +322,7 @@ class Ros1Storage:
             else:
                 content = split_chunk(read_chunk(self._file, record))
         except DAMAGE as error:
-            return Content([], [], str(error) or "its header is damaged")
+            return Content([], [], in_words(error))
         for fields, data in content.connections:
             with suppress(*DAMAGE):
                 self._register(fields, data)

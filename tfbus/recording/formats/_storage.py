@@ -69,6 +69,14 @@ def index_missing(received: int, read: Counter[Channel], finished_once: bool) ->
     return received, MalformedMessageError("unfinished", detail), b""
 
 
+def in_words(error: Exception) -> str:
+    """The fault that an error of a parser tells: what Python and others word for programmers is told in other words."""
+    if isinstance(error, UnicodeDecodeError):
+        return "a text in it is no text"
+    # `struct.error`, `KeyError` and the like have no words for people.
+    return str(error) if isinstance(error, ValueError) else "it ends inside of a record, or a record is damaged"
+
+
 _log_time = itemgetter(0)
 _channel = itemgetter(1)
 
