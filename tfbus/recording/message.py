@@ -15,8 +15,8 @@ class RecordedMessage(NamedTuple):
     batch: Batch
     """The valid transforms."""
     errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """The reason why others were refused; ``"damaged"`` for a part of the file that is lost here, and ``"unfinished"`` at
-    the end of a file without its index."""
+    """The reason why others were refused; with ``"damaged"``, the part of the file that is lost here, and with
+    ``"unfinished"``, why messages may be missing at the end."""
 
     @property
     def is_report(self) -> bool:

@@ -36,7 +36,7 @@ def test_a_file_without_its_end_is_examined_as_far_as_it_goes(tmp_path: Path, tf
     path = write_mcap(tmp_path / "run.mcap", LINES, finish=False)
     done = tfbus("check", path)
     assert (done.returncode, done.stderr) == (1, "")
-    assert done.stdout.startswith("unfinished        the file is cut, or its writer did not finish it: 10 messages")
+    assert done.stdout.startswith("unfinished        10 messages were read of the file; it is cut, or")
 
 
 def test_a_finished_bag_that_is_cut_is_a_finding(tmp_path: Path, tfbus: Command) -> None:
@@ -47,7 +47,7 @@ def test_a_finished_bag_that_is_cut_is_a_finding(tmp_path: Path, tfbus: Command)
     assert done.returncode == 1
     unfinished, *_ = json.loads(done.stdout)
     assert unfinished["kind"] == "unfinished"
-    assert "the file was finished once and is cut or damaged" in unfinished["detail"]
+    assert "it was finished once and is cut or damaged" in unfinished["detail"]
 
 
 def test_a_domain_is_examined_for_some_time(tfbus: Command) -> None:

@@ -18,6 +18,9 @@ MAX_OTHER_MESSAGE: Final = 256 * MIB
 """The size in bytes of any other message."""
 MAX_INDEX: Final = 64 * MIB
 """The size in bytes of the index of a file; a file with a larger one is read from its beginning."""
+MAX_DESCRIBED: Final = 64 * MIB
+"""The size in bytes of all descriptions of channels and types of a file, each with `DESCRIPTION` bytes more."""
+DESCRIPTION: Final = 1_024
 MAX_METADATA: Final = 4 * MIB
 """The size in bytes of ``metadata.yaml``."""
 MAX_FACTOR: Final = 100

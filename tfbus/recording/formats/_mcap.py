@@ -33,13 +33,15 @@ from tfbus.recording.formats._mcap_records import (
 )
 from tfbus.recording.formats._packed import Packed, Stored, batches
 from tfbus.recording.formats._storage import (
+    FINISHED_ONCE,
+    NEVER_FINISHED,
     Channel,
     StoredMessage,
     Wanted,
-    index_missing,
     lost_message,
     select,
     shortfalls,
+    unfinished,
 )
 from tfbus.stamps import STAMP_MAX
 
@@ -132,7 +134,7 @@ class McapStorage:
             yield stored
         yield from self._reports(reading, now, None if since is not None or until is not None else read)
         if not self.finished and (until is None or self.end is None or until >= self.end):
-            yield index_missing(now, read, reading.finished_once)
+            yield unfinished(now, read, FINISHED_ONCE if reading.finished_once else NEVER_FINISHED)
 
     def packed(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[Stored]:
         """The messages of `messages`, many at once."""

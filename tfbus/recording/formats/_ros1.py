@@ -37,14 +37,16 @@ from tfbus.recording.formats._bag_records import (
 from tfbus.recording.formats._bounds import MAX_INDEX
 from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks
 from tfbus.recording.formats._storage import (
+    FINISHED_ONCE,
+    NEVER_FINISHED,
     Channel,
     StoredMessage,
     Wanted,
     in_words,
-    index_missing,
     lost_message,
     select,
     shortfalls,
+    unfinished,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
@@ -200,7 +202,7 @@ class Ros1Storage:
                     read,
                 )
         if not self.finished and (until is None or until >= (self.end or 0)):
-            yield index_missing(now, read, self._finished_once)
+            yield unfinished(now, read, FINISHED_ONCE if self._finished_once else NEVER_FINISHED)
 
     def _may_be_wanted(self, number: int, wanted: Wanted) -> bool:
         channel = self._numbered.get(number)

@@ -51,8 +51,12 @@ def lost_message(received: int, detail: str) -> StoredMessage:
     return received, MalformedMessageError("damaged", detail), b""
 
 
-def index_missing(received: int, read: Counter[Channel], finished_once: bool) -> StoredMessage:
-    """The report of a file without the index that its writer puts at its end.
+FINISHED_ONCE = "it was finished once and is cut or damaged: its index is missing"
+NEVER_FINISHED = "it is cut, or its writer did not finish it: its index is missing"
+
+
+def unfinished(received: int, read: Counter[Channel], why: str) -> StoredMessage:
+    """The report of a file without the end that its writer gives it.
 
     Parameters
     ----------
@@ -60,13 +64,11 @@ def index_missing(received: int, read: Counter[Channel], finished_once: bool) ->
         The log time of the report, in ns.
     read : Counter of Channel
         The number of messages that were read of each channel.
-    finished_once : bool
-        Whether the file shows that there was an index.
+    why : str
+        What shows it.
     """
     count = sum(number for channel, number in read.items() if isinstance(channel, Channel))
-    why = "was finished once and is cut or damaged" if finished_once else "is cut, or its writer did not finish it"
-    detail = f"the file {why}: {count:,} messages were read, and its index is missing"
-    return received, MalformedMessageError("unfinished", detail), b""
+    return received, MalformedMessageError("unfinished", f"{count:,} messages were read of the file; {why}"), b""
 
 
 def in_words(error: Exception) -> str:
@@ -170,7 +172,7 @@ class Storage(Protocol):
         """Iterate over the messages of some channels from one log time to another, inclusive, in their order.
 
         An iteration without limits ends with a report of what the file promises and does not have. One that reaches the
-        end of a file without its index ends with `index_missing`.
+        end of a file without its index ends with `unfinished`.
         """
         ...
 
