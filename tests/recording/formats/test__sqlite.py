@@ -312,7 +312,7 @@ def test_what_a_killed_writer_had_not_finished_is_undone_in_a_copy_and_told(
 
 def test_a_journal_removes_no_other_file(tmp_path: Path) -> None:
     path, victim = tmp_path / "run.db3", tmp_path / "precious"
-    victim.write_bytes(b"")
+    victim.write_bytes(b"precious")
     killed_writer(path, "DELETE")
     # At the end of a journal may be the name of another one, which SQLite removes behind the last of its children.
     name = str(victim).encode()
