@@ -19,7 +19,7 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats._bounds import MAX_INDEX
+from tfbus.recording.formats._bounds import MAX_INDEX, DescriptionBudget
 from tfbus.recording.formats._chunks import ChunkPlace, separate
 from tfbus.recording.formats._mcap_reading import IndexedChunk, McapReading
 from tfbus.recording.formats._mcap_records import (
@@ -83,6 +83,7 @@ class McapStorage:
             self.size = self._file.seek(0, 2)
             self._schemas: dict[int, records.Schema] = {}
             self._numbered: dict[int, Channel] = {}
+            self._budget = DescriptionBudget()
             self._chunks: list[IndexedChunk] = []
             self._statistics: records.Statistics | None = None
             self._counted: Counter[int] | None = None
@@ -187,6 +188,7 @@ class McapStorage:
             # They would contradict what the chunks say.
             self._schemas.clear()
             self._numbered.clear()
+            self._budget = DescriptionBudget()
         return True
 
     def _checksum(self, start: int, end: int) -> int:
@@ -222,6 +224,8 @@ class McapStorage:
             statistics is not None
             and statistics.channel_message_counts.keys() <= self._numbered.keys()
             and kinds <= {0, *self._schemas}
+            # Else a small file could have one chunk read any number of times.
+            and len({chunk.place.offset for chunk in chunks}) == len(chunks)
         ):
             self._statistics = statistics
             self._chunks = sorted(chunks)
@@ -229,6 +233,8 @@ class McapStorage:
     def register(self, record: records.McapRecord) -> bool:
         """Note a schema or a channel; returns whether it agrees with what is known already."""
         if isinstance(record, records.Schema):
+            if record.id not in self._schemas:
+                self._budget.take(record.name, record.data)
             return self._schemas.setdefault(record.id, record) == record
         if not isinstance(record, records.Channel):
             return True
@@ -241,6 +247,8 @@ class McapStorage:
             b"" if schema is None else schema.data,
             record.metadata,
         )
+        if record.id not in self._numbered:
+            self._budget.take(record.topic, *record.metadata, *record.metadata.values())
         known = self._numbered.setdefault(record.id, channel)
         return all(getattr(known, name) == getattr(channel, name) for name in ("topic", "type", "encoding", "metadata"))
 
@@ -251,8 +259,10 @@ class McapStorage:
     @cached_property
     def _span(self) -> tuple[int, int] | None:
         if self._statistics is None:
-            spans = list(self._log_times())
-            return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
+            span: tuple[int, int] | None = None
+            for first, last in self._log_times():
+                span = (first, last) if span is None else (min(span[0], first), max(span[1], last))
+            return span
         if not self._statistics.message_count:
             return None
         return self._statistics.message_start_time, self._statistics.message_end_time
