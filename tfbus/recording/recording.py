@@ -177,7 +177,8 @@ class Recording:
         try:
             samples, errors = self._decoders[channel].decode(payload)
         except MalformedMessageError as error:
-            return RecordedMessage(received, (), (error,))
+            # Its traceback would keep the payload.
+            return RecordedMessage(received, (), (MalformedMessageError(error.reason, error.detail),))
         return RecordedMessage(received, tuple(filter(None, samples)), tuple(errors))
 
     def _check_topics(self, storage: Storage) -> None:

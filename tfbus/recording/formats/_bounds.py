@@ -23,6 +23,8 @@ MAX_INDEX: Final = 64 * MIB
 MAX_DESCRIBED: Final = 64 * MIB
 """The size in bytes of all descriptions of channels and types of a file, each with `DESCRIPTION` bytes more."""
 DESCRIPTION: Final = 1_024
+MAX_PACKED: Final = 64 * MIB
+"""The size in bytes of chunks that overlap and are decoded at once; others are decoded message by message."""
 MAX_OVERLAPPING: Final = 512 * MIB
 """The size in bytes of the messages of chunks that overlap in time, which are sorted in memory."""
 MAX_METADATA: Final = 4 * MIB

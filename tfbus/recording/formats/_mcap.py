@@ -19,7 +19,7 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats._bounds import MAX_INDEX, DescriptionBudget
+from tfbus.recording.formats._bounds import MAX_INDEX, MAX_PACKED, DescriptionBudget
 from tfbus.recording.formats._chunks import ChunkPlace, separate
 from tfbus.recording.formats._mcap_reading import IndexedChunk, McapReading
 from tfbus.recording.formats._mcap_records import (
@@ -140,7 +140,7 @@ class McapStorage:
     def packed(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[Stored]:
         """The messages of `messages`, many at once."""
         parts = separate([chunk.place for chunk in self._chunks])
-        if not parts or max(part.stop - part.start for part in parts) > _MOST_OVERLAPPING:
+        if not parts or any(self._is_large(self._chunks[part]) for part in parts):
             yield from batches(self.messages(wanted, since, until))
             return
         low = 0 if since is None else since
@@ -158,6 +158,11 @@ class McapStorage:
                 yield block
         reports = self._reports(reading, now, None if since is not None or until is not None else read)
         yield from batches(reports)
+
+    @staticmethod
+    def _is_large(chunks: list[IndexedChunk]) -> bool:
+        """Whether chunks that overlap are too many, or too large, to be in memory at once."""
+        return len(chunks) > _MOST_OVERLAPPING or sum(chunk.size for chunk in chunks) > MAX_PACKED
 
     def _reports(self, reading: McapReading, now: int, read: Counter[Channel] | None) -> Iterator[StoredMessage]:
         """The faults that a reading has found; `read` has the number of the messages, if none was left out."""
@@ -212,7 +217,11 @@ class McapStorage:
             if isinstance(record, records.ChunkIndex):
                 numbers = tuple(record.message_index_offsets)
                 place = ChunkPlace(record.message_start_time, record.message_end_time, record.chunk_start_offset)
-                chunks.append(IndexedChunk(place, record.chunk_length, shared.setdefault(numbers, numbers)))
+                chunks.append(
+                    IndexedChunk(
+                        place, record.chunk_length, record.uncompressed_size, shared.setdefault(numbers, numbers)
+                    )
+                )
             elif isinstance(record, records.Statistics):
                 statistics = record
             elif record is not None:

@@ -42,6 +42,8 @@ class IndexedChunk(NamedTuple):
 
     place: ChunkPlace
     length: int
+    size: int
+    """Of its content, in bytes."""
     channels: tuple[int, ...]
 
 
@@ -94,7 +96,7 @@ class McapReading:
         """The messages of all chunks that overlap the range, in the order of their log times."""
         size = self._source.size
         places, too_long = [], set()
-        for place, length, numbers in self._source.index:
+        for place, length, _, numbers in self._source.index:
             # Without numbers, or with unknown ones, only reading the chunk tells what is in it.
             if place.start <= high and place.end >= low and (not numbers or any(map(self._may_be_wanted, numbers))):
                 places.append(place)
@@ -117,13 +119,18 @@ class McapReading:
         chunks: list[OpenChunk] = []
         size, enough = 0, _FIRST_BLOCK
         for part in separated:
-            for place, length, numbers in sorted(self._source.index[part], key=lambda chunk: chunk.place.offset):
+            for place, length, claimed, numbers in sorted(
+                self._source.index[part], key=lambda chunk: chunk.place.offset
+            ):
                 if place.start > high or place.end < low or (numbers and not any(map(self._may_be_wanted, numbers))):
                     continue
                 try:
                     if place.offset + length > self._source.size:
                         raise ValueError("it is behind the end of the file")
-                    chunk = OpenChunk(place, self._source.read_chunk(place.offset).unfold())
+                    read = self._source.read_chunk(place.offset)
+                    if read.size > claimed:
+                        raise ValueError(f"the index claims {claimed:,} bytes, and it has {read.size:,}")
+                    chunk = OpenChunk(place, read.unfold())
                 except (*DAMAGE, EndOfFile) as error:
                     yield from packer.pack(chunks, low, high)
                     chunks.clear()
