@@ -80,7 +80,7 @@ class SqliteStorage:
                     self._recover(path, journals)
         except _DAMAGE as error:
             raise RecordingError(
-                f"it cannot be read as a recording of ROS 2: {error}", path=str(path), reason="damaged"
+                f"it cannot be read as a recording of ROS 2: {_in_words(error)}", path=str(path), reason="damaged"
             ) from error
 
     def _open(self, path: Path, mode: str) -> None:
@@ -207,8 +207,12 @@ class SqliteStorage:
                     block, size = [], 0
         except _DAMAGE as error:
             now = block[-1][0] if block else now
-            block.append(lost_message(now, f"nothing more can be read: {error}"))
+            block.append(lost_message(now, f"nothing more can be read: {_in_words(error)}"))
         yield block
+
+
+def _in_words(error: Exception) -> str:
+    return "it takes more steps than a file of its size needs" if str(error) == "interrupted" else str(error)
 
 
 def _beside(path: Path, suffix: str) -> Path:
