@@ -49,7 +49,8 @@ def check(
 ) -> None:
     """Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.
 
-    The exit status is 0 if nothing is wrong and 1 if something is. A frame that never moves is only a hint.
+    The exit status is 0 if nothing is wrong and 1 if something is; a recording that is cut, or that its writer did not
+    finish, is wrong as well. A frame that never moves is only a hint.
 
     Example: tfbus check run.mcap
 
