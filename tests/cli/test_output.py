@@ -121,3 +121,11 @@ def test_an_error_names_the_file_that_cannot_be_written(name: str, tmp_path: Pat
     path = tmp_path / name
     with pytest.raises(UsageError, match=re.escape(f"cannot write {path}: ")):
         write_file(path, b"")
+
+
+def test_a_link_that_somebody_has_made_beside_a_file_leads_nowhere(tmp_path: Path) -> None:
+    path, precious = tmp_path / "frames.dot", tmp_path / "precious"
+    precious.write_bytes(b"precious")
+    (tmp_path / ".frames.dot.part").symlink_to(precious)
+    write_file(path, b"digraph")
+    assert (path.read_bytes(), precious.read_bytes()) == (b"digraph", b"precious")

@@ -379,3 +379,21 @@ def test_a_conversion_that_fails_leaves_no_file_and_keeps_none_open(tmp_path: Pa
     assert list(tmp_path.iterdir()) == []
     assert not is_open(tmp_path)
     assert not is_open(SMALL)
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "bag", "db3"])
+def test_a_link_that_somebody_has_made_beside_the_output_leads_nowhere(tmp_path: Path, suffix: str) -> None:
+    precious = tmp_path / "precious"
+    precious.write_bytes(b"precious")
+    output = tmp_path / f"run.{suffix}"
+    for name in (f".run.part.{suffix}", f".run.{suffix}.part", f".run.part.{suffix}-journal"):
+        (tmp_path / name).symlink_to(precious)
+    before = sorted(tmp_path.iterdir())
+    convert([SMALL], output)
+    # Also where the output is a link: it is replaced, and not followed.
+    output.unlink()
+    output.symlink_to(precious)
+    convert([SMALL], output, overwrite=True)
+    assert precious.read_bytes() == b"precious"
+    assert not output.is_symlink()
+    assert sorted(tmp_path.iterdir()) == sorted([*before, output])

@@ -217,7 +217,9 @@ async def test_what_is_flushed_can_be_read_while_the_recording_goes_on(tmp_path:
                 await recorder.flush()
                 assert (recorder.statistics().samples, recorder.statistics().queue.pending) == (number, 0)
                 with open_recording(path) as recording:
-                    assert len(list(recording.messages())) == number
+                    *messages, unfinished = recording.messages()
+                    assert len(messages) == number
+                    assert [error.reason for error in unfinished.errors] == ["unfinished"]
                     assert not recording.finished
         await recorder.flush()
 
@@ -232,7 +234,8 @@ async def test_a_flush_writes_all_that_is_pending_in_whatever_parts(tmp_path: Pa
             await recorder.flush()
             assert recorder.statistics().queue.pending == 0
             with open_recording(path) as recording:
-                assert sum(map(len, recording.blocks())) == 5_120
+                # And the report that the file is not finished.
+                assert sum(map(len, recording.blocks())) == 5_120 + 1
 
 
 @pytest.fixture
@@ -481,8 +484,72 @@ async def test_a_disk_that_fails_causes_an_event_and_the_body_goes_on(
     assert isinstance(recorder.error, BrokenPipeError)
     assert heard == [RecordingFailed(3 * SECOND, str(pipe.path), recorder.error)]
     statistics = recorder.statistics()
-    assert (statistics.samples, statistics.queue.pending, statistics.queue.dropped) == (0, 0, 100)
-    assert ["has ended early" in record.message for record in caplog.records] == [True]
+    # Also the one that was published later.
+    assert (statistics.samples, statistics.queue.pending, statistics.queue.dropped) == (0, 0, 101)
+    assert ["has ended early, with 0 samples in it" in record.message for record in caplog.records] == [True]
+
+
+def remove(path: Path) -> None:
+    path.unlink()
+
+
+def replace(path: Path) -> None:
+    path.with_name("other").write_bytes(b"other")
+    path.with_name("other").replace(path)
+
+
+def cut(path: Path) -> None:
+    os.truncate(path, path.stat().st_size - 1)
+
+
+@pytest.mark.parametrize(
+    ("harm", "why"),
+    [(remove, "removed or replaced the file"), (replace, "removed or replaced the file"), (cut, "cut the file")],
+)
+@pytest.mark.parametrize("more", [True, False])
+async def test_a_file_that_is_removed_replaced_or_cut_meanwhile_ends_the_recording(
+    tmp_path: Path, harm: Callable[[Path], None], why: str, more: bool
+) -> None:
+    path = tmp_path / "run.mcap"
+    with Bus(SimulatedClock()) as bus, bus.events() as events:
+        async with Recorder(bus, path) as recorder:
+            bus.publish(moving("map", "a", 1))
+            await recorder.flush()
+            await anyio.to_thread.run_sync(harm, path)
+            if more:
+                for stamp in (2, 3):
+                    bus.publish(moving("map", "a", stamp))
+                    await recorder.flush()
+        bus.close()
+        (failed,) = [event async for event in events if isinstance(event, RecordingFailed)]
+    assert failed.error is recorder.error
+    assert why in str(recorder.error)
+    statistics = recorder.statistics()
+    assert (statistics.samples, statistics.messages, statistics.queue.dropped) == (0, 0, 3 if more else 1)
+
+
+async def test_a_file_that_is_moved_meanwhile_is_finished_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    moved = tmp_path / "moved.mcap"
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, "run.mcap") as recorder:
+            bus.publish(moving("map", "a", 1))
+            await recorder.flush()
+            await anyio.to_thread.run_sync((tmp_path / "run.mcap").replace, moved)
+            bus.publish(moving("map", "a", 2))
+    assert "somebody moved the file" in str(recorder.error)
+    assert recorder.statistics().samples == len(recorded(moved)) == 2
+
+
+async def test_a_change_of_the_working_directory_is_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with Bus(SimulatedClock()) as bus:
+        async with Recorder(bus, "run.mcap") as recorder:
+            bus.publish(moving("map", "a", 1))
+            monkeypatch.chdir("/")
+    assert recorder.error is None
 
 
 async def test_a_disk_that_fails_at_the_end_causes_an_event_and_raises_nothing(pipe: Pipe) -> None:

@@ -113,3 +113,32 @@ def test_what_convert_writes_is_read(tmp_path: Path) -> None:
         '- parent: "base"\n  child: "lidar"\n  translation: [1.0, 2.0, 3.0]\n  rotation: [0.0, 0.0, 1.0, 0.0]\n'
     )
     assert load_static(file) == [TransformStamped("base", "lidar", 0, Transform((1, 2, 3), (0, 0, 1, 0)), static=True)]
+
+
+LAUGHS = "\n".join(["a0: &a0 [x]", *(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12))])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"[" * 10_000,
+        b"- " * 10_000,
+        b"\xff",
+        b"[1, {}, []]",
+        b'[{"parent": "a", "child": "b", "xyz": [1e400, 1, 1]}]',
+        b'[{"parent": "a", "child": "b", "xyz": [1' + b"0" * 400 + b", 1, 1]}]",
+        b'[{"parent": "a", "child": "b", "transform": 3}]',
+        b'[{"parent": ["a"], "child": "b"}]',
+        f"{LAUGHS}\nlist:\n- {{parent: a, child: b, xyz: *a11}}\n".encode(),
+        f"- {{parent: a, child: b, xyz: [&a [{', '.join(['1'] * 9)}], *a, *a]}}\n".encode(),
+        "\n".join(["- &a0 [x]", *(f"- &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12))]).encode(),
+        b"? [a]\n: 1\n",
+        b"- 2026-99-99\n- !!python/object:os.system {}\n",
+    ],
+)
+def test_a_hostile_file_is_a_defined_error_of_bounded_length(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_bytes(content)
+    with pytest.raises(RecordingError) as raised:
+        load_static(file)
+    assert len(str(raised.value)) < 1_500

@@ -116,7 +116,7 @@ def test_the_summary_shows_an_unfinished_and_damaged_file(tmp_path: Path) -> Non
     path.write_bytes(data)
     summary = summary_of(path)
     assert not summary.finished
-    assert summary.problems == {"damaged": 1}
+    assert summary.problems == {"damaged": 1, "unfinished": 1}
     assert 50 < summary.transforms < 100
 
 

@@ -98,9 +98,14 @@ def sender_of(connection: Any) -> str:
 
 
 def messages_in(path: Path, since: int | None = None, until: int | None = None) -> list[RecordedMessage]:
-    """All messages of a recording."""
+    """All messages of a recording, without the report that its index is missing."""
     with open_recording(path) as recording:
-        return list(recording.messages(since, until))
+        return without_unfinished(recording.messages(since, until))
+
+
+def without_unfinished(messages: Iterable[RecordedMessage]) -> list[RecordedMessage]:
+    """The messages without the report that the index of their file is missing."""
+    return [message for message in messages if [error.reason for error in message.errors] != ["unfinished"]]
 
 
 def batches_in(path: Path) -> list[tuple[int, tuple[TransformStamped, ...]]]:

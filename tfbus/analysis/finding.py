@@ -21,6 +21,7 @@ ADVICE = {
     "never moves": "if it is fixed, send it once as a static transform; if it only stood still, all is well",
     "disconnected": "nothing can be looked up between these trees: a transform is missing",
     "refused": "these are left out",
+    "unfinished": "copy the file again; if its writer was killed, this is what can be read",
 }
 """The advice for each kind of finding."""
 HINTS = frozenset(("never moves",))

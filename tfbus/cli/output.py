@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TypeVar
 
@@ -91,12 +91,11 @@ def write_file(path: Path, content: bytes) -> None:
         If the file cannot be written.
     """
     replaceable = path.is_file() or not path.exists()
-    written = path.with_name(f".{path.name}.part") if replaceable else path
+    # Its packages take long to load, and few commands write a file.
+    from tfbus.recording.convert import new_file
+
     try:
-        written.write_bytes(content)
-        if replaceable:
-            written.replace(path)
+        with new_file(path) if replaceable else nullcontext(path) as written:
+            written.write_bytes(content)
     except OSError as error:
-        if replaceable:
-            written.unlink(missing_ok=True)
         raise UsageError(f"cannot write {path}: {error.strerror}") from None

@@ -30,8 +30,6 @@ def load_tree(
     problems = Problems()
     limit = None if max_speed is None else SpeedLimit(max_speed)
     with topics.open(file) as recording, progress(recording.count, "reading") as advance:
-        if not recording.finished:
-            warn(f"{file} was not finished by its writer: this is what can be read")
         fill(tree, recording, problems, limit=limit, progress=advance)
         remarks, start = recording.remarks, recording.start
     if problems:

@@ -5,12 +5,13 @@ import os
 import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby
 from json import dumps
 from operator import itemgetter
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 from tfbus.errors import RecordingError, pip_install
@@ -151,8 +152,8 @@ def convert(
         raise ValueError(f"{target} is an input as well")
     if target.exists() and not overwrite:
         raise FileExistsError(17, "it is there already", str(target))
-    part = target.with_name(f".{target.stem}.part{target.suffix}")
     with ExitStack() as stack:
+        part = stack.enter_context(new_file(target))
         storages = []
         for path in inputs:
             storages.append(open_storage(Path(path)))
@@ -163,7 +164,6 @@ def convert(
             extras = "bag,foxglove" if schema == "foxglove" else "bag"
             problem = f"to write it, tfbus needs some packages more: {pip_install(extras)} ({error})"
             raise RecordingError(problem, path=str(target), reason="missing extra") from error
-        stack.callback(part.unlink, missing_ok=True)
         stack.callback(copy.close)
         run = _Run(copy, Edits() if edits is None else edits, topics)
         for received, channel, payload in run.merged(storages, since, until):
@@ -171,8 +171,24 @@ def convert(
             if progress is not None:
                 progress(1)
         copy.finish()
-        part.replace(target)
     return run.result
+
+
+@contextmanager
+def new_file(target: Path) -> Iterator[Path]:
+    """A path to write a file at, which takes the place of another one at the end of the ``with``, if nothing fails.
+
+    It is in a new folder that only this user may enter. So no link that somebody has made leads it elsewhere.
+
+    Raises
+    ------
+    OSError
+        If there can be no folder beside the target, or it cannot be replaced.
+    """
+    with TemporaryDirectory(prefix=".tfbus-", dir=target.parent) as folder:
+        part = Path(folder, target.name)
+        yield part
+        part.replace(target)
 
 
 class _Run:

@@ -43,6 +43,7 @@ def examine(
         Empty if nothing is wrong.
     """
     examiner = Examiner(limits)
+    unfinished: list[Finding] = []
     parsers: dict[Channel, Callable[[bytes], list[RawTransform]]] = {}
     for block in recording.blocks(since, until):
         if isinstance(block, Block):
@@ -53,10 +54,14 @@ def examine(
                         _note_norms(examiner, parse(bounded(payload)))
         for received, batch, errors in block.messages():
             examiner.add(batch, received)
-            examiner.add_refused(error.reason for error in errors)
+            for error in errors:
+                if isinstance(error, MalformedMessageError) and error.reason == "unfinished":
+                    unfinished.append(Finding("unfinished", None, 1, None, None, "", error.detail))
+                else:
+                    examiner.add_refused((error.reason,))
         if progress is not None:
             progress(len(block))
-    return examiner.findings()
+    return unfinished + examiner.findings()
 
 
 def _note_norms(examiner: Examiner, transforms: list[RawTransform]) -> None:

@@ -66,7 +66,7 @@ def load_joint_states(
     try:
         for _, channel, payload in storage.messages(lambda each: _is_wanted(each, name), since, until):
             if isinstance(channel, MalformedMessageError):
-                counted[channel.reason] += 1
+                counted.note((channel,))
                 continue
             read += 1
             try:

@@ -105,6 +105,8 @@ def load(
         remarks = recording.remarks
     if problems is not None:
         problems.update(found)
+        if isinstance(problems, Problems):
+            problems.details += found.details
         return tree
     logger = logging.getLogger("tfbus")
     if found:

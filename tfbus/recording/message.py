@@ -15,4 +15,10 @@ class RecordedMessage(NamedTuple):
     batch: Batch
     """The valid transforms."""
     errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """The reason why others were refused; with ``reason="damaged"``, the part of the file that is lost here."""
+    """The reason why others were refused; with ``"damaged"``, the part of the file that is lost here, and with
+    ``"unfinished"``, why messages may be missing at the end."""
+
+    @property
+    def is_report(self) -> bool:
+        """Whether it stands for no message of the file, but for what is missing there."""
+        return any(error.reason in ("damaged", "unfinished") for error in self.errors)

@@ -313,7 +313,7 @@ class Player:
 
     def _publish(self, message: RecordedMessage) -> None:
         self.position = message.received
-        self.messages += 1
+        self.messages += not message.is_report
         self.bad.update(error.reason for error in message.errors)
         if not message.batch:
             return

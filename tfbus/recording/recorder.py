@@ -68,8 +68,10 @@ class Recorder:
     -----
     Entering raises the `OSError` of a file that cannot be created, `FileExistsError` for a file that exists,
     `ImportError` if the extra is missing, and `BusClosedError` if the bus is closed. After that, a disk that is full or
-    fails causes a `RecordingFailed` event; the error is kept in `error` and logged, but raised nowhere: the body goes
-    on, and the file holds all that was written before.
+    fails, and a file that somebody removes, replaces or cuts, cause a `RecordingFailed` event; the error is kept in
+    `error` and logged, but raised nowhere: the body goes on. `statistics` tells how many samples the file still holds,
+    none of one that was removed or cut; all that are published later count as dropped. A file that is moved is
+    recorded to its end, and then told in the same way.
 
     Leaving waits for the disk, also when the body is cancelled. The log time of a batch is the time of its publication
     on the bus's clock. The format cannot express that a frame was removed, nor that the clock jumped back: programs
@@ -167,6 +169,9 @@ class Recorder:
             raise RuntimeError("enter the recorder first: async with Recorder(...) as recorder")
 
     def _enqueue(self, batch: Batch) -> None:
+        if self.error is not None:
+            self._queue.dropped += len(batch)
+            return
         now = self.bus.clock.now()
         dropped_before = self._queue.dropped
         self._queue.put(batch, now)
@@ -239,10 +244,11 @@ class Recorder:
 
     def _fail(self, error: Exception) -> None:
         self.error = error
-        if self._registration is not None:
-            self._registration.close()
+        # What is still published is counted as dropped.
         self._queue.clear()
-        logging.getLogger("tfbus.recording").warning("the recording %s has ended early: %s", self.path, error)
+        logging.getLogger("tfbus.recording").warning(
+            "the recording %s has ended early, with %d samples in it: %s", self.path, self.statistics().samples, error
+        )
         self.bus._announce(RecordingFailed(self.bus.clock.now(), self.path, error))
 
 

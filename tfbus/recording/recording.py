@@ -59,7 +59,8 @@ class Recording:
     ----------
     path : Path
     finished : bool
-        Whether the writer finished the file. If not, the last messages may be missing.
+        Whether the file has the end that a writer gives it. If not, the last messages may be missing, and a reading of
+        the end reports ``"unfinished"``.
     """
 
     def __init__(self, path: Path, storage: Storage, selection: Selection) -> None:
@@ -113,7 +114,8 @@ class Recording:
 
         Damage raises nothing: it is reported in the `errors` of a message, and reading continues behind it. An MCAP
         file without an index, because its writer was killed, is read in the order of the file. At the end of a reading
-        without limits, the number of messages is compared with what the file promises.
+        without limits, the number of messages is compared with what the file promises. A reading that reaches the end
+        of a file without its index ends with a report, an error whose reason is ``"unfinished"``.
 
         Parameters
         ----------
@@ -177,7 +179,8 @@ class Recording:
         try:
             samples, errors = self._decoders[channel].decode(payload)
         except MalformedMessageError as error:
-            return RecordedMessage(received, (), (error,))
+            # Its traceback would keep the payload.
+            return RecordedMessage(received, (), (MalformedMessageError(error.reason, error.detail),))
         return RecordedMessage(received, tuple(filter(None, samples)), tuple(errors))
 
     def _check_topics(self, storage: Storage) -> None:
@@ -255,7 +258,12 @@ def open_recording(
     The sizes that a file claims or unfolds to are bounded, and what exceeds its bound is left out and reported: 8 MiB
     for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and for a value in
     SQLite, 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its size, or 64 MiB
-    if that is more, in a nameless temporary file. An index of more than 64 MiB is not used.
+    if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The descriptions of all
+    channels and types take at most 64 MiB. Messages of chunks that overlap in time are sorted in memory up to 512 MiB.
+    With all that, reading a hostile file takes at most 2 GiB of memory.
+
+    An SQLite file beside which a writer has left a journal is copied to a temporary folder, where SQLite undoes the
+    last transaction; if the writer still runs, the file is read in its place.
     """
     file = Path(path)
     selection = Selection(topics, prefix, namespaces)

@@ -3,19 +3,24 @@
 import json
 import math
 import os
+import reprlib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from tfbus.errors import InvalidTransformError, MissingRecordingError, RecordingError, pip_install
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.recording.formats._bounds import MAX_INDEX, MAX_METADATA
 from tfbus.stamps import is_real
 
 _SIZES = {"xyz": 3, "rpy": 3, "rpy_deg": 3, "quaternion": 4}
 _SAME = {"translation": "xyz", "rotation": "quaternion"}
 """The names that ``tfbus convert --static-to-yaml`` writes."""
 _ROTATIONS = ("rpy", "rpy_deg", "quaternion")
+_LONGEST: Final = 1_000
+"""Letters of an error."""
 
 
 def save_static(path: str | os.PathLike[str], samples: Iterable[TransformStamped]) -> None:
@@ -65,14 +70,18 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
     Raises
     ------
     RecordingError
-        If the file is not such a list, or an entry is not valid; the message has its number. A file that is not there
-        is a `FileNotFoundError` as well.
+        If the file is not such a list, has more than 64 MiB (4 MiB of YAML that is no JSON), or an entry is not valid;
+        the message has its number. A file that is not there is a `FileNotFoundError` as well.
     ImportError
         If YAML beyond JSON needs the extra: ``pip install "tfbus[bag]"``.
     """
     file = Path(path)
     try:
-        entries = _parse(file.read_text(encoding="utf-8"))
+        with file.open("rb") as content:
+            data = content.read(MAX_INDEX + 1)
+        if len(data) > MAX_INDEX:
+            raise ValueError(f"it has more than {MAX_INDEX:,} bytes, which is the bound")
+        entries = _parse(data.decode())
     except FileNotFoundError:
         raise MissingRecordingError(path=str(file)) from None
     except OSError as error:
@@ -80,7 +89,9 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
             f"it cannot be read: {error.strerror or error}", path=str(file), reason="unreadable"
         ) from error
     except ValueError as error:
-        raise RecordingError(f"it is neither YAML nor JSON: {error}", path=str(file), reason="foreign") from error
+        raise RecordingError(
+            f"it is neither YAML nor JSON: {error}"[:_LONGEST], path=str(file), reason="foreign"
+        ) from error
     if not isinstance(entries, list):
         problem = "it is not a list of transforms, each with a parent and a child"
         raise RecordingError(problem, path=str(file), reason="foreign")
@@ -88,30 +99,30 @@ def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[Tr
     for number, entry in enumerate(entries, 1):
         try:
             samples.append(_sample(entry, authority))
-        except (ValueError, TypeError) as error:
-            raise RecordingError(f"transform {number}: {error}", path=str(file), reason="damaged") from error
+        except (ValueError, TypeError, ArithmeticError, LookupError, RecursionError) as error:
+            raise RecordingError(f"transform {number}: {error}"[:_LONGEST], path=str(file), reason="damaged") from error
     return samples
 
 
 def _parse(text: str) -> Any:
-    try:
+    with suppress(ValueError, RecursionError):
         return json.loads(text)
-    except ValueError:
-        pass
+    if len(text) > MAX_METADATA:
+        raise ValueError(f"it is no JSON, and YAML may have {MAX_METADATA:,} bytes")
     try:
         from ruamel.yaml import YAML
-        from ruamel.yaml.error import YAMLError
     except ImportError as error:
         raise ImportError(f"to read YAML, tfbus needs a package more: {pip_install('bag')}") from error
     try:
         return YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
-        raise ValueError(str(error)) from None
+    # For damaged text, a parser of YAML raises more than its own errors; deep nesting is one of recursion.
+    except Exception as error:  # noqa: BLE001
+        raise ValueError(str(error) or type(error).__name__) from None
 
 
 def _sample(entry: Any, authority: str) -> TransformStamped:
     if not isinstance(entry, Mapping):
-        raise ValueError(f"expected a parent, a child and numbers, not {entry!r}")  # noqa: TRY004 - the file is wrong
+        raise ValueError(f"expected a parent, a child and numbers, not {reprlib.repr(entry)}")  # noqa: TRY004 - the file is wrong
     if "transform" in entry:
         sample = TransformStamped.from_dict(entry)
         return sample.replace(stamp=0, static=True, authority=sample.authority or authority)
@@ -142,5 +153,5 @@ def _sample(entry: Any, authority: str) -> TransformStamped:
 
 def _numbers(name: str, value: Any) -> list[float]:
     if not isinstance(value, Sequence) or len(value) != _SIZES[name] or not all(map(is_real, value)):
-        raise ValueError(f"{name!r} is a list of {_SIZES[name]} numbers, not {value!r}")
+        raise ValueError(f"{name!r} is a list of {_SIZES[name]} numbers, not {reprlib.repr(value)}")
     return [float(number) for number in value]

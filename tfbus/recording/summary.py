@@ -214,8 +214,9 @@ class _Counts:
 
     def add_messages(self, messages: Iterable[RecordedMessage]) -> None:
         """Count messages one by one."""
-        for received, batch, errors in messages:
-            self.messages += 1
+        for message in messages:
+            received, batch, errors = message
+            self.messages += not message.is_report
             if errors:
                 self.problems.note(errors)
             self._add_batch(received, sound_samples(self.frames, batch, self.named, self.problems))

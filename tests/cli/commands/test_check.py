@@ -2,7 +2,7 @@ import json
 from pathlib import Path
 
 from support.commands import START, Command, check_wrong_call
-from support.recorded import write_mcap
+from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
 from tfbus import SECOND, Bus
@@ -34,7 +34,20 @@ def test_what_is_wrong_is_told_with_an_advice_and_status_1(tmp_path: Path, tfbus
 
 def test_a_file_without_its_end_is_examined_as_far_as_it_goes(tmp_path: Path, tfbus: Command) -> None:
     path = write_mcap(tmp_path / "run.mcap", LINES, finish=False)
-    assert tfbus("check", path).stderr == f"tfbus: {path} was not finished by its writer: this is what can be read\n"
+    done = tfbus("check", path)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.startswith("unfinished        10 messages were read of the file; it is cut, or")
+
+
+def test_a_finished_bag_that_is_cut_is_a_finding(tmp_path: Path, tfbus: Command) -> None:
+    path = tmp_path / "cut.bag"
+    # Its index is at its end, and its header tells where.
+    path.write_bytes(SMALL.read_bytes()[:-100])
+    done = tfbus("check", path, "--json")
+    assert done.returncode == 1
+    unfinished, *_ = json.loads(done.stdout)
+    assert unfinished["kind"] == "unfinished"
+    assert "it was finished once and is cut or damaged" in unfinished["detail"]
 
 
 def test_a_domain_is_examined_for_some_time(tfbus: Command) -> None:

@@ -117,7 +117,7 @@ def test_an_unfinished_file_is_marked_and_read(tmp_path: Path, tfbus: Command) -
     path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])], finish=False)
     done = tfbus("info", path)
     assert done.returncode == 0
-    assert done.stdout.splitlines()[0] == f"{path}, not finished by its writer"
+    assert done.stdout.splitlines()[0] == f"{path}, cut or not finished by its writer"
     assert "b" in rows_of(done.stdout)
 
 

@@ -214,7 +214,8 @@ def test_an_unfinished_recording_is_a_warning_on_standard_error(tmp_path: Path, 
     path = write_mcap(tmp_path / "run.mcap", [(1, "/tf", [moving("a", "b", 1)])], finish=False)
     done = tfbus("query", path, "a", "b", "--csv")
     assert (done.returncode, len(done.stdout.splitlines())) == (0, 2)
-    assert done.stderr == f"tfbus: {path} was not finished by its writer: this is what can be read\n"
+    why = "1 messages were read of the file; it is cut, or its writer did not finish it: its index is missing"
+    assert done.stderr == f"tfbus: left out of {path}: 1 x unfinished\ntfbus: {why}\n"
 
 
 def test_a_real_recording_has_the_transform_of_a_lookup(tfbus: Command) -> None:

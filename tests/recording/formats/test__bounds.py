@@ -12,7 +12,15 @@ def test_a_small_file_unfolds_to_64_mib_and_a_large_one_to_100_times_its_size() 
 
 def test_the_bounds_are_those_that_open_recording_tells() -> None:
     text = " ".join((open_recording.__doc__ or "").partition("Notes")[2].split())
-    names = ("MAX_MESSAGE", "MAX_OTHER_MESSAGE", "MAX_METADATA", "MIN_UNPACKED", "MAX_INDEX")
+    names = (
+        "MAX_MESSAGE",
+        "MAX_OTHER_MESSAGE",
+        "MAX_METADATA",
+        "MIN_UNPACKED",
+        "MAX_INDEX",
+        "MAX_DESCRIBED",
+        "MAX_OVERLAPPING",
+    )
     assert [int(number) * 2**20 for number in re.findall(r"(\d+) MiB", text)] == [
         getattr(_bounds, name) for name in names
     ]

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
-from support.recorded import batches_in, facts, messages_in, write_mcap
+from support.recorded import batches_in, facts, messages_in, without_unfinished, write_mcap
 from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
@@ -46,9 +46,9 @@ def damage(path: Path, part: bytes) -> None:
 
 
 def in_blocks(path: Path, since: int | None = None, until: int | None = None) -> list[RecordedMessage]:
-    """All messages of a recording, as they are in its blocks."""
+    """All messages of a recording, as they are in its blocks, without the report that its index is missing."""
     with open_recording(path) as recording:
-        return [message for block in recording.blocks(since, until) for message in block.messages()]
+        return without_unfinished(message for block in recording.blocks(since, until) for message in block.messages())
 
 
 def errors_in(messages: list[RecordedMessage]) -> list[str]:
@@ -529,7 +529,7 @@ def test_messages_on_channels_that_are_not_described_are_counted(write: Write, u
         assert recording.count is None
         for part in ((0, None), (None, 10**9)):
             assert len(list(recording.messages(*part))) > 0
-        assert len(list(recording.messages())) == len(EXPECTED) - 3 + 1
+        assert len(without_unfinished(recording.messages())) == len(EXPECTED) - 3 + 1
         assert recording.count == len(EXPECTED) - 3
 
 

@@ -49,7 +49,8 @@ def check(
 ) -> None:
     """Examine a recording, or a domain for some time, and say what is wrong, when, how often, and what to do.
 
-    The exit status is 0 if nothing is wrong and 1 if something is. A frame that never moves is only a hint.
+    The exit status is 0 if nothing is wrong and 1 if something is; a recording that is cut, or that its writer did not
+    finish, is wrong as well. A frame that never moves is only a hint.
 
     Example: tfbus check run.mcap
 
@@ -91,8 +92,6 @@ def _check_file(
     file: Path, topics: TopicOptions, limits: Limits, since: Instant | None, until: Instant | None
 ) -> list[Finding]:
     with topics.open(file) as recording, progress(recording.count, "reading") as advance:
-        if not recording.finished:
-            warn(f"{file} was not finished by its writer: this is what can be read")
         start = recording.start
         first = None if since is None else since.stamp(start)
         last = None if until is None else until.stamp(start)

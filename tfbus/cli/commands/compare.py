@@ -124,8 +124,8 @@ def _load(file: Path, topics: TopicOptions) -> TransformTree:
         remarks = recording.remarks
     if problems:
         warn(f"left out of {file}: {format_counts(problems)}")
-    for remark in remarks:
-        warn(f"{file}: {remark}")
+    for line in (*problems.details, *remarks):
+        warn(f"{file}: {line}")
     return tree
 
 

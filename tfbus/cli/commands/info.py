@@ -107,7 +107,7 @@ def _format_instant(stamp: int | None) -> str | None:
 
 
 def _heading(summary: RecordingSummary) -> list[str]:
-    lines = [printable(f"{summary.path}") + ("" if summary.finished else ", not finished by its writer")]
+    lines = [printable(f"{summary.path}") + ("" if summary.finished else ", cut or not finished by its writer")]
     if summary.start is not None and summary.end is not None:
         lines.append(f"start     {format_seconds(summary.start)} s{_format_date(summary.start)}")
         lines.append(f"end       {format_seconds(summary.end)} s{_format_date(summary.end)}")

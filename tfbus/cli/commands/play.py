@@ -153,7 +153,7 @@ def _log_times(
     """The log times, in ns, of the first and the last instant to play."""
     with topics.open(file) as recording:
         if not recording.finished:
-            warn(f"{file} was not finished by its writer: this is what can be read")
+            warn(f"{file} is cut, or its writer did not finish it: this is what can be read")
         start, end = recording.start, recording.end
         for remark in recording.remarks:
             warn(remark)

@@ -5,10 +5,12 @@ A record is a header, which is a list of named fields, and data; each of the two
 
 import re
 import struct
-from collections.abc import Iterator
 from typing import IO, Final, NamedTuple
 
+import numpy as np
+
 from tfbus.recording.formats._bounds import MAX_CHUNK, MAX_CHUNK_MESSAGES, MAX_INDEX
+from tfbus.recording.formats._storage import in_words
 from tfbus.recording.formats._unfold import unfold
 from tfbus.stamps import SECOND
 
@@ -144,10 +146,14 @@ def find_chunk(file: IO[bytes], offset: int) -> int | None:
         offset += len(block)
 
 
-def index_entries(data: bytes) -> Iterator[int]:
-    """The log times, in ns, of the messages in the data of an index record."""
-    for seconds, nanoseconds, _ in struct.iter_unpack("<III", data[: len(data) // _INDEX_ENTRY * _INDEX_ENTRY]):
-        yield seconds * SECOND + nanoseconds
+def index_span(data: bytes) -> tuple[int, int, int]:
+    """The first and the last log time, in ns, of the messages in the data of an index record, and their number."""
+    count = len(data) // _INDEX_ENTRY
+    if not count:
+        return 0, 0, 0
+    entries = np.frombuffer(data, "<u4", 3 * count).reshape(count, 3)
+    times = entries[:, 0].astype(np.int64) * SECOND + entries[:, 1]
+    return int(times.min()), int(times.max()), count
 
 
 def counts_in(data: bytes) -> dict[int, int]:
@@ -215,7 +221,7 @@ def split_chunk(data: bytes) -> Content:
             if len(messages) > MAX_CHUNK_MESSAGES:
                 raise ValueError(f"it has more than {MAX_CHUNK_MESSAGES:,} messages, which is the bound")
     except DAMAGE as error:
-        return content._replace(damage=str(error) or "a record is damaged")
+        return content._replace(damage=in_words(error))
     return content
 
 

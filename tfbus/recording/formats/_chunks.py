@@ -6,7 +6,8 @@ from itertools import pairwise
 from operator import itemgetter
 from typing import NamedTuple
 
-from tfbus.recording.formats._storage import StoredMessage
+from tfbus.recording.formats._bounds import MAX_OVERLAPPING, MESSAGE_SIZE
+from tfbus.recording.formats._storage import StoredMessage, lost_message
 
 _log_time = itemgetter(0)
 _END = 2**64
@@ -25,7 +26,8 @@ def merge_chunks(
 ) -> Iterator[list[StoredMessage]]:
     """Iterate over the messages of all chunks, many at once, in the order of their log times even if chunks overlap.
 
-    Messages of the same log time stay in the order of the file. Only the messages of chunks that overlap are in memory.
+    Messages of the same log time stay in the order of the file. Only the messages of chunks that overlap are in memory;
+    beyond `MAX_OVERLAPPING` they come before it is known that they are in order, and that is told once.
 
     Parameters
     ----------
@@ -38,6 +40,7 @@ def merge_chunks(
     in_file_order = all(before.offset < after.offset for before, after in pairwise(places))
     waiting: list[StoredMessage] = []
     origins: list[int] = []
+    told = False
     for number, place in enumerate(places, 1):
         following = places[number].start + in_file_order if number < len(places) else _END
         found = read(place)
@@ -51,6 +54,12 @@ def merge_chunks(
         waiting = [waiting[at] for at in order]
         origins = [origins[at] for at in order]
         ready = bisect_left(waiting, following, key=_log_time)
+        if sum(MESSAGE_SIZE + len(payload) for _, _, payload in waiting[ready:]) > MAX_OVERLAPPING:
+            ready = len(waiting)
+            if not told:
+                told = True
+                detail = f"chunks of more than {MAX_OVERLAPPING:,} bytes overlap: their messages are not in order"
+                yield [lost_message(waiting[0][0], detail)]
         yield waiting[:ready]
         del waiting[:ready], origins[:ready]
 

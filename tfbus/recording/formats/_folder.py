@@ -94,10 +94,10 @@ class FolderStorage:
                 raise ValueError(f"it has more than {MAX_METADATA:,} bytes, which is the bound")
             known = _as_yaml(path.read_bytes())["rosbag2_bagfile_information"]
             # Old versions of ROS 2 put the name of the folder before it.
-            names = [Path(str(name)).name for name in known["relative_file_paths"]]
+            names = [Path(_text(name)).name for name in known["relative_file_paths"]]
             counts = Counter[str]()
             for topic in known.get("topics_with_message_count") or ():
-                counts[str(topic["topic_metadata"]["name"])] += int(topic["message_count"])
+                counts[_text(topic["topic_metadata"]["name"])] += int(topic["message_count"])
             if not names:
                 raise ValueError("it names no file")
         except FileNotFoundError:
@@ -182,6 +182,13 @@ class FolderStorage:
             elif channels and all(map(wanted, channels)):
                 found = dict.fromkeys(channels, 0)
                 yield from shortfalls(now, {**found, channels[0]: count}, read)
+
+
+def _text(value: object) -> str:
+    """A name in the metadata; a text of anything else, such as of lists that are in each other, could be endless."""
+    if not isinstance(value, str):
+        raise TypeError(f"a name is a {type(value).__name__}")
+    return value
 
 
 def _as_yaml(text: bytes) -> Any:

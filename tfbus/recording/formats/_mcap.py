@@ -19,7 +19,7 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats._bounds import MAX_INDEX
+from tfbus.recording.formats._bounds import MAX_INDEX, MAX_PACKED, DescriptionBudget
 from tfbus.recording.formats._chunks import ChunkPlace, separate
 from tfbus.recording.formats._mcap_reading import IndexedChunk, McapReading
 from tfbus.recording.formats._mcap_records import (
@@ -32,7 +32,17 @@ from tfbus.recording.formats._mcap_records import (
     split_message,
 )
 from tfbus.recording.formats._packed import Packed, Stored, batches
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message, select, shortfalls
+from tfbus.recording.formats._storage import (
+    FINISHED_ONCE,
+    NEVER_FINISHED,
+    Channel,
+    StoredMessage,
+    Wanted,
+    lost_message,
+    select,
+    shortfalls,
+    unfinished,
+)
 from tfbus.stamps import STAMP_MAX
 
 _FOOTER = struct.Struct("<BQQQI8s")
@@ -73,6 +83,7 @@ class McapStorage:
             self.size = self._file.seek(0, 2)
             self._schemas: dict[int, records.Schema] = {}
             self._numbered: dict[int, Channel] = {}
+            self._budget = DescriptionBudget()
             self._chunks: list[IndexedChunk] = []
             self._statistics: records.Statistics | None = None
             self._counted: Counter[int] | None = None
@@ -123,11 +134,13 @@ class McapStorage:
             now = stored[0]
             yield stored
         yield from self._reports(reading, now, None if since is not None or until is not None else read)
+        if not self.finished and (until is None or self.end is None or until >= self.end):
+            yield unfinished(now, read, FINISHED_ONCE if reading.finished_once else NEVER_FINISHED)
 
     def packed(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[Stored]:
         """The messages of `messages`, many at once."""
         parts = separate([chunk.place for chunk in self._chunks])
-        if not parts or max(part.stop - part.start for part in parts) > _MOST_OVERLAPPING:
+        if not parts or any(self._is_large(self._chunks[part]) for part in parts):
             yield from batches(self.messages(wanted, since, until))
             return
         low = 0 if since is None else since
@@ -145,6 +158,11 @@ class McapStorage:
                 yield block
         reports = self._reports(reading, now, None if since is not None or until is not None else read)
         yield from batches(reports)
+
+    @staticmethod
+    def _is_large(chunks: list[IndexedChunk]) -> bool:
+        """Whether chunks that overlap are too many, or too large, to be in memory at once."""
+        return len(chunks) > _MOST_OVERLAPPING or sum(chunk.size for chunk in chunks) > MAX_PACKED
 
     def _reports(self, reading: McapReading, now: int, read: Counter[Channel] | None) -> Iterator[StoredMessage]:
         """The faults that a reading has found; `read` has the number of the messages, if none was left out."""
@@ -175,6 +193,7 @@ class McapStorage:
             # They would contradict what the chunks say.
             self._schemas.clear()
             self._numbered.clear()
+            self._budget = DescriptionBudget()
         return True
 
     def _checksum(self, start: int, end: int) -> int:
@@ -198,7 +217,11 @@ class McapStorage:
             if isinstance(record, records.ChunkIndex):
                 numbers = tuple(record.message_index_offsets)
                 place = ChunkPlace(record.message_start_time, record.message_end_time, record.chunk_start_offset)
-                chunks.append(IndexedChunk(place, record.chunk_length, shared.setdefault(numbers, numbers)))
+                chunks.append(
+                    IndexedChunk(
+                        place, record.chunk_length, record.uncompressed_size, shared.setdefault(numbers, numbers)
+                    )
+                )
             elif isinstance(record, records.Statistics):
                 statistics = record
             elif record is not None:
@@ -210,6 +233,8 @@ class McapStorage:
             statistics is not None
             and statistics.channel_message_counts.keys() <= self._numbered.keys()
             and kinds <= {0, *self._schemas}
+            # Else a small file could have one chunk read any number of times.
+            and len({chunk.place.offset for chunk in chunks}) == len(chunks)
         ):
             self._statistics = statistics
             self._chunks = sorted(chunks)
@@ -217,6 +242,8 @@ class McapStorage:
     def register(self, record: records.McapRecord) -> bool:
         """Note a schema or a channel; returns whether it agrees with what is known already."""
         if isinstance(record, records.Schema):
+            if record.id not in self._schemas:
+                self._budget.take(record.name, record.data)
             return self._schemas.setdefault(record.id, record) == record
         if not isinstance(record, records.Channel):
             return True
@@ -229,6 +256,8 @@ class McapStorage:
             b"" if schema is None else schema.data,
             record.metadata,
         )
+        if record.id not in self._numbered:
+            self._budget.take(record.topic, *record.metadata, *record.metadata.values())
         known = self._numbered.setdefault(record.id, channel)
         return all(getattr(known, name) == getattr(channel, name) for name in ("topic", "type", "encoding", "metadata"))
 
@@ -239,8 +268,10 @@ class McapStorage:
     @cached_property
     def _span(self) -> tuple[int, int] | None:
         if self._statistics is None:
-            spans = list(self._log_times())
-            return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
+            span: tuple[int, int] | None = None
+            for first, last in self._log_times():
+                span = (first, last) if span is None else (min(span[0], first), max(span[1], last))
+            return span
         if not self._statistics.message_count:
             return None
         return self._statistics.message_start_time, self._statistics.message_end_time

@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from io import FileIO
 from itertools import groupby
+from pathlib import Path
+from stat import S_ISREG
 from typing import Any, cast
 
 from tfbus.bus.sample_queue import TimedBatch
@@ -51,7 +53,7 @@ class McapOutput:
     Attributes
     ----------
     samples, messages : int
-        Samples and messages that the operating system has.
+        Samples and messages that the operating system has; none, once the file was removed or cut.
     buffered : int
         Samples in the unfinished chunk.
     unattributed : int
@@ -105,8 +107,9 @@ class McapOutput:
         Raises
         ------
         OSError
-            If the disk fails; then the file can only be closed.
+            If the disk fails, or somebody removed, replaced or cut the file; then the file can only be closed.
         """
+        self._check_file()
         messages = ((received, samples) for received, batch in batches for samples in _by_kind(batch))
         for number, (received, samples) in enumerate(messages, 1):
             self._write("/tf_static" if samples[0].static else "/tf", received, samples)
@@ -123,10 +126,13 @@ class McapOutput:
         Raises
         ------
         OSError
+            As `write`; also if the file is whole, and was moved meanwhile.
         """
         with self._file:
             self.write((), flush=True)
             self._writer.finish()
+            self._check_file()
+            self._file.check_path()
 
     def close(self) -> None:
         """Close the file without an index."""
@@ -160,6 +166,14 @@ class McapOutput:
         self._writer.add_message(channel, log_time, data, log_time)
         self._count_written()
 
+    def _check_file(self) -> None:
+        """Raise `OSError` if the file does not have all that was written, and count that as not written."""
+        try:
+            self._file.check()
+        except OSError:
+            self.samples = self.messages = 0
+            raise
+
     def _count_written(self) -> None:
         if self._file.size > self._written:
             self._written = self._file.size
@@ -187,6 +201,8 @@ class _UnbufferedFile:
     """A file for the writer, each write of which is complete and goes to the operating system at once."""
 
     def __init__(self, path: str, overwrite: bool) -> None:
+        # The working directory may change.
+        self._path = Path(path).absolute()
         self.size = 0
         self._file = FileIO(path, "w" if overwrite else "x")
 
@@ -197,6 +213,29 @@ class _UnbufferedFile:
             self.size += written
             rest = rest[written:]
         return len(data)
+
+    def check(self) -> None:
+        """Raise `OSError` if somebody removed, replaced or cut the file."""
+        status = os.fstat(self._file.fileno())
+        # A pipe or a device has no size.
+        if not S_ISREG(status.st_mode):
+            return
+        if not status.st_nlink:
+            raise OSError("somebody removed or replaced the file while it was recorded: nothing is left of it")
+        if status.st_size < self.size:
+            raise OSError(
+                f"somebody cut the file while it was recorded: it has {status.st_size:,} of {self.size:,} bytes"
+            )
+
+    def check_path(self) -> None:
+        """Raise `OSError` if the file was moved."""
+        status = os.fstat(self._file.fileno())
+        try:
+            moved = not os.path.samestat(self._path.stat(), status)
+        except FileNotFoundError:
+            moved = True
+        if moved and S_ISREG(status.st_mode):
+            raise OSError("somebody moved the file while it was recorded: it is whole, and elsewhere")
 
     def tell(self) -> int:
         return self.size

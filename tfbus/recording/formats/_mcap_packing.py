@@ -7,14 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap import records
-from mcap.exceptions import EndOfFile
 
 from tfbus.recording.formats._bounds import MAX_CHUNK_MESSAGES
 from tfbus.recording.formats._chunks import ChunkPlace
 from tfbus.recording.formats._mcap_records import DAMAGE, scan_chunks, split_chunk
 from tfbus.recording.formats._packed import Packed, Stored, in_order
 from tfbus.recording.formats._record_places import record_places
-from tfbus.recording.formats._storage import Channel, StoredMessage, lost_message
+from tfbus.recording.formats._storage import Channel, StoredMessage, in_words, lost_message
 
 
 class OpenChunk(NamedTuple):
@@ -94,5 +93,4 @@ class ChunkPacker:
 
 def lost_chunk(place: ChunkPlace, low: int, error: Exception) -> list[StoredMessage]:
     """A message in place of a chunk that cannot be read, at its first log time or at `low`, in ns."""
-    reason = str(error) if not isinstance(error, EndOfFile) else "it is cut off"
-    return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {reason}")]
+    return [lost_message(max(place.start, low), f"the chunk at byte {place.offset}: {in_words(error)}")]

@@ -21,7 +21,7 @@ from tfbus.recording.formats._mcap_records import (
     split_message,
 )
 from tfbus.recording.formats._packed import Stored
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message
+from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, in_words, lost_message
 
 _KINDS: Final[dict[int, str]] = {
     Opcode.CHUNK: "chunk",
@@ -42,6 +42,8 @@ class IndexedChunk(NamedTuple):
 
     place: ChunkPlace
     length: int
+    size: int
+    """Of its content, in bytes."""
     channels: tuple[int, ...]
 
 
@@ -78,6 +80,8 @@ class McapReading:
         Messages on channels that the file does not describe.
     contradictions : set of int
         Numbers of channels and schemas that are described in two ways.
+    finished_once : bool
+        Whether a reading in sequence has come to the end of the data, which a writer marks before its index.
     """
 
     def __init__(self, source: McapSource, wanted: Wanted) -> None:
@@ -86,12 +90,13 @@ class McapReading:
         self._counts: Counter[int] = Counter()
         self.unknown = 0
         self.contradictions: set[int] = set()
+        self.finished_once = False
 
     def by_index(self, low: int, high: int) -> Iterator[list[StoredMessage]]:
         """The messages of all chunks that overlap the range, in the order of their log times."""
         size = self._source.size
         places, too_long = [], set()
-        for place, length, numbers in self._source.index:
+        for place, length, _, numbers in self._source.index:
             # Without numbers, or with unknown ones, only reading the chunk tells what is in it.
             if place.start <= high and place.end >= low and (not numbers or any(map(self._may_be_wanted, numbers))):
                 places.append(place)
@@ -114,13 +119,18 @@ class McapReading:
         chunks: list[OpenChunk] = []
         size, enough = 0, _FIRST_BLOCK
         for part in separated:
-            for place, length, numbers in sorted(self._source.index[part], key=lambda chunk: chunk.place.offset):
+            for place, length, claimed, numbers in sorted(
+                self._source.index[part], key=lambda chunk: chunk.place.offset
+            ):
                 if place.start > high or place.end < low or (numbers and not any(map(self._may_be_wanted, numbers))):
                     continue
                 try:
                     if place.offset + length > self._source.size:
                         raise ValueError("it is behind the end of the file")
-                    chunk = OpenChunk(place, self._source.read_chunk(place.offset).unfold())
+                    read = self._source.read_chunk(place.offset)
+                    if read.size > claimed:
+                        raise ValueError(f"the index claims {claimed:,} bytes, and it has {read.size:,}")
+                    chunk = OpenChunk(place, read.unfold())
                 except (*DAMAGE, EndOfFile) as error:
                     yield from packer.pack(chunks, low, high)
                     chunks.clear()
@@ -137,17 +147,18 @@ class McapReading:
     def in_sequence(self, low: int) -> Iterator[list[StoredMessage]]:
         """All messages in the order of the file, up to its end; damage before `low` is reported at `low`."""
         now = low
-        summary = False
         try:
             for offset, opcode, content in self._source.records_from(len(MAGIC)):
                 # Behind the data, schemas and channels come again, and these copies may be the damaged part.
-                summary = summary or opcode == Opcode.DATA_END
-                if summary and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
+                self.finished_once = self.finished_once or opcode == Opcode.DATA_END
+                if self.finished_once and opcode not in (Opcode.CHUNK, Opcode.MESSAGE):
                     continue
                 try:
                     found = self._in_record(opcode, content)
                 except DAMAGE as error:
-                    found = [lost_message(now, f"the {_KINDS.get(opcode, 'record')} at byte {offset}: {error}")]
+                    found = [
+                        lost_message(now, f"the {_KINDS.get(opcode, 'record')} at byte {offset}: {in_words(error)}")
+                    ]
                 if found:
                     now = max(now, found[-1][0])
                     yield found

@@ -25,7 +25,7 @@ from tfbus.recording.formats._bag_records import (
     Record,
     counts_in,
     find_chunk,
-    index_entries,
+    index_span,
     number_in,
     parse_fields,
     read_chunk,
@@ -34,9 +34,20 @@ from tfbus.recording.formats._bag_records import (
     text_in,
     time_in,
 )
-from tfbus.recording.formats._bounds import MAX_INDEX
+from tfbus.recording.formats._bounds import MAX_INDEX, DescriptionBudget
 from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks
-from tfbus.recording.formats._storage import Channel, StoredMessage, Wanted, lost_message, select, shortfalls
+from tfbus.recording.formats._storage import (
+    FINISHED_ONCE,
+    NEVER_FINISHED,
+    Channel,
+    StoredMessage,
+    Wanted,
+    in_words,
+    lost_message,
+    select,
+    shortfalls,
+    unfinished,
+)
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 MAGIC: Final = b"#ROSBAG V"
@@ -88,9 +99,11 @@ class Ros1Storage:
                     reason="foreign",
                 )
             self._numbered: dict[int, Channel] = {}
+            self._budget = DescriptionBudget()
             self._chunks: list[_Chunk] = []
             self._damage: list[str] = []
             self._contradictions: set[int] = set()
+            self._finished_once = False
             self._counted: Counter[int] | None = None
             self.finished = self._read_index()
             if not self.finished:
@@ -189,6 +202,8 @@ class Ros1Storage:
                     {channel: promised[number] for number, channel in self._numbered.items() if wanted(channel)},
                     read,
                 )
+        if not self.finished and (until is None or until >= (self.end or 0)):
+            yield unfinished(now, read, FINISHED_ONCE if self._finished_once else NEVER_FINISHED)
 
     def _may_be_wanted(self, number: int, wanted: Wanted) -> bool:
         channel = self._numbered.get(number)
@@ -201,6 +216,8 @@ class Ros1Storage:
         try:
             header = read_record(self._file, len(_VERSION))
             at = number_in(header.fields, b"index_pos", 8)
+            # A writer leaves nothing there until it has written all chunks.
+            self._finished_once = at != 0
             missing = [number_in(header.fields, name) for name in (b"conn_count", b"chunk_count")]
             if header.kind == BAG_HEADER and header.end <= at <= self._size and self._size - at <= MAX_INDEX:
                 while at < self._size:
@@ -209,13 +226,15 @@ class Ros1Storage:
                     if at > self._size:
                         raise CutOffError("the index goes on behind the end of the file")
                     self._use_index_record(record, missing)
-                if not any(missing):
+                # Else a small file could have one chunk read any number of times.
+                if not any(missing) and len({chunk.offset for chunk in self._chunks}) == len(self._chunks):
                     return True
         except DAMAGE:
             # Then the chunks tell all of it.
             pass
         self._chunks.clear()
         self._numbered.clear()
+        self._budget = DescriptionBudget()
         return False
 
     def _use_index_record(self, record: Record, missing: list[int]) -> None:
@@ -249,11 +268,11 @@ class Ros1Storage:
                     # As every file that was cut, it ends inside of a record.
                     cause = error
                     break
-                self._damage.append(f"nothing can be read from byte {at} to byte {following}: {error}")
+                self._damage.append(f"nothing can be read from byte {at} to byte {following}: {in_words(error)}")
                 at = following
         if self._chunks:
             return
-        why = next(iter(self._damage), None) if cause is None or isinstance(cause, CutOffError) else cause
+        why = next(iter(self._damage), None) if cause is None or isinstance(cause, CutOffError) else in_words(cause)
         if why is not None:
             raise RecordingError(f"it cannot be read as a bag of ROS 1: {why}", path=str(self._path), reason="damaged")
         raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
@@ -271,27 +290,29 @@ class Ros1Storage:
         if torn and find_chunk(self._file, record.data) is not None:
             raise ValueError(f"a chunk claims {record.size:,} bytes")
         counts: dict[int, int] = {}
-        times: list[int] = []
+        ends: list[int] = []
         at = self._size if torn else record.end
         while at < self._size:
             try:
                 following = read_record(self._file, at)
                 if following.kind != INDEX or following.end > self._size:
                     break
-                entries = list(index_entries(following.read(self._file)))
-                counts[number_in(following.fields, b"conn")] = len(entries)
+                number = number_in(following.fields, b"conn")
+                first, last, count = index_span(following.read(self._file))
             except DAMAGE:
                 break
-            times += entries
+            counts[number] = count
+            if count:
+                ends = [min([first, *ends]), max([last, *ends])]
             at = following.end
         if not counts or not counts.keys() <= self._numbered.keys():
             content = self._content(record.offset, torn)
-            times = times or [received for received, _, _ in content.messages]
-            if not times and content.damage:
+            ends = ends or [received for received, _, _ in content.messages]
+            if not ends and content.damage:
                 # It has no log time, so it is told at the start.
                 self._damage.append(f"the chunk at byte {record.offset}: {content.damage}")
-        if times:
-            self._chunks.append(_Chunk(min(times), max(times), record.offset, counts or None))
+        if ends:
+            self._chunks.append(_Chunk(min(ends), max(ends), record.offset, counts or None))
         return at
 
     # Reading
@@ -308,7 +329,7 @@ class Ros1Storage:
             else:
                 content = split_chunk(read_chunk(self._file, record))
         except DAMAGE as error:
-            return Content([], [], str(error) or "its header is damaged")
+            return Content([], [], in_words(error))
         for fields, data in content.connections:
             with suppress(*DAMAGE):
                 self._register(fields, data)
@@ -326,6 +347,8 @@ class Ros1Storage:
             header.get(b"message_definition", b""),
             {name: text_in(header, name.encode()) for name in ("callerid", "md5sum", "latching")},
         )
+        if number not in self._numbered:
+            self._budget.take(data)
         known = self._numbered.setdefault(number, channel)
         if (known.topic, known.type) != (channel.topic, channel.type):
             self._contradictions.add(number)

@@ -51,6 +51,34 @@ def lost_message(received: int, detail: str) -> StoredMessage:
     return received, MalformedMessageError("damaged", detail), b""
 
 
+FINISHED_ONCE = "it was finished once and is cut or damaged: its index is missing"
+NEVER_FINISHED = "it is cut, or its writer did not finish it: its index is missing"
+
+
+def unfinished(received: int, read: Counter[Channel], why: str) -> StoredMessage:
+    """The report of a file without the end that its writer gives it.
+
+    Parameters
+    ----------
+    received : int
+        The log time of the report, in ns.
+    read : Counter of Channel
+        The number of messages that were read of each channel.
+    why : str
+        What shows it.
+    """
+    count = sum(number for channel, number in read.items() if isinstance(channel, Channel))
+    return received, MalformedMessageError("unfinished", f"{count:,} messages were read of the file; {why}"), b""
+
+
+def in_words(error: Exception) -> str:
+    """The fault that an error of a parser tells: what Python and others word for programmers is told in other words."""
+    if isinstance(error, UnicodeDecodeError):
+        return "a text in it is no text"
+    # `struct.error`, `KeyError` and the like have no words for people.
+    return str(error) if isinstance(error, ValueError) else "it ends inside of a record, or a record is damaged"
+
+
 _log_time = itemgetter(0)
 _channel = itemgetter(1)
 
@@ -143,7 +171,8 @@ class Storage(Protocol):
     def messages(self, wanted: Wanted, since: int | None = None, until: int | None = None) -> Iterator[StoredMessage]:
         """Iterate over the messages of some channels from one log time to another, inclusive, in their order.
 
-        An iteration without limits ends with a report of what the file promises and does not have.
+        An iteration without limits ends with a report of what the file promises and does not have. One that reaches the
+        end of a file without its index ends with `unfinished`.
         """
         ...
 
