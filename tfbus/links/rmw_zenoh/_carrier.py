@@ -125,11 +125,11 @@ class RmwZenohCarrier(RosCarrier):
         self, session: zenoh.Session, key: str, latched: bool, take: Callable[[zenoh.Sample], None]
     ) -> object:
         if not latched:
-            return session.declare_subscriber(key, directly(take))
+            return session.declare_subscriber(key, directly(take, self._receive))
         return zenoh.ext.declare_advanced_subscriber(
             session,
             key,
-            directly(take),
+            directly(take, self._receive),
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             subscriber_detection=True,

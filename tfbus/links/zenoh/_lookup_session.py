@@ -24,7 +24,6 @@ from tfbus.bus.once_logger import OnceLogger
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_at_exit, wait_until_closed
 from tfbus.links.zenoh._keys import NO_ROBOT, check_domain, check_robot
 from tfbus.links.zenoh._opening import open_session
-from tfbus.links.zenoh._session import directly
 from tfbus.links.zenoh._settings import Addresses, settings
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 
@@ -51,6 +50,17 @@ class Failures:
         with self._lock:
             self.count += 1
             self._log.warning((what, type(error)), "%s failed with %s", what, type(error).__name__, exc_info=error)
+
+    def guard(self, callback: Callable[[Any], object], end: Callable[[], object] | None = None) -> Any:
+        """Have something called in zenoh's threads, and then `end`; what it raises is noted."""
+
+        def call(thing: Any) -> None:
+            try:
+                callback(thing)
+            except Exception as error:  # noqa: BLE001 - zenoh would print it, and count nothing
+                self.note("a message of a lookup", error)
+
+        return zenoh.handlers.Callback(call, end, indirect=False)
 
 
 class LookupSession:
@@ -131,7 +141,7 @@ class LookupSession:
         """Have questions received in zenoh's threads, and announce a server."""
         session = self._opened()
         self._declared += [
-            session.declare_queryable(self.key("lookup"), directly(receive), complete=True),
+            session.declare_queryable(self.key("lookup"), self.failures.guard(receive), complete=True),
             session.liveliness().declare_token(self.key("@lookup", server)),
         ]
 
@@ -146,7 +156,9 @@ class LookupSession:
             note(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT)
 
         key = self.key(kind, "*")
-        self._declared.append(self._opened().liveliness().declare_subscriber(key, directly(receive), history=True))
+        self._declared.append(
+            self._opened().liveliness().declare_subscriber(key, self.failures.guard(receive), history=True)
+        )
 
     @property
     def is_closed(self) -> bool:
@@ -181,7 +193,7 @@ class LookupSession:
             try:
                 session.get(
                     self.key("lookup"),
-                    zenoh.handlers.Callback(take_reply, end, indirect=False),
+                    self.failures.guard(take_reply, end),
                     target=zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING,
                     payload=payload,
                     consolidation=zenoh.ConsolidationMode.NONE,

@@ -34,8 +34,30 @@ _URGENT = zenoh.Priority.INTERACTIVE_HIGH
 _SINCE = struct.Struct("<Q")
 _SECONDS = struct.Struct("<d")
 _LONGEST_NAME = 2**16
+_LONGEST_SHOWN_ERROR = 200
 _SERVES_FILTERS = "tfbus/state;filters"
 """The encoding of answers of a link that sends those who hear only some frames no more than these."""
+
+
+class OpenQuestion:
+    """A question of a peer; it is open until it is answered, or nobody refers to it any more.
+
+    Attributes
+    ----------
+    query : zenoh.Query
+    kind : str
+        The kind of key that was asked. The asker may have asked several by an expression.
+    """
+
+    __slots__ = ("__weakref__", "kind", "query")
+
+    def __init__(self, query: zenoh.Query, kind: str) -> None:
+        self.query = query
+        self.kind = kind
+
+    def drop(self) -> None:
+        """End the question, whether or not it was answered."""
+        self.query.drop()
 
 
 class ZenohSession:
@@ -104,7 +126,7 @@ class ZenohSession:
         self._session: zenoh.Session | None = None
         self.is_open = False
         self._declared: list[object] = []
-        self._questions = 0
+        self._questions = weakref.WeakSet[OpenQuestion]()
         self._close_at_exit: weakref.finalize[..., ZenohSession] | None = None
 
     def open(self) -> None:
@@ -144,27 +166,33 @@ class ZenohSession:
         # Whoever sees the token can ask at once. zenoh undeclares a token that nobody refers to.
         self._declared = [
             *(
-                session.declare_subscriber(key, directly(self._receive_live), allowed_origin=remote)
+                session.declare_subscriber(key, self._directly(self._receive_live), allowed_origin=remote)
                 for key in keys.heard("live")
             ),
             *(
-                session.declare_subscriber(key, directly(self._receive_slow(rate)), allowed_origin=remote)
+                session.declare_subscriber(key, self._directly(self._receive_slow(rate)), allowed_origin=remote)
                 for key, rate in keys.slow()
             ),
             # Before presence, so that what goes to a peer is known when the peer is.
-            session.liveliness().declare_subscriber(keys.filter_tokens(), directly(self._receive_filter), history=True),
+            session.liveliness().declare_subscriber(
+                keys.filter_tokens(), self._directly(self._receive_filter), history=True
+            ),
             *(
-                session.liveliness().declare_subscriber(key, directly(self._receive_presence), history=True)
+                session.liveliness().declare_subscriber(key, self._directly(self._receive_presence), history=True)
                 for key in keys.heard("@alive")
             ),
-            session.declare_queryable(keys.own("state"), directly(self._receive_question)),
-            session.declare_queryable(keys.own("history"), directly(self._receive_history_question)),
-            *([session.declare_queryable(keys.own("hears"), directly(self._note_asked))] if self._note_asked else []),
+            session.declare_queryable(keys.own("state"), self._directly(self._receive_question)),
+            session.declare_queryable(keys.own("history"), self._directly(self._receive_history_question)),
+            *(
+                [session.declare_queryable(keys.own("hears"), self._directly(self._note_asked))]
+                if self._note_asked
+                else []
+            ),
             *([session.liveliness().declare_token(keys.filter_token(self._name))] if keys.filter else []),
             session.liveliness().declare_token(keys.token(self._name)),
         ]
         if self._note_connection is not None:
-            listener = session.info.declare_link_events_listener(directly(self._receive_connection), history=True)
+            listener = session.info.declare_link_events_listener(self._directly(self._receive_connection), history=True)
             self._declared.append(listener)
         self.is_open = True
 
@@ -182,7 +210,7 @@ class ZenohSession:
         for peer in peers - self._unfiltered.keys():
             self._unfiltered[peer] = self.session.declare_subscriber(
                 self._keys.of("live", peer, ANY_ROBOT),
-                directly(self._receive_all),
+                self._directly(self._receive_all),
                 allowed_origin=zenoh.Locality.REMOTE,
             )
 
@@ -231,7 +259,7 @@ class ZenohSession:
         try:
             self.session.get(
                 self._key(kind, peer),
-                zenoh.handlers.Callback(take, end, indirect=False),
+                self._directly(take, end),
                 payload=payload,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_TIME,
@@ -265,7 +293,7 @@ class ZenohSession:
         with suppress(zenoh.ZError):
             self.session.get(
                 self._key("hears", peer),
-                zenoh.handlers.Callback(take_reply, end, indirect=False),
+                self._directly(take_reply, end),
                 payload=self._keys.token(FIRST_SESSION),
                 timeout=_HEARING_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
@@ -280,18 +308,17 @@ class ZenohSession:
                 query.reply(self._keys.own("hears"), ",".join(names)[:MOST_NAMES], attachment=named or None)
             query.drop()
 
-    def answer(self, question: zenoh.Query, message: Message) -> None:
+    def answer(self, question: OpenQuestion, message: Message) -> None:
         """Answer a question; may block, because zenoh waits for a peer whose queue is full."""
         encoding = zenoh.Encoding(_SERVES_FILTERS) if self._filters.are_served else None
+        key = self._keys.own(question.kind)
         try:
             # A peer that has gone needs no answer.
             with suppress(zenoh.ZError):
-                kind = str(question.key_expr).rsplit("/", 2)[1]
-                question.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
+                question.query.reply(key, message.payload, attachment=message.attachment, encoding=encoding)
         finally:
             question.drop()
-            with self._lock:
-                self._questions -= 1
+            self._questions.discard(question)
 
     def close(self) -> threading.Thread:
         """Begin to close the session, also one that is still being opened.
@@ -370,30 +397,32 @@ class ZenohSession:
             self._note_connection(str(event.link.zid), event.link.src, event.link.dst)
 
     def _receive_question(self, query: zenoh.Query) -> None:
+        payload = b"" if query.payload is None else query.payload.to_bytes()
+        if len(payload) != _SINCE.size:
+            raise MalformedMessageError("question", f"a question for changes has {len(payload)} bytes")
+        self._admit(Question(_SINCE.unpack(payload)[0], OpenQuestion(query, "state")))
         if query.attachment is not None and self._note_heard is not None:
             self._note_heard(query.attachment.to_bytes()[:MOST_NAMES])
-        payload = b"" if query.payload is None else query.payload.to_bytes()
-        self._admit(query, Question(_SINCE.unpack(payload)[0], query) if len(payload) == _SINCE.size else None)
 
     def _receive_history_question(self, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        question = None
-        if _SECONDS.size <= len(payload) <= _SECONDS.size + _LONGEST_NAME:
-            seconds = _SECONDS.unpack_from(payload)[0]
-            with suppress(UnicodeDecodeError):
-                after = payload[_SECONDS.size :].decode()
-                question = HistoryQuestion(seconds, after, query) if 0 < seconds <= LONGEST_HISTORY else None
-        self._admit(query, question)
+        if not _SECONDS.size <= len(payload) <= _SECONDS.size + _LONGEST_NAME:
+            raise MalformedMessageError("question", f"a question for the past has {len(payload)} bytes")
+        seconds = _SECONDS.unpack_from(payload)[0]
+        if not 0 < seconds <= LONGEST_HISTORY:
+            raise MalformedMessageError("question", f"a question for the last {seconds} s")
+        after = payload[_SECONDS.size :].decode()
+        self._admit(HistoryQuestion(seconds, after, OpenQuestion(query, "history")))
 
-    def _admit(self, query: zenoh.Query, question: Question | HistoryQuestion | None) -> None:
+    def _admit(self, question: Question | HistoryQuestion) -> None:
         with self._lock:
-            admitted = question is not None and self._questions < MOST_QUESTIONS
-            self._questions += admitted
-        if admitted:
-            self._receive(Received("", question))
-        else:
+            admitted = len(self._questions) < MOST_QUESTIONS
+            if admitted:
+                self._questions.add(question.handle)
+        if not admitted:
             # Whoever means it asks again.
-            query.drop()
+            raise MalformedMessageError("busy", f"{MOST_QUESTIONS} questions wait for answers")
+        self._receive(Received("", question))
 
     def _key(self, kind: str, peer: str) -> str:
         return self._keys.of(kind, peer, self._robot_of(peer))
@@ -413,7 +442,32 @@ class ZenohSession:
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
         self._receive(Received(sender, MalformedMessageError(reason, detail)))
 
+    def _directly(self, callback: Callable[[Any], object], end: Callable[[], object] | None = None) -> Any:
+        return directly(callback, self._receive, end)
 
-def directly(callback: Callable[[Any], object]) -> Any:
+
+def directly(
+    callback: Callable[[Any], object], refused: Callable[[Received], object], end: Callable[[], object] | None = None
+) -> Any:
+    """Have something called in zenoh's threads with what strangers send, and then `end`.
+
+    What it raises is no end of anything: it is passed to `refused` as an item, which is counted as refused.
+    """
+
+    def call(thing: Any) -> None:
+        try:
+            callback(thing)
+        except Exception as error:  # noqa: BLE001 - zenoh would print it, and count nothing
+            refused(refusal(error))
+
     # Otherwise each subscriber has a thread of its own, and one overtakes the other.
-    return zenoh.handlers.Callback(callback, indirect=False)
+    return zenoh.handlers.Callback(call, end, indirect=False)
+
+
+def refusal(error: Exception, sender: str = "") -> Received:
+    """The item by which a link counts that something of a stranger could not be used."""
+    if not isinstance(error, MalformedMessageError):
+        detail = f"{type(error).__name__}: {error}"[:_LONGEST_SHOWN_ERROR]
+        error = MalformedMessageError("unreadable", detail)
+    # The traceback would keep what was sent.
+    return Received(sender, error.with_traceback(None))

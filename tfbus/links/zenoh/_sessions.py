@@ -28,14 +28,16 @@ from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._introductions import Introductions
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._listening import Listening
-from tfbus.links.zenoh._notes import MOST_ASKING, Notes
+from tfbus.links.zenoh._notes import MOST_ASKING, Noted, Notes
 from tfbus.links.zenoh._patch import Patch
 from tfbus.links.zenoh._present import Present
-from tfbus.links.zenoh._session import ZenohSession
+from tfbus.links.zenoh._session import OpenQuestion, ZenohSession, refusal
 from tfbus.links.zenoh._unmet import Unmet
+from tfbus.tf_message import MalformedMessageError
 
 _MEETING_TIME = 10.0
 """s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
+_LONGEST_SHOWN_TOKEN = 100
 
 
 class ZenohSessions:
@@ -159,7 +161,7 @@ class ZenohSessions:
         patch = self._patches.get(peer)
         return patch if patch is not None and patch.is_open else self._main
 
-    def answer(self, question: zenoh.Query, message: Message) -> None:
+    def answer(self, question: OpenQuestion, message: Message) -> None:
         """Answer a question, in a thread, because zenoh may wait for a peer that is frozen."""
         self._answering.submit(self._main.answer, question, message).add_done_callback(_log_failure)
 
@@ -185,32 +187,44 @@ class ZenohSessions:
                 began = monotonic()
                 await anyio.sleep(interval)
                 late = monotonic() - min(began, self._notes.since) > 3 * interval
-                noted = self._notes.take()
-                connected = [self._reached(*connection) for connection in noted.connected]
-                self._note(noted.changes)
-                for peer, _ in connected:
-                    if self._present.is_direct(peer):
-                        self._hearing.joined(peer)
-                for peer in noted.hearers:
-                    self._hearing.is_heard(peer)
-                for peer, names, named in noted.heard_by:
-                    # Where this loop has no time, nobody's silence proves anything, and many have not come yet.
-                    if names is not None or not late:
-                        self._judge(peer, names)
-                    if not late:
-                        self._introductions.take(named, self._present)
-                # Before all that may wait for zenoh; who is due after this is dialled in the next round.
-                self._dial(self._dialing.take_due(), tasks)
-                if noted.asking:
-                    self._answer_hearing(noted.asking)
-                if self._keys.filter:
-                    self._hear_unserved()
-                for peer in self._hearing.take_due():
-                    self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
-                self._ask_for_missing()
-                self._closing = [closing for closing in self._closing if closing.is_alive()]
-                unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
-                self._dial(unmet, tasks)
+                try:
+                    await self._look_after(self._notes.take(), late, tasks)
+                except Exception as error:  # noqa: BLE001 - no peer may end the link
+                    self._receive(refusal(error))
+
+    async def _look_after(self, noted: Noted, late: bool, tasks: TaskGroup) -> None:
+        """Do what the notes ask for, and what is due; `late` is whether this loop has had no time."""
+        connected = [self._reached(*connection) for connection in noted.connected]
+        self._note(noted.changes)
+        for peer, _ in connected:
+            if self._present.is_direct(peer):
+                self._hearing.joined(peer)
+        for peer in noted.hearers:
+            self._hearing.is_heard(peer)
+        for peer, names, named in noted.heard_by:
+            # Where this loop has no time, nobody's silence proves anything, and many have not come yet.
+            if names is not None or not late:
+                self._judge(peer, names)
+            if not late:
+                self._take_introduction(peer, named)
+        # Before all that may wait for zenoh; who is due after this is dialled in the next round.
+        self._dial(self._dialing.take_due(), tasks)
+        if noted.asking:
+            self._answer_hearing(noted.asking)
+        if self._keys.filter:
+            self._hear_unserved()
+        for peer in self._hearing.take_due():
+            self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
+        self._ask_for_missing()
+        self._closing = [closing for closing in self._closing if closing.is_alive()]
+        unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
+        self._dial(unmet, tasks)
+
+    def _take_introduction(self, peer: str, named: bytes) -> None:
+        try:
+            self._introductions.take(named, self._present)
+        except MalformedMessageError as error:
+            self._receive(refusal(error, peer))
 
     def _reached(self, peer: str, near: str, far: str) -> tuple[str, str | None]:
         """Note a connection that has come or gone; returns where the peer listens, or None if it has dialled."""
@@ -317,22 +331,43 @@ class ZenohSessions:
         asker = self._asker(query)
         if asker is None or query.attachment is None:
             return b""
-        return self._introductions.answer(query.attachment.to_bytes(), asker, self._present.robots())
+        try:
+            return self._introductions.answer(query.attachment.to_bytes(), asker, self._present.robots())
+        except MalformedMessageError as error:
+            self._receive(refusal(error, asker))
+            return b""
 
     def _asker(self, query: zenoh.Query) -> str | None:
         """The link that asks whether it is heard; None for one that this link does not mean to hear."""
         return self._keys.heard_link(b"" if query.payload is None else query.payload.to_bytes())
 
     def _note_asked(self, query: zenoh.Query) -> None:
-        if self._asker(query) is None or not self._notes.add_question(query):
+        self._check_token(b"" if query.payload is None else query.payload.to_bytes())
+        if self._asker(query) is None:
+            # It is not meant to be heard.
             query.drop()
+        elif not self._notes.add_question(query):
+            raise MalformedMessageError("busy", f"{MOST_ASKING} links ask whether they are heard")
+
+    def _check_token(self, token: bytes) -> None:
+        if self._keys.session(token.decode("ascii", "replace")) is None:
+            raise MalformedMessageError("token", f"no link has the token {token[:_LONGEST_SHOWN_TOKEN]!r}")
 
     def _note_heard(self, token: bytes) -> None:
+        self._check_token(token)
         peer = self._keys.heard_link(token)
         if peer is not None:
             self._notes.add_hearer(peer)
 
     async def _patch(self, peer: str, address: str) -> None:
+        try:
+            await self._dial_and_meet(peer, address)
+        except Exception as error:  # noqa: BLE001 - no address that a peer names may end the link
+            self._drop_patch(peer)
+            self._dialing.taken(peer, address)
+            self._receive(refusal(error, peer))
+
+    async def _dial_and_meet(self, peer: str, address: str) -> None:
         try:
             reachable = await is_reachable(address)
         except ConnectionRefusedError:

@@ -20,7 +20,6 @@ from tfbus.bus.sample_queue import check_capacity
 from tfbus.errors import MAY_COME, RemoteLookupError, TransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import (
-    MAX_BYTES,
     Cancellation,
     RemoteQuestion,
     as_timeout,
@@ -249,7 +248,8 @@ class BufferServer:
         """Count an answer and send it; no error of one question ends the thread or the task."""
         try:
             if isinstance(answer, Exception) and not isinstance(answer, (TransformError, TypeError, ValueError)):
-                raise answer  # noqa: TRY301 - as one that cannot be written
+                # As one that cannot be written.
+                raise answer
             message = write_answer(answer)
         except Exception as error:  # noqa: BLE001 - the next question is answered
             self._session.failures.note("a lookup of another process", error)
