@@ -32,7 +32,7 @@ from tfbus.links.rmw_zenoh._wire import (
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
-from tfbus.links.zenoh._session import directly
+from tfbus.links.zenoh._opening import directly, refusal
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import encode
 
@@ -125,15 +125,18 @@ class RmwZenohCarrier(RosCarrier):
         self, session: zenoh.Session, key: str, latched: bool, take: Callable[[zenoh.Sample], None]
     ) -> object:
         if not latched:
-            return session.declare_subscriber(key, directly(take, self._receive))
+            return session.declare_subscriber(key, self._directly(take))
         return zenoh.ext.declare_advanced_subscriber(
             session,
             key,
-            directly(take, self._receive),
+            self._directly(take),
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             subscriber_detection=True,
         )
+
+    def _directly(self, take: Callable[[zenoh.Sample], None]) -> Any:
+        return directly(take, lambda error: self._receive(refusal(error, _AUTHORITY)))
 
     async def close(self) -> None:
         """Close the session, or give up waiting for that."""

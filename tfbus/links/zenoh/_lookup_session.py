@@ -23,7 +23,7 @@ import zenoh
 from tfbus.bus.once_logger import OnceLogger
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_at_exit, wait_until_closed
 from tfbus.links.zenoh._keys import NO_ROBOT, check_domain, check_robot
-from tfbus.links.zenoh._opening import open_session
+from tfbus.links.zenoh._opening import directly, open_session
 from tfbus.links.zenoh._settings import Addresses, settings
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 
@@ -45,22 +45,11 @@ class Failures:
         self._lock = threading.Lock()
         self._log = OnceLogger(logging.getLogger("tfbus"))
 
-    def note(self, what: str, error: Exception) -> None:
+    def note(self, error: Exception, what: str = "a message of a lookup") -> None:
         """Count an error, and log the first of its type; for any thread."""
         with self._lock:
             self.count += 1
             self._log.warning((what, type(error)), "%s failed with %s", what, type(error).__name__, exc_info=error)
-
-    def guard(self, callback: Callable[[Any], object], end: Callable[[], object] | None = None) -> Any:
-        """Have something called in zenoh's threads, and then `end`; what it raises is noted."""
-
-        def call(thing: Any) -> None:
-            try:
-                callback(thing)
-            except Exception as error:  # noqa: BLE001 - zenoh would print it, and count nothing
-                self.note("a message of a lookup", error)
-
-        return zenoh.handlers.Callback(call, end, indirect=False)
 
 
 class LookupSession:
@@ -141,7 +130,7 @@ class LookupSession:
         """Have questions received in zenoh's threads, and announce a server."""
         session = self._opened()
         self._declared += [
-            session.declare_queryable(self.key("lookup"), self.failures.guard(receive), complete=True),
+            session.declare_queryable(self.key("lookup"), directly(receive, self.failures.note), complete=True),
             session.liveliness().declare_token(self.key("@lookup", server)),
         ]
 
@@ -157,7 +146,7 @@ class LookupSession:
 
         key = self.key(kind, "*")
         self._declared.append(
-            self._opened().liveliness().declare_subscriber(key, self.failures.guard(receive), history=True)
+            self._opened().liveliness().declare_subscriber(key, directly(receive, self.failures.note), history=True)
         )
 
     @property
@@ -193,7 +182,7 @@ class LookupSession:
             try:
                 session.get(
                     self.key("lookup"),
-                    self.failures.guard(take_reply, end),
+                    directly(take_reply, self.failures.note, end),
                     target=zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING,
                     payload=payload,
                     consolidation=zenoh.ConsolidationMode.NONE,
@@ -242,7 +231,7 @@ def _send_all(sending: _Sending, failures: Failures) -> None:
         try:
             send()
         except Exception as error:  # noqa: BLE001 - the next one is sent
-            failures.note("a message of a lookup", error)
+            failures.note(error)
         # It refers to the session, which is closed when nobody else does.
         del send
 

@@ -18,7 +18,7 @@ from tfbus.links.zenoh._closing import begin_to_close, close_session
 from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._keys import ANY_ROBOT, FIRST_SESSION, Keys
 from tfbus.links.zenoh._newest import Thinning
-from tfbus.links.zenoh._opening import open_session
+from tfbus.links.zenoh._opening import OpenQuestion, directly, open_session, refusal
 from tfbus.links.zenoh._publishers import Publishers
 from tfbus.tf_message import MalformedMessageError
 
@@ -34,30 +34,8 @@ _URGENT = zenoh.Priority.INTERACTIVE_HIGH
 _SINCE = struct.Struct("<Q")
 _SECONDS = struct.Struct("<d")
 _LONGEST_NAME = 2**16
-_LONGEST_SHOWN_ERROR = 200
 _SERVES_FILTERS = "tfbus/state;filters"
 """The encoding of answers of a link that sends those who hear only some frames no more than these."""
-
-
-class OpenQuestion:
-    """A question of a peer; it is open until it is answered, or nobody refers to it any more.
-
-    Attributes
-    ----------
-    query : zenoh.Query
-    kind : str
-        The kind of key that was asked. The asker may have asked several by an expression.
-    """
-
-    __slots__ = ("__weakref__", "kind", "query")
-
-    def __init__(self, query: zenoh.Query, kind: str) -> None:
-        self.query = query
-        self.kind = kind
-
-    def drop(self) -> None:
-        """End the question, whether or not it was answered."""
-        self.query.drop()
 
 
 class ZenohSession:
@@ -166,33 +144,29 @@ class ZenohSession:
         # Whoever sees the token can ask at once. zenoh undeclares a token that nobody refers to.
         self._declared = [
             *(
-                session.declare_subscriber(key, self._directly(self._receive_live), allowed_origin=remote)
+                session.declare_subscriber(key, self._door(self._receive_live), allowed_origin=remote)
                 for key in keys.heard("live")
             ),
             *(
-                session.declare_subscriber(key, self._directly(self._receive_slow(rate)), allowed_origin=remote)
+                session.declare_subscriber(key, self._door(self._receive_slow(rate)), allowed_origin=remote)
                 for key, rate in keys.slow()
             ),
             # Before presence, so that what goes to a peer is known when the peer is.
             session.liveliness().declare_subscriber(
-                keys.filter_tokens(), self._directly(self._receive_filter), history=True
+                keys.filter_tokens(), self._door(self._receive_filter), history=True
             ),
             *(
-                session.liveliness().declare_subscriber(key, self._directly(self._receive_presence), history=True)
+                session.liveliness().declare_subscriber(key, self._door(self._receive_presence), history=True)
                 for key in keys.heard("@alive")
             ),
-            session.declare_queryable(keys.own("state"), self._directly(self._receive_question)),
-            session.declare_queryable(keys.own("history"), self._directly(self._receive_history_question)),
-            *(
-                [session.declare_queryable(keys.own("hears"), self._directly(self._note_asked))]
-                if self._note_asked
-                else []
-            ),
+            session.declare_queryable(keys.own("state"), self._door(self._receive_question)),
+            session.declare_queryable(keys.own("history"), self._door(self._receive_history_question)),
+            *([session.declare_queryable(keys.own("hears"), self._door(self._note_asked))] if self._note_asked else []),
             *([session.liveliness().declare_token(keys.filter_token(self._name))] if keys.filter else []),
             session.liveliness().declare_token(keys.token(self._name)),
         ]
         if self._note_connection is not None:
-            listener = session.info.declare_link_events_listener(self._directly(self._receive_connection), history=True)
+            listener = session.info.declare_link_events_listener(self._door(self._receive_connection), history=True)
             self._declared.append(listener)
         self.is_open = True
 
@@ -210,7 +184,7 @@ class ZenohSession:
         for peer in peers - self._unfiltered.keys():
             self._unfiltered[peer] = self.session.declare_subscriber(
                 self._keys.of("live", peer, ANY_ROBOT),
-                self._directly(self._receive_all),
+                self._door(self._receive_all),
                 allowed_origin=zenoh.Locality.REMOTE,
             )
 
@@ -259,7 +233,7 @@ class ZenohSession:
         try:
             self.session.get(
                 self._key(kind, peer),
-                self._directly(take, end),
+                self._door(take, end),
                 payload=payload,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_TIME,
@@ -293,7 +267,7 @@ class ZenohSession:
         with suppress(zenoh.ZError):
             self.session.get(
                 self._key("hears", peer),
-                self._directly(take_reply, end),
+                self._door(take_reply, end),
                 payload=self._keys.token(FIRST_SESSION),
                 timeout=_HEARING_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
@@ -424,6 +398,9 @@ class ZenohSession:
             raise MalformedMessageError("busy", f"{MOST_QUESTIONS} questions wait for answers")
         self._receive(Received("", question))
 
+    def _door(self, callback: Callable[[Any], object], end: Callable[[], object] | None = None) -> Any:
+        return directly(callback, lambda error: self._receive(refusal(error)), end)
+
     def _key(self, kind: str, peer: str) -> str:
         return self._keys.of(kind, peer, self._robot_of(peer))
 
@@ -441,33 +418,3 @@ class ZenohSession:
 
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
         self._receive(Received(sender, MalformedMessageError(reason, detail)))
-
-    def _directly(self, callback: Callable[[Any], object], end: Callable[[], object] | None = None) -> Any:
-        return directly(callback, self._receive, end)
-
-
-def directly(
-    callback: Callable[[Any], object], refused: Callable[[Received], object], end: Callable[[], object] | None = None
-) -> Any:
-    """Have something called in zenoh's threads with what strangers send, and then `end`.
-
-    What it raises is no end of anything: it is passed to `refused` as an item, which is counted as refused.
-    """
-
-    def call(thing: Any) -> None:
-        try:
-            callback(thing)
-        except Exception as error:  # noqa: BLE001 - zenoh would print it, and count nothing
-            refused(refusal(error))
-
-    # Otherwise each subscriber has a thread of its own, and one overtakes the other.
-    return zenoh.handlers.Callback(call, end, indirect=False)
-
-
-def refusal(error: Exception, sender: str = "") -> Received:
-    """The item by which a link counts that something of a stranger could not be used."""
-    if not isinstance(error, MalformedMessageError):
-        detail = f"{type(error).__name__}: {error}"[:_LONGEST_SHOWN_ERROR]
-        error = MalformedMessageError("unreadable", detail)
-    # The traceback would keep what was sent.
-    return Received(sender, error.with_traceback(None))

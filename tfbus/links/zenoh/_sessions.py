@@ -29,15 +29,15 @@ from tfbus.links.zenoh._introductions import Introductions
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._listening import Listening
 from tfbus.links.zenoh._notes import MOST_ASKING, Noted, Notes
+from tfbus.links.zenoh._opening import OpenQuestion, guarded, refusal
 from tfbus.links.zenoh._patch import Patch
 from tfbus.links.zenoh._present import Present
-from tfbus.links.zenoh._session import OpenQuestion, ZenohSession, refusal
+from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._unmet import Unmet
 from tfbus.tf_message import MalformedMessageError
 
 _MEETING_TIME = 10.0
 """s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
-_LONGEST_SHOWN_TOKEN = 100
 
 
 class ZenohSessions:
@@ -71,17 +71,9 @@ class ZenohSessions:
         self._filters = Filters(keys.robot)
         self._unserved: set[str] = set()
         self._present = Present(receive, self._notes.add_change)
+        notes = self._note_asked, self._notes.add_connection, self._note_heard, self._filters, self._note_served
         self._main = ZenohSession(
-            config,
-            keys,
-            receive,
-            self._note_directly,
-            note_asked=self._note_asked,
-            note_connection=self._notes.add_connection,
-            note_heard=self._note_heard,
-            filters=self._filters,
-            note_served=self._note_served,
-            robot_of=self._present.robot,
+            config, keys, receive, self._note_directly, FIRST_SESSION, *notes, self._present.robot
         )
         self._patches: dict[str, Patch] = {}
         self._dialing = Dialing(monotonic) if dialing is None else dialing
@@ -206,7 +198,7 @@ class ZenohSessions:
             if names is not None or not late:
                 self._judge(peer, names)
             if not late:
-                self._take_introduction(peer, named)
+                guarded(self._receive, peer, self._introductions.take, named, self._present)
         # Before all that may wait for zenoh; who is due after this is dialled in the next round.
         self._dial(self._dialing.take_due(), tasks)
         if noted.asking:
@@ -219,12 +211,6 @@ class ZenohSessions:
         self._closing = [closing for closing in self._closing if closing.is_alive()]
         unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
         self._dial(unmet, tasks)
-
-    def _take_introduction(self, peer: str, named: bytes) -> None:
-        try:
-            self._introductions.take(named, self._present)
-        except MalformedMessageError as error:
-            self._receive(refusal(error, peer))
 
     def _reached(self, peer: str, near: str, far: str) -> tuple[str, str | None]:
         """Note a connection that has come or gone; returns where the peer listens, or None if it has dialled."""
@@ -331,30 +317,23 @@ class ZenohSessions:
         asker = self._asker(query)
         if asker is None or query.attachment is None:
             return b""
-        try:
-            return self._introductions.answer(query.attachment.to_bytes(), asker, self._present.robots())
-        except MalformedMessageError as error:
-            self._receive(refusal(error, asker))
-            return b""
+        known, answer = query.attachment.to_bytes(), self._introductions.answer
+        return guarded(self._receive, asker, answer, known, asker, self._present.robots()) or b""
 
     def _asker(self, query: zenoh.Query) -> str | None:
         """The link that asks whether it is heard; None for one that this link does not mean to hear."""
         return self._keys.heard_link(b"" if query.payload is None else query.payload.to_bytes())
 
     def _note_asked(self, query: zenoh.Query) -> None:
-        self._check_token(b"" if query.payload is None else query.payload.to_bytes())
+        self._keys.check_token(b"" if query.payload is None else query.payload.to_bytes())
         if self._asker(query) is None:
             # It is not meant to be heard.
             query.drop()
         elif not self._notes.add_question(query):
             raise MalformedMessageError("busy", f"{MOST_ASKING} links ask whether they are heard")
 
-    def _check_token(self, token: bytes) -> None:
-        if self._keys.session(token.decode("ascii", "replace")) is None:
-            raise MalformedMessageError("token", f"no link has the token {token[:_LONGEST_SHOWN_TOKEN]!r}")
-
     def _note_heard(self, token: bytes) -> None:
-        self._check_token(token)
+        self._keys.check_token(token)
         peer = self._keys.heard_link(token)
         if peer is not None:
             self._notes.add_hearer(peer)
@@ -376,16 +355,8 @@ class ZenohSessions:
         if not reachable or peer in self._patches:
             return
         config = self._patch_config(address)
-        patch = Patch(
-            config,
-            self._keys,
-            peer,
-            self._receive,
-            self._note_by_patch,
-            self._filters,
-            self._note_served,
-            self._present.robot,
-        )
+        notes = self._note_by_patch, self._filters, self._note_served, self._present.robot
+        patch = Patch(config, self._keys, peer, self._receive, *notes)
         self._patches[peer] = patch
         try:
             await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)

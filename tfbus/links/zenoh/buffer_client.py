@@ -160,12 +160,12 @@ class BufferClient:
             target=target,
             source=source,
             at=at if isinstance(at, Latest) else as_stamp(at),
-            max_age=max_age,
+            max_age=None if max_age is None else as_duration(max_age, "max_age"),
             source_at=source_at if source_at is None or isinstance(source_at, Latest) else as_stamp(source_at),
             fixed=fixed,
-            tolerance=tolerance,
-            max_gap=max_gap,
-            hold=None if extrapolate is None else extrapolate.max_age,
+            tolerance=float(tolerance),
+            max_gap=None if max_gap is None else float(max_gap),
+            hold=None if extrapolate is None else float(extrapolate.max_age),
         )
         if not self._is_open:
             raise RuntimeError("the client is not entered")
@@ -229,7 +229,7 @@ class BufferClient:
             if not self._servers:
                 raise self._error("lost", "it has gone")
             raise self._error("silent", "it has dropped the question, or it has gone")
-        answer = read_answer(pending.answer, self._session.domain, self._session.robot)
+        answer = read_answer(pending.answer, self._session.domain, self._session.robot, question)
         if isinstance(answer, Exception):
             raise answer
         return answer

@@ -2,7 +2,7 @@
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from time import monotonic
@@ -186,7 +186,7 @@ class BufferServer:
             return
         except Exception as error:  # noqa: BLE001 - it is told to the asker
             answer = error
-        self._answer(answer, partial(reply_now, query))
+        self._answer(query, answer, at_once=True)
 
     async def _take_all(self, tasks: anyio.abc.TaskGroup) -> None:
         while True:
@@ -242,9 +242,9 @@ class BufferServer:
         if answer is None:
             query.drop()
         else:
-            self._answer(answer, partial(self._reply, query))
+            self._answer(query, answer)
 
-    def _answer(self, answer: TransformStamped | Exception, reply: Callable[[bytes], object]) -> None:
+    def _answer(self, query: zenoh.Query, answer: TransformStamped | Exception, at_once: bool = False) -> None:
         """Count an answer and send it; no error of one question ends the thread or the task."""
         try:
             if isinstance(answer, Exception) and not isinstance(answer, (TransformError, TypeError, ValueError)):
@@ -252,11 +252,11 @@ class BufferServer:
                 raise answer
             message = write_answer(answer)
         except Exception as error:  # noqa: BLE001 - the next question is answered
-            self._session.failures.note("a lookup of another process", error)
+            self._session.failures.note(error, "a lookup of another process")
             message = self._refusal("internal", f"the lookup failed there with {type(error).__name__}")
         else:
             self._count("failed" if isinstance(answer, Exception) else "answered")
-        reply(message)
+        (reply_now if at_once else self._reply)(query, message)
 
     def _refuse(self, query: zenoh.Query, reason: str, detail: str) -> None:
         self._count(reason)
