@@ -6,10 +6,12 @@ nothing can be lost between "sent" and "buffered".
 """
 
 import logging
+import os
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, suppress
 from threading import get_ident
 from types import TracebackType
+from weakref import WeakSet
 
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._intake import Intake
@@ -67,7 +69,8 @@ class Bus:
     -----
     A bus may be made before an event loop runs. It belongs to the thread that made it, until an event loop in another
     thread uses it first; a loop has a claim on it once it has awaited a lookup, read a stream or entered `threadsafe`.
-    Other threads publish through `threadsafe`.
+    Other threads publish through `threadsafe`. A child made by ``fork`` may use its copy of a bus only if no link,
+    recorder, view, server or `threadsafe` was entered on it: they work in the parent.
 
     Examples
     --------
@@ -108,6 +111,9 @@ class Bus:
         self._resets = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
+        # Entered links, recorders and the like: threads and the event loop of this process do their work.
+        self._entered: WeakSet[object] = WeakSet()
+        _BUSES.add(self)
         self._jumps = self.clock.on_jump(self._clock_jumped)
 
     @property
@@ -144,7 +150,8 @@ class Bus:
         BusClosedError
             If the bus is closed.
         RuntimeError
-            If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
+            If this is not the bus's thread, or this process was forked and has the bus without its links; if
+            subscribers that publish have queued more than 1,000 batches.
         """
         # Nearly always samples only continue known edges, and the buffers are all that hears of them.
         if self._take(samples, invalid):
@@ -303,7 +310,7 @@ class Bus:
         """
         self._check_usable()
         return ThreadPublisher(
-            capacity, self._attach_publisher, self._check_from_thread, self._publish_from_thread, self._threads.remove
+            capacity, self._attach_publisher, self._check_from_thread, self._publish_from_thread, self._detach_publisher
         )
 
     def _attach(self, buffer: LiveTree) -> None:
@@ -422,7 +429,12 @@ class Bus:
 
     def _attach_publisher(self, publisher: ThreadPublisher) -> None:
         self._check_usable()
+        self._entered.add(publisher)
         self._threads.append(publisher)
+
+    def _detach_publisher(self, publisher: ThreadPublisher) -> None:
+        self._entered.discard(publisher)
+        self._threads.remove(publisher)
 
     def _detach_stream(self, stream: Stream) -> None:
         if stream in self._streams:
@@ -462,6 +474,7 @@ class Bus:
         return self._topology.recorded_time()
 
     def _check_from_thread(self, batch: Batch) -> None:
+        self._owner.check_process()
         check_translations(batch, self._plausibility.max_translation)
 
     def _well_typed(self, samples: object) -> Batch:
@@ -498,3 +511,18 @@ class Bus:
             buffer.reset(before, after)
         for late in self._late.values():
             late.clear_moving()
+
+
+_BUSES: WeakSet[Bus] = WeakSet()
+
+
+def _leave_in_parent() -> None:
+    """Disown, in a child made by `fork`, each bus on which something works in the parent only."""
+    for bus in tuple(_BUSES):
+        if bus._entered:
+            bus._owner.leave(" and ".join(sorted({type(thing).__name__ for thing in bus._entered})))
+            bus._intake.thread = bus._owner.thread
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_in_parent)

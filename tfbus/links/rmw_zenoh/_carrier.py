@@ -31,7 +31,7 @@ from tfbus.links.rmw_zenoh._wire import (
 )
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
-from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
+from tfbus.links.zenoh._closing import begin_to_close, close_session, use_zenoh, wait_until_closed
 from tfbus.links.zenoh._opening import directly, refusal
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import encode
@@ -72,6 +72,7 @@ class RmwZenohCarrier(RosCarrier):
             raise ConnectionError(f"no router of rmw_zenoh: {without_source_location(error)}") from error
 
     def _join(self) -> None:
+        use_zenoh()
         session = self._session = zenoh.open(self._config)
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, close_session, session)

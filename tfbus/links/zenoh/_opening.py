@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import zenoh
 
 from tfbus.links._receive_queue import Received
+from tfbus.links.zenoh._closing import use_zenoh
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import MalformedMessageError
 
@@ -46,7 +47,10 @@ def open_session(config: zenoh.Config) -> zenoh.Session:
     ------
     OSError
         If it cannot listen where it should, or as a client reaches nobody; with its `errno`, if there is one.
+    RuntimeError
+        If this process was forked from one that uses zenoh.
     """
+    use_zenoh()
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

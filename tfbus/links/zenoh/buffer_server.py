@@ -26,6 +26,7 @@ from tfbus.links._remote_lookup import (
     read_question,
     write_answer,
 )
+from tfbus.links.link import warn_unless_entered
 from tfbus.links.zenoh._keys import new_id
 from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 from tfbus.links.zenoh._settings import Addresses
@@ -108,6 +109,7 @@ class BufferServer:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._tasks: anyio.abc.TaskGroup | None = None
+        self._never_entered = warn_unless_entered(self)
 
     def statistics(self) -> BufferServerStatistics:
         """All counters, as they are now."""
@@ -126,6 +128,7 @@ class BufferServer:
         if self._entered:
             raise RuntimeError("a buffer server is entered once: make another one")
         self._entered = True
+        self._never_entered.detach()
         self._waker.bind()
         await self._session.open()
         self._tasks = await anyio.create_task_group().__aenter__()
