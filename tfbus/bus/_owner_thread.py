@@ -6,28 +6,40 @@ no thread of the child. One that nothing of this kind is on is a plain object, a
 """
 
 import asyncio
+import os
 from threading import get_ident
+from weakref import WeakSet
 
 import anyio
+
+from tfbus.bus._intake import Intake
 
 
 class OwnerThread:
     """The thread that may use a bus: first the one that made it, then that of the first event loop that uses it.
 
+    Parameters
+    ----------
+    intake : Intake
+        That of the bus; it takes batches from this thread only.
+
     Attributes
     ----------
     thread : int
         Its identity, as `threading.get_ident` gives it; 0 for none.
-    left_in : str
-        What is on the bus and works in the process only from which this one was forked; empty if that is nothing.
+    entered : WeakSet
+        What was entered on the bus and works in threads and on the event loop of this process, such as links.
     """
 
-    __slots__ = ("_on_a_loop", "left_in", "thread")
+    __slots__ = ("__weakref__", "_intake", "_left_behind", "_on_a_loop", "entered", "thread")
 
-    def __init__(self) -> None:
-        self.thread = get_ident()
-        self.left_in = ""
+    def __init__(self, intake: Intake) -> None:
+        self._intake = intake
+        self.thread = intake.thread = get_ident()
         self._on_a_loop = _runs_a_loop()
+        self._left_behind = ""
+        self.entered: WeakSet[object] = WeakSet()
+        _OWNERS.add(self)
 
     def check(self) -> None:
         """Raise `RuntimeError` unless this thread owns the bus, or runs an event loop and may take it over."""
@@ -39,21 +51,34 @@ class OwnerThread:
         if thread != self.thread:
             if self._on_a_loop or not on_a_loop:
                 raise RuntimeError("the bus belongs to another thread: publish with `with bus.threadsafe() as publish`")
-            self.thread = thread
+            self.thread = self._intake.thread = thread
         self._on_a_loop = on_a_loop
 
     def check_process(self) -> None:
         """Raise `RuntimeError` in a child of `fork` that has the bus without what is on it."""
-        if self.left_in:
+        if self._left_behind:
             raise RuntimeError(
-                f"this process was forked, and fork has not copied what works for the bus, {self.left_in}: make a bus "
-                "in the child, or start the child with the method 'spawn' of multiprocessing"
+                f"this process was forked, and fork has not copied what works for the bus, {self._left_behind}: "
+                "make a bus in the child, or start the child with the method 'spawn' of multiprocessing"
             )
 
-    def leave(self, things: str) -> None:
-        """Belong to no thread, because this process was forked and has not got some things."""
-        self.thread = 0
-        self.left_in = things
+    def leave_behind(self) -> None:
+        """Belong to no thread of this process, which was forked, if anything was entered on the bus."""
+        if self.entered:
+            self._left_behind = " and ".join(sorted({type(thing).__name__ for thing in self.entered}))
+            self.thread = self._intake.thread = 0
+
+
+_OWNERS: WeakSet[OwnerThread] = WeakSet()
+
+
+def _leave_behind() -> None:
+    for owner in tuple(_OWNERS):
+        owner.leave_behind()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_behind)
 
 
 def _runs_a_loop() -> bool:

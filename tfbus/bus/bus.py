@@ -6,12 +6,10 @@ nothing can be lost between "sent" and "buffered".
 """
 
 import logging
-import os
 from collections.abc import Iterable
 from contextlib import AbstractContextManager, suppress
 from threading import get_ident
 from types import TracebackType
-from weakref import WeakSet
 
 from tfbus.bus._announcer import Announcer
 from tfbus.bus._intake import Intake
@@ -90,7 +88,6 @@ class Bus:
         reject_ahead: bool = False,
     ) -> None:
         self.clock: Clock = SystemClock() if clock is None else clock
-        self._owner = OwnerThread()
         self._closed = False
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._events: list[EventStream] = []
@@ -106,14 +103,13 @@ class Bus:
         self._threads: list[ThreadPublisher] = []
         listeners = self._subscribers.callbacks, self._streams, self._events, self._late
         self._intake = Intake(self._topology.judge, TransformStamped, listeners)
-        self._intake.thread = self._owner.thread
+        self._owner = OwnerThread(self._intake)
         self._take = self._intake.take
         self._resets = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
-        # Entered links, recorders and the like: threads and the event loop of this process do their work.
-        self._entered: WeakSet[object] = WeakSet()
-        _BUSES.add(self)
+        # Links, recorders and the like; a child made by `fork` has them no more.
+        self._entered = self._owner.entered
         self._jumps = self.clock.on_jump(self._clock_jumped)
 
     @property
@@ -192,7 +188,6 @@ class Bus:
         The first event loop to use a bus that another thread has made takes it over.
         """
         self._owner.check()
-        self._intake.thread = self._owner.thread
 
     def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
@@ -511,18 +506,3 @@ class Bus:
             buffer.reset(before, after)
         for late in self._late.values():
             late.clear_moving()
-
-
-_BUSES: WeakSet[Bus] = WeakSet()
-
-
-def _leave_in_parent() -> None:
-    """Disown, in a child made by `fork`, each bus on which something works in the parent only."""
-    for bus in tuple(_BUSES):
-        if bus._entered:
-            bus._owner.leave(" and ".join(sorted({type(thing).__name__ for thing in bus._entered})))
-            bus._intake.thread = bus._owner.thread
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_leave_in_parent)
