@@ -108,7 +108,7 @@ async def test_a_lost_peer_is_reached_again_by_a_patch_that_carries_everything()
             asking.sessions.ask(asked.id, 7)
             question = (await asked.next()).content
             assert isinstance(question, Question)
-            assert str(question.handle.key_expr) == asked.sessions._keys.own("state")
+            assert str(question.handle.query.key_expr) == asked.sessions._keys.own("state")
             asked.sessions.answer(question.handle, Message(b"answer", b"", 0))
             assert await asking.next() == Received(asked.id, Answer((b"answer", b"")), 6)
 
@@ -280,7 +280,7 @@ async def test_a_peer_is_asked_by_its_own_key_which_costs_a_router_nothing_for_o
         joining.sessions.ask_history(here.id, 1.0, "")
         for kind in ("state", "history"):
             question = await here.next()
-            assert str(question.content.handle.key_expr) == here.sessions._keys.own(kind)
+            assert str(question.content.handle.query.key_expr) == here.sessions._keys.own(kind)
             question.content.handle.drop()
 
 

@@ -154,7 +154,7 @@ class Introductions:
         Raises
         ------
         MalformedMessageError
-            If a line of it names no link that this one hears; the others were taken.
+            If a line of it names no link that this one hears, or what is no address; all else was taken.
         """
         now = self._now()
         named = {}
@@ -162,7 +162,7 @@ class Introductions:
         for line in answer[:MOST_BYTES].decode("ascii", "replace").split("\n")[:MOST_NAMED]:
             token, *addresses = line.split(" ")
             link = self._keys.heard_link(token.encode())
-            foreign += link is None and bool(line)
+            foreign += bool(line) and not (link and all(map(_is_address, addresses)))
             if link is not None and link != self._keys.link and link not in present:
                 named[link] = self._useful(addresses)
         self._missing = {
@@ -181,7 +181,7 @@ class Introductions:
                 self._missing[peer] = now
                 self._due = now + FIRST_PAUSE
         if foreign:
-            raise MalformedMessageError("introduction", f"{foreign} lines of an answer name no link")
+            raise MalformedMessageError("introduction", f"{foreign} lines of an answer name no link or no address")
 
     def _useful(self, addresses: Iterable[str]) -> list[str]:
         """Those of some addresses that are well formed, and lead to the same machine for others."""

@@ -374,9 +374,11 @@ class ZenohSession:
         payload = b"" if query.payload is None else query.payload.to_bytes()
         if len(payload) != _SINCE.size:
             raise MalformedMessageError("question", f"a question for changes has {len(payload)} bytes")
+        # The question may be answered, and its attachment gone, as soon as it is admitted.
+        token = None if query.attachment is None else query.attachment.to_bytes()[:MOST_NAMES]
         self._admit(Question(_SINCE.unpack(payload)[0], OpenQuestion(query, "state")))
-        if query.attachment is not None and self._note_heard is not None:
-            self._note_heard(query.attachment.to_bytes()[:MOST_NAMES])
+        if token is not None and self._note_heard is not None:
+            self._note_heard(token)
 
     def _receive_history_question(self, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
