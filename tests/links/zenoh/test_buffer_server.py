@@ -113,6 +113,7 @@ async def test_no_question_ends_a_server_and_each_is_counted(address: str, domai
 
 def lookup_by_hand(session: zenoh.Session, domain: str, payload: bytes, key: str = "") -> object:
     (reply,) = session.get(key or f"tfbus/{domain}/~/lookup", payload=payload, timeout=PATIENCE)
+    assert reply.ok is not None
     return read_answer(reply.ok.payload.to_bytes(), domain, None)
 
 
