@@ -392,12 +392,10 @@ class ZenohSession:
 
     def _admit(self, question: Question | HistoryQuestion) -> None:
         with self._lock:
-            admitted = len(self._questions) < MOST_QUESTIONS
-            if admitted:
-                self._questions.add(question.handle)
-        if not admitted:
-            # Whoever means it asks again.
-            raise MalformedMessageError("busy", f"{MOST_QUESTIONS} questions wait for answers")
+            if len(self._questions) >= MOST_QUESTIONS:
+                # Whoever means it asks again.
+                raise MalformedMessageError("busy", f"{MOST_QUESTIONS} questions wait for answers")
+            self._questions.add(question.handle)
         self._receive(Received("", question))
 
     def _door(self, callback: Callable[[Any], object], end: Callable[[], object] | None = None) -> Any:
