@@ -434,7 +434,8 @@ class RemoteLookupError(TransformLookupError):
     reason : str
         ``"absent"``: there is no such server; ``"lost"``: it has gone, or cannot be reached any more; ``"busy"``: too
         many lookups wait there, or come in a second; ``"silent"``: it is there, and does not answer;
-        ``"malformed"``: its answer, or the question, could not be read.
+        ``"malformed"``: its answer, or the question, could not be read, or the answer is one to another question;
+        ``"internal"``: the lookup failed there with an error that is none of lookups.
     detail : str
         The same in words.
     """

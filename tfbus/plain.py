@@ -174,7 +174,10 @@ def _read_dict(kind: Any, value: Any, _name: str) -> Any:
 def _read_float(_kind: Any, value: Any, _name: str) -> Any:
     if value in _NOT_FINITE and isinstance(value, str):
         return float(value)
-    return float(value) if type(value) in (int, float) else _OTHER
+    try:
+        return float(value) if type(value) in (int, float) else _OTHER
+    except OverflowError:
+        raise ValueError(f"an integer of {value.bit_length()} bits is too large for a float") from None
 
 
 def _read_latest(_kind: Any, value: Any, _name: str) -> Any:

@@ -261,13 +261,16 @@ def as_duration(seconds: float, name: str) -> float:
     TypeError
         If it is not a real number. The message has `name`, the name of the argument, and the value.
     ValueError
-        If it is negative or NaN.
+        If it is negative or NaN, or an integer beyond all floats.
     """
     if not is_real(seconds):
         raise TypeError(f"{name} must be a number of seconds, not {seconds!r}")
     if not seconds >= 0:
         raise ValueError(f"{name} must not be negative, got {seconds!r}")
-    return float(seconds)
+    try:
+        return float(seconds)
+    except OverflowError:
+        raise ValueError(f"{name} must be a number of seconds that a float can hold") from None
 
 
 def is_real(value: object) -> bool:

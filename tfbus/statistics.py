@@ -166,7 +166,8 @@ class BufferServerStatistics(PlainData):
     cancelled : int
         Lookups whose asker was cancelled, or has gone.
     refused : mapping of str to int
-        Questions that were refused, by reason: ``"busy"``, because too many wait or come; ``"malformed"``.
+        Questions that were refused, by reason: ``"busy"``, because too many wait or come; ``"malformed"``;
+        ``"internal"``, because of an error that is none of lookups, which is logged.
     queue : QueueStatistics
         Questions that wait for the event loop.
     """

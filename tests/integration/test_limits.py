@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 PAGE = Path(__file__).parents[2] / "demos" / "guide" / "limits.md"
-UNITS = {"": 1, "bytes": 1, "KiB": 2**10, "MiB": 2**20, "s": 1}
+UNITS = {"": 1, "levels": 1, "bytes": 1, "KiB": 2**10, "MiB": 2**20, "s": 1}
 ROWS = re.findall(r"^\| (?!what \|)(.+?) \| ([\d,.e]+) ?(\w*) \|", PAGE.read_text(), re.MULTILINE)
 BOUNDS = {
     "geometry.bounds": "MAX_TRANSLATION",
@@ -36,7 +36,7 @@ BOUNDS = {
     "links._asker": "MOST_OPEN",
     "links.zenoh._session": "MOST_QUESTIONS",
     "links.zenoh._keys": "LONGEST_NAME",
-    "links._remote_lookup": "MAX_BYTES",
+    "links._remote_lookup": "MAX_BYTES MAX_DEPTH",
     "links.zenoh.buffer_server": "LONGEST_WAIT",
     "links.ros._carrier": "MAX_SIZE MOST_TRANSFORMS",
     "links.rosbridge._carrier": "MOST_QUEUED SILENCE",

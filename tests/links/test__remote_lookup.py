@@ -1,8 +1,20 @@
+import json
 import math
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from tfbus import LATEST, FutureExtrapolationError, LookupTimeoutError, RemoteLookupError, Transform, TransformStamped
+from tfbus import (
+    LATEST,
+    FutureExtrapolationError,
+    LookupTimeoutError,
+    RecordingError,
+    RemoteLookupError,
+    Transform,
+    TransformStamped,
+)
 from tfbus.links._remote_lookup import (
     MAX_BYTES,
     Cancellation,
@@ -46,6 +58,9 @@ def test_so_large_a_message_is_read_and_no_larger_one() -> None:
         b'{"type": "Cancellation", "asker": "me"}',
         b'{"type": "Cancellation", "asker": "me", "number": "1"}',
         b"[" * 30_000,
+        b'{"type": %b, "message": "m", "cause": null}' % (b"[" * 300 + b"]" * 300),
+        b'{"type": "ValueError", "message": ["m"]}',
+        b'{"type": {}, "message": "m"}',
         write_question(Cancellation("m" * MAX_BYTES, 1)),
     ],
 )
@@ -73,3 +88,101 @@ def test_an_answer_and_each_kind_of_error_come_back_with_their_facts() -> None:
 
 def test_the_server_waits_no_longer_than_its_own_limit() -> None:
     assert [as_timeout(timeout, 10.0) for timeout in (None, math.nan, math.inf, 20.0, 3.0)] == [10.0] * 4 + [3.0]
+
+
+QUESTION = RemoteQuestion("me", 2, "map", "base", 7, 0.5, 1.0, LATEST, "odom", 0.3, 0.2, 0.1)
+FOUND = TransformStamped("map", "base", 7, Transform((0.1, 0.2, 1 / 3)))
+LATE = LookupTimeoutError(target="map", source="base", timeout=0.5, missing=SHORT)
+LATE.__cause__ = SHORT
+
+
+def fields_of(data: bytes, **changes: Any) -> bytes:
+    return json.dumps(json.loads(data) | changes).encode()
+
+
+@pytest.mark.parametrize("name", ["number", "at", "timeout", "max_age", "source_at", "tolerance", "max_gap", "hold"])
+@pytest.mark.parametrize("digits", [20, 401, 5_000])
+def test_a_question_with_an_integer_of_more_than_64_bits_is_refused(name: str, digits: int) -> None:
+    data = fields_of(write_question(QUESTION), **{name: None}).replace(b"null", b"9" * digits)
+    with pytest.raises(ValueError, match=f"{digits} digits does not fit 64 bits"):
+        read_question(data)
+
+
+@pytest.mark.parametrize("name", ["asker", "target", "source", "fixed"])
+def test_a_question_with_a_longer_name_than_a_message_of_samples_may_have_is_refused(name: str) -> None:
+    read_question(fields_of(write_question(QUESTION), **{name: "x" * 1_024}))
+    with pytest.raises(ValueError, match="more than 1024 bytes"):
+        read_question(fields_of(write_question(QUESTION), **{name: "\u20ac" * 342}))
+
+
+def nested(depth: int) -> bytes:
+    cause: dict[str, Any] | None = None
+    for _ in range(depth):
+        cause = LATE.to_dict() | {"cause": cause}
+    return json.dumps(cause).encode()
+
+
+@pytest.mark.parametrize("depth", [17, 100, 240])
+def test_causes_of_causes_are_read_to_a_bound(depth: int) -> None:
+    assert isinstance(read_answer(nested(8), "tf", None), LookupTimeoutError)
+    error = read_answer(nested(depth), "tf", None)
+    assert isinstance(error, RemoteLookupError)
+    assert error.detail == "not an answer: it is nested more than 16 levels deep"
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        TransformStamped("map", "arm", 7, Transform()),
+        TransformStamped("odom", "base", 7, Transform()),
+        TransformStamped("base", "map", 7, Transform()),
+        TransformStamped("map", "base", 8, Transform()),
+    ],
+)
+def test_an_answer_to_another_question_is_none(answer: TransformStamped) -> None:
+    assert read_answer(write_answer(FOUND), "tf", None, QUESTION) == FOUND
+    static = TransformStamped("map", "base", 0, Transform(), static=True)
+    assert read_answer(write_answer(static), "tf", None, QUESTION) == static
+    error = read_answer(write_answer(answer), "tf", None, QUESTION)
+    assert isinstance(error, RemoteLookupError)
+    assert error.reason == "malformed"
+
+
+def test_an_error_that_no_lookup_raises_is_no_answer() -> None:
+    error = read_answer(write_answer(RecordingError("it is cut off", path="/etc/passwd", reason="damaged")), "tf", None)
+    assert isinstance(error, RemoteLookupError)
+    assert "no lookup raises RecordingError" in error.detail
+
+
+PLAIN: st.SearchStrategy[Any] = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.sampled_from([10**400, -(2**63), 2**63, 10**25])
+    | st.floats()
+    | st.text(max_size=8)
+    | st.sampled_from(["LATEST", "NaN", "Infinity", "ValueError", "UnknownFrameError", "\ud800", "x" * 2_000]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=8,
+)
+MESSAGES = [write_question(QUESTION), write_question(Cancellation("me", 2))]
+MESSAGES += [write_answer(answer) for answer in (FOUND, SHORT, LATE, ValueError("too long"))]
+
+
+@given(st.sampled_from(MESSAGES), st.data())
+def test_one_wrong_field_or_byte_raises_nothing_but_a_value_error(message: bytes, data: st.DataObject) -> None:
+    if data.draw(st.booleans()):
+        name = data.draw(st.sampled_from([*json.loads(message), "more"]))
+        bad = fields_of(message, **{name: data.draw(PLAIN)})
+    else:
+        place = data.draw(st.integers(0, len(message) - 1))
+        bad = message[:place] + data.draw(st.binary(max_size=3)) + message[place + data.draw(st.integers(0, 9)) :]
+    try:
+        read_question(bad)
+    except ValueError as error:
+        assert len(str(error)) < 1_000
+    answer = read_answer(bad, "tf", None, QUESTION)
+    # It can be worded, too.
+    assert str(answer)
+    if isinstance(answer, TransformStamped):
+        assert (answer.parent, answer.child) == ("map", "base")

@@ -75,7 +75,8 @@ class Bus:
     -----
     A bus may be made before an event loop runs. It belongs to the thread that made it, until an event loop in another
     thread uses it first; a loop has a claim on it once it has awaited a lookup, read a stream or entered `threadsafe`.
-    Other threads publish through `threadsafe`.
+    Other threads publish through `threadsafe`. A child made by ``fork`` may use its copy of a bus only if no link,
+    recorder, view, server or `threadsafe` was entered on it: they work in the parent.
 
     Examples
     --------
@@ -97,7 +98,6 @@ class Bus:
         max_frames: int | None = None,
     ) -> None:
         self.clock: Clock = SystemClock() if clock is None else clock
-        self._owner = OwnerThread()
         self._closed = False
         self._log = OnceLogger(logging.getLogger("tfbus"))
         self._events: list[EventStream] = []
@@ -118,11 +118,13 @@ class Bus:
         self._threads: list[ThreadPublisher] = []
         listeners = self._subscribers.callbacks, self._streams, self._events, self._late
         self._intake = Intake(self._topology.judge, TransformStamped, listeners)
-        self._intake.thread = self._owner.thread
+        self._owner = OwnerThread(self._intake)
         self._take = self._intake.take
         self._resets = 0
         # The links of this bus share a relay, and keep it here; the bus itself knows nothing of it.
         self._relay: object = None
+        # Links, recorders and the like; a child made by `fork` has them no more.
+        self._entered = self._owner.entered
         self._jumps = self.clock.on_jump(self._clock_jumped)
         self._moves: Registration | None = None
         if isinstance(self.clock, SimulatedClock):
@@ -169,7 +171,8 @@ class Bus:
         BusClosedError
             If the bus is closed.
         RuntimeError
-            If this is not the bus's thread, or if subscribers that publish have queued more than 1,000 batches.
+            If this is not the bus's thread, or this process was forked and has the bus without its links; if
+            subscribers that publish have queued more than 1,000 batches.
         """
         # Nearly always samples only continue known edges, and the buffers are all that hears of them.
         if self._take(samples, invalid):
@@ -210,7 +213,6 @@ class Bus:
         The first event loop to use a bus that another thread has made takes it over.
         """
         self._owner.check()
-        self._intake.thread = self._owner.thread
 
     def subscribe(self, callback: BatchCallback, removed: FrameCallback | None = None) -> Registration:
         """Call `callback` with each batch, a tuple of samples, until the registration is closed.
@@ -328,7 +330,7 @@ class Bus:
         """
         self._check_usable()
         return ThreadPublisher(
-            capacity, self._attach_publisher, self._check_from_thread, self._publish_from_thread, self._threads.remove
+            capacity, self._attach_publisher, self._check_from_thread, self._publish_from_thread, self._detach_publisher
         )
 
     def _attach(self, buffer: LiveTree) -> None:
@@ -449,7 +451,12 @@ class Bus:
 
     def _attach_publisher(self, publisher: ThreadPublisher) -> None:
         self._check_usable()
+        self._entered.add(publisher)
         self._threads.append(publisher)
+
+    def _detach_publisher(self, publisher: ThreadPublisher) -> None:
+        self._entered.discard(publisher)
+        self._threads.remove(publisher)
 
     def _detach_stream(self, stream: Stream) -> None:
         if stream in self._streams:
@@ -493,6 +500,7 @@ class Bus:
         return self._topology.kept_samples()
 
     def _check_from_thread(self, batch: Batch) -> None:
+        self._owner.check_process()
         check_translations(batch, self._plausibility.max_translation)
 
     def _well_typed(self, samples: object) -> Batch:

@@ -12,6 +12,7 @@ from tfbus._aio.loop_waker import LoopWaker
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.links.link import warn_unless_entered
 from tfbus.registration import Registration
 from tfbus.stamps import SECOND
 
@@ -82,6 +83,7 @@ class FoxgloveServer:
         self._context: foxglove.Context
         self._channel: FrameTransformsChannel
         self._server: WebSocketServer | None = None
+        self._never_entered = warn_unless_entered(self)
 
     async def __aenter__(self) -> Self:
         if self._entered:
@@ -90,6 +92,8 @@ class FoxgloveServer:
         if self.bus.closed:
             raise BusClosedError
         self._entered = True
+        self.bus._entered.add(self)
+        self._never_entered.detach()
         self._waker.bind()
         with anyio.CancelScope(shield=True):
             server = self._server = await anyio.to_thread.run_sync(self._start)
@@ -100,6 +104,7 @@ class FoxgloveServer:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.address = ""
+        self.bus._entered.discard(self)
         server, self._server = self._server, None
         self._unsubscribe()
         if server is not None:

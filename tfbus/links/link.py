@@ -1,10 +1,12 @@
 """The half that all links share: it joins a bus to a carrier for as long as its ``async with`` lasts."""
 
 import logging
+import os
 from collections.abc import Iterable
 from time import monotonic
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
+from weakref import finalize
 
 import anyio
 import anyio.abc
@@ -29,6 +31,19 @@ _FULL_TURN = 5_000
 """So many samples and removals are sent at once, before the turn of the event loop ends."""
 _ITEMS_PER_TURN = 100
 _BYTES_PER_TURN = 2**16
+
+
+def warn_unless_entered(thing: object) -> "finalize[..., Any]":
+    """Have a line logged when something ends that nobody has entered; to enter it is to `detach` this."""
+    return finalize(thing, _warn_never_entered, type(thing).__name__, os.getpid())
+
+
+def _warn_never_entered(name: str, process: int) -> None:
+    # A child made by `fork` has copies of what its parent is about to enter.
+    if os.getpid() == process:
+        logging.getLogger("tfbus").warning(
+            "a %s was made and never entered, so it has done nothing: write `async with %s(...)`", name, name
+        )
 
 
 class Link:
@@ -130,6 +145,7 @@ class Link:
         self._attached = False
         self._tasks: anyio.abc.TaskGroup | None = None
         self._jumps: Registration | None = None
+        self._never_entered = warn_unless_entered(self)
 
     @property
     def peers(self) -> tuple[str, ...]:
@@ -164,6 +180,7 @@ class Link:
         if self.bus.closed:
             raise BusClosedError
         self._entered = True
+        self._never_entered.detach()
         for waker in (self._received, self._turn_ends):
             waker.bind()
         try:
@@ -173,6 +190,7 @@ class Link:
             await self._carrier.close()
             raise
         self._attached = True
+        self.bus._entered.add(self)
         self._jumps = self.bus.clock.on_jump(self._clock_jumped)
         self._tasks = await anyio.create_task_group().__aenter__()
         self._tasks.start_soon(self._carrier.run)
@@ -201,6 +219,7 @@ class Link:
         try:
             await close_task_group(self._tasks)
         finally:
+            self.bus._entered.discard(self)
             await self._carrier.close()
 
     async def _keep_agreed(self) -> None:

@@ -137,6 +137,7 @@ class Recorder:
         self._arrived = anyio.Event()
         self._urgent = anyio.Event()
         self._registration = self.bus.subscribe(self._enqueue)
+        self.bus._entered.add(self)
         self._tasks = await anyio.create_task_group().__aenter__()
         opened = anyio.Event()
         failures: list[Exception] = []
@@ -159,6 +160,7 @@ class Recorder:
     async def _end(self) -> None:
         assert self._registration is not None
         self._registration.close()
+        self.bus._entered.discard(self)
         self._ended = True
         self._arrived.set()
         self._urgent.set()

@@ -205,6 +205,7 @@ class View:
         if self.bus.closed:
             raise BusClosedError
         self._entered = True
+        self.bus._entered.add(self)
         self._controls.bind()
         self._drawn_waker.bind()
         fixed, trails, live, stale_after = self._page_options
@@ -237,6 +238,7 @@ class View:
 
     async def _stop(self) -> None:
         self.address = ""
+        self.bus._entered.discard(self)
         self._controls.end()
         server, self._server = self._server, None
         if server is not None:

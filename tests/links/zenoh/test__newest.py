@@ -67,6 +67,15 @@ def test_very_many_frames_are_told_in_several_messages() -> None:
     assert [len(said([message])) for message in messages] == [1_000, 1_000, 1]
 
 
+def test_samples_with_long_authorities_are_told_in_as_many_messages_as_they_need() -> None:
+    newest = NewestSamples()
+    long = [moving("map", f"{number}", 1, authority=f"{number}" + "x" * 60_000) for number in range(40)]
+    newest.note(turn(OutgoingBatch(ORIGIN, 1, long)))
+    messages = newest.take()
+    assert len(messages) == 4
+    assert said(messages).keys() == {f"{number}" for number in range(40)}
+
+
 def test_before_the_first_claim_there_is_nothing_to_tell() -> None:
     assert NewestSamples().take() == []
 

@@ -3,7 +3,7 @@ import socket
 
 import pytest
 
-from tfbus.links.zenoh._opening import open_session
+from tfbus.links.zenoh._opening import directly, open_session
 from tfbus.links.zenoh._settings import settings
 
 
@@ -21,3 +21,15 @@ def test_an_os_error_that_only_zenoh_has_found_has_no_number() -> None:
     with pytest.raises(OSError, match="private key") as caught:
         open_session(config)
     assert caught.value.errno is None
+
+
+def test_what_is_received_by_several_subscribers_stays_in_order() -> None:
+    assert not directly(print, print).indirect, "each would have a thread of its own"
+
+
+def test_what_a_callback_raises_is_told_to_one_that_counts() -> None:
+    told: list[Exception] = []
+    handler = directly({"known": 1}.__getitem__, told.append)
+    handler.callback("known")
+    handler.callback("unknown")
+    assert list(map(type, told)) == [KeyError]

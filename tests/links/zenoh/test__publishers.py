@@ -6,8 +6,8 @@ from support.processes import PATIENCE, until
 
 from tfbus.links._message import Message
 from tfbus.links.zenoh._keys import Keys
+from tfbus.links.zenoh._opening import directly
 from tfbus.links.zenoh._publishers import Publishers
-from tfbus.links.zenoh._session import directly
 from tfbus.links.zenoh._settings import settings
 
 LINK = "a" * 32
@@ -21,7 +21,7 @@ async def test_each_message_goes_to_those_who_hear_its_key_and_none_to_filters_t
     keys, came = Keys(domain, LINK), Queue[zenoh.Sample]()
     with zenoh.open(settings(address, None, None, 2.0)) as hearer:
         # Threads of their own would put what two subscribers have received in another order.
-        put = directly(came.put)
+        put = directly(came.put, print)
         declared = [hearer.declare_subscriber(f"tfbus/{domain}/~/{kind}/**", put) for kind in ("live", "only")]
         with zenoh.open(settings([], address, None, 2.0)) as session:
             publishers = Publishers(session, keys)

@@ -24,9 +24,11 @@ from tfbus.links.zenoh._filters import write_filter
 from tfbus.links.zenoh._hearing import DEAF
 from tfbus.links.zenoh._keys import FIRST_SESSION, NO_ROBOT, Keys
 from tfbus.links.zenoh._notes import MOST_ASKING
+from tfbus.links.zenoh._opening import OpenQuestion
 from tfbus.links.zenoh._sessions import ZenohSessions
 from tfbus.links.zenoh._settings import patch_settings, settings
 from tfbus.links.zenoh._unmet import Unmet
+from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio
 
@@ -106,7 +108,7 @@ async def test_a_lost_peer_is_reached_again_by_a_patch_that_carries_everything()
             asking.sessions.ask(asked.id, 7)
             question = (await asked.next()).content
             assert isinstance(question, Question)
-            assert str(question.handle.key_expr) == asked.sessions._keys.own("state")
+            assert str(question.handle.query.key_expr) == asked.sessions._keys.own("state")
             asked.sessions.answer(question.handle, Message(b"answer", b"", 0))
             assert await asking.next() == Received(asked.id, Answer((b"answer", b"")), 6)
 
@@ -278,7 +280,7 @@ async def test_a_peer_is_asked_by_its_own_key_which_costs_a_router_nothing_for_o
         joining.sessions.ask_history(here.id, 1.0, "")
         for kind in ("state", "history"):
             question = await here.next()
-            assert str(question.content.handle.key_expr) == here.sessions._keys.own(kind)
+            assert str(question.content.handle.query.key_expr) == here.sessions._keys.own(kind)
             question.content.handle.drop()
 
 
@@ -362,11 +364,12 @@ async def test_a_peer_is_present_while_one_of_its_ways_is() -> None:
 
 async def test_an_answer_that_cannot_be_sent_is_logged_and_frees_its_place(caplog: pytest.LogCaptureFixture) -> None:
     alone = Alone()
-    question = alone.question()
-    alone.sessions._main._questions = 1
+    query = alone.question()
+    question = OpenQuestion(query, "state")
+    alone.sessions._main._questions.add(question)
     alone.sessions.answer(question, Message(b"", b"", 0, 0))
     await until(lambda: bool(caplog.records))
-    assert (question.dropped, alone.sessions._main._questions) == ([True], 0)
+    assert (query.dropped, len(alone.sessions._main._questions)) == ([True], 0)
     (record,) = caplog.records
     assert (record.name, record.message) == ("tfbus", "an answer could not be sent")
     assert record.exc_info is not None
@@ -524,16 +527,17 @@ async def test_questions_and_those_who_hear_are_kept_up_to_a_bound_and_strangers
     assert alone.sessions._names_heard(query) == sorted([FIRST_SESSION, "another"])
     assert alone.sessions._names_heard(alone.question(uuid4().hex)) == []
     for unknown in (alone.question(""), alone.question("no id")):
-        alone.sessions._note_asked(unknown)
-        assert unknown.dropped == [True]
+        with pytest.raises(MalformedMessageError, match="token"):
+            alone.sessions._note_asked(unknown)
     for number in range(MOST_ASKING):
         alone.sessions._note_asked(query)
         alone.sessions._note_heard(Keys(alone.domain, f"{number + 1:032x}").token(FIRST_SESSION).encode())
     assert query.dropped == []
-    alone.sessions._note_asked(query)
+    with pytest.raises(MalformedMessageError, match="busy"):
+        alone.sessions._note_asked(query)
     alone.sessions._note_heard(Keys(alone.domain, alone.peer).token(FIRST_SESSION).encode())
     noted = alone.sessions._notes.take()
-    assert (query.dropped, len(noted.asking), len(noted.hearers)) == ([True], MOST_ASKING, MOST_ASKING)
+    assert (len(noted.asking), len(noted.hearers)) == (MOST_ASKING, MOST_ASKING)
     assert alone.peer not in noted.hearers
 
 

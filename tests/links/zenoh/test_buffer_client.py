@@ -1,9 +1,11 @@
+import json
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from itertools import islice
 from typing import Any
 
 import anyio
+import anyio.to_thread
 import pytest
 import zenoh
 from support.asking import settle
@@ -19,6 +21,7 @@ from tfbus import (
     Hold,
     LookupTimeoutError,
     PastExtrapolationError,
+    RecordingError,
     RemoteLookupError,
     TransformStamped,
     UnknownFrameError,
@@ -26,6 +29,7 @@ from tfbus import (
 from tfbus.links._remote_lookup import Cancellation, read_question, write_answer
 from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink, buffer_client
 from tfbus.links.zenoh._lookup_session import LookupSession
+from tfbus.links.zenoh._settings import settings
 from tfbus.links.zenoh.buffer_client import PATIENCE
 from tfbus.links.zenoh.buffer_server import LONGEST_WAIT
 
@@ -167,6 +171,65 @@ async def test_a_client_has_a_bound_and_is_entered_once(address: str, domain: st
             raise AssertionError("it has no session")
 
 
+SHORT = FutureExtrapolationError(child="base", stamp=9, oldest=1, newest=5, authority="odometry")
+FOUND = moving("map", "base", 7)
+MISSING = UnknownFrameError(frame="base", known=("map",))
+LATE = LookupTimeoutError(target="map", source="base", timeout=LONGEST_WAIT, missing=MISSING)
+LATE.__cause__ = MISSING
+
+
+def deep(depth: int) -> bytes:
+    error = LATE.to_dict()
+    for _ in range(depth):
+        error = LATE.to_dict() | {"cause": error}
+    return json.dumps(error).encode()
+
+
+def of_digits(digits: int) -> bytes:
+    return write_answer(SHORT).replace(b'"newest": 5', b'"newest": ' + b"9" * digits)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        pytest.param(write_answer(static("map", "arm")), id="other frames"),
+        pytest.param(write_answer(moving("map", "base", 4)), id="another stamp"),
+        pytest.param(of_digits(20), id="20 digits"),
+        pytest.param(of_digits(401), id="401 digits"),
+        pytest.param(of_digits(5_000), id="5,000 digits"),
+        pytest.param(deep(240), id="deep"),
+        pytest.param(b'{"type": "TransformStamped"', id="cut off"),
+        pytest.param(b'{"type": [], "message": ""}', id="no type"),
+        pytest.param(write_answer(RecordingError("cut off", path="/", reason="damaged")), id="foreign error"),
+    ],
+)
+async def test_whatever_a_server_answers_a_lookup_has_its_answer_or_a_remote_lookup_error(
+    answer: bytes, address: str, domain: str
+) -> None:
+    answers = [answer, write_answer(moving("map", "base", 5))]
+
+    def reply(query: zenoh.Query) -> None:
+        if query.payload is not None and isinstance(read_question(query.payload.to_bytes()), Cancellation):
+            return
+        query.reply(query.key_expr, answers.pop(0))
+
+    rogue = await anyio.to_thread.run_sync(zenoh.open, settings(address, None, None, 2.0))
+    try:
+        keep = [
+            rogue.declare_queryable(f"tfbus/{domain}/~/lookup", zenoh.handlers.Callback(reply, indirect=False)),
+            rogue.liveliness().declare_token(f"tfbus/{domain}/~/@lookup/{0:032x}"),
+        ]
+        async with BufferClient(domain, connect=address) as client:
+            with pytest.raises(RemoteLookupError) as refused:
+                await client.lookup("map", "base", 5)
+            assert refused.value.reason == "malformed"
+            assert len(str(refused.value)) < 500
+            assert await client.lookup("map", "base", 5) == moving("map", "base", 5)
+        del keep
+    finally:
+        await anyio.to_thread.run_sync(rogue.close)
+
+
 class Session:
     """Answers the questions of a client by what a test gives, in a time that passes only while they wait.
 
@@ -211,12 +274,6 @@ def met(session: Session, monkeypatch: pytest.MonkeyPatch, **options: Any) -> Bu
     client._note_server("server", True)
     client._handle_arrived()
     return client
-
-
-FOUND = moving("map", "base", 7)
-MISSING = UnknownFrameError(frame="base", known=("map",))
-LATE = LookupTimeoutError(target="map", source="base", timeout=LONGEST_WAIT, missing=MISSING)
-LATE.__cause__ = MISSING
 
 
 @pytest.mark.parametrize(

@@ -31,8 +31,8 @@ from tfbus.links.rmw_zenoh._wire import (
 )
 from tfbus.links.ros._carrier import RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
-from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_until_closed
-from tfbus.links.zenoh._session import directly
+from tfbus.links.zenoh._closing import begin_to_close, close_session, use_zenoh, wait_until_closed
+from tfbus.links.zenoh._opening import directly, refusal
 from tfbus.links.zenoh._settings import without_source_location
 from tfbus.tf_message import encode
 
@@ -72,6 +72,7 @@ class RmwZenohCarrier(RosCarrier):
             raise ConnectionError(f"no router of rmw_zenoh: {without_source_location(error)}") from error
 
     def _join(self) -> None:
+        use_zenoh()
         session = self._session = zenoh.open(self._config)
         # A program may exit without the end of its link. A callback of zenoh while the interpreter ends is an abort.
         self._close_at_exit = weakref.finalize(self, close_session, session)
@@ -125,15 +126,18 @@ class RmwZenohCarrier(RosCarrier):
         self, session: zenoh.Session, key: str, latched: bool, take: Callable[[zenoh.Sample], None]
     ) -> object:
         if not latched:
-            return session.declare_subscriber(key, directly(take))
+            return session.declare_subscriber(key, self._directly(take))
         return zenoh.ext.declare_advanced_subscriber(
             session,
             key,
-            directly(take),
+            self._directly(take),
             history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
             recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             subscriber_detection=True,
         )
+
+    def _directly(self, take: Callable[[zenoh.Sample], None]) -> Any:
+        return directly(take, lambda error: self._receive(refusal(error, _AUTHORITY)))
 
     async def close(self) -> None:
         """Close the session, or give up waiting for that."""

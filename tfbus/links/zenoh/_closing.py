@@ -6,6 +6,7 @@ would a thread that comes back from a call of zenoh.
 """
 
 import atexit
+import os
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
@@ -18,11 +19,38 @@ CLOSING_TIME = 1.0
 LONGEST_CLOSE = 15.0
 """s; so long the event loop and the interpreter wait."""
 _NAME = "tfbus and zenoh end"
+_forked = _used = False
+
+
+def use_zenoh() -> None:
+    """Note that this process uses zenoh from now on.
+
+    Raises
+    ------
+    RuntimeError
+        If it was forked from one that did: zenoh's threads are there, and its sessions here would hear nobody.
+    """
+    global _used
+    if _forked:
+        raise RuntimeError(
+            "this process was forked from one that uses zenoh, whose threads are not here: start it with the method "
+            "'spawn' of multiprocessing, or fork before the first link"
+        )
+    _used = True
+
+
+def _note_fork() -> None:
+    global _forked
+    _forked = _used
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
 
 
 def close_session(session: zenoh.Session | None) -> None:
-    """Close a session, if there is one; a second call does nothing."""
-    if session is not None:
+    """Close a session, if there is one; a second call does nothing, and so does one in a child made by `fork`."""
+    if session is not None and not _forked:
         # zenoh may give up waiting for a peer; that peer notices the end by itself.
         with suppress(zenoh.ZError):
             session.close()

@@ -6,6 +6,7 @@ asks one of its peers, any, for those that it lacks: soon after each change, and
 that are named twice.
 """
 
+import re
 from collections.abc import Callable, Container, Iterable, Mapping
 from itertools import islice
 from random import Random
@@ -16,6 +17,7 @@ from tfbus.links.zenoh._dialing import MOST_ADDRESSES, Dialing
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._listening import Listening
 from tfbus.links.zenoh._settings import endpoints, is_on_this_machine
+from tfbus.tf_message import MalformedMessageError
 
 FIRST_PAUSE = 2.0
 LONGEST_PAUSE = 300.0
@@ -31,6 +33,7 @@ MOST_MISSING = 100
 MOST_BYTES = 2**18
 """So much is read of a question or of an answer."""
 _MOST_EXPRESSIONS = 1_000
+_PLAIN = re.compile(r"[\w.:/%@\[\]-]{1,300}", re.ASCII)
 _DIGITS = 8
 """So much of each id is told in a question."""
 
@@ -110,17 +113,22 @@ class Introductions:
             The link that asks.
         robots : mapping of str to str
             The peers that are there, each with its robot.
+
+        Raises
+        ------
+        MalformedMessageError
+            If it is no such question.
         """
         lines = question[:MOST_BYTES].decode("ascii", "replace").split("\n")
         if len(lines) != 3:
-            return b""
+            raise MalformedMessageError("introduction", f"a question for peers has {len(lines)} lines")
         listens, expressions, known = lines
         for address in self._useful(listens.split(" ")):
             self._dialing.reached(asker, address)
         try:
             wanted = [zenoh.KeyExpr(expression) for expression in expressions.split(",")[:_MOST_EXPRESSIONS]]
-        except zenoh.ZError:
-            return b""
+        except zenoh.ZError as error:
+            raise MalformedMessageError("introduction", f"a question for peers: {error}") from None
         has = {known[start : start + _DIGITS] for start in range(0, len(known), _DIGITS)} | {asker[:_DIGITS]}
         named = []
         for peer, robot in robots.items():
@@ -142,12 +150,19 @@ class Introductions:
         answer : bytes
         present : container of str
             The peers that are there.
+
+        Raises
+        ------
+        MalformedMessageError
+            If a line of it names no link that this one hears, or what is no address; all else was taken.
         """
         now = self._now()
         named = {}
+        foreign = 0
         for line in answer[:MOST_BYTES].decode("ascii", "replace").split("\n")[:MOST_NAMED]:
             token, *addresses = line.split(" ")
             link = self._keys.heard_link(token.encode())
+            foreign += bool(line) and not (link and all(map(_is_address, addresses)))
             if link is not None and link != self._keys.link and link not in present:
                 named[link] = self._useful(addresses)
         self._missing = {
@@ -165,6 +180,8 @@ class Introductions:
             elif since is None and len(self._missing) < MOST_MISSING:
                 self._missing[peer] = now
                 self._due = now + FIRST_PAUSE
+        if foreign:
+            raise MalformedMessageError("introduction", f"{foreign} lines of an answer name no link or no address")
 
     def _useful(self, addresses: Iterable[str]) -> list[str]:
         """Those of some addresses that are well formed, and lead to the same machine for others."""
@@ -173,6 +190,9 @@ class Introductions:
 
 
 def _is_address(address: str) -> bool:
+    """Whether an address that a stranger names may be dialled: plain letters, without options of zenoh, no device."""
+    if not _PLAIN.fullmatch(address) or address.startswith("serial/"):
+        return False
     try:
         endpoints(address)
     except ValueError:

@@ -23,11 +23,13 @@ from dataclasses import dataclass
 import zenoh
 
 from tfbus.links.zenoh._filters import name_of
+from tfbus.tf_message import MalformedMessageError
 
 NO_ROBOT = "~"
 ANY_ROBOT = "*"
 FIRST_SESSION = "0"
 LONGEST_NAME = 200
+_LONGEST_SHOWN = 100
 
 _ID = re.compile("[0-9a-f]{32}")
 _SESSION = re.compile("0|[0-9a-f]{32}")
@@ -119,6 +121,11 @@ class Keys:
         if found is None or not any(zenoh.KeyExpr(heard).includes(key) for heard in self.heard("@alive")):
             return None
         return found[0]
+
+    def check_token(self, token: bytes) -> None:
+        """Raise `MalformedMessageError` for what is no token of a link of the domain."""
+        if self.session(token.decode("ascii", "replace")) is None:
+            raise MalformedMessageError("token", f"no link has the token {token[:_LONGEST_SHOWN]!r}")
 
     def filter_of(self, key: str) -> tuple[str, str, str] | None:
         """The link, the session and the filter that such a token's key belongs to; None if it names none."""

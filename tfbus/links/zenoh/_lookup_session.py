@@ -7,6 +7,7 @@ Where *robot* is ``~`` without one, the keys are::
     tfbus/domain/robot/@asking/asker     a liveliness token of each asker
 """
 
+import logging
 import threading
 import weakref
 from collections.abc import Callable, Mapping
@@ -19,16 +20,36 @@ import anyio
 import anyio.to_thread
 import zenoh
 
+from tfbus.bus.once_logger import OnceLogger
 from tfbus.links.zenoh._closing import begin_to_close, close_session, wait_at_exit, wait_until_closed
 from tfbus.links.zenoh._keys import NO_ROBOT, check_domain, check_robot
-from tfbus.links.zenoh._opening import open_session
-from tfbus.links.zenoh._session import directly
+from tfbus.links.zenoh._opening import directly, open_session
 from tfbus.links.zenoh._settings import Addresses, settings
 from tfbus.links.zenoh.zenoh_link import ZenohLink
 
 _CLOSING_TIME = 1.0
 
 _Sending = SimpleQueue[Callable[[], object] | None]
+
+
+class Failures:
+    """Counts and logs what went wrong in a thread that has to go on: the data of a stranger must not end it.
+
+    Attributes
+    ----------
+    count : int
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._lock = threading.Lock()
+        self._log = OnceLogger(logging.getLogger("tfbus"))
+
+    def note(self, error: Exception, what: str = "a message of a lookup") -> None:
+        """Count an error, and log the first of its type; for any thread."""
+        with self._lock:
+            self.count += 1
+            self._log.warning((what, type(error)), "%s failed with %s", what, type(error).__name__, exc_info=error)
 
 
 class LookupSession:
@@ -50,6 +71,8 @@ class LookupSession:
     ----------
     domain : str
     robot : str or None
+    failures : Failures
+        What went wrong in the session's thread, or in one of zenoh.
     """
 
     def __init__(
@@ -70,6 +93,7 @@ class LookupSession:
         else:
             self.domain = link.domain
         self.robot = robot
+        self.failures = Failures()
         self._link = link
         self._base = f"tfbus/{self.domain}/{NO_ROBOT if robot is None else check_robot(robot)}"
         self._session: zenoh.Session | None = None
@@ -96,7 +120,7 @@ class LookupSession:
             self._session = self._link._zenoh_session()
         else:
             self._session = await anyio.to_thread.run_sync(open_session, self._config)
-        self._sender = threading.Thread(target=_send_all, args=(self._sending,), daemon=True)
+        self._sender = threading.Thread(target=_send_all, args=(self._sending, self.failures), daemon=True)
         self._sender.start()
         # A program may exit without the end of its server.
         own = None if self._link is not None else self._session
@@ -106,7 +130,7 @@ class LookupSession:
         """Have questions received in zenoh's threads, and announce a server."""
         session = self._opened()
         self._declared += [
-            session.declare_queryable(self.key("lookup"), directly(receive), complete=True),
+            session.declare_queryable(self.key("lookup"), directly(receive, self.failures.note), complete=True),
             session.liveliness().declare_token(self.key("@lookup", server)),
         ]
 
@@ -121,7 +145,9 @@ class LookupSession:
             note(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT)
 
         key = self.key(kind, "*")
-        self._declared.append(self._opened().liveliness().declare_subscriber(key, directly(receive), history=True))
+        self._declared.append(
+            self._opened().liveliness().declare_subscriber(key, directly(receive, self.failures.note), history=True)
+        )
 
     @property
     def is_closed(self) -> bool:
@@ -134,7 +160,7 @@ class LookupSession:
         return self._sending.qsize()
 
     def soon(self, do: Callable[[], object]) -> None:
-        """Have something done by the session's thread, in order; it must not raise."""
+        """Have something done by the session's thread, in order."""
         self._sending.put(do)
 
     def ask(self, payload: bytes, take: Callable[[bytes | None], object], timeout: float, to_all: bool = False) -> None:
@@ -156,7 +182,7 @@ class LookupSession:
             try:
                 session.get(
                     self.key("lookup"),
-                    zenoh.handlers.Callback(take_reply, end, indirect=False),
+                    directly(take_reply, self.failures.note, end),
                     target=zenoh.QueryTarget.ALL if to_all else zenoh.QueryTarget.BEST_MATCHING,
                     payload=payload,
                     consolidation=zenoh.ConsolidationMode.NONE,
@@ -200,9 +226,12 @@ def reply_now(query: zenoh.Query, answer: bytes) -> None:
     query.drop()
 
 
-def _send_all(sending: _Sending) -> None:
+def _send_all(sending: _Sending, failures: Failures) -> None:
     while (send := sending.get()) is not None:
-        send()
+        try:
+            send()
+        except Exception as error:  # noqa: BLE001 - the next one is sent
+            failures.note(error)
         # It refers to the session, which is closed when nobody else does.
         del send
 

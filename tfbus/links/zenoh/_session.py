@@ -18,7 +18,7 @@ from tfbus.links.zenoh._closing import begin_to_close, close_session
 from tfbus.links.zenoh._filters import Filters
 from tfbus.links.zenoh._keys import ANY_ROBOT, FIRST_SESSION, Keys
 from tfbus.links.zenoh._newest import Thinning
-from tfbus.links.zenoh._opening import open_session
+from tfbus.links.zenoh._opening import OpenQuestion, directly, open_session, refusal
 from tfbus.links.zenoh._publishers import Publishers
 from tfbus.tf_message import MalformedMessageError
 
@@ -104,7 +104,7 @@ class ZenohSession:
         self._session: zenoh.Session | None = None
         self.is_open = False
         self._declared: list[object] = []
-        self._questions = 0
+        self._questions = weakref.WeakSet[OpenQuestion]()
         self._close_at_exit: weakref.finalize[..., ZenohSession] | None = None
 
     def open(self) -> None:
@@ -144,27 +144,29 @@ class ZenohSession:
         # Whoever sees the token can ask at once. zenoh undeclares a token that nobody refers to.
         self._declared = [
             *(
-                session.declare_subscriber(key, directly(self._receive_live), allowed_origin=remote)
+                session.declare_subscriber(key, self._door(self._receive_live), allowed_origin=remote)
                 for key in keys.heard("live")
             ),
             *(
-                session.declare_subscriber(key, directly(self._receive_slow(rate)), allowed_origin=remote)
+                session.declare_subscriber(key, self._door(self._receive_slow(rate)), allowed_origin=remote)
                 for key, rate in keys.slow()
             ),
             # Before presence, so that what goes to a peer is known when the peer is.
-            session.liveliness().declare_subscriber(keys.filter_tokens(), directly(self._receive_filter), history=True),
+            session.liveliness().declare_subscriber(
+                keys.filter_tokens(), self._door(self._receive_filter), history=True
+            ),
             *(
-                session.liveliness().declare_subscriber(key, directly(self._receive_presence), history=True)
+                session.liveliness().declare_subscriber(key, self._door(self._receive_presence), history=True)
                 for key in keys.heard("@alive")
             ),
-            session.declare_queryable(keys.own("state"), directly(self._receive_question)),
-            session.declare_queryable(keys.own("history"), directly(self._receive_history_question)),
-            *([session.declare_queryable(keys.own("hears"), directly(self._note_asked))] if self._note_asked else []),
+            session.declare_queryable(keys.own("state"), self._door(self._receive_question)),
+            session.declare_queryable(keys.own("history"), self._door(self._receive_history_question)),
+            *([session.declare_queryable(keys.own("hears"), self._door(self._note_asked))] if self._note_asked else []),
             *([session.liveliness().declare_token(keys.filter_token(self._name))] if keys.filter else []),
             session.liveliness().declare_token(keys.token(self._name)),
         ]
         if self._note_connection is not None:
-            listener = session.info.declare_link_events_listener(directly(self._receive_connection), history=True)
+            listener = session.info.declare_link_events_listener(self._door(self._receive_connection), history=True)
             self._declared.append(listener)
         self.is_open = True
 
@@ -182,7 +184,7 @@ class ZenohSession:
         for peer in peers - self._unfiltered.keys():
             self._unfiltered[peer] = self.session.declare_subscriber(
                 self._keys.of("live", peer, ANY_ROBOT),
-                directly(self._receive_all),
+                self._door(self._receive_all),
                 allowed_origin=zenoh.Locality.REMOTE,
             )
 
@@ -231,7 +233,7 @@ class ZenohSession:
         try:
             self.session.get(
                 self._key(kind, peer),
-                zenoh.handlers.Callback(take, end, indirect=False),
+                self._door(take, end),
                 payload=payload,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=_ANSWER_TIME,
@@ -265,7 +267,7 @@ class ZenohSession:
         with suppress(zenoh.ZError):
             self.session.get(
                 self._key("hears", peer),
-                zenoh.handlers.Callback(take_reply, end, indirect=False),
+                self._door(take_reply, end),
                 payload=self._keys.token(FIRST_SESSION),
                 timeout=_HEARING_TIME,
                 congestion_control=zenoh.CongestionControl.DROP,
@@ -280,18 +282,17 @@ class ZenohSession:
                 query.reply(self._keys.own("hears"), ",".join(names)[:MOST_NAMES], attachment=named or None)
             query.drop()
 
-    def answer(self, question: zenoh.Query, message: Message) -> None:
+    def answer(self, question: OpenQuestion, message: Message) -> None:
         """Answer a question; may block, because zenoh waits for a peer whose queue is full."""
         encoding = zenoh.Encoding(_SERVES_FILTERS) if self._filters.are_served else None
+        key = self._keys.own(question.kind)
         try:
             # A peer that has gone needs no answer.
             with suppress(zenoh.ZError):
-                kind = str(question.key_expr).rsplit("/", 2)[1]
-                question.reply(self._keys.own(kind), message.payload, attachment=message.attachment, encoding=encoding)
+                question.query.reply(key, message.payload, attachment=message.attachment, encoding=encoding)
         finally:
             question.drop()
-            with self._lock:
-                self._questions -= 1
+            self._questions.discard(question)
 
     def close(self) -> threading.Thread:
         """Begin to close the session, also one that is still being opened.
@@ -370,30 +371,35 @@ class ZenohSession:
             self._note_connection(str(event.link.zid), event.link.src, event.link.dst)
 
     def _receive_question(self, query: zenoh.Query) -> None:
-        if query.attachment is not None and self._note_heard is not None:
-            self._note_heard(query.attachment.to_bytes()[:MOST_NAMES])
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        self._admit(query, Question(_SINCE.unpack(payload)[0], query) if len(payload) == _SINCE.size else None)
+        if len(payload) != _SINCE.size:
+            raise MalformedMessageError("question", f"a question for changes has {len(payload)} bytes")
+        # The question may be answered, and its attachment gone, as soon as it is admitted.
+        token = None if query.attachment is None else query.attachment.to_bytes()[:MOST_NAMES]
+        self._admit(Question(_SINCE.unpack(payload)[0], OpenQuestion(query, "state")))
+        if token is not None and self._note_heard is not None:
+            self._note_heard(token)
 
     def _receive_history_question(self, query: zenoh.Query) -> None:
         payload = b"" if query.payload is None else query.payload.to_bytes()
-        question = None
-        if _SECONDS.size <= len(payload) <= _SECONDS.size + _LONGEST_NAME:
-            seconds = _SECONDS.unpack_from(payload)[0]
-            with suppress(UnicodeDecodeError):
-                after = payload[_SECONDS.size :].decode()
-                question = HistoryQuestion(seconds, after, query) if 0 < seconds <= LONGEST_HISTORY else None
-        self._admit(query, question)
+        if not _SECONDS.size <= len(payload) <= _SECONDS.size + _LONGEST_NAME:
+            raise MalformedMessageError("question", f"a question for the past has {len(payload)} bytes")
+        seconds = _SECONDS.unpack_from(payload)[0]
+        if not 0 < seconds <= LONGEST_HISTORY:
+            raise MalformedMessageError("question", f"a question for the last {seconds} s")
+        after = payload[_SECONDS.size :].decode()
+        self._admit(HistoryQuestion(seconds, after, OpenQuestion(query, "history")))
 
-    def _admit(self, query: zenoh.Query, question: Question | HistoryQuestion | None) -> None:
+    def _admit(self, question: Question | HistoryQuestion) -> None:
         with self._lock:
-            admitted = question is not None and self._questions < MOST_QUESTIONS
-            self._questions += admitted
-        if admitted:
-            self._receive(Received("", question))
-        else:
-            # Whoever means it asks again.
-            query.drop()
+            if len(self._questions) >= MOST_QUESTIONS:
+                # Whoever means it asks again.
+                raise MalformedMessageError("busy", f"{MOST_QUESTIONS} questions wait for answers")
+            self._questions.add(question.handle)
+        self._receive(Received("", question))
+
+    def _door(self, callback: Callable[[Any], object], end: Callable[[], object] | None = None) -> Any:
+        return directly(callback, lambda error: self._receive(refusal(error)), end)
 
     def _key(self, kind: str, peer: str) -> str:
         return self._keys.of(kind, peer, self._robot_of(peer))
@@ -412,8 +418,3 @@ class ZenohSession:
 
     def _refuse(self, sender: str, reason: str, detail: str) -> None:
         self._receive(Received(sender, MalformedMessageError(reason, detail)))
-
-
-def directly(callback: Callable[[Any], object]) -> Any:
-    # Otherwise each subscriber has a thread of its own, and one overtakes the other.
-    return zenoh.handlers.Callback(callback, indirect=False)

@@ -28,11 +28,13 @@ from tfbus.links.zenoh._hearing import DEAF, Hearing
 from tfbus.links.zenoh._introductions import Introductions
 from tfbus.links.zenoh._keys import FIRST_SESSION, Keys
 from tfbus.links.zenoh._listening import Listening
-from tfbus.links.zenoh._notes import MOST_ASKING, Notes
+from tfbus.links.zenoh._notes import MOST_ASKING, Noted, Notes
+from tfbus.links.zenoh._opening import OpenQuestion, guarded, refusal
 from tfbus.links.zenoh._patch import Patch
 from tfbus.links.zenoh._present import Present
 from tfbus.links.zenoh._session import ZenohSession
 from tfbus.links.zenoh._unmet import Unmet
+from tfbus.tf_message import MalformedMessageError
 
 _MEETING_TIME = 10.0
 """s that a peer has to be met where it was dialled; on a busy machine that takes more than three."""
@@ -69,17 +71,9 @@ class ZenohSessions:
         self._filters = Filters(keys.robot)
         self._unserved: set[str] = set()
         self._present = Present(receive, self._notes.add_change)
+        notes = self._note_asked, self._notes.add_connection, self._note_heard, self._filters, self._note_served
         self._main = ZenohSession(
-            config,
-            keys,
-            receive,
-            self._note_directly,
-            note_asked=self._note_asked,
-            note_connection=self._notes.add_connection,
-            note_heard=self._note_heard,
-            filters=self._filters,
-            note_served=self._note_served,
-            robot_of=self._present.robot,
+            config, keys, receive, self._note_directly, FIRST_SESSION, *notes, self._present.robot
         )
         self._patches: dict[str, Patch] = {}
         self._dialing = Dialing(monotonic) if dialing is None else dialing
@@ -159,7 +153,7 @@ class ZenohSessions:
         patch = self._patches.get(peer)
         return patch if patch is not None and patch.is_open else self._main
 
-    def answer(self, question: zenoh.Query, message: Message) -> None:
+    def answer(self, question: OpenQuestion, message: Message) -> None:
         """Answer a question, in a thread, because zenoh may wait for a peer that is frozen."""
         self._answering.submit(self._main.answer, question, message).add_done_callback(_log_failure)
 
@@ -185,32 +179,38 @@ class ZenohSessions:
                 began = monotonic()
                 await anyio.sleep(interval)
                 late = monotonic() - min(began, self._notes.since) > 3 * interval
-                noted = self._notes.take()
-                connected = [self._reached(*connection) for connection in noted.connected]
-                self._note(noted.changes)
-                for peer, _ in connected:
-                    if self._present.is_direct(peer):
-                        self._hearing.joined(peer)
-                for peer in noted.hearers:
-                    self._hearing.is_heard(peer)
-                for peer, names, named in noted.heard_by:
-                    # Where this loop has no time, nobody's silence proves anything, and many have not come yet.
-                    if names is not None or not late:
-                        self._judge(peer, names)
-                    if not late:
-                        self._introductions.take(named, self._present)
-                # Before all that may wait for zenoh; who is due after this is dialled in the next round.
-                self._dial(self._dialing.take_due(), tasks)
-                if noted.asking:
-                    self._answer_hearing(noted.asking)
-                if self._keys.filter:
-                    self._hear_unserved()
-                for peer in self._hearing.take_due():
-                    self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
-                self._ask_for_missing()
-                self._closing = [closing for closing in self._closing if closing.is_alive()]
-                unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
-                self._dial(unmet, tasks)
+                try:
+                    await self._look_after(self._notes.take(), late, tasks)
+                except Exception as error:  # noqa: BLE001 - no peer may end the link
+                    self._receive(refusal(error))
+
+    async def _look_after(self, noted: Noted, late: bool, tasks: TaskGroup) -> None:
+        """Do what the notes ask for, and what is due; `late` is whether this loop has had no time."""
+        connected = [self._reached(*connection) for connection in noted.connected]
+        self._note(noted.changes)
+        for peer, _ in connected:
+            if self._present.is_direct(peer):
+                self._hearing.joined(peer)
+        for peer in noted.hearers:
+            self._hearing.is_heard(peer)
+        for peer, names, named in noted.heard_by:
+            # Where this loop has no time, nobody's silence proves anything, and many have not come yet.
+            if names is not None or not late:
+                self._judge(peer, names)
+            if not late:
+                guarded(self._receive, peer, self._introductions.take, named, self._present)
+        # Before all that may wait for zenoh; who is due after this is dialled in the next round.
+        self._dial(self._dialing.take_due(), tasks)
+        if noted.asking:
+            self._answer_hearing(noted.asking)
+        if self._keys.filter:
+            self._hear_unserved()
+        for peer in self._hearing.take_due():
+            self._main.ask_hearing(peer, partial(self._notes.add_answer, peer))
+        self._ask_for_missing()
+        self._closing = [closing for closing in self._closing if closing.is_alive()]
+        unmet = await self._unmet.find(connected, self._present, self._dialing.is_dialled)
+        self._dial(unmet, tasks)
 
     def _reached(self, peer: str, near: str, far: str) -> tuple[str, str | None]:
         """Note a connection that has come or gone; returns where the peer listens, or None if it has dialled."""
@@ -317,22 +317,36 @@ class ZenohSessions:
         asker = self._asker(query)
         if asker is None or query.attachment is None:
             return b""
-        return self._introductions.answer(query.attachment.to_bytes(), asker, self._present.robots())
+        known, answer = query.attachment.to_bytes(), self._introductions.answer
+        return guarded(self._receive, asker, answer, known, asker, self._present.robots()) or b""
 
     def _asker(self, query: zenoh.Query) -> str | None:
         """The link that asks whether it is heard; None for one that this link does not mean to hear."""
         return self._keys.heard_link(b"" if query.payload is None else query.payload.to_bytes())
 
     def _note_asked(self, query: zenoh.Query) -> None:
-        if self._asker(query) is None or not self._notes.add_question(query):
+        self._keys.check_token(b"" if query.payload is None else query.payload.to_bytes())
+        if self._asker(query) is None:
+            # It is not meant to be heard.
             query.drop()
+        elif not self._notes.add_question(query):
+            raise MalformedMessageError("busy", f"{MOST_ASKING} links ask whether they are heard")
 
     def _note_heard(self, token: bytes) -> None:
+        self._keys.check_token(token)
         peer = self._keys.heard_link(token)
         if peer is not None:
             self._notes.add_hearer(peer)
 
     async def _patch(self, peer: str, address: str) -> None:
+        try:
+            await self._dial_and_meet(peer, address)
+        except Exception as error:  # noqa: BLE001 - no address that a peer names may end the link
+            self._drop_patch(peer)
+            self._dialing.taken(peer, address)
+            self._receive(refusal(error, peer))
+
+    async def _dial_and_meet(self, peer: str, address: str) -> None:
         try:
             reachable = await is_reachable(address)
         except ConnectionRefusedError:
@@ -341,16 +355,8 @@ class ZenohSessions:
         if not reachable or peer in self._patches:
             return
         config = self._patch_config(address)
-        patch = Patch(
-            config,
-            self._keys,
-            peer,
-            self._receive,
-            self._note_by_patch,
-            self._filters,
-            self._note_served,
-            self._present.robot,
-        )
+        notes = self._note_by_patch, self._filters, self._note_served, self._present.robot
+        patch = Patch(config, self._keys, peer, self._receive, *notes)
         self._patches[peer] = patch
         try:
             await anyio.to_thread.run_sync(patch.open, abandon_on_cancel=True)

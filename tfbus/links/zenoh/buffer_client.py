@@ -15,6 +15,8 @@ from tfbus.bus.sample_queue import check_capacity
 from tfbus.errors import LookupTimeoutError, RemoteLookupError, TransformLookupError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import Cancellation, RemoteQuestion, read_answer, write_question
+from tfbus.links.link import warn_unless_entered
+from tfbus.links.zenoh._closing import use_zenoh
 from tfbus.links.zenoh._keys import new_id
 from tfbus.links.zenoh._lookup_session import LookupSession
 from tfbus.links.zenoh._settings import Addresses
@@ -94,11 +96,13 @@ class BufferClient:
         self._servers: set[str] = set()
         self._changed = anyio.Event()
         self._waker = LoopWaker(self._handle_arrived)
+        self._never_entered = warn_unless_entered(self)
 
     async def __aenter__(self) -> Self:
         if self._entered:
             raise RuntimeError("a buffer client is entered once: make another one")
         self._entered = True
+        self._never_entered.detach()
         self._waker.bind()
         await self._session.open()
         self._session.announce_asker(self._id)
@@ -149,7 +153,7 @@ class BufferClient:
         TransformLookupError, BusClosedError, ClockResetError, TypeError, ValueError
             As `tfbus.Buffer.lookup` there: the same error, with its facts.
         RuntimeError
-            If `capacity` lookups wait already, or the client is not entered.
+            If `capacity` lookups wait already, the client is not entered, or this process was forked after it was.
         """
         policy_of(tolerance, max_gap, extrapolate)
         limit = math.inf if timeout is None else as_duration(timeout, "timeout")
@@ -160,15 +164,16 @@ class BufferClient:
             target=target,
             source=source,
             at=at if isinstance(at, Latest) else as_stamp(at),
-            max_age=max_age,
+            max_age=None if max_age is None else as_duration(max_age, "max_age"),
             source_at=source_at if source_at is None or isinstance(source_at, Latest) else as_stamp(source_at),
             fixed=fixed,
-            tolerance=tolerance,
-            max_gap=max_gap,
-            hold=None if extrapolate is None else extrapolate.max_age,
+            tolerance=float(tolerance),
+            max_gap=None if max_gap is None else float(max_gap),
+            hold=None if extrapolate is None else float(extrapolate.max_age),
         )
         if not self._is_open:
             raise RuntimeError("the client is not entered")
+        use_zenoh()
         silences = 0
         while True:
             if not self._servers:
@@ -229,7 +234,7 @@ class BufferClient:
             if not self._servers:
                 raise self._error("lost", "it has gone")
             raise self._error("silent", "it has dropped the question, or it has gone")
-        answer = read_answer(pending.answer, self._session.domain, self._session.robot)
+        answer = read_answer(pending.answer, self._session.domain, self._session.robot, question)
         if isinstance(answer, Exception):
             raise answer
         return answer

@@ -20,13 +20,13 @@ from tfbus.bus.sample_queue import check_capacity
 from tfbus.errors import MAY_COME, RemoteLookupError, TransformError
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._remote_lookup import (
-    MAX_BYTES,
     Cancellation,
     RemoteQuestion,
     as_timeout,
     read_question,
     write_answer,
 )
+from tfbus.links.link import warn_unless_entered
 from tfbus.links.zenoh._keys import new_id
 from tfbus.links.zenoh._lookup_session import LookupSession, reply_now
 from tfbus.links.zenoh._settings import Addresses
@@ -109,16 +109,18 @@ class BufferServer:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._tasks: anyio.abc.TaskGroup | None = None
+        self._never_entered = warn_unless_entered(self)
 
     def statistics(self) -> BufferServerStatistics:
         """All counters, as they are now."""
         counts = self._counts
+        refused = {**counts, "internal": self._session.failures.count}
         return BufferServerStatistics(
             waiting=len(self._waiting),
             answered=counts["answered"],
             failed=counts["failed"],
             cancelled=counts["cancelled"],
-            refused={reason: counts[reason] for reason in ("busy", "malformed") if counts[reason]},
+            refused={reason: refused[reason] for reason in ("busy", "malformed", "internal") if refused.get(reason)},
             queue=QueueStatistics("lookups", "drop_newest", self._capacity, len(self._received), counts["dropped"]),
         )
 
@@ -126,6 +128,7 @@ class BufferServer:
         if self._entered:
             raise RuntimeError("a buffer server is entered once: make another one")
         self._entered = True
+        self._never_entered.detach()
         self._waker.bind()
         await self._session.open()
         self._tasks = await anyio.create_task_group().__aenter__()
@@ -169,7 +172,7 @@ class BufferServer:
         try:
             question = read_question(b"" if query.payload is None else query.payload.to_bytes())
         except ValueError as error:
-            self._refuse(query, "malformed", f"the question cannot be read: {str(error)[: MAX_BYTES // 100]}")
+            self._refuse(query, "malformed", f"the question cannot be read: {error}")
             return
         if isinstance(question, Cancellation):
             self._hand_over(question)
@@ -178,18 +181,15 @@ class BufferServer:
         if not self._admit():
             self._refuse(query, "busy", f"more than {self._rate:g} lookups come in a second")
             return
+        answer: TransformStamped | Exception
         try:
-            answer: TransformStamped | Exception = self._buffer.lookup_nowait(**_arguments(question))
+            answer = self._buffer.lookup_nowait(**_arguments(question))
         except MAY_COME:
             self._hand_over((query, question))
             return
-        except (TransformError, TypeError, ValueError) as error:
+        except Exception as error:  # noqa: BLE001 - it is told to the asker
             answer = error
-        except Exception:  # noqa: BLE001 - the wait on the event loop raises it again, where it is seen
-            self._hand_over((query, question))
-            return
-        self._count_answer(answer)
-        reply_now(query, write_answer(answer))
+        self._answer(query, answer, at_once=True)
 
     async def _take_all(self, tasks: anyio.abc.TaskGroup) -> None:
         while True:
@@ -238,7 +238,7 @@ class BufferServer:
             try:
                 timeout = as_timeout(question.timeout, LONGEST_WAIT)
                 answer = await self._buffer.lookup(**_arguments(question), timeout=timeout)
-            except (TransformError, TypeError, ValueError) as error:
+            except Exception as error:  # noqa: BLE001 - it is told to the asker
                 answer = error
             finally:
                 self._waiting.pop(key, None)
@@ -247,14 +247,27 @@ class BufferServer:
         else:
             self._answer(query, answer)
 
-    def _answer(self, query: zenoh.Query, answer: TransformStamped | Exception) -> None:
-        self._count_answer(answer)
-        self._reply(query, write_answer(answer))
+    def _answer(self, query: zenoh.Query, answer: TransformStamped | Exception, at_once: bool = False) -> None:
+        """Count an answer and send it; no error of one question ends the thread or the task."""
+        try:
+            if isinstance(answer, Exception) and not isinstance(answer, (TransformError, TypeError, ValueError)):
+                # As one that cannot be written.
+                raise answer
+            message = write_answer(answer)
+        except Exception as error:  # noqa: BLE001 - the next question is answered
+            self._session.failures.note(error, "a lookup of another process")
+            message = self._refusal("internal", f"the lookup failed there with {type(error).__name__}")
+        else:
+            self._count("failed" if isinstance(answer, Exception) else "answered")
+        (reply_now if at_once else self._reply)(query, message)
 
     def _refuse(self, query: zenoh.Query, reason: str, detail: str) -> None:
         self._count(reason)
-        error = RemoteLookupError(domain=self._session.domain, robot=self._session.robot, reason=reason, detail=detail)
-        self._reply(query, write_answer(error))
+        self._reply(query, self._refusal(reason, detail))
+
+    def _refusal(self, reason: str, detail: str) -> bytes:
+        domain, robot = self._session.domain, self._session.robot
+        return write_answer(RemoteLookupError(domain=domain, robot=robot, reason=reason, detail=detail))
 
     def _reply(self, query: zenoh.Query, answer: bytes) -> None:
         if self._session.unsent >= self._capacity:
@@ -262,9 +275,6 @@ class BufferServer:
             query.drop()
             return
         self._session.reply(query, answer)
-
-    def _count_answer(self, answer: TransformStamped | Exception) -> None:
-        self._count("failed" if isinstance(answer, Exception) else "answered")
 
     def _count(self, what: str) -> None:
         # Threads of zenoh, that of the session and the event loop count.

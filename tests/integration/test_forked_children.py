@@ -1,0 +1,179 @@
+"""Programs that fork: a child has the copy of a bus, and none of the threads and loops that work for it."""
+
+import subprocess
+import sys
+
+import pytest
+
+BEGIN = """
+import asyncio, multiprocessing, os, sys, tempfile
+import anyio
+from tfbus import Buffer, Bus, TransformBroadcaster, Transform, TransformStamped
+from tfbus.links.zenoh import BufferClient, BufferServer, ZenohLink
+from tfbus.recording import Recorder
+
+def sample(stamp):
+    return TransformStamped("map", "base", stamp, Transform((float(stamp), 0.0, 0.0)))
+
+def tell(do, *arguments):
+    try:
+        print("did", do(*arguments))
+    except Exception as error:
+        print(type(error).__name__, error)
+
+def in_a_child(body):
+    child = os.fork()
+    if child == 0:
+        body()
+        sys.stdout.flush()
+        os._exit(0)
+    os.waitpid(child, 0)
+"""
+
+
+def said(program: str) -> list[str]:
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", BEGIN + program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stderr == ""
+    return done.stdout.splitlines()
+
+
+def test_a_child_may_use_its_copy_of_a_bus_that_only_buffers_and_callbacks_are_on() -> None:
+    lines = said("""
+bus = Bus(max_ahead=None)
+buffer = Buffer(bus)
+bus.publish([sample(1), sample(3)])
+def child():
+    with bus.subscribe(lambda batch: print("heard", batch[-1].stamp)):
+        tell(bus.publish, sample(5))
+    print(buffer.lookup_nowait("map", "base", 4).transform.translation)
+    tell(bus.remove_frame, "base")
+in_a_child(child)
+# The parent's is another one.
+print(buffer.lookup_nowait("map", "base").stamp)
+""")
+    assert lines == ["heard 5", "did None", "(4.0, 0.0, 0.0)", "did None", "3"]
+
+
+ENTERED = {
+    "ZenohLink": "ZenohLink(bus, listen='tcp/127.0.0.1:0')",
+    "Recorder": "Recorder(bus, tempfile.mkdtemp() + '/a.tfbus')",
+}
+
+
+@pytest.mark.parametrize("kind", ENTERED)
+@pytest.mark.parametrize(
+    "started", ["in_a_child(child)", pytest.param("by_multiprocessing(child)", marks=pytest.mark.thorough)]
+)
+def test_a_child_is_told_that_nobody_hears_what_it_publishes_on_the_bus_of_its_parent(kind: str, started: str) -> None:
+    lines = said(f"""
+def by_multiprocessing(body):
+    process = multiprocessing.get_context("fork").Process(target=body)
+    process.start()
+    process.join()
+
+async def main():
+    with Bus(max_ahead=None) as bus, Buffer(bus) as buffer:
+        one, two = TransformBroadcaster(bus), ({ENTERED[kind]})
+        def child():
+            # What it has heard so far is there.
+            print(buffer.lookup_nowait("map", "base").stamp)
+            tell(bus.publish, sample(2))
+            tell(bus.publish, [sample(2), sample(3)])
+            tell(one.send_static, "map", "lamp", Transform())
+            tell(bus.remove_frame, "base")
+            tell(bus.subscribe, print)
+            with Bus() as own:
+                tell(own.publish, sample(2))
+        async with two:
+            bus.publish(sample(1))
+            {started}
+            tell(bus.publish, sample(2))
+        # Nothing works for it any more.
+        in_a_child(lambda: tell(bus.publish, sample(3)))
+
+anyio.run(main)
+""")
+    assert lines[0] == "1"
+    for line in lines[1:6]:
+        assert line.startswith(
+            f"RuntimeError this process was forked, and fork has not copied what works for the bus, {kind}"
+        )
+        assert "'spawn' of multiprocessing" in line
+    assert lines[6:] == ["did None"] * 3
+
+
+def test_a_child_is_told_that_the_threads_of_a_loop_are_those_of_its_parent() -> None:
+    lines = said("""
+async def main():
+    with Bus(max_ahead=None) as bus, bus.threadsafe() as publish:
+        in_a_child(lambda: tell(publish, sample(1)))
+        in_a_child(lambda: tell(bus.publish, sample(1)))
+        tell(publish, sample(2))
+anyio.run(main)
+""")
+    assert [line.partition(":")[0] for line in lines] == [
+        *["RuntimeError this process was forked, and fork has not copied what works for the bus, ThreadPublisher"] * 2,
+        "did None",
+    ]
+
+
+def test_a_child_of_a_program_with_zenoh_cannot_enter_a_link_and_ends_without_waiting() -> None:
+    lines = said("""
+async def enter(make):
+    async with make():
+        print("entered")
+
+async def main():
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with ZenohLink(bus, listen="tcp/127.0.0.1:0"), BufferClient(listen="tcp/127.0.0.1:0") as client:
+            def child():
+                own = Bus()
+                tell(asyncio.run, enter(lambda: ZenohLink(own, listen="tcp/127.0.0.1:0")))
+                tell(asyncio.run, enter(lambda: BufferClient(listen="tcp/127.0.0.1:0")))
+                tell(asyncio.run, client.lookup("map", "base"))
+            process = multiprocessing.get_context("fork").Process(target=child)
+            process.start()
+            process.join()
+anyio.run(main)
+""")
+    assert [line.partition(",")[0] for line in lines] == [
+        "RuntimeError this process was forked from one that uses zenoh"
+    ] * 3
+
+
+def test_a_child_that_forks_before_the_first_link_has_links_of_its_own() -> None:
+    lines = said("""
+async def enter():
+    with Bus() as bus:
+        async with ZenohLink(bus, listen="tcp/127.0.0.1:0") as link:
+            print(link.peers)
+in_a_child(lambda: tell(anyio.run, enter))
+anyio.run(enter)
+""")
+    assert lines == ["()", "did None", "()"]
+
+
+def test_each_link_that_was_made_and_never_entered_is_told_of_in_one_line_and_no_other() -> None:
+    program = f"""{BEGIN}
+from tfbus.links.dds import DdsLink
+from tfbus.links.rosbridge import RosbridgeLink
+async def enter(link):
+    async with link:
+        pass
+entered = ZenohLink(Bus(), listen="tcp/127.0.0.1:0")
+anyio.run(enter, entered)
+tell(anyio.run, enter, ZenohLink(Bus(), config={{"mode": "client"}}, connect="tcp/127.0.0.1:1"))
+tell(ZenohLink, Bus(), "no domain")
+# One that goes at once, and those that the program keeps to its end; the copies of a child are no others.
+DdsLink(Bus())
+kept = [ZenohLink(Bus()), RosbridgeLink(Bus(), "ws://127.0.0.1:9090"), BufferServer(Buffer(Bus())), BufferClient()]
+in_a_child(lambda: sys.exit())
+"""
+    command = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert [line.split()[0] for line in done.stdout.splitlines()] == ["OSError", "ValueError"]
+    assert sorted(done.stderr.splitlines()) == [
+        f"a {name} was made and never entered, so it has done nothing: write `async with {name}(...)`"
+        for name in ("BufferClient", "BufferServer", "DdsLink", "RosbridgeLink", "ZenohLink")
+    ]
