@@ -2,10 +2,10 @@
 
 import random
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import inf
 from time import monotonic
-from typing import Any, Literal
+from typing import Any, Final, Literal
 from uuid import uuid4
 
 import anyio
@@ -21,12 +21,16 @@ from tfbus.links.rosbridge._protocol import (
     JOINT_TYPE,
     TEXT_TYPE,
     Incoming,
+    LargeMessage,
     advertise,
     decode_content,
+    decode_content_in_parts,
     decode_joints,
+    is_large,
     is_of_ros2,
     publish,
     read,
+    read_large,
     subscribe,
     unsubscribe,
 )
@@ -35,6 +39,8 @@ from tfbus.tf_message import Decoded, MalformedMessageError
 
 MOST_QUEUED = 1_000
 """So many messages wait for a slow server; then the oldest are dropped."""
+MOST_SAID: Final = 20
+"""So many different things that a server says of itself are logged for one connection."""
 Encoding = Literal["cbor", "cbor-raw"]
 CONNECT_TIME = 5.0
 SILENCE = 10.0
@@ -79,6 +85,7 @@ class RosbridgeCarrier(RosCarrier):
         self._moving: deque[tuple[str, int]] = deque()
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
+        self._said: set[str] = set()
         self._woken = anyio.Event()
         self._of_ros2 = False
         self._advertised = self._heard_moving = False
@@ -96,6 +103,7 @@ class RosbridgeCarrier(RosCarrier):
         self._connected_at = monotonic()
         self._moving.clear()
         self._requests.clear()
+        self._said.clear()
         # First of all: what is latched may come only once, and moving frames come again.
         for topic in (*self.settings.tf_static, *self.settings.tf):
             self._request(subscribe(topic, self._encoding))
@@ -157,6 +165,12 @@ class RosbridgeCarrier(RosCarrier):
     def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
         return decode_content(payload)
 
+    def _is_large(self, payload: Any) -> bool:
+        return isinstance(payload, LargeMessage) or (isinstance(payload, bytes) and super()._is_large(payload))
+
+    def _decode_in_parts(self, payload: Any) -> Iterator[Decoded[ReceivedTransform]]:
+        return decode_content_in_parts(payload)
+
     def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
         return decode_joints(payload)
 
@@ -200,13 +214,20 @@ class RosbridgeCarrier(RosCarrier):
         while True:
             message = await socket.receive()
             try:
-                self._take(read(message), len(message))
+                large = is_large(message)
+                self._take(await read_large(message, socket.give_way) if large else read(message), len(message))
             except MalformedMessageError as error:
-                self._receive(Received(self._url, error))
+                # Thousands of them, each with what it was read from, would be work for the collector.
+                error.__context__ = None
+                self._receive(Received(self._url, error.with_traceback(None)))
 
     def _take(self, incoming: Incoming, size: int) -> None:
         if not incoming.topic:
-            self._report.failed(ConnectionError(f"{self._url} says: {incoming.content}"))
+            if len(self._said) < MOST_SAID:
+                self._said.add(incoming.content)
+                # Not to end the line, or to turn it around.
+                said = incoming.content.encode("unicode_escape").decode()
+                self._report.failed(ConnectionError(f"{self._url} says: {said}"))
             return
         others = {
             "joints": self.settings.joint_topic,
@@ -229,8 +250,11 @@ class RosbridgeCarrier(RosCarrier):
             self._heard_moving = True
             if monotonic() > self._connected_at + ECHO_TIME:
                 self._held_until = -inf
-        content = RosMessage(incoming.content, static, "rosbridge")
-        self._receive(Received(self._url, content, size, moving=not static))
+        payload = incoming.content
+        if isinstance(payload, dict):
+            # Samples take less memory than what they are read from.
+            payload = decode_content(payload)
+        self._receive(Received(self._url, RosMessage(payload, static, "rosbridge"), size, moving=not static))
 
     def _ask_for_cbor(self) -> None:
         """Subscribe anew: a server that answers ``cbor-raw`` in JSON may know ``cbor``, which is older."""
