@@ -284,7 +284,7 @@ async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_fo
             while link.statistics().received_samples < 2_000:
                 seen.add(link.statistics().received_samples)
                 await anyio.lowlevel.checkpoint()
-            # At most 20 items of 0.1 ms in a turn of 2 ms, and this task has been run in between.
+            # At most 10 items of 0.1 ms in a turn of 1 ms, and this task has been run in between.
             assert len(seen) >= 90
             assert link.statistics().received_messages == 2_000
 

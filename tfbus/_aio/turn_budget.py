@@ -6,8 +6,8 @@ from typing import Final
 
 import anyio.lowlevel
 
-TURN: Final = 0.002
-"""s; two pieces of work and what they are late by stay within 5 ms."""
+TURN: Final = 0.001
+"""s; two such pieces of work, each late by one message, stay within 5 ms."""
 
 
 class TurnBudget:

@@ -36,7 +36,7 @@ class Link:
     """Joins a bus to other buses, or to another world: ``async with link``.
 
     What is published in one turn of the event loop goes out together at its end. What comes in waits in a bounded queue
-    and is published on the event loop, 2 ms a turn. A carrier may split a large message, so that it takes several.
+    and is published on the event loop, 1 ms a turn. A carrier may split a large message, so that it takes several.
 
     Parameters
     ----------

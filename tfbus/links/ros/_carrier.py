@@ -27,9 +27,9 @@ MAX_SIZE = 2**22
 """The largest message that is received, in bytes."""
 MAX_OTHER_SIZE = 2**15
 """The largest message of joints or of the time, in bytes."""
-AT_ONCE = 2**14
+AT_ONCE = 2**13
 """A message of transforms beyond so many bytes or characters is read in parts."""
-PART = 100
+PART = 40
 """So many transforms of a large message are decoded and published at once."""
 MOST_TRANSFORMS = 1_000
 """So many moving transforms go into one message."""

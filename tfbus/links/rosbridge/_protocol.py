@@ -4,7 +4,7 @@
 does not know an encoding uses another, so the answer is read as it comes.
 
 Nothing that a server sends may keep the event loop, and the decoders of JSON and CBOR keep it until they are done, in a
-thread too. So they are given at most `AT_ONCE` bytes: a message that is larger is taken apart here, and each of its
+thread too. So they are given at most `MAX_VALUE` bytes: a message that is larger is taken apart here, and each of its
 transforms is decoded for itself. Of CBOR, only what JSON has too is taken. A map of other keys than text could be made
 so that all keys have one hash, and the values of most tags are worth a decoder of their own: numbers of any size,
 regular expressions, references.
@@ -37,6 +37,8 @@ _DOUBLES: Final = 86
 MOST_TRANSFORMS: Final = MAX_SIZE // 128
 """More of them in one message are no transforms."""
 _MOST_FIELDS: Final = 100
+MAX_VALUE: Final = 2**14
+"""The largest value in a large message, in bytes or characters, other than text and bytes."""
 _DEPTH: Final = 20
 _MAP, _ARRAY, _TEXT, _BYTES = 5, 4, 3, 2
 """Major types of CBOR (RFC 8949, section 3.1)."""
@@ -80,9 +82,11 @@ def advertise(topic: str, static: bool) -> str:
     return _request("advertise", topic, type=TYPE, latch=static, queue_size=1 if static else QUEUE)
 
 
-def publish(topic: str, samples: Sequence[TransformStamped]) -> str:
-    """A message of transforms for a topic."""
-    return json.dumps({"op": "publish", "topic": topic, "msg": {"transforms": list(map(as_mapping, samples))}})
+def publish(topic: str, samples: Sequence[TransformStamped], static: bool = False) -> str:
+    """A message of transforms for a topic, which is advertised with the same `static`."""
+    request = {"op": "publish", "topic": topic, "msg": {"transforms": list(map(as_mapping, samples))}}
+    # A server of ROS 2 would else warn at each message, and if its logger fails, refuse it.
+    return json.dumps({**request, "latch": True, "queue_size": 1} if static else request)
 
 
 def read(message: str | bytes) -> Incoming:
@@ -136,7 +140,7 @@ async def read_large(message: str | bytes, give_way: GiveWay) -> Incoming:
     Raises
     ------
     MalformedMessageError
-        If it is none, or has a field, other than text, bytes and the transforms, of more than `AT_ONCE` bytes.
+        If it is none, or has a field, other than text, bytes and the transforms, of more than `MAX_VALUE` bytes.
     """
     source = _Json(message) if isinstance(message, str) else _Cbor(message)
     transforms = LargeMessage()
@@ -166,7 +170,7 @@ async def read_large(message: str | bytes, give_way: GiveWay) -> Incoming:
             await give_way()
         if isinstance(error, MalformedMessageError):
             raise
-        detail = f"it is neither JSON nor CBOR, or has a value of more than {AT_ONCE} bytes: {error!r}"
+        detail = f"it is neither JSON nor CBOR, or has a value of more than {MAX_VALUE} bytes: {error!r}"
         raise MalformedMessageError("encoding", detail[:200]) from None
 
 
@@ -215,14 +219,14 @@ class _Json:
         return self._places() if self._opens("[") else None
 
     def value(self) -> Any:
-        """What comes next: text of any length, or something else of at most `AT_ONCE` characters."""
+        """What comes next: text of any length, or something else of at most `MAX_VALUE` characters."""
         self._skip()
         if self._text.startswith('"', self._at):
             value, self._at = self._DECODER.raw_decode(self._text, self._at)
             return value
-        window = self._text[self._at : self._at + AT_ONCE]
+        window = self._text[self._at : self._at + MAX_VALUE]
         value, end = self._DECODER.raw_decode(window)
-        if end == AT_ONCE:
+        if end == MAX_VALUE:
             # A number may go on.
             raise ValueError("cut off")
         self._at += end
@@ -296,7 +300,7 @@ class _Cbor:
                 raise ValueError("cut off")
             self._at += size
             return held.decode() if kind == _TEXT else held
-        window = BytesIO(self._data[self._at : self._at + AT_ONCE])
+        window = BytesIO(self._data[self._at : self._at + MAX_VALUE])
         value = _decoder(window).decode()
         self._at += window.tell()
         return value
