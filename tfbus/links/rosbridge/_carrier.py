@@ -1,12 +1,5 @@
-"""The carrier of links through rosbridge.
+"""The carrier of links through rosbridge."""
 
-A server tells nobody what it refuses: rosbridge_suite writes it to its own log, and then a static frame never arrives.
-One of ROS 2 does so when its logger fails, for the next client that advertises a topic whose last client has just left.
-But a server gives its clients back what they publish on a topic to which they subscribe. So the link looks whether its
-static frames come back, and if not, it says so, and advertises and publishes them again.
-"""
-
-import logging
 import random
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -23,6 +16,7 @@ from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros._carrier import MAX_SIZE, RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
+from tfbus.links.rosbridge._confirmation import Confirmation
 from tfbus.links.rosbridge._protocol import (
     CLOCK_TYPE,
     JOINT_TYPE,
@@ -58,8 +52,6 @@ LINGER_TIME = 11.0
 """s; a server of ROS 2 keeps the publisher of a client that has gone for 10, and then ROS takes a while."""
 ECHO_TIME = 2.0
 """s; a server of ROS 2 gives the last second of its own clients to those who come, so it may come from this link."""
-CONFIRM_TIME, LONGEST_CONFIRM_TIME = 2.0, 30.0
-"""s; static frames that have not come back for so long are sent again, and then after twice that time each."""
 _CLOSING_TIME = 1.0
 _MISS_PERIODS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """s; while a lookup waits, the static frames are asked for again so often, and then after the last of these."""
@@ -95,16 +87,12 @@ class RosbridgeCarrier(RosCarrier):
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
         self._said: set[str] = set()
-        # By child, with their names in ROS.
-        self._unconfirmed: dict[str, TransformStamped] = {}
-        self._doubted = False
-        self._log = logging.getLogger("tfbus")
+        self._confirmation = Confirmation(url, self._publish_statics)
         self._woken = anyio.Event()
         self._of_ros2 = False
         self._advertised = self._heard_moving = False
         self._connected_at = self._broken_at = self._held_until = -inf
         # Made when the server is there: anyio makes none without an event loop.
-        self._statics_sent: anyio.Event
         self._writing: anyio.CancelScope
         self._ending: bool
 
@@ -156,8 +144,8 @@ class RosbridgeCarrier(RosCarrier):
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
         if static:
             self._changed_statics = publish(self.settings.tf_static[0], samples, static=True)
-            self._unconfirmed = {sample.child: sample for sample in samples}
-            if self._doubted:
+            self._confirmation.expect(samples)
+            if self._confirmation.doubted:
                 # Else a server that has forgotten the topic takes them, and keeps them for nobody.
                 self._request(advertise(self.settings.tf_static[0], static=True))
         elif self._socket is None:
@@ -184,14 +172,8 @@ class RosbridgeCarrier(RosCarrier):
         return decode_content(payload)
 
     def _heard(self, samples: Sequence[ReceivedTransform | None], static: bool) -> None:
-        if not static or not self._unconfirmed:
-            return
-        for sample in samples:
-            own = None if sample is None else self._unconfirmed.get(sample.child)
-            if sample is None or own is None or (own.parent, own.stamp) != (sample.parent, sample.stamp):
-                continue
-            if own.transform.is_close(sample.transform):
-                del self._unconfirmed[own.child]
+        if static:
+            self._confirmation.heard(samples)
 
     def _is_large(self, payload: Any) -> bool:
         return isinstance(payload, LargeMessage) or (isinstance(payload, bytes) and super()._is_large(payload))
@@ -206,7 +188,6 @@ class RosbridgeCarrier(RosCarrier):
         """Send and receive until the server is gone."""
         # What is being sent when the link ends goes out whole, or later messages could not be read.
         self._writing, self._ending = anyio.CancelScope(shield=True), False
-        self._statics_sent = anyio.Event()
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
         for work in (self._read_all, self._write_all, self._keep_alive):
@@ -316,7 +297,7 @@ class RosbridgeCarrier(RosCarrier):
             elif self._changed_statics is not None:
                 text, self._changed_statics = self._changed_statics, None
                 await socket.send(text)
-                self._statics_sent.set()
+                self._confirmation.sent()
             elif self._moving:
                 await socket.send(self._moving.popleft()[0])
             else:
@@ -359,34 +340,12 @@ class RosbridgeCarrier(RosCarrier):
             self._held_until = -inf
 
     async def _confirm_statics(self) -> None:
-        """Look whether the static frames come back, and advertise and publish them again while they do not."""
         if self._of_ros2 and self._broken_at > -inf:
             # Until then, they come from the publisher of the connection that broke.
             await anyio.sleep(max(0.0, self._broken_at + LINGER_TIME - monotonic()))
-            self._doubted = True
+            self._confirmation.doubted = True
             self._publish_statics()
-        pause, told = CONFIRM_TIME, False
-        while True:
-            await self._statics_sent.wait()
-            self._statics_sent = anyio.Event()
-            await anyio.sleep(pause)
-            if self._statics_sent.is_set():
-                # What was sent meanwhile has its time too.
-                continue
-            if not self._unconfirmed:
-                if told:
-                    self._log.warning("%s has taken all static frames now", self._url)
-                pause, self._doubted, told = CONFIRM_TIME, False, False
-                continue
-            if not told:
-                count, some = len(self._unconfirmed), next(iter(self._unconfirmed))
-                what = f"the static frame {some!r}" if count == 1 else f"{count} static frames, such as {some!r},"
-                why = "as it does with all that it takes: it may have refused it, and its log says why"
-                error = ConnectionError(f"{self._url} has not given back {what} within {pause:g} s, {why}; trying again")
-                self._report.refused("not confirmed", error, count)
-            self._doubted = told = True
-            pause = min(2 * pause, LONGEST_CONFIRM_TIME)
-            self._publish_statics()
+        await self._confirmation.run(lambda *what: self._report.refused(*what))
 
     def _subscribe_again(self, topics: Iterable[str]) -> None:
         for topic in topics:
