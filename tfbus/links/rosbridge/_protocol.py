@@ -244,7 +244,7 @@ class _Json:
         while True:
             name = self.value()
             if not isinstance(name, str):
-                raise ValueError("a name that is no text")
+                raise TypeError("a name that is no text")
             self._take(":")
             yield name
             if self._take(",}") == "}":
@@ -313,7 +313,7 @@ class _Cbor:
         for _ in range(count):
             name = self.value()
             if not isinstance(name, str):
-                raise ValueError("a name that is no text")
+                raise TypeError("a name that is no text")
             yield name
 
     def _head(self) -> int:
