@@ -50,8 +50,9 @@ class RosbridgeLink(RosLink):
     Notes
     -----
     One message larger than 4 MiB ends the connection. A large message is read and published in parts, so that other
-    tasks have their turn whatever the server sends; one with CBOR that no message of ROS has is refused. The only peer is the server. While a lookup waits on the bus, the
-    static frames are asked for now and then, because a server for ROS 2 may have had them before this link came.
+    tasks have their turn whatever the server sends; one with CBOR that no message of ROS has is refused. The only peer
+    is the server. While a lookup waits on the bus, the static frames are asked for now and then, because a server for
+    ROS 2 may have had them before this link came.
 
     A server asks ROS once for each topic, for all its clients, as the first of them wants it: decoded, or as bytes.
     With ``"cbor"`` this link and clients that want JSON, such as roslib in a browser, hear the same topics side by
