@@ -124,6 +124,21 @@ async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
                 assert link.statistics().rejected == {"encoding": 4, "topic": 1, "truncated": 1}
 
 
+async def test_what_a_server_says_of_itself_is_logged_in_one_line_each_and_not_without_end(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: len(server.operations("subscribe")) == 2)
+                texts = [f"full\n2026 CRITICAL \x1b[2J {number}" for number in range(25)]
+                await server.say_anything(*(json.dumps({"op": "status", "msg": text}) for text in texts * 2))
+                await until(lambda: link.statistics().rejected == {"status": 10})
+    said = [line for line in caplog.messages if "says: status: full" in line]
+    assert len(said) == 20
+    assert all(line.isprintable() for line in said)
+
+
 TINY = {
     "empty": b"\x81\0",
     "one byte": b"\x81\1x",

@@ -234,7 +234,9 @@ class RosbridgeCarrier(RosCarrier):
 
     def _take(self, incoming: Incoming, size: int) -> None:
         if not incoming.topic:
-            if len(self._said) < MOST_SAID:
+            if incoming.content not in self._said and len(self._said) == MOST_SAID:
+                raise MalformedMessageError("status", f"the server says more than {MOST_SAID} things of itself")
+            if incoming.content not in self._said:
                 self._said.add(incoming.content)
                 # Not to end the line, or to turn it around.
                 said = incoming.content.encode("unicode_escape").decode()
