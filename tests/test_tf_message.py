@@ -18,7 +18,7 @@ from support.samples import moving
 
 from tfbus import SECOND, InvalidTransformError, Transform, TransformStamped, tf_message
 from tfbus.geometry.rows import IDENTITY, Row
-from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, encode, refusal
+from tfbus.tf_message import MAX_NAME, MIN_SIZE, MalformedMessageError, decode, decode_in_parts, encode, refusal
 
 MESSAGE = "tf2_msgs/msg/TFMessage"
 ROS = get_typestore(Stores.ROS2_JAZZY)
@@ -180,6 +180,21 @@ def test_a_name_of_the_greatest_length_or_with_a_nul_is_decoded_again(name: str)
 
 
 # Decoding what is good.
+
+
+@pytest.mark.parametrize("most", [1, 3, 4, 5])
+def test_a_message_in_parts_is_the_whole_one(most: int) -> None:
+    payload = encode([moving("map", f"frame{'x' * number}", number) for number in range(4)])
+    whole = decode(payload, kind=TransformStamped)
+    parts = list(decode_in_parts(payload, most, TransformStamped))
+    assert [sample for part in parts for sample in part.samples] == whole.samples
+    assert max(len(part.samples) for part in parts) <= most
+    for bad, sound in ((payload[:-1], 3), (payload + b"more", 4)):
+        parts = []
+        with pytest.raises(MalformedMessageError, match=r"truncated|oversized"):
+            for part in decode_in_parts(bad, 1, TransformStamped):
+                parts.append(part)
+        assert len(parts) == sound
 
 
 def test_without_tags_samples_are_moving_and_have_no_authority() -> None:

@@ -83,6 +83,8 @@ _LITTLE_ENDIAN = _Layout("<")
 _LAYOUTS = {b"\x00\x00": _Layout(">"), b"\x00\x01": _LITTLE_ENDIAN}
 _HEADER = b"\x00\x01\x00\x00"
 _STAMP = struct.Struct("<iI")
+_FIRST: Final = 4
+"""The offset of the first transform in the body, behind their number."""
 
 _SHOWN = 40
 _MAX_CACHED = 2_048
@@ -203,6 +205,33 @@ def decode(
     A single transform is refused for anything that `Transform` and `TransformStamped` refuse, for a name that is longer
     than `MAX_NAME` or not UTF-8 (``"frame name"``), and for a stamp with a second or more of nanoseconds (``"stamp"``).
     """
+    body, layout, count = _open(payload)
+    decoded, end = _transforms(body, layout, _as_tags(tags, count), kind, bare_names)
+    _check_end(body, end)
+    return decoded
+
+
+def decode_in_parts(
+    payload: bytes, most: int, kind: type[SampleT], bare_names: bool = False
+) -> Iterator[Decoded[SampleT]]:
+    """Decode the samples of a message, at most so many at a time; the parameters are those of `decode`.
+
+    Raises
+    ------
+    MalformedMessageError
+        Once the samples that are sound up to there are decoded.
+    """
+    body, layout, count = _open(payload)
+    end = _FIRST
+    for first in range(0, count, most):
+        tags = repeat(("", False), min(most, count - first))
+        decoded, end = _transforms(body, layout, tags, kind, bare_names, end)
+        yield decoded
+    _check_end(body, end)
+
+
+def _open(payload: bytes | memoryview) -> tuple[bytes, _Layout, int]:
+    """The body of a message, its byte order, and the number of its transforms."""
     body = bytes(payload)
     layout = _LAYOUTS.get(body[:2])
     if len(body) < 8:
@@ -213,13 +242,12 @@ def decode(
     (count,) = layout.size.unpack_from(body)
     if count and 8 + count * MIN_SIZE > len(body):
         raise MalformedMessageError("truncated", f"{len(body)} bytes cannot hold {count} transforms")
-    try:
-        decoded, end = _transforms(body, layout, _as_tags(tags, count), kind, bare_names)
-    except struct.error:
-        raise MalformedMessageError("truncated", f"{len(body)} bytes end inside of a transform") from None
-    if body[end:] not in (b"", b"\0", b"\0\0", b"\0\0\0"):
+    return body, layout, count
+
+
+def _check_end(body: bytes, end: int) -> None:
+    if body[end : end + 4] not in (b"", b"\0", b"\0\0", b"\0\0\0"):
         raise MalformedMessageError("oversized", f"{len(body) - end} bytes behind the last transform")
-    return decoded
 
 
 def _as_tags(tags: Iterable[Tag] | None, count: int) -> Iterable[Tag]:
@@ -232,15 +260,23 @@ def _as_tags(tags: Iterable[Tag] | None, count: int) -> Iterable[Tag]:
 
 
 def _transforms(
-    body: bytes, layout: _Layout, tags: Iterable[Tag], kind: type[Any], bare_names: bool
+    body: bytes, layout: _Layout, tags: Iterable[Tag], kind: type[Any], bare_names: bool, at: int = _FIRST
 ) -> tuple[Decoded[Any], int]:
-    """The transforms of a message, and the offset of its end; `struct.error` if that is beyond the end of the body."""
+    """The transforms of a message from an offset on, one for each tag, and the offset behind the last."""
+    try:
+        return _transforms_of(body, layout, tags, kind, bare_names, at)
+    except struct.error:
+        raise MalformedMessageError("truncated", f"{len(body)} bytes end inside of a transform") from None
+
+
+def _transforms_of(
+    body: bytes, layout: _Layout, tags: Iterable[Tag], kind: type[Any], bare_names: bool, at: int
+) -> tuple[Decoded[Any], int]:
     head, size, numbers = layout.head.unpack_from, layout.size.unpack_from, layout.numbers.unpack_from
     cache = _bare_names if bare_names else _names
     names_of, make = cache.get, cast(Any, kind.__new__)
     samples: list[Any] = []
     errors: list[InvalidTransformError] = []
-    at = 4
     for tag in tags:
         seconds, nanoseconds, length = head(body, at)
         middle = at + 12 + length + 3 & -4

@@ -20,6 +20,7 @@ import pytest
 from support.both_sides import SECONDS, Node, Program, meet, node
 from support.processes import free_ports, until
 from support.robot_of_ros import URDF, check_clock, check_command, check_description_and_joints
+from support.samples import static
 from support.wires import latched
 
 from tfbus import Buffer, Bus
@@ -274,6 +275,35 @@ async def test_a_link_to_rosbridge_whose_connection_broke_hears_moving_frames_ag
     # Some 11 s of 25 are lost for moving frames.
     assert facts["received"]["arm"] > 900
     assert facts["wrong"] == 0
+
+
+async def test_a_static_frame_that_a_rosbridge_refuses_at_first_arrives_in_the_end(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    domain = next(_next_domain)
+    lidar = static("map", "lidar", 2.0, stamp=5)
+    async with links("rosbridge", domain) as (link_of, peer_of):
+        with peer_of(domain, 60.0):
+            for _ in range(2):
+                # A client that listens, and is gone without a word while it is written to: then the server logs a
+                # warning, after which its logger refuses those of the next advertise, and with them that.
+                with Bus() as bus, Buffer(bus) as buffer:
+                    async with link_of(bus) as link:
+                        await buffer.lookup("odom", "base", timeout=20.0)
+                        stream = link._carrier._socket._stream  # type: ignore[attr-defined]
+                        await anyio.aclose_forcefully(stream)
+                        await until(lambda: link.peers == ())
+            with Bus() as bus:
+                bus.publish(lidar)
+                async with link_of(bus) as link:
+                    await until(lambda: link.statistics().duplicates > 0)
+                    refused = link.statistics().not_sent.get("not confirmed", 0)
+                    said = [record.getMessage() for record in caplog.records if "given back" in record.getMessage()]
+                    assert len(said) == refused
+                    with Bus() as late, Buffer(late) as buffer:
+                        async with link_of(late):
+                            found = await buffer.lookup("map", "lidar", timeout=20.0)
+    assert found.transform.is_close(lidar.transform)
 
 
 def test_messages_of_rclpy_become_data_and_messages_again() -> None:

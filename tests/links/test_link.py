@@ -1,7 +1,8 @@
 import asyncio
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import count, pairwise
 from typing import Any
 
 import anyio
@@ -19,6 +20,7 @@ from tfbus.links._carrier import SendReport
 from tfbus.links._inbox import ReceivedMessage
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
+from tfbus.tf_message import MalformedMessageError
 
 pytestmark = pytest.mark.anyio
 
@@ -67,6 +69,12 @@ class LoggedCarrier(ForeignCarrier):
     async def close(self) -> None:
         self.calls.append("close")
         await super().close()
+
+
+def slow_clock(step: float) -> Callable[[], float]:
+    """A monotonic clock for which so many s pass from one look to the next."""
+    looks = count()
+    return lambda: next(looks) * step
 
 
 async def receive_samples(link: Link, samples: int) -> None:
@@ -262,7 +270,7 @@ async def test_a_cancelled_body_closes_the_carrier() -> None:
 async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_for_others() -> None:
     carrier = LoggedCarrier()
     with Bus() as bus:
-        async with Link(bus, "world", carrier) as link:
+        async with Link(bus, "world", carrier, now=slow_clock(0.0001)) as link:
 
             def bring() -> None:
                 for stamp in range(2_000):
@@ -276,23 +284,55 @@ async def test_threads_may_bring_messages_in_any_number_and_the_loop_has_time_fo
             while link.statistics().received_samples < 2_000:
                 seen.add(link.statistics().received_samples)
                 await anyio.lowlevel.checkpoint()
-            # At most 100 items in a turn, and this task has been run in between.
-            assert len(seen) >= 3
+            # At most 10 items of 0.1 ms in a turn of 1 ms, and this task has been run in between.
+            assert len(seen) >= 90
             assert link.statistics().received_messages == 2_000
 
 
-async def test_a_large_message_ends_a_turn_by_its_bytes() -> None:
-    carrier = LoggedCarrier()
+class SplittingForeignCarrier(LoggedCarrier):
+    """Splits each message in its transforms."""
+
+    def split(self, content: Any) -> Iterator[Any]:
+        for number, each in enumerate(content.transforms):
+            if each.child == self.fails:
+                raise MalformedMessageError("cut", "it ends here")
+            self.later = number > 0
+            yield content._replace(transforms=[each])
+
+    def read(self, content: ForeignMessage) -> ReceivedMessage:
+        message = super().read(content)
+        message.continues = self.later
+        return message
+
+
+async def test_a_message_that_its_carrier_splits_takes_several_turns_and_is_counted_once() -> None:
+    carrier = SplittingForeignCarrier(fails="broken")
     with Bus() as bus:
-        async with Link(bus, "world", carrier) as link:
-            for stamp in range(50):
-                message = ForeignMessage(False, [ARM._replace(stamp=stamp)])
-                carrier.receive(Received("driver", message, size=2**16, moving=True))
-            seen = set()
-            while link.statistics().received_samples < 50:
-                seen.add(link.statistics().received_samples)
+        async with Link(bus, "world", carrier, now=slow_clock(0.001)) as link:
+            many = [ARM._replace(child=f"arm{number}", stamp=1) for number in range(50)]
+            carrier.receive(Received("driver", ForeignMessage(False, [*many, ARM._replace(child="broken"), ARM])))
+            carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(stamp=2)])))
+            seen = []
+            while link.statistics().received_samples < 51:
+                seen.append(link.statistics().received_samples)
                 await anyio.lowlevel.checkpoint()
-            assert len(seen) >= 3
+            assert max(after - before for before, after in pairwise(seen)) <= 4
+            assert link.statistics().received_messages == 2
+            assert link.statistics().rejected == {"cut": 1}
+
+
+async def test_the_rest_of_a_split_message_is_dropped_when_the_clock_jumps_back() -> None:
+    clock, carrier = SimulatedClock(start=10), SplittingForeignCarrier()
+    with Bus(clock) as bus:
+        async with Link(bus, "world", carrier, now=slow_clock(0.001)) as link:
+            many = [ARM._replace(child=f"arm{number}") for number in range(50)]
+            carrier.receive(Received("driver", ForeignMessage(False, many), moving=True))
+            while link.statistics().received_samples < 5:
+                await anyio.lowlevel.checkpoint()
+            clock.set(5)
+            carrier.receive(Received("driver", ForeignMessage(False, [ARM._replace(child="last")])))
+            await until(lambda: link.statistics().received_messages == 2)
+            assert link.statistics().received_samples < 50
 
 
 async def test_messages_beyond_the_capacity_are_dropped_and_counted() -> None:

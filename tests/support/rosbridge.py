@@ -52,6 +52,11 @@ class RosbridgeServer:
     ----------
     encodings : collection of str
         Those that it knows; it answers in JSON to others.
+
+    Attributes
+    ----------
+    refuses : set of str
+        Topics that it lets nobody advertise or publish to, without a word.
     """
 
     def __init__(self, encodings: tuple[str, ...] = ("cbor-raw", "cbor")) -> None:
@@ -61,6 +66,7 @@ class RosbridgeServer:
         self.latched: dict[str, tuple[TransformStamped, ...]] = {}
         self.port = 0
         self.silent = False
+        self.refuses: set[str] = set()
 
     @property
     def url(self) -> str:
@@ -137,7 +143,7 @@ class RosbridgeServer:
                 await client.send(self.encoded(topic, self.latched[topic], request["compression"]))
         elif request["op"] == "unsubscribe":
             del client.subscriptions[topic]
-        elif request["op"] == "publish":
+        elif request["op"] == "publish" and topic not in self.refuses:
             samples = [sample for sample in decode_mapping(request["msg"]).samples if sample is not None]
             await self.say(*samples, topic=topic)
 

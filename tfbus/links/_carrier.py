@@ -1,7 +1,7 @@
 """The protocol between a link and the carrier below it."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from tfbus.geometry.stamped import TransformStamped
@@ -115,6 +115,20 @@ class Carrier(Protocol):
 
         The closing has to begin before the first checkpoint, because asyncio's own cancellation knows no shield, and
         has to return within about a second, whatever the network does.
+        """
+
+
+@runtime_checkable
+class SplittingCarrier(Carrier, Protocol):
+    """A carrier with messages that may be too large for one turn of the event loop."""
+
+    def split(self, content: Any) -> Iterator[Any]:
+        """The content of an item in parts, for `read` one by one; an item that is small is its only part.
+
+        Raises
+        ------
+        MalformedMessageError
+            If the rest of the message cannot be used; the parts before it are.
         """
 
 

@@ -64,6 +64,8 @@ class ReceivedMessage:
         What the message claims to tell of the peer's state, if it claims that.
     time : int or None
         The time of the sender's clock, in ns, if it tells that.
+    continues : bool
+        Whether it is a later part of a message that was counted.
     """
 
     entries: list[ReceivedBatch | RemovedFrame | MovingFrame]
@@ -71,6 +73,7 @@ class ReceivedMessage:
     errors: list[InvalidTransformError] = field(default_factory=list)
     step: StateStep | None = None
     time: int | None = None
+    continues: bool = False
 
 
 class Inbox:
@@ -119,7 +122,7 @@ class Inbox:
             return
         step = message.step
         newest = message.number or (0 if step is None else step.message)
-        if message.number or step is None:
+        if (message.number or step is None) and not message.continues:
             self.messages += 1
         missing = self._count_gap(peer, newest, was_sent=message.number > 0)
         if missing and peer.mirror is not None:

@@ -2,7 +2,8 @@
 
 import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from time import monotonic
 from types import TracebackType
 from typing import Any, Self
@@ -13,12 +14,13 @@ import anyio.abc
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
+from tfbus._aio.turn_budget import TurnBudget
 from tfbus.bus.bus import Bus
 from tfbus.bus.once_logger import OnceLogger
 from tfbus.bus.sample_queue import check_capacity
 from tfbus.clock import SimulatedClock
 from tfbus.errors import BusClosedError
-from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._carrier import Carrier, SendReport, SplittingCarrier
 from tfbus.links._clock_follower import ClockFollower, HearsTime
 from tfbus.links._endpoint import Endpoint
 from tfbus.links._history import LONGEST_HISTORY
@@ -26,11 +28,10 @@ from tfbus.links._receive_queue import Received, ReceiveQueue
 from tfbus.registration import Registration
 from tfbus.stamps import as_duration
 from tfbus.statistics import LinkStatistics
+from tfbus.tf_message import MalformedMessageError
 
 _FULL_TURN = 5_000
 """So many samples and removals are sent at once, before the turn of the event loop ends."""
-_ITEMS_PER_TURN = 100
-_BYTES_PER_TURN = 2**16
 
 
 def warn_unless_entered(thing: object) -> "finalize[..., Any]":
@@ -50,7 +51,7 @@ class Link:
     """Joins a bus to other buses, or to another world: ``async with link``.
 
     What is published in one turn of the event loop goes out together at its end. What comes in waits in a bounded queue
-    and is published on the event loop, a limited amount a turn.
+    and is published on the event loop, 1 ms a turn. A carrier may split a large message, so that it takes several.
 
     Parameters
     ----------
@@ -74,6 +75,8 @@ class Link:
         time is followed until it is lost; the time of others is refused and counted.
     tell_clock : bool
         Whether to tell peers the time of the bus's clock, which is a `SimulatedClock`.
+    now : callable, optional
+        The monotonic clock, in s, by which a turn ends.
 
     Attributes
     ----------
@@ -106,6 +109,7 @@ class Link:
         history: float | None = None,
         clock: SimulatedClock | HearsTime | None = None,
         tell_clock: bool = False,
+        now: Callable[[], float] = monotonic,
     ) -> None:
         if tell_clock and not isinstance(bus.clock, SimulatedClock):
             raise TypeError(f"to tell the time, the bus needs a SimulatedClock, not {bus.clock!r}")
@@ -139,6 +143,11 @@ class Link:
         self._stirred: anyio.Event | None = None
         self._send_report = SendReport(self._warn_not_sent)
         self._receive_queue = ReceiveQueue(capacity)
+        self._split = carrier.split if isinstance(carrier, SplittingCarrier) else None
+        # What is left of a large message, and the item that has brought it.
+        self._parts: Iterator[Any] = iter(())
+        self._whole: Received | None = None
+        self._budget = TurnBudget(now=now)
         self._received = LoopWaker(self._handle_received)
         self._turn_ends = LoopWaker(self._endpoint.send)
         self._entered = False
@@ -252,18 +261,36 @@ class Link:
             return
 
     def _handle_received(self) -> None:
-        cost = 0
-        while self._attached and cost < _BYTES_PER_TURN:
-            item = self._receive_queue.get()
+        self._budget.begin()
+        while self._attached:
+            item = self._next_item()
             if item is None:
                 return
-            cost += item.size + _BYTES_PER_TURN // _ITEMS_PER_TURN
             self._endpoint.handle(item)
-        if self._attached:
-            # Other tasks get their turn first.
-            self._received.wake()
+            if self._budget.spent:
+                # Other tasks get their turn first.
+                self._received.wake()
+                return
+
+    def _next_item(self) -> Received | None:
+        """The next part of a large message that was begun, or else the next item of the queue."""
+        while True:
+            if self._whole is not None:
+                try:
+                    return replace(self._whole, content=next(self._parts))
+                except StopIteration:
+                    self._whole = None
+                except MalformedMessageError as error:
+                    whole, self._whole = self._whole, None
+                    return replace(whole, content=error)
+            item = self._receive_queue.get()
+            if item is None or self._split is None:
+                return item
+            self._parts, self._whole = self._split(item.content), item
 
     def _clock_jumped(self, before: int, after: int) -> None:
         if after < before:
             self._receive_queue.discard_moving()
+            if self._whole is not None and self._whole.moving:
+                self._whole = None
             self._endpoint.clock_jumped_back()

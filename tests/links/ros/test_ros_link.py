@@ -46,6 +46,32 @@ async def test_the_frames_of_a_lost_peer_stay_unless_they_are_to_be_dropped(opti
             assert bus.statistics().frames == frames
 
 
+async def test_a_large_message_is_published_in_parts_up_to_its_first_fault() -> None:
+    carrier, heard = ListCarrier(), list[tuple[object, ...]]()
+    payload = encode([moving("map", f"frame{number}", 9) for number in range(200)])
+    with Bus() as bus:
+        bus.subscribe(heard.append)
+        async with RosLink(bus, "ros", carrier) as link:
+            for sent, static_topic in ((payload, False), (payload[:-1], True)):
+                carrier._receive(Received("peer", RosMessage(sent, static_topic, authority="/n"), len(sent)))
+            await until(lambda: link.statistics().rejected == {"truncated": 1})
+            assert link.statistics().received_messages == 2
+    assert [len(batch) for batch in heard] == [40] * 9
+    assert [getattr(batch[0], "static", None) for batch in heard] == [False] * 5 + [True] * 4
+
+
+@pytest.mark.parametrize("kind", ["joints", "clock"])
+async def test_a_huge_message_of_joints_or_of_the_time_is_refused(kind: str) -> None:
+    taken: list[object] = []
+    carrier = ListCarrier({"joint_states": lambda *state: taken.append(state)})
+    content = RosMessage(b"\0\1\0\0" + bytes(2**15), static=False, authority="", **{kind: True})
+    with Bus() as bus:
+        async with RosLink(bus, "ros", carrier) as link:
+            carrier._receive(Received("peer", content, 2**15))
+            await until(lambda: link.statistics().rejected == {"oversized": 1})
+    assert taken == []
+
+
 async def test_a_simulated_clock_follows_the_time_of_ros_and_one_jump_back_is_one_reset() -> None:
     clock = SimulatedClock()
     options: RosOptions = {"clock": clock}

@@ -19,6 +19,7 @@ from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros._carrier import RosMessage
+from tfbus.links.ros._transforms import as_mapping
 from tfbus.links.ros.settings import settings_of
 from tfbus.links.rosbridge import _carrier
 from tfbus.links.rosbridge._carrier import Encoding, RosbridgeCarrier
@@ -126,7 +127,9 @@ class Alone:
 
 
 MOVING, STATIC = (Incoming(topic, {"transforms": []}, "cbor") for topic in ("/tf", "/tf_static"))
-OF_ROS_2 = Incoming("/tf_static", {"transforms": [{"header": {"stamp": {"sec": 5, "nanosec": 0}}}]}, "cbor")
+_ROW = as_mapping(static("map", "lidar"))
+_ROW["header"]["stamp"] = {"sec": 5, "nanosec": 0}
+OF_ROS_2 = Incoming("/tf_static", {"transforms": [_ROW]}, "cbor")
 
 
 async def test_each_topic_has_its_kind_and_only_what_comes_again_may_be_dropped(

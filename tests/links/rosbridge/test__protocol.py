@@ -2,6 +2,8 @@ import json
 import struct
 from typing import Any
 
+import anyio
+import anyio.lowlevel
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,18 +16,24 @@ pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
 import cbor2
 
+from tfbus.links.ros._transforms import as_mapping
 from tfbus.links.rosbridge._protocol import (
     JOINT_TYPE,
     advertise,
     decode_content,
+    decode_content_in_parts,
     decode_joints,
+    is_large,
     is_of_ros2,
     publish,
     read,
+    read_large,
     subscribe,
     unsubscribe,
 )
 from tfbus.tf_message import MalformedMessageError, encode
+
+asynchronous = pytest.mark.anyio
 
 
 def test_requests_are_those_of_the_protocol() -> None:
@@ -130,6 +138,143 @@ def test_garbage_is_a_message_or_malformed(garbage: str | bytes) -> None:
         decode_content(incoming.content)
     except MalformedMessageError:
         return
+
+
+def enveloped(content: bytes) -> bytes:
+    """A message in CBOR with some content."""
+    return b"\xa3\x62op\x67publish\x65topic\x63/tf\x63msg" + content
+
+
+TRANSFORM = cbor2.dumps(as_mapping(moving("map", "base", 5)))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        cbor2.dumps({5: 0}),
+        cbor2.dumps({2**64 * (2**61 - 1): 0}),
+        cbor2.dumps({0.5: 0}),
+        b"\xa1\x80\x00",
+        *(
+            cbor2.dumps(cbor2.CBORTag(tag, value))
+            for tag, value in [(258, [1, 2]), (30, [1, 2]), (35, "(a)"), (2, b"123")]
+        ),
+        *(cbor2.dumps(cbor2.CBORTag(tag, value)) for tag, value in [(4, [1, 2]), (5, [9, 2]), (28, [1]), (256, ["a"])]),
+        b"\x81" * 50,
+        b"\xd8\x40" * 50,
+    ],
+)
+@asynchronous
+async def test_what_costs_a_decoder_more_than_its_bytes_is_refused_in_small_and_in_large_messages(
+    content: bytes,
+) -> None:
+    with pytest.raises(MalformedMessageError, match="encoding"):
+        read(enveloped(content))
+    large = b"\xa2\x64more" + content + b"\x64fill\x59\x40\x00" + bytes(2**14)
+    with pytest.raises(MalformedMessageError, match="encoding"):
+        await read_large(enveloped(large), anyio.lowlevel.checkpoint)
+    count = 200
+    rows = b"\x98" + bytes([count]) + TRANSFORM * (count - 1) + content
+    with pytest.raises(MalformedMessageError, match="encoding"):
+        await read_large(enveloped(b"\xa1\x6atransforms" + rows), anyio.lowlevel.checkpoint)
+
+
+def large_message(count: int, encoding: str, last: bool = False) -> str | bytes:
+    fields = {"transforms": [as_mapping(moving("map", f"frame{number}", number)) for number in range(count)]}
+    message: dict[str, Any] = {"op": "publish", "topic": "/tf", "msg": fields}
+    if last:
+        # The order of fields that have been sorted.
+        message = dict(sorted(message.items()))
+    if encoding == "cbor":
+        return bytes(cbor2.dumps(message))
+    return json.dumps(message, indent=1 if last else None)
+
+
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("encoding", ["none", "cbor"])
+@asynchronous
+async def test_a_large_message_is_read_in_pieces_and_gives_way_after_each(encoding: str, last: bool) -> None:
+    turns = 0
+
+    async def give_way() -> None:
+        nonlocal turns
+        turns += 1
+
+    message = large_message(500, encoding, last)
+    assert is_large(message)
+    incoming = await read_large(message, give_way)
+    assert (incoming.topic, incoming.encoding) == ("/tf", encoding)
+    assert turns >= 500
+    parts = list(decode_content_in_parts(incoming.content))
+    found = [sample for part in parts for sample in part.samples]
+    assert found == [moving("map", f"frame{number}", number) for number in range(500)]
+    assert max(len(part.samples) for part in parts) <= 40
+
+
+@given(st.data())
+def test_a_damaged_large_message_is_read_or_malformed(data: st.DataObject) -> None:
+    message = large_message(60, data.draw(st.sampled_from(["none", "cbor"])))
+    at = data.draw(st.integers(0, len(message) - 1))
+    piece = data.draw(st.binary(max_size=6))
+    end = min(len(message), at + data.draw(st.sampled_from([0, 1, 5, 10**6])))
+    damaged: str | bytes
+    if isinstance(message, str):
+        damaged = message[:at] + piece.decode("latin-1") + message[end:]
+    else:
+        damaged = message[:at] + piece + message[end:]
+
+    async def check() -> None:
+        try:
+            incoming = await read_large(damaged, anyio.lowlevel.checkpoint)
+            list(decode_content_in_parts(incoming.content)) if incoming.topic and incoming.content else None
+        except MalformedMessageError:
+            return
+
+    anyio.run(check)
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (enveloped(b"\xa1\x6atransforms\x9a\x00\x3f\x00\x00" + b"\x80" * 0x3F0000), "encoding"),
+        (enveloped(b"\xa1\x61a" + b"\x9a\x00\x0f\x00\x00" + b"\x80" * 0xF0000), "encoding"),
+        ('{"op": "publish", "msg": {"transforms": [' + "{}," * 1_000_000 + "{}]}}", "encoding"),
+        ("[" * 2**20, "encoding"),
+        ('{"op": ' + "9" * 2**20 + "}", "encoding"),
+        ('{"op": ' + " " * 2**20 + "1}", "encoding"),
+        (cbor2.dumps({f"field{number}": 0 for number in range(5_000)}), "oversized"),
+        ('{"op": "publish"} ' + "x" * 2**15, "encoding"),
+    ],
+)
+@asynchronous
+async def test_a_large_message_that_is_none_is_given_up_at_the_first_piece_that_tells_it(
+    message: str | bytes, reason: str
+) -> None:
+    pieces = 0
+
+    async def give_way() -> None:
+        nonlocal pieces
+        pieces += 1
+
+    with pytest.raises(MalformedMessageError, match=reason):
+        await read_large(message, give_way)
+    assert pieces <= 150
+
+
+@asynchronous
+async def test_a_long_text_and_long_bytes_are_read_whole() -> None:
+    text = "<robot/>\n" * 200_000
+    for message in (
+        json.dumps({"op": "publish", "topic": "/robot_description", "msg": {"data": text}}),
+        bytes(cbor2.dumps({"op": "publish", "topic": "/robot_description", "msg": {"data": text}})),
+    ):
+        assert (await read_large(message, anyio.lowlevel.checkpoint)).content == {"data": text}
+    rows = [moving("map", f"frame{number}", 0) for number in range(1_000)]
+    for payload in (encode(rows), ros1(*map(ros1_of, rows))):
+        raw = bytes(cbor2.dumps({"op": "publish", "topic": "/tf", "msg": {"secs": 1, "nsecs": 2, "bytes": payload}}))
+        incoming = await read_large(raw, anyio.lowlevel.checkpoint)
+        assert incoming.encoding == "cbor-raw"
+        assert [sample for part in decode_content_in_parts(incoming.content) for sample in part.samples] == rows
 
 
 def test_positions_of_joints_are_read_in_every_encoding() -> None:

@@ -43,6 +43,7 @@ MESSAGES = PEER.with_name("real_ros_messages.py")
 ROBOT = PEER.with_name("ros1_robot.py")
 SECONDS = 10.0
 MOST_FAILED = 0.01
+NEEDED = "set ROS1_PYTHON to a Python with rospy, tf2_ros, and the messages of common_msgs"
 
 
 @contextmanager
@@ -100,8 +101,10 @@ async def next_line(node: subprocess.Popen[str]) -> dict[str, Any]:
     return dict(json.loads(await anyio.to_thread.run_sync(node.stdout.readline)))
 
 
-def has_rospy(python: str) -> bool:
-    command = [python, "-c", "import rospy, tf2_ros"]
+def has_rospy(python: str, further: str = "") -> bool:
+    """Whether a Python has what the tests' nodes of ROS 1 import."""
+    nodes = "rospy, tf2_ros, tf2_msgs.msg, geometry_msgs.msg, std_msgs.msg, sensor_msgs.msg, rosgraph_msgs.msg"
+    command = [python, "-c", f"import {nodes}{further}"]
     return Path(python).exists() and subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
@@ -113,7 +116,7 @@ async def ros1(folder: Path) -> AsyncIterator[Ros1]:
     if roscore is None:
         pytest.skip("no ROS 1: there is no roscore on the path")
     if not has_rospy(python):
-        pytest.skip("no ROS 1: set ROS1_PYTHON to a Python with rospy and tf2_ros")
+        pytest.skip(f"no ROS 1: {NEEDED}")
     if not command:
         pytest.skip(
             "no rosbridge: set ROS1_ROSBRIDGE to a command that serves one at the port that is its last argument"
@@ -137,8 +140,8 @@ async def ros1(folder: Path) -> AsyncIterator[Ros1]:
 
 def test_messages_of_rospy_become_data_and_messages_again() -> None:
     python = os.environ.get("ROS1_PYTHON", "/usr/bin/python3")
-    if not has_rospy(python):
-        pytest.skip("no ROS 1: set ROS1_PYTHON to a Python with rospy and tf2_ros")
+    if not has_rospy(python, ", numpy"):
+        pytest.skip(f"no ROS 1: {NEEDED}, and numpy")
     # The Python of ROS comes first, for its numpy.
     script = f"import sys, runpy; sys.path += {sys.path!r}; runpy.run_path({str(MESSAGES)!r}, run_name='__main__')"
     done = subprocess.run([python, "-c", script], capture_output=True, text=True, check=False)

@@ -1,11 +1,13 @@
 import json
 from contextlib import AsyncExitStack
+from random import Random
 from typing import Any, Literal
 
 import pytest
 
 pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
+import anyio.lowlevel
 import cbor2
 from support.processes import until
 from support.rosbridge import rosbridge_server
@@ -13,8 +15,10 @@ from support.samples import moving, static
 from support.wires import latched
 
 from tfbus import Buffer, Bus, PeerJoined, PeerLost, SimulatedClock
+from tfbus.links.ros._transforms import as_mapping
 from tfbus.links.rosbridge import RosbridgeLink, _carrier
 from tfbus.links.rosbridge._websocket import WebSocket
+from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio
 
@@ -118,6 +122,123 @@ async def test_garbage_is_counted_by_reason_and_ends_nothing() -> None:
                 await server.say(moving("map", "base", 5))
                 await until(lambda: link.statistics().received_samples == 1)
                 assert link.statistics().rejected == {"encoding": 4, "topic": 1, "truncated": 1}
+
+
+async def test_what_a_server_says_of_itself_is_logged_in_one_line_each_and_not_without_end(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: len(server.operations("subscribe")) == 2)
+                texts = [f"full\n2026 CRITICAL \x1b[2J {number}" for number in range(25)]
+                await server.say_anything(*(json.dumps({"op": "status", "msg": text}) for text in texts * 2))
+                await until(lambda: link.statistics().rejected == {"status": 10})
+    said = [line for line in caplog.messages if "says: status: full" in line]
+    assert len(said) == 20
+    assert all(line.isprintable() for line in said)
+
+
+TINY = {
+    "empty": b"\x81\0",
+    "one byte": b"\x81\1x",
+    "no operation": b"\x81\2{}",
+    "fragments": b"\x01\0" + b"\0\0" * 20_000,
+}
+
+
+@pytest.mark.parametrize("frames", TINY)
+async def test_tens_of_thousands_of_tiny_frames_share_the_event_loop_with_others(frames: str) -> None:
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            async with RosbridgeLink(bus, server.url) as link:
+                await until(lambda: len(server.operations("subscribe")) == 2)
+                count = 1 if frames == "fragments" else 20_000
+                await server.clients[0].stream.send(TINY[frames] * count + b"\x80\1x" * (frames == "fragments"))
+                turns, most, before = 0, 0, 0
+                while before < count:
+                    await anyio.lowlevel.checkpoint()
+                    statistics = link.statistics()
+                    seen = statistics.rejected.get("encoding", 0) + statistics.queue.pending
+                    turns, most, before = turns + 1, max(most, seen - before), seen
+                # In one turn, it would be all of a read.
+                assert most < 5_000
+                assert turns > 5
+                await server.say(moving("map", "base", 5))
+                await until(lambda: link.statistics().received_samples == 1)
+
+
+def mutated(random: Random, message: bytes) -> bytes:
+    """A message with some bytes changed, cut, doubled, or replaced by pieces that decoders do not like."""
+    nasty = (
+        b"\xff",
+        b"\x9b",
+        b"\xbb",
+        b"\xdb",
+        b"\xc2",
+        b"\x5f",
+        b"\xfb\x7f\xf0",
+        b"[",
+        b"{",
+        b'"',
+        b"1" * 5_000,
+        b"NaN",
+        b"1e999",
+    )
+    for _ in range(random.randint(1, 4)):
+        at, end = sorted(random.choices(range(len(message) + 1), k=2))
+        message = random.choice(
+            [
+                message[:at] + random.choice(nasty) + message[at:],
+                message[:at] + random.choice(nasty) * random.randint(1, 300) + message[end:],
+                message[:at] + random.randbytes(random.randint(1, 8)) + message[at + 1 :],
+                message[:at],
+                message[:at] + message[at:end] * 2 + message[end:],
+            ]
+        )
+    return message
+
+
+@pytest.mark.parametrize("cases", [150, pytest.param(5_000, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("size", [1, 100])
+async def test_no_damaged_message_ends_a_link_and_each_is_counted_or_heard(cases: int, size: int) -> None:
+    random = Random(cases)
+    samples = [moving("map", f"frame{number}", number) for number in range(size)]
+    text = json.dumps({"op": "publish", "topic": "/tf", "msg": {"transforms": list(map(as_mapping, samples))}})
+    raw = {"op": "publish", "topic": "/tf", "msg": {"secs": 1, "nsecs": 2, "bytes": encode(samples)}}
+    good = [text.encode(), cbor2.dumps(json.loads(text)), cbor2.dumps(raw)]
+    heard: set[str] = set()
+    async with rosbridge_server() as server:
+        with Bus() as bus:
+            bus.subscribe(lambda batch: heard.update(sample.child for sample in batch))
+            async with RosbridgeLink(bus, server.url, max_frames=10**6) as link:
+                await until(lambda: len(server.operations("subscribe")) == 2)
+                for number in range(cases):
+                    content = mutated(random, good[number % 3])
+                    as_text = number % 3 == 0
+                    await server.say_anything(content.decode(errors="replace") if as_text else content)
+                await server.say(moving("map", "last", 5))
+                await until(lambda: "last" in heard)
+                assert len(server.operations("subscribe")) == 2, "it is the first connection"
+                counted = link.statistics()
+                assert sum(counted.rejected.values()) > 0
+                assert counted.received_messages > 0
+
+
+async def test_one_message_of_thousands_of_transforms_is_published_in_parts_in_its_order() -> None:
+    samples = [moving("map", f"frame{number}", 5) for number in range(2_000)]
+    for known in ((), ("cbor",), ("cbor", "cbor-raw")):
+        async with rosbridge_server(known) as server:
+            heard: list[Any] = []
+            with Bus() as bus:
+                bus.subscribe(heard.append)
+                async with RosbridgeLink(bus, server.url, encoding="cbor-raw") as link:
+                    await until(lambda: len(server.operations("subscribe")) == 2)
+                    await server.say(*samples)
+                    await until(lambda: link.statistics().received_samples == 2_000)
+                    assert link.statistics().received_messages == 1
+            assert [sample.child for batch in heard for sample in batch] == [sample.child for sample in samples]
+            assert max(map(len, heard)) <= 40
 
 
 @pytest.mark.thorough

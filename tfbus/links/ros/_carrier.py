@@ -5,8 +5,8 @@ static frames that this link sends. ROS has no message that removes a frame: a s
 message, which late joiners get, and of a moving one nobody is told.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from tfbus.errors import InvalidTransformError
@@ -21,10 +21,16 @@ from tfbus.links.ros._clock_message import decode_clock
 from tfbus.links.ros._text_message import decode_text
 from tfbus.links.ros.settings import RosSettings
 from tfbus.robot.joint_state_message import decode_joint_state
-from tfbus.tf_message import Decoded, MalformedMessageError, decode, refusal
+from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
 
 MAX_SIZE = 2**22
 """The largest message that is received, in bytes."""
+MAX_OTHER_SIZE = 2**15
+"""The largest message of joints or of the time, in bytes."""
+AT_ONCE = 2**13
+"""A message of transforms beyond so many bytes or characters is read in parts."""
+PART = 40
+"""So many transforms of a large message are decoded and published at once."""
 MOST_TRANSFORMS = 1_000
 """So many moving transforms go into one message."""
 
@@ -36,13 +42,15 @@ class RosMessage:
     Attributes
     ----------
     payload : Any
-        Bytes of CDR; a carrier with other messages decodes them itself.
+        Bytes of CDR, or `Decoded` for a part of a large message; a carrier with other messages decodes them itself.
     static : bool
         Whether the topic is one of static frames.
     authority : str
         The node that has published it, or what is known of it.
     joints, clock, description : bool
         Whether it has positions of joints, the time, or the URDF of a robot, rather than transforms.
+    continues : bool
+        Whether it is a later part of a large message.
     """
 
     payload: Any
@@ -51,6 +59,12 @@ class RosMessage:
     joints: bool = False
     clock: bool = False
     description: bool = False
+    continues: bool = False
+
+    @property
+    def has_transforms(self) -> bool:
+        """Whether it has transforms."""
+        return not (self.joints or self.clock or self.description)
 
 
 class RosCarrier:
@@ -99,8 +113,22 @@ class RosCarrier:
         if changed:
             self._put(list(self._statics.values()), static=True)
 
+    def split(self, content: Any) -> Iterator[Any]:
+        """The parts of a large message of transforms, each of `PART` of them; anything else is its only part."""
+        if not isinstance(content, RosMessage) or not content.has_transforms or not self._is_large(content.payload):
+            yield content
+            return
+        continues = False
+        for decoded in self._decode_in_parts(content.payload):
+            yield replace(content, payload=decoded, continues=continues)
+            continues = True
+
     def read(self, content: RosMessage) -> ReceivedMessage:
         """The samples of a message by their names on the bus, or the time; positions of joints are handed on."""
+        if (content.clock or content.joints) and isinstance(content.payload, bytes):
+            size = len(content.payload)
+            if size > MAX_OTHER_SIZE:
+                raise MalformedMessageError("oversized", f"{size} bytes, more than {MAX_OTHER_SIZE}")
         if content.clock:
             return ReceivedMessage([], time=decode_clock(content.payload))
         if content.joints:
@@ -113,7 +141,8 @@ class RosCarrier:
             if self.settings.robot_description is not None:
                 self.settings.robot_description(description)
             return ReceivedMessage([])
-        decoded = self._decode(content.payload)
+        decoded = content.payload if isinstance(content.payload, Decoded) else self._decode(content.payload)
+        self._heard(decoded.samples, content.static)
         errors = decoded.errors
         samples: list[ReceivedTransform] = []
         authority = content.authority if self.settings.authority is None else self.settings.authority
@@ -130,7 +159,7 @@ class RosCarrier:
             else:
                 samples.append(sample)
         entries: list[Any] = [ReceivedBatch(samples, {authority})] if samples else []
-        return ReceivedMessage(entries, errors=errors)
+        return ReceivedMessage(entries, errors=errors, continues=content.continues)
 
     async def run(self) -> None:
         """Do nothing that takes time."""
@@ -150,6 +179,17 @@ class RosCarrier:
     def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
         """The transforms of a message; raises `MalformedMessageError`."""
         return decode(payload, kind=ReceivedTransform, bare_names=True)
+
+    def _is_large(self, payload: Any) -> bool:
+        """Whether a message of transforms takes too long for one turn."""
+        return len(payload) > AT_ONCE
+
+    def _decode_in_parts(self, payload: Any) -> Iterator[Decoded[ReceivedTransform]]:
+        """The transforms of a large message, `PART` at a time; raises `MalformedMessageError` at the first fault."""
+        return decode_in_parts(payload, PART, ReceivedTransform, bare_names=True)
+
+    def _heard(self, samples: Sequence[ReceivedTransform | None], static: bool) -> None:
+        """Take note of transforms by their names in ROS."""
 
     def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
         """The stamp and the positions of joints of a message; raises `MalformedMessageError`."""

@@ -5,7 +5,8 @@ strings of a length and UTF-8, and seven ``float64``; everything is little endia
 """
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from typing import Any
 
 from tfbus.errors import InvalidTransformError
@@ -47,6 +48,13 @@ def decode_mapping(message: object) -> Decoded[ReceivedTransform]:
         return _decoded(_parts_of_mapping(message))
     except (LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise MalformedMessageError("encoding", f"it has not the fields of a TFMessage: {error!r}"[:200]) from None
+
+
+def decode_ros1_in_parts(payload: bytes, most: int) -> Iterator[Decoded[ReceivedTransform]]:
+    """As `decode_ros1`, but at most so many transforms at a time."""
+    parts = _parts_of_ros1(payload)
+    while (decoded := _decoded(islice(parts, most))).samples:
+        yield decoded
 
 
 def as_mapping(sample: TransformStamped) -> dict[str, Any]:
@@ -111,7 +119,7 @@ def _either(stamp: Mapping[str, Any], name: str, of_ros1: str) -> int:
     return value
 
 
-def _decoded(parts: Iterator[_Parts]) -> Decoded[ReceivedTransform]:
+def _decoded(parts: Iterable[_Parts]) -> Decoded[ReceivedTransform]:
     samples: list[ReceivedTransform | None] = []
     errors: list[InvalidTransformError] = []
     for parent, child, seconds, nanoseconds, numbers in parts:

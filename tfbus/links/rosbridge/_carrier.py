@@ -2,10 +2,10 @@
 
 import random
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from math import inf
 from time import monotonic
-from typing import Any, Literal
+from typing import Any, Final, Literal
 from uuid import uuid4
 
 import anyio
@@ -16,17 +16,22 @@ from tfbus.links._provenance import ReceivedTransform
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros._carrier import MAX_SIZE, RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
+from tfbus.links.rosbridge._confirmation import Confirmation
 from tfbus.links.rosbridge._protocol import (
     CLOCK_TYPE,
     JOINT_TYPE,
     TEXT_TYPE,
     Incoming,
+    LargeMessage,
     advertise,
     decode_content,
+    decode_content_in_parts,
     decode_joints,
+    is_large,
     is_of_ros2,
     publish,
     read,
+    read_large,
     subscribe,
     unsubscribe,
 )
@@ -35,6 +40,8 @@ from tfbus.tf_message import Decoded, MalformedMessageError
 
 MOST_QUEUED = 1_000
 """So many messages wait for a slow server; then the oldest are dropped."""
+MOST_SAID: Final = 20
+"""So many different things that a server says of itself are logged for one connection."""
 Encoding = Literal["cbor", "cbor-raw"]
 CONNECT_TIME = 5.0
 SILENCE = 10.0
@@ -79,6 +86,8 @@ class RosbridgeCarrier(RosCarrier):
         self._moving: deque[tuple[str, int]] = deque()
         self._changed_statics: str | None = None
         self._requests: deque[str] = deque()
+        self._said: set[str] = set()
+        self._confirmation = Confirmation(url, self._publish_statics)
         self._woken = anyio.Event()
         self._of_ros2 = False
         self._advertised = self._heard_moving = False
@@ -96,6 +105,7 @@ class RosbridgeCarrier(RosCarrier):
         self._connected_at = monotonic()
         self._moving.clear()
         self._requests.clear()
+        self._said.clear()
         # First of all: what is latched may come only once, and moving frames come again.
         for topic in (*self.settings.tf_static, *self.settings.tf):
             self._request(subscribe(topic, self._encoding))
@@ -133,7 +143,11 @@ class RosbridgeCarrier(RosCarrier):
 
     def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
         if static:
-            self._changed_statics = publish(self.settings.tf_static[0], samples)
+            self._changed_statics = publish(self.settings.tf_static[0], samples, static=True)
+            self._confirmation.expect(samples)
+            if self._confirmation.doubted:
+                # Else a server that has forgotten the topic takes them, and keeps them for nobody.
+                self._request(advertise(self.settings.tf_static[0], static=True))
         elif self._socket is None:
             error = ConnectionError(f"{self._url} is not connected")
             self._report.refused("not connected", error, len(samples))
@@ -157,6 +171,16 @@ class RosbridgeCarrier(RosCarrier):
     def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
         return decode_content(payload)
 
+    def _heard(self, samples: Sequence[ReceivedTransform | None], static: bool) -> None:
+        if static:
+            self._confirmation.heard(samples)
+
+    def _is_large(self, payload: Any) -> bool:
+        return isinstance(payload, LargeMessage) or (isinstance(payload, bytes) and super()._is_large(payload))
+
+    def _decode_in_parts(self, payload: Any) -> Iterator[Decoded[ReceivedTransform]]:
+        return decode_content_in_parts(payload)
+
     def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
         return decode_joints(payload)
 
@@ -170,6 +194,7 @@ class RosbridgeCarrier(RosCarrier):
             tasks.start_soon(self._until_gone, work, socket, tasks.cancel_scope)
         tasks.start_soon(self._ask_again)
         tasks.start_soon(self._end_holding)
+        tasks.start_soon(self._confirm_statics)
         tasks.start_soon(self._end_writing)
         await close_task_group(tasks)
         # Not when the link ends: then there is still something to send.
@@ -200,13 +225,22 @@ class RosbridgeCarrier(RosCarrier):
         while True:
             message = await socket.receive()
             try:
-                self._take(read(message), len(message))
+                large = is_large(message)
+                self._take(await read_large(message, socket.give_way) if large else read(message), len(message))
             except MalformedMessageError as error:
-                self._receive(Received(self._url, error))
+                # Thousands of them, each with what it was read from, would be work for the collector.
+                error.__context__ = None
+                self._receive(Received(self._url, error.with_traceback(None)))
 
     def _take(self, incoming: Incoming, size: int) -> None:
         if not incoming.topic:
-            self._report.failed(ConnectionError(f"{self._url} says: {incoming.content}"))
+            if incoming.content not in self._said and len(self._said) == MOST_SAID:
+                raise MalformedMessageError("status", f"the server says more than {MOST_SAID} things of itself")
+            if incoming.content not in self._said:
+                self._said.add(incoming.content)
+                # Not to end the line, or to turn it around.
+                said = incoming.content.encode("unicode_escape").decode()
+                self._report.failed(ConnectionError(f"{self._url} says: {said}"))
             return
         others = {
             "joints": self.settings.joint_topic,
@@ -229,8 +263,11 @@ class RosbridgeCarrier(RosCarrier):
             self._heard_moving = True
             if monotonic() > self._connected_at + ECHO_TIME:
                 self._held_until = -inf
-        content = RosMessage(incoming.content, static, "rosbridge")
-        self._receive(Received(self._url, content, size, moving=not static))
+        payload = incoming.content
+        if isinstance(payload, dict):
+            # Samples take less memory than what they are read from.
+            payload = decode_content(payload)
+        self._receive(Received(self._url, RosMessage(payload, static, "rosbridge"), size, moving=not static))
 
     def _ask_for_cbor(self) -> None:
         """Subscribe anew: a server that answers ``cbor-raw`` in JSON may know ``cbor``, which is older."""
@@ -262,6 +299,7 @@ class RosbridgeCarrier(RosCarrier):
             elif self._changed_statics is not None:
                 text, self._changed_statics = self._changed_statics, None
                 await socket.send(text)
+                self._confirmation.sent()
             elif self._moving:
                 await socket.send(self._moving.popleft()[0])
             else:
@@ -302,6 +340,14 @@ class RosbridgeCarrier(RosCarrier):
         if self._held_until > -inf:
             self._subscribe_again(self.settings.tf)
             self._held_until = -inf
+
+    async def _confirm_statics(self) -> None:
+        if self._of_ros2 and self._broken_at > -inf:
+            # Until then, they come from the publisher of the connection that broke.
+            await anyio.sleep(max(0.0, self._broken_at + LINGER_TIME - monotonic()))
+            self._confirmation.doubted = True
+            self._publish_statics()
+        await self._confirmation.run(lambda *what: self._report.refused(*what))
 
     def _subscribe_again(self, topics: Iterable[str]) -> None:
         for topic in topics:

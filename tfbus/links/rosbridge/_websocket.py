@@ -1,6 +1,8 @@
 """`WebSocket`, a client's end of a websocket that takes no message beyond a size."""
 
 import ssl
+from collections.abc import Iterator
+from io import StringIO
 from time import monotonic
 from typing import Self
 from urllib.parse import SplitResult, urlsplit
@@ -19,6 +21,8 @@ from wsproto.events import (
     TextMessage,
 )
 from wsproto.utilities import ProtocolError
+
+from tfbus._aio.turn_budget import TurnBudget
 
 _AT_ONCE = 2**16
 _GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError)
@@ -48,6 +52,9 @@ def check_url(url: str) -> SplitResult:
 class WebSocket:
     """An open websocket (RFC 6455); one task may receive while others send.
 
+    One read may bring tens of thousands of frames. They are taken from it one by one, and other tasks get their turn in
+    between, with `give_way`.
+
     Parameters
     ----------
     stream : anyio.abc.ByteStream
@@ -64,7 +71,8 @@ class WebSocket:
         self._stream = stream
         self._max_size = max_size
         self._connection = WSConnection(ConnectionType.CLIENT)
-        self._received: list[Event] = []
+        self._received: Iterator[Event] = iter(())
+        self._budget = TurnBudget()
         self._sending = anyio.Lock()
         self.heard = monotonic()
 
@@ -111,8 +119,7 @@ class WebSocket:
         OSError
             If the other end has closed, is gone, sends a message that is too large, or what is no websocket.
         """
-        texts: list[str] = []
-        pieces: list[bytes] = []
+        text, data = StringIO(), bytearray()
         size = 0
         while True:
             event = await self._next_event()
@@ -121,15 +128,19 @@ class WebSocket:
                 if size > self._max_size:
                     raise ConnectionAbortedError(f"a message of more than {self._max_size} bytes")
                 if isinstance(event, TextMessage):
-                    texts.append(event.data)
+                    text.write(event.data)
                 else:
-                    pieces.append(bytes(event.data))
+                    data += event.data
                 if event.message_finished:
-                    return "".join(texts) if isinstance(event, TextMessage) else b"".join(pieces)
+                    return text.getvalue() if isinstance(event, TextMessage) else bytes(data)
             elif isinstance(event, Ping):
                 await self._send(event.response())
             elif isinstance(event, CloseConnection):
                 raise ConnectionResetError(f"the other end has closed: {event.reason or event.code}")
+
+    async def give_way(self) -> None:
+        """Let other tasks have their turn, if what this websocket brings has kept the event loop for too long."""
+        await self._budget.give_way()
 
     async def send(self, text: str) -> None:
         """Send a message; raises `OSError` if the other end is gone."""
@@ -150,18 +161,24 @@ class WebSocket:
             await anyio.aclose_forcefully(self._stream)
 
     async def _next_event(self) -> Event:
-        while not self._received:
+        await self._budget.give_way()
+        while True:
             try:
-                data: bytes | None = await self._stream.receive(_AT_ONCE)
+                event = next(self._received, None)
+                if event is not None:
+                    return event
+                data = await self._stream.receive(_AT_ONCE)
+                self._budget.begin()
+                self.heard = monotonic()
+                self._connection.receive_data(data)
+                self._received = self._connection.events()
             except _GONE:
                 raise ConnectionResetError("the connection is gone") from None
-            self.heard = monotonic()
-            try:
-                self._connection.receive_data(data)
-                self._received = list(self._connection.events())
-            except ProtocolError as error:
-                raise ConnectionAbortedError(f"it is no websocket: {error}") from None
-        return self._received.pop(0)
+            # Bytes that are no websocket also get a few other errors out of the library.
+            except Exception as error:
+                if isinstance(error, OSError):
+                    raise
+                raise ConnectionAbortedError(f"it is no websocket: {error!r}"[:200]) from None
 
     async def _send(self, event: Event) -> None:
         try:

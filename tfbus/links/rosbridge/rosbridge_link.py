@@ -49,8 +49,10 @@ class RosbridgeLink(RosLink):
 
     Notes
     -----
-    One message larger than 4 MiB ends the connection. The only peer is the server. While a lookup waits on the bus, the
-    static frames are asked for now and then, because a server for ROS 2 may have had them before this link came.
+    One message larger than 4 MiB ends the connection. A large message is read and published in parts, so that other
+    tasks have their turn whatever the server sends; one with CBOR that no message of ROS has is refused. The only peer
+    is the server. While a lookup waits on the bus, the static frames are asked for now and then, because a server for
+    ROS 2 may have had them before this link came.
 
     A server asks ROS once for each topic, for all its clients, as the first of them wants it: decoded, or as bytes.
     With ``"cbor"`` this link and clients that want JSON, such as roslib in a browser, hear the same topics side by
@@ -61,6 +63,10 @@ class RosbridgeLink(RosLink):
 
     A server keeps one latched message of ``/tf_static`` for all its clients. So of several programs that send static
     frames through one server, late joiners hear only the last.
+
+    A server tells its clients nothing of what it refuses, but gives back what it takes. Static frames that do not come
+    back within 2 s are told in a log line, counted in `LinkStatistics.not_sent` as ``"not confirmed"``, and advertised
+    and sent again until they do.
 
     Whoever reaches the server can publish and read everything.
     """
