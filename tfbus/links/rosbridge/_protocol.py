@@ -219,7 +219,7 @@ class _Json:
         return self._places() if self._opens("[") else None
 
     def value(self) -> Any:
-        """What comes next: text of any length, or something else of at most `MAX_VALUE` characters."""
+        """The next value: text of any length, or something else of at most `MAX_VALUE` characters."""
         self._skip()
         if self._text.startswith('"', self._at):
             value, self._at = self._DECODER.raw_decode(self._text, self._at)
