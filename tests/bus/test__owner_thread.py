@@ -9,7 +9,7 @@ from tfbus.bus.bus import OwnerThread
 
 def owner() -> OwnerThread:
     """That of a bus that is made here; only the thread of its intake is of interest."""
-    return OwnerThread(SimpleNamespace(thread=0))  # type: ignore[arg-type]
+    return OwnerThread(SimpleNamespace(thread=0))
 
 
 Run = Callable[[Callable[[], Awaitable[None]]], None]

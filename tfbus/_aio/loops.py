@@ -1,5 +1,6 @@
 """Waiting for threads that may never end."""
 
+import logging
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ class LoopWaker:
     Parameters
     ----------
     callback : callable
-        Called on the loop. It must not raise, and must process everything that has been queued.
+        Called on the loop. It must process everything that has been queued, or wake again. An `Exception` is logged.
 
     Notes
     -----
@@ -70,7 +71,11 @@ class LoopWaker:
 
     def _call(self) -> None:
         self._requested = False
-        self._callback()
+        try:
+            self._callback()
+        except Exception:
+            # No task would hear of it, and it would end the whole run of trio.
+            logging.getLogger("tfbus").exception("a callback of another thread raised")
 
 
 def _never() -> bool:

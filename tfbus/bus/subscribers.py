@@ -9,6 +9,7 @@ from typing import Protocol, TypeVar
 
 from tfbus.events import Event, SubscriberFailed
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.plain import printable
 from tfbus.registration import Registration
 
 _KEPT = 1_000
@@ -45,7 +46,8 @@ class SeenKeys:
 class OnceLogger:
     """Writes a log line the first time that its key is seen; the last thousand keys are kept.
 
-    A line that repeats at 100 Hz buries all others. Callers count the repetitions.
+    A line that repeats at 100 Hz buries all others. Callers count the repetitions. Names and errors of strangers may be
+    arguments as they are: none of them begins a line of its own.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
@@ -64,7 +66,23 @@ class OnceLogger:
         self, level: int, key: Hashable, message: str, args: tuple[object, ...], exc_info: BaseException | None
     ) -> None:
         if self._seen.add(key):
-            self._logger.log(level, message, *args, exc_info=exc_info)
+            shown = (arg if isinstance(arg, (int, float)) else _Printable(arg) for arg in args)
+            self._logger.log(level, message, *shown, exc_info=exc_info)
+
+
+class _Printable:
+    """An argument of a line; made a text when a handler wants the line, as other arguments are."""
+
+    __slots__ = ("_value",)
+
+    def __init__(self, value: object) -> None:
+        self._value = value
+
+    def __str__(self) -> str:
+        return printable(str(self._value))
+
+    def __repr__(self) -> str:
+        return printable(repr(self._value))
 
 
 class Listener(Protocol):
