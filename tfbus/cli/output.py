@@ -9,6 +9,7 @@ from typing import TypeVar
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
 from tfbus.geometry.transform import Transform
+from tfbus.plain import printable
 from tfbus.stamps import SECOND
 
 ItemT = TypeVar("ItemT")
@@ -25,8 +26,8 @@ def fitted(line: str) -> str:
 
 
 def say(line: str) -> None:
-    """Print a notice to standard error."""
-    print(line, file=sys.stderr, flush=True)
+    """Print a notice to standard error, in one line whatever names are in it."""
+    print(printable(line), file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:
@@ -55,9 +56,9 @@ def progress(total: int | None, description: str) -> Iterator[Callable[[int], ob
         yield lambda count: bar.advance(task, count)
 
 
-def printable(text: str) -> str:
-    """Escape the characters of a text that would control a terminal."""
-    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+def csv_name(name: str) -> str:
+    """A name as a cell of CSV: as it is for programs and files, and escaped on a terminal, which would obey it."""
+    return printable(name) if sys.stdout.isatty() else name
 
 
 def format_seconds(nanoseconds: int) -> str:
