@@ -15,7 +15,6 @@ from tfbus.cli.output import (
     format_seconds,
     format_transform,
     print_now,
-    printable,
     say,
     track,
     warn,
@@ -38,21 +37,6 @@ def test_lines_leave_a_buffered_stream_at_once(stream: str, monkeypatch: pytest.
     monkeypatch.setattr(sys, stream, io.TextIOWrapper(io.BufferedWriter(received), encoding="utf-8"))
     (print_now if stream == "stdout" else say)("line")
     assert received.getvalue() == b"line\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("base_link", "base_link"),
-        ("雷达 é", "雷达 é"),
-        ("\x1b[2J", "\\x1b[2J"),
-        ("a\nb\r\x07", "a\\nb\\r\\x07"),
-        # This character would reverse the direction of the text.
-        ("\u202egpj", "\\u202egpj"),
-    ],
-)
-def test_letters_of_any_alphabet_stay_and_control_characters_are_escaped(text: str, shown: str) -> None:
-    assert printable(text) == shown
 
 
 @pytest.mark.parametrize(

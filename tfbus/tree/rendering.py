@@ -123,10 +123,6 @@ def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, f
             '    node [shape=box, style=rounded, fontname="Helvetica", fontsize=11, height=0.3];',
             '    edge [fontname="Helvetica", fontsize=9];',
         ]
-    for frame in dict.fromkeys(name for edge in edges for name in (edge.parent, edge.child)):
-        # Graphviz shows a name as it is, but for breaks of lines and HTML's names of characters.
-        if not frame.isprintable() or "&" in frame:
-            lines.append(f"    {quoted(frame)} [label={_label(frame)}];")
     for edge in edges:
         known = {"rate": _rate(edge)} if now is None else facts(edge, now)
         known["authority"] = edge.authority
@@ -138,6 +134,10 @@ def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, f
             colour = state_of(edge, now).value
             style += f', color="{colour}", fontcolor="{colour}"'
         lines.append(f'    {quoted(edge.parent)} -> {quoted(edge.child)} [label="{label}"{style}];')
+    for frame in dict.fromkeys(name for edge in edges for name in (edge.parent, edge.child)):
+        # Graphviz would break lines in these, and show what HTML's names of characters stand for.
+        if not frame.isprintable() or "&" in frame:
+            lines.append(f"    {quoted(frame)} [label={_label(frame)}];")
     return "\n".join([*lines, "}", ""])
 
 
