@@ -1,10 +1,11 @@
 """The output of the subcommands: results, notices, warnings, and values as text for people."""
 
+import csv
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
@@ -54,6 +55,20 @@ def progress(total: int | None, description: str) -> Iterator[Callable[[int], ob
     with progress_bar() as bar:
         task = bar.add_task(description, total=total)
         yield lambda count: bar.advance(task, count)
+
+
+class _Rows:
+    """Standard output for the rows of CSV: they end as lines do."""
+
+    def write(self, row: str) -> int:
+        """Write a row that ends with a carriage return and a newline."""
+        return sys.stdout.write(row.removesuffix("\r\n") + "\n")
+
+
+def csv_writer() -> Any:
+    """A writer of CSV on standard output."""
+    # With newlines alone as ends, a name with a carriage return is not quoted, and begins a row for readers.
+    return csv.writer(_Rows(), lineterminator="\r\n")
 
 
 def csv_name(name: str) -> str:
