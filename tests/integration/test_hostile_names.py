@@ -40,7 +40,7 @@ from tfbus import (
 from tfbus.analysis import Finding
 from tfbus.buffer.buffer import Buffer
 from tfbus.cli._overview import COMMANDS
-from tfbus.recording import Recorder, load
+from tfbus.recording import Recorder, load, load_static, save_static
 from tfbus.robot import Joint, RobotModel
 from tfbus.stamps import LATEST, Latest
 from tfbus.testing import simulate
@@ -211,6 +211,15 @@ def test_yaml_and_plain_data_have_every_name_as_it_is() -> None:
     for name in (*NAMES, HALF):
         sample = moving("map", name, 0, authority=name)
         assert TransformStamped.from_dict(json.loads(json.dumps(sample.to_dict()))) == sample
+
+
+def test_a_file_of_static_transforms_has_every_name_as_it_is(tmp_path: Path) -> None:
+    yaml: Any = pytest.importorskip("yaml")
+    path = tmp_path / "static.yaml"
+    samples = [static("map", name, authority=name) for name in (*NAMES, HALF)]
+    save_static(path, samples)
+    assert [sample.child for sample in load_static(path)] == [*NAMES, HALF]
+    assert [entry["child"] for entry in yaml.safe_load(path.read_text())] == [*NAMES, HALF]
 
 
 def test_every_explanation_has_a_line_for_each_edge() -> None:
@@ -464,7 +473,8 @@ def test_figures_show_every_name_in_one_line_and_in_no_formula(kind: str, record
     else:
         draw = plot.plot_path if kind == "path" else plot.plot_transforms
         figure = draw(tree, NAMES[34], *NAMES)
-        (legend,) = figure.legends or [figure.axes[0].get_legend()]
+        legend = figure.legends[0] if figure.legends else figure.axes[0].get_legend()
+        assert legend is not None
         shown = [text.get_text() for text in legend.get_texts()]
         assert len(shown) == len(NAMES)
     # A formula that is none would end the drawing.
