@@ -1,3 +1,4 @@
+import csv
 import errno
 import io
 import os
@@ -10,6 +11,8 @@ import pytest
 from tfbus import Transform
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import (
+    csv_name,
+    csv_writer,
     format_counts,
     format_numbers,
     format_seconds,
@@ -29,6 +32,25 @@ def test_results_go_to_standard_output_and_everything_else_to_standard_error(
     say("a notice")
     warn("a warning")
     assert capsys.readouterr() == ("a result\n", "a notice\ntfbus: a warning\n")
+
+
+def test_a_notice_is_one_line_whatever_names_are_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    say("waiting for x\ny\x1b[2J")
+    warn("no x\rtfbus: all is well")
+    assert capsys.readouterr().err == "waiting for x\\ny\\x1b[2J\ntfbus: no x\\rtfbus: all is well\n"
+
+
+class Screen(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_name_in_csv_is_as_it_is_but_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    for screen, cell in ((io.StringIO(newline=""), "x\x1b[2J\r"), (Screen(newline=""), r"x\x1b[2J\r")):
+        monkeypatch.setattr(sys, "stdout", screen)
+        csv_writer().writerow((csv_name("x\x1b[2J\r"), 1.5))
+        assert screen.getvalue().endswith("\n")
+        assert next(csv.reader(io.StringIO(screen.getvalue(), newline=""))) == [cell, "1.5"]
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

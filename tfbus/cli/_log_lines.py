@@ -70,8 +70,8 @@ class FoldingHandler(logging.Handler):
             self.release()
         if held is not None:
             line, more, _ = held
-            # Only a traceback has several lines: tfbus escapes those of names.
+            # Only a traceback has several lines. No message in it begins a line as those of tfbus do.
             first, *traceback = line.split("\n")
             warn(f"{first} (and {more:,} more like it)" if more else first)
             for part in traceback:
-                say(part)
+                say(f"  {part}")
