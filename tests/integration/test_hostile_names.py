@@ -19,7 +19,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import anyio
 import anyio.lowlevel
 import pytest
-from support.commands import Command, Done
+from support.commands import Command, Done, nobody
 from support.recorded import write_mcap
 from support.samples import moving, static, tree_of
 
@@ -31,6 +31,7 @@ from tfbus import (
     InvalidTransformError,
     PointStamped,
     SimulatedClock,
+    SystemClock,
     TransformError,
     TransformStamped,
     TransformTree,
@@ -387,12 +388,13 @@ ON_DOMAIN = {
     "static": ("static", 1, 2),
     "tree": ("tree",),
 }
-# What these print has only names that their user gives, and texts that others make.
-OWN = {"bridge", "broadcast", "demo", "foxglove", "listen", "play", "record", "router", "view"}
+OF_BOTH = {"play": ("play", 0, "--rate", "inf"), "record": ("record", "NEW", "--duration", "0")}
+# What these print has only names that their user gives, and texts of errors.
+OWN = {"bridge", "broadcast", "demo", "foxglove", "listen", "router", "view"}
 
 
 def test_every_command_is_walked_or_prints_no_names() -> None:
-    walked = {arguments[0] for arguments in (*OF_FILE.values(), *ON_DOMAIN.values())}
+    walked = {arguments[0] for arguments in (*OF_FILE.values(), *ON_DOMAIN.values(), *OF_BOTH.values())}
     assert walked | OWN == set(COMMANDS)
     assert walked.isdisjoint(OWN)
 
@@ -436,6 +438,16 @@ def test_no_command_prints_a_name_of_a_domain_as_it_is(tfbus: Command, arguments
         return tfbus.on_domain(publish, *filled(arguments, Path("none"), names))
 
     check_output(run(NAMES), run(PLAIN))
+
+
+@pytest.mark.parametrize("arguments", OF_BOTH.values(), ids=OF_BOTH)
+def test_no_command_between_a_file_and_a_domain_prints_a_name_as_it_is(
+    recording: Path, plain_recording: Path, tfbus: Command, arguments: Sequence[object]
+) -> None:
+    def run(file: Path, names: Sequence[str]) -> Done:
+        return tfbus.on_domain(nobody, *filled(arguments, file, names), clock=SystemClock())
+
+    check_output(run(recording, NAMES), run(plain_recording, PLAIN))
 
 
 def test_documents_for_programs_have_every_name_as_it_is(recording: Path, tmp_path: Path, tfbus: Command) -> None:
