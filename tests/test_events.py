@@ -47,7 +47,7 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     ),
     (
         SampleRejected(AT, "cycle", "a", "b", "rogue", InvalidTransformError("no\nloops", reason="cycle")),
-        "a sample from 'rogue' was rejected: no loops",
+        "a sample from 'rogue' was rejected: no\\nloops",
     ),
     (
         SampleRejected(AT, "not a sample", None, None, None, TypeError("what is 7?")),
@@ -80,10 +80,10 @@ ONE_OF_EACH: list[tuple[Event, str]] = [
     (PeerLost(AT, "tf", "5eed", (), ()), "peer 5eed is lost on tf: 0 frames"),
     (
         PeerRejected(AT, "tf", "5eed", "truncated", ValueError("ends\nearly")),
-        "peer 5eed on tf sent what was refused: ends early",
+        "peer 5eed on tf sent what was refused: ends\\nearly",
     ),
     (RecordingDropped(AT, "run.mcap", 7), "the recording run.mcap is behind and loses samples, 7 so far"),
-    (RecordingFailed(AT, "run.mcap", OSError("disk\nfull")), "the recording run.mcap has ended early: disk full"),
+    (RecordingFailed(AT, "run.mcap", OSError("disk\nfull")), "the recording run.mcap has ended early: disk\\nfull"),
 ]
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tfbus import LATEST, Latest, Transform
-from tfbus.plain import PlainData, from_plain, to_plain
+from tfbus.plain import PlainData, from_plain, printable, to_plain
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,3 +184,26 @@ def test_a_value_without_plain_data_is_a_type_error() -> None:
 
 def test_objects_with_to_dict_are_converted_by_it() -> None:
     assert to_plain((Transform(), None)) == [Transform().to_dict(), None]
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("base_link", "base_link"),
+        ("雷达 é", "雷达 é"),
+        ("\x1b[2J", "\\x1b[2J"),
+        ("a\nb\r\x07", "a\\nb\\r\\x07"),
+        # This character would reverse the direction of the text.
+        ("\u202egpj", "\\u202egpj"),
+    ],
+)
+def test_letters_of_any_alphabet_stay_and_control_characters_are_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown
+
+
+@given(st.text())
+def test_a_printable_text_is_one_line_stays_as_it_is_and_has_the_escapes_of_repr(text: str) -> None:
+    shown = printable(text)
+    assert shown.isprintable()
+    assert printable(shown) == shown
+    assert shown.replace("\\", "").replace("'", "") == repr(text)[1:-1].replace("\\", "").replace("'", "")

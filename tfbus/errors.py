@@ -32,7 +32,7 @@ from heapq import nlargest
 from itertools import islice
 from typing import Any, Self, TypeVar, get_type_hints
 
-from tfbus.plain import from_fields, from_plain, to_plain
+from tfbus.plain import from_fields, from_plain, printable, to_plain
 from tfbus.stamps import Latest, format_duration, format_stamp, likely_cause
 
 MOST_NAMES = 2_000
@@ -78,7 +78,10 @@ def _restore(
 
 
 class TransformError(Exception):
-    """Base class of all tfbus errors."""
+    """Base class of all tfbus errors. The text is one line: control characters in names are escaped in it."""
+
+    def __str__(self) -> str:
+        return printable(self._why())
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self)!r})"
@@ -121,7 +124,8 @@ class TransformError(Exception):
 
     def _why(self) -> str:
         """The message; a class that makes it of its facts has its own."""
-        return super().__str__()
+        # Not that of the next class, because `OSError` would make a message of its own.
+        return Exception.__str__(self)
 
 
 def _with_subclasses(cls: type[AnyError]) -> Iterable[type[AnyError]]:
@@ -142,7 +146,8 @@ class TransformLookupError(TransformError, LookupError):
     index: int | None = None
 
     def __str__(self) -> str:
-        return self._why() if self.index is None else f"stamps[{self.index}]: {self._why()}"
+        text = super().__str__()
+        return text if self.index is None else f"stamps[{self.index}]: {text}"
 
 
 class UnknownFrameError(TransformLookupError):
@@ -570,10 +575,6 @@ class MissingRecordingError(RecordingError, FileNotFoundError):
 
     def __init__(self, *, path: str) -> None:
         super().__init__("there is no such file", path=path, reason="missing")
-
-    def __str__(self) -> str:
-        # `OSError` would make a message of its own.
-        return Exception.__str__(self)
 
 
 class ClockResetError(TransformError):

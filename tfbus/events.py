@@ -8,7 +8,7 @@ and so do `FrameStale` and `FrameLive`. After a `ClockReset` the first sample of
 from dataclasses import dataclass, field
 
 from tfbus.errors import TransformError, loop_text
-from tfbus.plain import PlainData
+from tfbus.plain import PlainData, printable
 from tfbus.stamps import format_duration, format_stamp, likely_cause
 
 
@@ -441,4 +441,4 @@ Event = (
 
 
 def _line(stamp: int, text: str) -> str:
-    return f"{format_stamp(stamp)}: {' '.join(text.splitlines())}"
+    return f"{format_stamp(stamp)}: {printable(text)}"

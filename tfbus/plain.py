@@ -1,4 +1,4 @@
-"""Plain data, as JSON has them: the half of `to_dict` and `from_dict` that all classes share.
+"""Plain data, as JSON has them: the half of `to_dict` and `from_dict` that all classes share; and plain text.
 
 Numbers, texts and None stay; a tuple becomes a list, a mapping a dict, and `LATEST` the text ``"LATEST"``. A number
 that is not finite becomes a text, because JSON has no such numbers: ``"NaN"``, ``"Infinity"`` or ``"-Infinity"``, as in
@@ -18,6 +18,18 @@ from tfbus.stamps import LATEST, Latest
 
 _NOT_FINITE = ("NaN", "Infinity", "-Infinity")
 _PLAIN = frozenset((types.NoneType, bool, int, str))
+
+
+def printable(text: str) -> str:
+    """A text with the characters escaped that `repr` would escape, so that it stays in its line and its place.
+
+    These are control and format characters, such as those that begin a new line, command a terminal, or reverse the
+    direction of letters; blanks other than the usual one; and what is no character. Letters of any alphabet stay. A
+    second call changes nothing, so a line may be made of names and of texts that are printable already.
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
 
 
 class PlainData:

@@ -28,6 +28,7 @@ from tfbus.errors import InvalidTransformError
 from tfbus.geometry.rows import NORM_TOLERANCE, ROUNDING, Row
 from tfbus.geometry.stamped import Fields, TransformStamped
 from tfbus.geometry.transform import Transform
+from tfbus.plain import printable
 from tfbus.stamps import SECOND, format_stamp
 
 MAX_NAME: Final = 1_024
@@ -58,7 +59,7 @@ class MalformedMessageError(ValueError):
         self.detail = detail
 
     def __str__(self) -> str:
-        return f"no message of transforms ({self.reason}): {self.detail}"
+        return printable(f"no message of transforms ({self.reason}): {self.detail}")
 
 
 class Decoded(NamedTuple, Generic[SampleT]):

@@ -63,3 +63,13 @@ def test_a_key_is_the_first_of_its_kind_until_it_is_forgotten() -> None:
     assert once.add("c")
     assert not once.add("b")
     assert once.add("a")
+
+
+def test_no_argument_begins_a_line_of_its_own(caplog: pytest.LogCaptureFixture) -> None:
+    log = OnceLogger(logging.getLogger("tfbus"))
+    name = "x\n2026 CRITICAL\x1b[2J"
+    log.warning("key", "%s %r %s %d %.1f", name, name, OSError(name), 3, 0.5)
+    (record,) = caplog.records
+    shown = r"x\n2026 CRITICAL\x1b[2J"
+    assert record.getMessage() == f"{shown} '{shown}' {shown} 3 0.5"
+    assert record.msg == "%s %r %s %d %.1f"

@@ -50,9 +50,11 @@ def test_a_line_is_printed_when_its_time_is_over_and_the_time_doubles(
 
 def test_a_traceback_stays_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     with log_lines("WARNING"):
-        LOGGER.warning("the callback raised", exc_info=ValueError("no"))
-    first, *_, last = capsys.readouterr().err.splitlines()
-    assert (first, last) == ("tfbus: the callback raised", "ValueError: no")
+        LOGGER.warning("the callback raised", exc_info=ValueError("no\ntfbus: all is well\x1b[2J"))
+    first, *traceback = capsys.readouterr().err.split("\n")
+    assert first == "tfbus: the callback raised"
+    assert traceback[-3:] == ["  ValueError: no", r"  tfbus: all is well\x1b[2J", ""]
+    assert all(line.startswith("  ") for line in traceback[:-1])
 
 
 def test_the_level_and_the_handlers_are_as_before_at_the_end() -> None:

@@ -1,3 +1,4 @@
+import csv
 import errno
 import io
 import os
@@ -10,12 +11,13 @@ import pytest
 from tfbus import Transform
 from tfbus.cli.arguments import UsageError
 from tfbus.cli.output import (
+    csv_name,
+    csv_writer,
     format_counts,
     format_numbers,
     format_seconds,
     format_transform,
     print_now,
-    printable,
     say,
     track,
     warn,
@@ -32,27 +34,31 @@ def test_results_go_to_standard_output_and_everything_else_to_standard_error(
     assert capsys.readouterr() == ("a result\n", "a notice\ntfbus: a warning\n")
 
 
+def test_a_notice_is_one_line_whatever_names_are_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    say("waiting for x\ny\x1b[2J")
+    warn("no x\rtfbus: all is well")
+    assert capsys.readouterr().err == "waiting for x\\ny\\x1b[2J\ntfbus: no x\\rtfbus: all is well\n"
+
+
+class Screen(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_name_in_csv_is_as_it_is_but_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    for screen, cell in ((io.StringIO(newline=""), "x\x1b[2J\r"), (Screen(newline=""), r"x\x1b[2J\r")):
+        monkeypatch.setattr(sys, "stdout", screen)
+        csv_writer().writerow((csv_name("x\x1b[2J\r"), 1.5))
+        assert screen.getvalue().endswith("\n")
+        assert next(csv.reader(io.StringIO(screen.getvalue(), newline=""))) == [cell, "1.5"]
+
+
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_lines_leave_a_buffered_stream_at_once(stream: str, monkeypatch: pytest.MonkeyPatch) -> None:
     received = io.BytesIO()
     monkeypatch.setattr(sys, stream, io.TextIOWrapper(io.BufferedWriter(received), encoding="utf-8"))
     (print_now if stream == "stdout" else say)("line")
     assert received.getvalue() == b"line\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("base_link", "base_link"),
-        ("雷达 é", "雷达 é"),
-        ("\x1b[2J", "\\x1b[2J"),
-        ("a\nb\r\x07", "a\\nb\\r\\x07"),
-        # This character would reverse the direction of the text.
-        ("\u202egpj", "\\u202egpj"),
-    ],
-)
-def test_letters_of_any_alphabet_stay_and_control_characters_are_escaped(text: str, shown: str) -> None:
-    assert printable(text) == shown
 
 
 @pytest.mark.parametrize(

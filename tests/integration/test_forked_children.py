@@ -40,7 +40,7 @@ def said(program: str) -> list[str]:
 
 def test_a_child_may_use_its_copy_of_a_bus_that_only_buffers_and_callbacks_are_on() -> None:
     lines = said("""
-bus = Bus(max_ahead=None)
+bus = Bus(max_ahead=None, max_behind=None)
 buffer = Buffer(bus)
 bus.publish([sample(1), sample(3)])
 def child():
@@ -73,7 +73,7 @@ def by_multiprocessing(body):
     process.join()
 
 async def main():
-    with Bus(max_ahead=None) as bus, Buffer(bus) as buffer:
+    with Bus(max_ahead=None, max_behind=None) as bus, Buffer(bus) as buffer:
         one, two = TransformBroadcaster(bus), ({ENTERED[kind]})
         def child():
             # What it has heard so far is there.
@@ -83,7 +83,7 @@ async def main():
             tell(one.send_static, "map", "lamp", Transform())
             tell(bus.remove_frame, "base")
             tell(bus.subscribe, print)
-            with Bus() as own:
+            with Bus(max_behind=None) as own:
                 tell(own.publish, sample(2))
         async with two:
             bus.publish(sample(1))
@@ -106,7 +106,7 @@ anyio.run(main)
 def test_a_child_is_told_that_the_threads_of_a_loop_are_those_of_its_parent() -> None:
     lines = said("""
 async def main():
-    with Bus(max_ahead=None) as bus, bus.threadsafe() as publish:
+    with Bus(max_ahead=None, max_behind=None) as bus, bus.threadsafe() as publish:
         in_a_child(lambda: tell(publish, sample(1)))
         in_a_child(lambda: tell(bus.publish, sample(1)))
         tell(publish, sample(2))
@@ -125,10 +125,10 @@ async def enter(make):
         print("entered")
 
 async def main():
-    with Bus() as bus, Buffer(bus) as buffer:
+    with Bus(max_behind=None) as bus, Buffer(bus) as buffer:
         async with ZenohLink(bus, listen="tcp/127.0.0.1:0"), BufferClient(listen="tcp/127.0.0.1:0") as client:
             def child():
-                own = Bus()
+                own = Bus(max_behind=None)
                 tell(asyncio.run, enter(lambda: ZenohLink(own, listen="tcp/127.0.0.1:0")))
                 tell(asyncio.run, enter(lambda: BufferClient(listen="tcp/127.0.0.1:0")))
                 tell(asyncio.run, client.lookup("map", "base"))
@@ -145,7 +145,7 @@ anyio.run(main)
 def test_a_child_that_forks_before_the_first_link_has_links_of_its_own() -> None:
     lines = said("""
 async def enter():
-    with Bus() as bus:
+    with Bus(max_behind=None) as bus:
         async with ZenohLink(bus, listen="tcp/127.0.0.1:0") as link:
             print(link.peers)
 in_a_child(lambda: tell(anyio.run, enter))

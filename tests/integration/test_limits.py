@@ -48,6 +48,7 @@ BOUNDS = {
     "view._trails": "SAMPLES",
     "view._server": "_PORTS_TRIED",
     "plot.series": "SAMPLES",
+    "plot._style": "LONGEST_NAME",
 }
 """The constants of the rows of the page, in their order."""
 

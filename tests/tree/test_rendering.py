@@ -1,7 +1,11 @@
+import ast
 import json
 import re
+import shutil
+import subprocess
 from dataclasses import replace
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import pytest
 from hypothesis import given
@@ -122,9 +126,40 @@ def test_graphviz_keeps_names_of_every_alphabet(name: str) -> None:
 def test_graphviz_escapes_every_name(parent: str, child: str, authority: str) -> None:
     text = to_dot([replace(STATIC, parent=parent, child=child, authority=authority)])
     quoted = r'"(?:[^"\\\n]|\\.)*"'
-    assert re.fullmatch(
-        rf"digraph tf {{\n    {quoted} -> {quoted} \[label={quoted}, style=dashed\];\n}}\n", text, re.DOTALL
+    names = rf"(?:    {quoted} \[label={quoted}\];\n){{0,2}}"
+    edge = rf"    {quoted} -> {quoted} \[label={quoted}, style=dashed\];\n"
+    assert re.fullmatch(rf"digraph tf {{\n{edge}{names}}}\n", text)
+    assert all(line.isprintable() for line in text.split("\n"))
+
+
+def drawn_by_graphviz(*edges: Edge) -> str:
+    """All texts of the picture, as SVG has them."""
+    if shutil.which("dot") is None:
+        pytest.skip("Graphviz is not installed")
+    svg = subprocess.run(["dot", "-Tsvg"], input=to_dot(edges).encode(), capture_output=True, check=True).stdout
+    return "\n".join(element.text or "" for element in ET.fromstring(svg).iter() if element.tag.endswith("}text"))
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("a\nb", r"a\nb"),
+        ("\u202egpj", r"\u202egpj"),
+        ("a\u200bb", r"a\u200bb"),
+        ("\x1b[2J", r"\x1b[2J"),
+        ("a&#8238;b", "a&#8238;b"),
+        ("<b>\\N</b>", "<b>\\N</b>"),
+    ],
+)
+def test_graphviz_shows_a_name_in_one_line_with_its_control_characters_escaped(name: str, shown: str) -> None:
+    assert drawn_by_graphviz(replace(STATIC, parent="map", child=name, authority=name)) == "\n".join(
+        ["map", shown, "static", shown]
     )
+
+
+def test_graphviz_tells_a_name_from_its_escaped_form() -> None:
+    text = drawn_by_graphviz(edge("map", "\u202e"), edge("map", r"\u202e"), edge("map", "\n"), edge("map", r"\n"))
+    assert sorted(text.split("\n")) == sorted(["map", r"\u202e", r"\u202e", r"\n", r"\n", *["static"] * 4])
 
 
 def test_graphviz_draws_a_loop() -> None:
@@ -135,16 +170,20 @@ def test_graphviz_draws_a_loop() -> None:
 
 
 def parsed(text: str) -> dict[str, dict[str, Any]]:
-    """The YAML of frames: blocks of one level, whose keys and values are those of JSON."""
+    """The YAML of frames: blocks of one level, whose texts are those of Python, and whose other values are JSON."""
+
+    def read(value: str) -> Any:
+        return ast.literal_eval(value) if value.startswith('"') else json.loads(value)
+
     frames: dict[str, dict[str, Any]] = {}
     frame = ""
     for line in text.removesuffix("\n").split("\n"):
         if line.startswith("  "):
             key, _, value = line.strip().partition(": ")
-            frames[frame][key] = json.loads(value)
+            frames[frame][key] = read(value)
         else:
             assert line.endswith(":")
-            frame = json.loads(line[:-1])
+            frame = read(line[:-1])
             frames[frame] = {}
     return frames
 
@@ -209,6 +248,24 @@ def test_yaml_round_trips_every_name(parent: str, child: str, authority: str) ->
     text = to_yaml([replace(STATIC, parent=parent, child=child, authority=authority)])
     facts = parsed(text)[child]
     assert (facts["parent"], facts["broadcaster"]) == (parent, authority)
+
+
+@pytest.mark.parametrize("length", [1, 1_000, 1_020, 1_021, 1_022, 1_023, 1_024, 1_025, 1_026, 5_000, 100_000])
+@pytest.mark.parametrize("letter", ["a", "é", "\u202e", "\U000e0001", "\\"])
+def test_pyyaml_reads_names_of_any_length_back(letter: str, length: int) -> None:
+    yaml: Any = pytest.importorskip("yaml")
+    name = letter * length
+    read = yaml.safe_load(to_yaml([replace(STATIC, parent=name, child=name, authority=name), edge(name, "tool")]))
+    assert list(read) == [name, "tool"]
+    assert (read[name]["parent"], read[name]["broadcaster"], read["tool"]["parent"]) == (name, name, name)
+
+
+@given(frame_names(), frame_names(), frame_names())
+def test_pyyaml_reads_every_name_back(parent: str, child: str, authority: str) -> None:
+    yaml: Any = pytest.importorskip("yaml")
+    read = yaml.safe_load(to_yaml([replace(STATIC, parent=parent, child=child, authority=authority)]))
+    assert list(read) == [child]
+    assert (read[child]["parent"], read[child]["broadcaster"]) == (parent, authority)
 
 
 def test_yaml_escapes_characters_outside_the_basic_plane_whole() -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from tfbus.plain import printable
 from tfbus.stamps import format_stamp
 
 ADVICE = {
@@ -76,4 +77,4 @@ class Finding:
         worst = "" if self.worst is None else f", worst {self.worst:.4g} {self.unit}".rstrip()
         at = "" if self.at is None or self.worst is None else f" at {format_stamp(self.at)}"
         first = "" if self.first is None else f", first at {format_stamp(self.first)}"
-        return f"{name}{self.detail}, {self.count:,} x{worst}{at}{first}"
+        return printable(f"{name}{self.detail}, {self.count:,} x{worst}{at}{first}")

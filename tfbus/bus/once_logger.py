@@ -3,6 +3,8 @@
 import logging
 from collections.abc import Hashable
 
+from tfbus.plain import printable
+
 _KEPT = 1_000
 
 
@@ -37,7 +39,8 @@ class SeenKeys:
 class OnceLogger:
     """Writes a log line the first time that its key is seen; the last thousand keys are kept.
 
-    A line that repeats at 100 Hz buries all others. Callers count the repetitions.
+    A line that repeats at 100 Hz buries all others. Callers count the repetitions. Names and errors of strangers may be
+    arguments as they are: none of them begins a line of its own.
     """
 
     def __init__(self, logger: logging.Logger) -> None:
@@ -56,4 +59,20 @@ class OnceLogger:
         self, level: int, key: Hashable, message: str, args: tuple[object, ...], exc_info: BaseException | None
     ) -> None:
         if self._seen.add(key):
-            self._logger.log(level, message, *args, exc_info=exc_info)
+            shown = (arg if isinstance(arg, (int, float)) else _Printable(arg) for arg in args)
+            self._logger.log(level, message, *shown, exc_info=exc_info)
+
+
+class _Printable:
+    """An argument of a line; made a text when a handler wants the line, as other arguments are."""
+
+    __slots__ = ("_value",)
+
+    def __init__(self, value: object) -> None:
+        self._value = value
+
+    def __str__(self) -> str:
+        return printable(str(self._value))
+
+    def __repr__(self) -> str:
+        return printable(repr(self._value))

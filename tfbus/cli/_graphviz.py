@@ -29,5 +29,5 @@ def draw(dot: str, kind: str, path: Path) -> None:
             f"--{kind} needs Graphviz: install it (apt install graphviz, brew install graphviz), or write --dot"
         ) from None
     if drawn.returncode != 0:
-        raise UsageError(f"Graphviz could not draw the tree: {drawn.stderr.decode(errors='replace').strip()}")
+        raise UsageError(f"Graphviz could not draw the tree: {' '.join(drawn.stderr.decode(errors='replace').split())}")
     write_file(path, drawn.stdout)

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from tfbus.cli.output import warn
+from tfbus.cli.output import say, warn
 
 FIRST_WINDOW = 0.3
 """The time in s for which the first line of a kind is held back, to count those that follow."""
@@ -70,4 +70,8 @@ class FoldingHandler(logging.Handler):
             self.release()
         if held is not None:
             line, more, _ = held
-            warn(f"{line} (and {more:,} more like it)" if more else line)
+            # Only a traceback has several lines. No message in it begins a line as those of tfbus do.
+            first, *traceback = line.split("\n")
+            warn(f"{first} (and {more:,} more like it)" if more else first)
+            for part in traceback:
+                say(f"  {part}")

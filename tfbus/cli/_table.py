@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from tfbus.cli._width import align, cells, shorten, shorten_widest
+from tfbus.plain import printable
 
 _GAP = "  "
 
@@ -34,12 +35,13 @@ def table_lines(
     ----------
     columns : sequence of Column
     rows : sequence of sequence of str
-        The cells of each row; printable.
+        The cells of each row; names need not be printable.
     width : int, optional
         The greatest length of a line; where columns that stay always do not fit, their longest cells are shortened.
     titles : bool
         Whether the first line has the titles.
     """
+    rows = [list(map(printable, row)) for row in rows]
     shown = [at for at in range(len(columns)) if any(row[at] for row in rows)]
     lines = [[column.title for column in columns], *rows] if titles else list(rows)
     widths = [max(cells(line[at]) for line in lines) for at in range(len(columns))] if rows else []

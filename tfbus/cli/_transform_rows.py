@@ -1,8 +1,6 @@
 """The rows of transforms that ``tfbus query`` prints or writes."""
 
-import csv
 import json
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, islice
 from pathlib import Path
@@ -10,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
-from tfbus.cli.output import format_seconds, printable, say
+from tfbus.cli.output import csv_name, csv_writer, format_seconds, say
 from tfbus.errors import pip_install
 
 Format = Literal["table", "csv", "json", "tum"]
@@ -78,10 +76,10 @@ def write_parquet(rows: Iterator[Row], path: Path) -> None:
 
 
 def _print_csv(rows: Iterator[Row], several: bool) -> None:
-    out = csv.writer(sys.stdout, lineterminator="\n")
+    out = csv_writer()
     out.writerow((*(("target", "source") if several else ()), "stamp", *_NUMBERS))
     for row in rows:
-        pair = (row.target, row.source) if several else ()
+        pair = (csv_name(row.target), csv_name(row.source)) if several else ()
         out.writerow((*pair, format_seconds(row.stamp), *row.translation, *row.rotation))
 
 
@@ -103,7 +101,7 @@ def _print_table(rows: Iterator[Row], several: bool) -> None:
     for row in rows:
         if pair != row[:2]:
             if several:
-                heading = f"{printable(row.source)} in {printable(row.target)}"
+                heading = f"{row.source} in {row.target}"
                 print(*([] if pair is None else [""]), *wrapped(heading, width, 2), sep="\n")
             titles = [f"{name:>{_NUMBER}}" for name in ("x [m]", "y [m]", "z [m]", *_NUMBERS[3:])]
             print(f"{'stamp [s]':>{_STAMP}}{''.join(titles[:3])}{between}{''.join(titles[3:])}")

@@ -9,7 +9,7 @@ from rich.live import Live
 from rich.text import Text
 
 from tfbus.cli._width import cells, narrow_guides, shorten, terminal_width
-from tfbus.cli.output import printable
+from tfbus.plain import printable
 from tfbus.stamps import SECOND
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import Branch, branches, facts

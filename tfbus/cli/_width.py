@@ -7,6 +7,8 @@ import textwrap
 import unicodedata
 from collections.abc import Sequence
 
+from tfbus.plain import printable
+
 _ELLIPSIS = "…"
 _STEP = 4
 """The width of the guides of one level of a tree."""
@@ -53,7 +55,11 @@ def shorten(text: str, width: int) -> str:
 
 
 def wrapped(text: str, width: int | None, indent: int) -> list[str]:
-    """The lines of a text that is broken between words, all but the first indented; a longer word is shortened."""
+    """The lines of a text that is broken between words, all but the first indented; a longer word is shortened.
+
+    Control characters in names are escaped first: no name begins a line.
+    """
+    text = printable(text)
     if width is None or cells(text) <= width:
         return [text]
     room = max(1, width - indent)

@@ -1,14 +1,16 @@
 """The output of the subcommands: results, notices, warnings, and values as text for people."""
 
+import csv
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import UsageError
 from tfbus.geometry.transform import Transform
+from tfbus.plain import printable
 from tfbus.stamps import SECOND
 
 ItemT = TypeVar("ItemT")
@@ -25,8 +27,8 @@ def fitted(line: str) -> str:
 
 
 def say(line: str) -> None:
-    """Print a notice to standard error."""
-    print(line, file=sys.stderr, flush=True)
+    """Print a notice to standard error, in one line whatever names are in it."""
+    print(printable(line), file=sys.stderr, flush=True)
 
 
 def warn(message: str) -> None:
@@ -55,9 +57,23 @@ def progress(total: int | None, description: str) -> Iterator[Callable[[int], ob
         yield lambda count: bar.advance(task, count)
 
 
-def printable(text: str) -> str:
-    """Escape the characters of a text that would control a terminal."""
-    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+class _Rows:
+    """Standard output for the rows of CSV: they end as lines do."""
+
+    def write(self, row: str) -> int:
+        """Write a row that ends with a carriage return and a newline."""
+        return sys.stdout.write(row.removesuffix("\r\n") + "\n")
+
+
+def csv_writer() -> Any:
+    """A writer of CSV on standard output."""
+    # With newlines alone as ends, a name with a carriage return is not quoted, and begins a row for readers.
+    return csv.writer(_Rows(), lineterminator="\r\n")
+
+
+def csv_name(name: str) -> str:
+    """A name as a cell of CSV: as it is for programs and files, and escaped on a terminal, which would obey it."""
+    return printable(name) if sys.stdout.isatty() else name
 
 
 def format_seconds(nanoseconds: int) -> str:

@@ -8,7 +8,7 @@ from tfbus.frames import check_frame
 from tfbus.geometry.rows import Row
 from tfbus.geometry.transform import Transform, from_row
 from tfbus.geometry.which_kernel import kernel
-from tfbus.plain import from_fields
+from tfbus.plain import from_fields, printable
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, StampLike, as_stamp, format_duration, format_stamp
 
 if kernel == "python":
@@ -176,7 +176,7 @@ class TransformStamped(Sample):
 
     def __str__(self) -> str:
         when = "static" if self.static else f"at {format_stamp(self.stamp)}"
-        return f"{self.parent} <- {self.child} {when}: {self.transform}"
+        return f"{printable(self.parent)} <- {printable(self.child)} {when}: {self.transform}"
 
 
 class QualifiedTransform(TransformStamped):

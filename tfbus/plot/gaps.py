@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from tfbus.plot._style import COLOURS, new_figure
+from tfbus.plot._style import COLOURS, new_figure, shown
 from tfbus.plot.reception import Floats, Reception
 from tfbus.stamps import SECOND, time_between
 
@@ -56,7 +56,7 @@ def plot_gaps(reception: Mapping[str, Reception], figure: Figure | None = None) 
                 linewidth=5,
                 solid_capstyle="butt",
             )
-    strips.set_yticks(range(len(frames)), list(reception), fontsize=7)
+    strips.set_yticks(range(len(frames)), [shown(name) for name in reception], fontsize=7)
     strips.set_ylim(len(frames) - 0.5, -0.5)
     strips.set_xlabel("time from the start [s]")
     strips.set_title("heard (static: dotted)")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from tfbus.plot._style import line_styles, new_figure
+from tfbus.plot._style import line_styles, new_figure, shown
 from tfbus.plot.transforms import labelled_series
 from tfbus.tree.tree import TransformTree
 
@@ -45,10 +45,10 @@ def plot_path(
         known = points[:, ~(points != points).any(axis=0)]
         for place, marker in ((0, "o"), (-1, "s")):
             axes.plot(*known[:, place : place + 1 or None], marker=marker, color=style["color"], linestyle="none")
-    axes.set_xlabel(f"x in {target} [m]")
-    axes.set_ylabel(f"y in {target} [m]")
+    axes.set_xlabel(f"x in {shown(target)} [m]")
+    axes.set_ylabel(f"y in {shown(target)} [m]")
     if three_d:
-        axes.set_zlabel(f"z in {target} [m]")  # type: ignore[attr-defined]
+        axes.set_zlabel(f"z in {shown(target)} [m]")  # type: ignore[attr-defined]
     axes.set_aspect("equal", adjustable="datalim" if not three_d else "box")
     axes.grid(alpha=0.3)
     axes.legend()

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from tfbus.plain import printable
 from tfbus.plot.series import Floats, Series
 
 _LEVELS = "▁▂▃▄▅▆▇█"
@@ -25,7 +26,7 @@ def sparklines(series: Series, width: int = 60) -> str:
         raise ValueError(f"a line has at least one letter, not {width}")
     places = np.linspace(0, len(series.seconds) - 1, width).round().astype(int)
     title = f"{series.source} in {series.target}, {series.seconds[0]:.3f} s to {series.seconds[-1]:.3f} s"
-    lines = [title]
+    lines = [printable(title)]
     rows = (
         zip(("x", "y", "z"), series.translations.T, strict=True),
         zip(("roll", "pitch", "yaw"), series.angles.T, strict=True),

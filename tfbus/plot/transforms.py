@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from tfbus.plot._style import line_styles, new_figure
+from tfbus.plot._style import line_styles, new_figure, shown
 from tfbus.plot.series import Floats, Series, read_series
 from tfbus.tree.tree import TransformTree
 
@@ -63,7 +63,7 @@ def plot_transforms(
                 axes[row, column].set_ylim(middle - _LEAST_SPAN / 2.0, middle + _LEAST_SPAN / 2.0)
     for column in range(2):
         axes[2, column].set_xlabel("time from the start [s]")
-    result.suptitle(f"in {target}")
+    result.suptitle(f"in {shown(target)}")
     result.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=min(len(drawn), 4))
     return result
 
@@ -84,7 +84,7 @@ def labelled_series(
     if not trees:
         raise ValueError("there is no tree")
     return [
-        (f"{source}, {name}" if name else source, read_series(each, target, source))
+        (shown(f"{source}, {name}" if name else source), read_series(each, target, source))
         for name, each in trees
         for source in sources
     ]

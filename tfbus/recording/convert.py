@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 from tfbus.errors import RecordingError, pip_install
+from tfbus.plain import printable
 from tfbus.recording.edits import Edits
 from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
 from tfbus.recording.formats._copies import (
@@ -149,7 +150,7 @@ def convert(
             raise ValueError(f"only MCAP holds Foxglove's schema: the output must end in .mcap, not {target.name!r}")
         make = FoxgloveCopy
     if any(target.exists() and Path(path).exists() and target.samefile(path) for path in inputs):
-        raise ValueError(f"{target} is an input as well")
+        raise ValueError(f"{printable(str(target))} is an input as well")
     if target.exists() and not overwrite:
         raise FileExistsError(17, "it is there already", str(target))
     with ExitStack() as stack:

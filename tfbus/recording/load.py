@@ -9,6 +9,7 @@ from operator import itemgetter
 from tfbus.errors import InvalidTransformError
 from tfbus.geometry.bounds import MAX_TRANSLATION, is_within, not_physical
 from tfbus.geometry.stamped import Batch, TransformStamped
+from tfbus.plain import printable
 from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._selection import Topics
 from tfbus.recording.formats._columns import Columns
@@ -108,12 +109,12 @@ def load(
         if isinstance(problems, Problems):
             problems.details += found.details
         return tree
-    logger = logging.getLogger("tfbus")
+    logger, file = logging.getLogger("tfbus"), printable(os.fspath(path))
     if found:
         reasons = ", ".join(f"{count} x {reason}" for reason, count in found.most_common())
-        logger.warning("left out of %s: %s", os.fspath(path), "; ".join([reasons, *found.details]))
+        logger.warning("left out of %s: %s", file, printable("; ".join([reasons, *found.details])))
     for remark in remarks:
-        logger.warning("%s: %s", os.fspath(path), remark)
+        logger.warning("%s: %s", file, printable(remark))
     return tree
 
 

@@ -23,6 +23,7 @@ from tfbus._aio.task_groups import close_task_group
 from tfbus.bus.bus import Bus
 from tfbus.events import RecordingDropped, RecordingFailed
 from tfbus.geometry.stamped import Batch
+from tfbus.plain import printable
 from tfbus.recording._write_queue import WriteQueue
 from tfbus.recording.formats._mcap_output import McapOutput
 from tfbus.registration import Registration
@@ -98,7 +99,7 @@ class Recorder:
         self._threads: anyio.CapacityLimiter
 
     def __repr__(self) -> str:
-        state = f", ended early: {self.error}" if self.error is not None else ""
+        state = f", ended early: {printable(str(self.error))}" if self.error is not None else ""
         return f"<Recorder of {self.path!r}: {self.statistics().samples:,} samples{state}>"
 
     def statistics(self) -> RecorderStatistics:
@@ -249,7 +250,10 @@ class Recorder:
         # What is still published is counted as dropped.
         self._queue.clear()
         logging.getLogger("tfbus.recording").warning(
-            "the recording %s has ended early, with %d samples in it: %s", self.path, self.statistics().samples, error
+            "the recording %s has ended early, with %d samples in it: %s",
+            printable(self.path),
+            self.statistics().samples,
+            printable(str(error)),
         )
         self.bus._announce(RecordingFailed(self.bus.clock.now(), self.path, error))
 

@@ -9,6 +9,7 @@ from typing import Final, Self
 
 from tfbus.errors import MissingRecordingError, RecordingError, pip_install
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.plain import printable
 from tfbus.recording._blocks import Block, DecodedBlock
 from tfbus.recording._selection import Selection, Topics, looks_like_transforms
 from tfbus.recording.formats._columns import ColumnDecoder
@@ -213,7 +214,7 @@ class Recording:
     @property
     def _opened(self) -> Storage:
         if self._storage is None:
-            raise ValueError(f"the recording {self.path} is closed")
+            raise ValueError(f"the recording {printable(str(self.path))} is closed")
         return self._storage
 
 

@@ -45,11 +45,18 @@ def save_static(path: str | os.PathLike[str], samples: Iterable[TransformStamped
                 "xyz": sample.transform.translation,
                 "quaternion": sample.transform.rotation,
                 "authority": sample.authority,
-            }
+            },
+            ensure_ascii=False,
         )
         for sample in samples
     ]
-    Path(path).write_text("[\n  " + ",\n  ".join(lines) + "\n]\n" if lines else "[]\n", encoding="utf-8")
+    text = "[\n  " + ",\n  ".join(map(_escaped, lines)) + "\n]\n" if lines else "[]\n"
+    Path(path).write_text(text, encoding="utf-8")
+
+
+def _escaped(line: str) -> str:
+    # YAML takes the two halves of a surrogate pair, with which JSON escapes what is beyond 16 bits, for two letters.
+    return "".join(c if c.isprintable() or ord(c) > 0xFFFF else f"\\u{ord(c):04x}" for c in line)
 
 
 def load_static(path: str | os.PathLike[str], *, authority: str = "") -> list[TransformStamped]:

@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from tfbus.errors import DisconnectedError, ExtrapolationError, TransformLookupError, UnknownFrameError
-from tfbus.plain import PlainData
+from tfbus.plain import PlainData, printable
 from tfbus.stamps import LATEST, Latest, format_age, format_duration, format_stamp, to_seconds
 from tfbus.tree.extrapolation import Extrapolation, read_stamp
 from tfbus.tree.forest import AT_A_TIME, Forest
@@ -134,12 +134,13 @@ class Explanation(PlainData):
 
 def _cells(edge: ExplainedEdge, now: int | None, below: bool) -> list[str]:
     """The cells of one edge's line of text."""
+    parent, child = printable(edge.parent), printable(edge.child)
     age = ""
     if edge.newest is not None and now is not None:
         age = format_age(edge.newest, now)
     return [
         "!" if edge.error is not None else " ",
-        f"{edge.parent} <- {edge.child}" if below else f"{edge.child} -> {edge.parent}",
+        f"{parent} <- {child}" if below else f"{child} -> {parent}",
         format_rate(edge.static, edge.newest, edge.rate),
         age,
         _samples(edge),

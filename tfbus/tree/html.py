@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 from html import escape
 
+from tfbus.plain import printable
 from tfbus.tree.edge_state import STALE_AFTER, EdgeState, state_of
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import branches, facts
@@ -36,22 +37,22 @@ def to_html(
     Returns
     -------
     str
-        One ``<pre>`` element. All names are escaped.
+        One ``<pre>`` element. All names are escaped, one that has control characters too.
     """
-    drawn = list(branches(edges))
+    drawn = [(guides, frame, printable(frame), edge) for guides, frame, edge in branches(edges)]
     if not drawn:
         return f'<pre style="{_PRE}">(no frames)</pre>'
-    width = max(len(branch.guides + branch.frame) for branch in drawn) + 2
+    width = max(len(guides + name) for guides, _, name, _ in drawn) + 2
     lines = []
-    for guides, frame, edge in drawn:
+    for guides, frame, name, edge in drawn:
         style = "font-weight: bold"
         if edge is not None:
             style += f"; color: {state_of(edge, now, stale_after).value}"
         if frame in marked:
             style += f"; {_MARK}"
-        line = f'{guides}<span style="{style}">{escape(frame)}</span>'
+        line = f'{guides}<span style="{style}">{escape(name)}</span>'
         if edge is not None and with_facts:
-            line += " " * (width - len(guides + frame)) + escape("  ".join(facts(edge, now).values()))
+            line += " " * (width - len(guides + name)) + escape("  ".join(facts(edge, now).values()))
         lines.append(line)
     return f'<pre style="{_PRE}">{chr(10).join(lines)}</pre>'
 

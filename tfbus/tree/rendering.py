@@ -1,15 +1,16 @@
 """Renderings of a tree: text for people, Graphviz, and tf2's YAML."""
 
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
+from tfbus.plain import printable
 from tfbus.stamps import SECOND, format_age, format_duration, format_stamp
 from tfbus.tree.edge_state import state_of
 from tfbus.tree.history import Edge
 
-_NOT_IN_YAML = re.compile(r"[\x7f-\xa0\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
+_LONGEST_KEY = 1_024
+"""The greatest length of a key in YAML, as it is written, without a question mark before it."""
 
 
 def describe(edges: Sequence[Edge], now: int | None = None) -> str:
@@ -25,7 +26,7 @@ def describe(edges: Sequence[Edge], now: int | None = None) -> str:
         return "(no frames)"
     if now is None:
         now = max((edge.newest for edge in edges if edge.newest is not None), default=0)
-    lines = [(f"{branch.guides}{branch.frame}", branch.edge) for branch in branches(edges)]
+    lines = [(f"{branch.guides}{printable(branch.frame)}", branch.edge) for branch in branches(edges)]
     width = max(len(label) for label, _ in lines) + 2
     return "\n".join(
         label if edge is None else f"{label:<{width}}{'  '.join(facts(edge, now).values())}" for label, edge in lines
@@ -127,12 +128,16 @@ def to_dot(edges: Sequence[Edge], now: int | None = None, delays: Mapping[str, f
         known["authority"] = edge.authority
         if now is not None and delays is not None and edge.child in delays:
             known["delay"] = f"delay {format_duration(round(delays[edge.child] * SECOND))}"
-        label = "\n".join(filter(None, known.values()))
+        label = r"\n".join(_label(text)[1:-1] for text in known.values() if text)
         style = ", style=dashed" if edge.static else ""
         if now is not None:
             colour = state_of(edge, now).value
             style += f', color="{colour}", fontcolor="{colour}"'
-        lines.append(f"    {_quoted(edge.parent)} -> {_quoted(edge.child)} [label={_quoted(label)}{style}];")
+        lines.append(f'    {quoted(edge.parent)} -> {quoted(edge.child)} [label="{label}"{style}];')
+    for frame in dict.fromkeys(name for edge in edges for name in (edge.parent, edge.child)):
+        # Graphviz would break lines in these, and show what HTML's names of characters stand for.
+        if not frame.isprintable() or "&" in frame:
+            lines.append(f"    {quoted(frame)} [label={_label(frame)}];")
     return "\n".join([*lines, "}", ""])
 
 
@@ -144,15 +149,16 @@ def to_yaml(edges: Sequence[Edge]) -> str:
     for edge in edges:
         length = None if edge.oldest is None or edge.newest is None else edge.newest - edge.oldest
         facts = {
-            "parent": _quoted(edge.parent),
-            "broadcaster": _quoted(edge.authority),
+            "parent": quoted(edge.parent),
+            "broadcaster": quoted(edge.authority),
             "static": json.dumps(edge.static),
             "rate": json.dumps(edge.rate),
             "most_recent_transform": _seconds(edge.newest),
             "oldest_transform": _seconds(edge.oldest),
             "buffer_length": _seconds(length),
         }
-        lines.append(f"{_quoted(edge.child)}:")
+        key = quoted(edge.child)
+        lines.append(f"{key}:" if len(key) <= _LONGEST_KEY else f"? {key}\n:")
         lines += [f"  {key}: {value}" for key, value in facts.items()]
     return "\n".join([*lines, ""])
 
@@ -162,6 +168,18 @@ def _seconds(stamp: int | None) -> str:
     return "null" if stamp is None else format_stamp(stamp).removesuffix(" s")
 
 
-def _quoted(text: str) -> str:
-    """In double quotes as YAML and Graphviz read them; Graphviz knows no ``\\u``, so letters of any alphabet stay."""
-    return _NOT_IN_YAML.sub(lambda found: f"\\u{ord(found[0]):04x}", json.dumps(text, ensure_ascii=False))
+def quoted(text: str) -> str:
+    """In double quotes as YAML reads it back, and as Graphviz, which knows no ``\\u``, tells names apart."""
+    result = json.dumps(text, ensure_ascii=False)
+    if result.isprintable():
+        return result
+    return "".join(letter if letter.isprintable() else _escaped(ord(letter)) for letter in result)
+
+
+def _escaped(code: int) -> str:
+    return f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+
+
+def _label(text: str) -> str:
+    """In double quotes as Graphviz shows it to people."""
+    return quoted(printable(text).replace("&", "&amp;"))

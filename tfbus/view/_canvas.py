@@ -12,6 +12,7 @@ import viser
 
 from tfbus.data import PointCloud
 from tfbus.geometry.rows import Row
+from tfbus.plain import printable
 from tfbus.view._page import Picture
 from tfbus.view._scene import NO_SCENE, Scene
 from tfbus.view._solids import Solids
@@ -147,9 +148,9 @@ class Canvas:
         places = {frame: place for place, frame in enumerate(scene.frames)} if frames else {}
         for number, frame in enumerate(frames):
             if number == len(self._labels):
-                self._labels.append(self._server.scene.add_label(f"/labels/{number}", frame))
+                self._labels.append(self._server.scene.add_label(f"/labels/{number}", printable(frame)))
             label = self._labels[number]
-            label.text = frame
+            label.text = printable(frame)
             label.position = scene.positions[places[frame]]
             label.visible = True
         for label in self._labels[len(frames) :]:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
+from tfbus.plain import printable
 from tfbus.robot.visual import Box, Cylinder, Mesh, Shape, Sphere, Visual
 
 _PLACEHOLDER = 0.05
@@ -103,7 +104,7 @@ def solids_of(visuals: Sequence[Visual], files: MeshFiles) -> list[Solid]:
     if files.missing:
         name, why = next(iter(files.missing.items()))
         logging.getLogger("tfbus").warning(
-            "%d mesh files are missing, boxes stand for them: %s (%s)", len(files.missing), name, why
+            "%d mesh files are missing, boxes stand for them: %s", len(files.missing), printable(f"{name} ({why})")
         )
     return solids
 

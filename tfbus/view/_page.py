@@ -13,6 +13,7 @@ import numpy as np
 
 from tfbus.errors import UnknownFrameError
 from tfbus.events import Event
+from tfbus.plain import printable
 from tfbus.stamps import LATEST, SECOND, format_stamp
 from tfbus.tree.edge_state import STALE_AFTER
 from tfbus.tree.html import legend, to_html
@@ -261,6 +262,6 @@ def _table(facts: Mapping[str, str]) -> str:
     label = "vertical-align: top; padding-right: 0.8em; opacity: 0.7"
     rows = (
         f'<tr><td style="{label}">{escape(name)}</td><td style="word-break: break-word">{escape(text)}</td></tr>'
-        for name, text in facts.items()
+        for name, text in zip(facts, map(printable, facts.values()), strict=True)
     )
     return f'<table style="font-size: 13px; line-height: 1.4">{"".join(rows)}</table>'

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 import viser
 
+from tfbus.plain import printable
 from tfbus.stamps import SECOND, from_seconds
 from tfbus.view._page import Page, Texts
 from tfbus.view._timeline import SPEEDS
@@ -62,8 +63,8 @@ class Panel:
             self._tree = gui.add_html("")
         with gui.add_folder("Events"):
             self._events = gui.add_html("")
-        self._chosen(self._fixed, lambda value: page.choose_fixed(None if value == LARGEST else value))
-        self._chosen(self._frame, lambda value: page.select(None if value == NONE else value))
+        self._chosen(self._fixed, lambda value: page.choose_fixed(None if value == LARGEST else self._named(value)))
+        self._chosen(self._frame, lambda value: page.select(None if value == NONE else self._named(value)))
         self._chosen(self._search, self._find)
         self._chosen(self._labels, lambda value: setattr(page, "labels", value))
         self._chosen(
@@ -114,6 +115,11 @@ class Panel:
 
         return used
 
+    def _named(self, shown: str) -> str:
+        """The frame that an option stands for."""
+        tree = self._page.tree
+        return shown if shown in tree else next((frame for frame in tree.frames() if printable(frame) == shown), shown)
+
     def _find(self, text: str) -> None:
         page = self._page
         page.search = text
@@ -130,12 +136,14 @@ class Panel:
 def _choices(dropdown: viser.GuiDropdownHandle[str], first: str, names: tuple[str, ...], chosen: str | None) -> None:
     """Offer the names, with the chosen one even if it is none of them."""
     # A browser takes no option twice.
+    names = tuple(dict.fromkeys(map(printable, names)))
     options = (first, *(name for name in names if name != first))
-    if chosen is not None and chosen not in names:
-        options = (*options, chosen)
+    shown = first if chosen is None else printable(chosen)
+    if shown not in options:
+        options = (*options, shown)
     if dropdown.options != options:
         dropdown.options = options
-    set_value(dropdown, first if chosen is None else chosen)
+    set_value(dropdown, shown)
 
 
 def set_value(control: Any, value: Any) -> None:

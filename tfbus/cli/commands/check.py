@@ -24,7 +24,7 @@ from tfbus.cli.arguments import (
     UsageError,
 )
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import printable, progress, say, warn
+from tfbus.cli.output import progress, say, warn
 from tfbus.geometry.stamped import Batch
 from tfbus.recording.examine import examine
 
@@ -121,5 +121,5 @@ def _print(findings: Sequence[Finding]) -> None:
     if not findings:
         print("nothing is wrong")
     for finding in findings:
-        for line in (printable(f"{finding.kind:<16}  {finding}"), f"{'':16}  -> {finding.advice}"):
+        for line in (f"{finding.kind:<16}  {finding}", f"{'':16}  -> {finding.advice}"):
             print("\n".join(wrapped(line, terminal_width(), 18)))

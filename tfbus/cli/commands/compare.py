@@ -1,8 +1,6 @@
 """``tfbus compare``."""
 
-import csv
 import json
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +11,7 @@ from tfbus.analysis.compare import compare as compare_trees
 from tfbus.cli._table import Column, table_lines
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import DEFAULT_TOPICS, CsvFlag, Duration, Flag, JsonFlag, TopicOptions, UsageError
-from tfbus.cli.output import format_counts, format_seconds, printable, progress, warn
+from tfbus.cli.output import csv_name, csv_writer, format_counts, format_seconds, progress, warn
 from tfbus.recording.load import Problems, fill
 from tfbus.tree.tree import TransformTree
 
@@ -161,7 +159,7 @@ def _print_tables(found: dict[tuple[str, bool], Comparison]) -> None:
         if each.alignment is not None and each.alignment.scale != 1.0:
             how += f" and scaled by {each.alignment.scale:.6g}"
         before = "\n" if number else ""
-        heading = f"{printable(text)}, {how}: {each.poses:,} poses of {each.of[0]:,} and {each.of[1]:,}"
+        heading = f"{text}, {how}: {each.poses:,} poses of {each.of[0]:,} and {each.of[1]:,}"
         print(before + "\n".join(wrapped(heading, terminal_width(), 2)))
         rows = [
             (name, unit, *(f"{getattr(statistics, key):.6g}" for key in _STATISTICS))
@@ -172,7 +170,7 @@ def _print_tables(found: dict[tuple[str, bool], Comparison]) -> None:
 
 
 def _print_csv(found: dict[tuple[str, bool], Comparison]) -> None:
-    out = csv.writer(sys.stdout, lineterminator="\n")
+    out = csv_writer()
     out.writerow(
         ("pair", "stamp", "absolute_translation", "absolute_rotation", "relative_translation", "relative_rotation")
     )
@@ -189,4 +187,4 @@ def _print_csv(found: dict[tuple[str, bool], Comparison]) -> None:
         for stamp, distance, angle in zip(
             absolute.stamps.tolist(), absolute.translation.tolist(), absolute.rotation.tolist(), strict=True
         ):
-            out.writerow((text, format_seconds(stamp), distance, angle, *steps.get(stamp, ("", ""))))
+            out.writerow((csv_name(text), format_seconds(stamp), distance, angle, *steps.get(stamp, ("", ""))))

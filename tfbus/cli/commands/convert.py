@@ -1,6 +1,5 @@
 """``tfbus convert``."""
 
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +12,7 @@ from tfbus.recording.convert import StaticTransform
 from tfbus.recording.convert import convert as convert_recordings
 from tfbus.recording.edits import Edits
 from tfbus.recording.recording import open_recording
+from tfbus.tree.rendering import quoted
 
 
 def convert(
@@ -107,8 +107,8 @@ def to_yaml(transforms: Iterable[StaticTransform]) -> str:
     lines = []
     for each in sorted(transforms, key=lambda each: each.child):
         lines += [
-            f"- parent: {json.dumps(each.parent)}",
-            f"  child: {json.dumps(each.child)}",
+            f"- parent: {quoted(each.parent)}",
+            f"  child: {quoted(each.child)}",
             f"  translation: [{', '.join(map(repr, each.translation))}]",
             f"  rotation: [{', '.join(map(repr, each.rotation))}]",
         ]

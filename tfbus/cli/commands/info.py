@@ -10,7 +10,7 @@ from typing import Any
 from tfbus.cli._table import Column, table_lines
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, JsonFlag, TopicOptions
-from tfbus.cli.output import format_counts, format_seconds, printable, progress
+from tfbus.cli.output import format_counts, format_seconds, progress
 from tfbus.recording.recording import RecordedTopic
 from tfbus.recording.spread import Spread
 from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
@@ -67,7 +67,7 @@ def info(
         print("\n".join(wrapped(line, width, _INDENT)))
     frames = [_frame_row(frame) for frame in summary.frames]
     timed = [frame for frame in summary.frames if frame.moving]
-    times = [(printable(frame.frame), *_times(frame.period, frame.delay)) for frame in timed]
+    times = [(frame.frame, *_times(frame.period, frame.delay)) for frame in timed]
     senders = [_sender_row(sender) for sender in summary.senders]
     tables = (
         (_FRAMES, frames),
@@ -107,7 +107,7 @@ def _format_instant(stamp: int | None) -> str | None:
 
 
 def _heading(summary: RecordingSummary) -> list[str]:
-    lines = [printable(f"{summary.path}") + ("" if summary.finished else ", cut or not finished by its writer")]
+    lines = [f"{summary.path}" + ("" if summary.finished else ", cut or not finished by its writer")]
     if summary.start is not None and summary.end is not None:
         lines.append(f"start     {format_seconds(summary.start)} s{_format_date(summary.start)}")
         lines.append(f"end       {format_seconds(summary.end)} s{_format_date(summary.end)}")
@@ -117,8 +117,8 @@ def _heading(summary: RecordingSummary) -> list[str]:
     lines.append(f"frames    {len(summary.frames):,}{below}")
     if summary.problems:
         lines.append(f"left out  {format_counts(summary.problems)}")
-    lines += [f"          {printable(detail)}" for detail in summary.details]
-    lines += [f"note      {printable(remark)}" for remark in summary.remarks]
+    lines += [f"          {detail}" for detail in summary.details]
+    lines += [f"note      {remark}" for remark in summary.remarks]
     return lines
 
 
@@ -131,7 +131,7 @@ def _format_date(stamp: int) -> str:
 
 def _frame_row(frame: FrameSummary) -> tuple[str, ...]:
     return (
-        printable(frame.frame),
+        frame.frame,
         _join_names(frame.parents),
         "static, moving" if frame.kind == "both" else frame.kind,
         f"{frame.static + frame.moving:,}",
@@ -143,7 +143,7 @@ def _frame_row(frame: FrameSummary) -> tuple[str, ...]:
 
 
 def _sender_row(sender: SenderSummary) -> tuple[str, ...]:
-    name = printable(sender.authority) or "(unknown)"
+    name = sender.authority or "(unknown)"
     count = sender.static + sender.moving
     return name, f"{len(sender.frames):,}", f"{count:,}", *_times(sender.period, sender.delay)
 
@@ -151,7 +151,7 @@ def _sender_row(sender: SenderSummary) -> tuple[str, ...]:
 def _topic_row(topic: RecordedTopic) -> tuple[str, ...]:
     count = "" if topic.count is None else f"{topic.count:,}"
     read = "yes" if topic.read else "no, it may hold transforms" if topic.ignored else "no"
-    return printable(topic.name), printable(topic.type), count, read
+    return topic.name, topic.type, count, read
 
 
 def _times(*spreads: Spread | None) -> list[str]:
@@ -167,4 +167,4 @@ def _duration(seconds: float | None) -> str:
 
 
 def _join_names(names: Iterable[str]) -> str:
-    return ", ".join(map(printable, names))
+    return ", ".join(names)

@@ -13,7 +13,7 @@ from tfbus.cli._table import Column, table_lines
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Positive, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import print_now, printable
+from tfbus.cli.output import print_now
 from tfbus.errors import TransformLookupError
 from tfbus.stamps import format_duration, from_seconds
 from tfbus.tree.tree import TransformTree
@@ -168,9 +168,9 @@ def text_lines(arrivals: Sequence[Arrival], chain: Chain | None, width: int | No
 def _describe(chain: Chain) -> str:
     if not chain.frames:
         return f"no transform: {chain.problem}"
-    way = " <- ".join(map(printable, chain.frames))
+    way = " <- ".join(chain.frames)
     age = "static" if chain.age is None else f"age {_duration(chain.age)}"
-    slowest = f", the slowest is {printable(chain.slowest)}" if chain.slowest else ""
+    slowest = f", the slowest is {chain.slowest}" if chain.slowest else ""
     return f"{way}: {age}{slowest}"
 
 
@@ -179,8 +179,8 @@ def _row(arrival: Arrival) -> tuple[str, ...]:
     state = "static" if arrival.static else "silent" if not arrival.samples else rate or "one sample"
     counted = not arrival.static
     return (
-        printable(arrival.frame),
-        printable(arrival.authority),
+        arrival.frame,
+        arrival.authority,
         state,
         _duration(arrival.delay_mean),
         _duration(arrival.delay_p99),

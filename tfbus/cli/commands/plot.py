@@ -11,6 +11,7 @@ from tfbus.cli.arguments import Flag, UsageError
 from tfbus.cli.output import track, write_file
 from tfbus.cli.recorded_tree import load_tree
 from tfbus.errors import UnknownFrameError
+from tfbus.plain import printable
 from tfbus.recording.recording import open_recording
 
 _KINDS = ("png", "svg", "pdf")
@@ -84,7 +85,9 @@ def plot(
     if text:
         for name, tree in trees:
             for source in sources:
-                print(*[name] * bool(name), plots.sparklines(plots.read_series(tree, target, source)), sep="\n")
+                if name:
+                    print(printable(name))
+                print(plots.sparklines(plots.read_series(tree, target, source)))
     elif path or three_d:
         _finish(lambda figure: plots.plot_path(trees, target, *sources, three_d=three_d, figure=figure), output, kind)
     else:

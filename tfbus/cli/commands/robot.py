@@ -16,10 +16,11 @@ from tfbus.cli._table import Column, table_lines
 from tfbus.cli._width import cells, narrow_guides, shorten, terminal_width
 from tfbus.cli.arguments import Flag, Rate, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import format_numbers, format_transform, printable, say, warn
+from tfbus.cli.output import format_numbers, format_transform, say, warn
 from tfbus.errors import InvalidRobotError, InvalidTransformError
 from tfbus.geometry.bounds import MAX_TRANSLATION, check_translations
 from tfbus.geometry.transform import Transform
+from tfbus.plain import printable
 from tfbus.robot.joint import Joint, Position
 from tfbus.robot.model import RobotModel
 from tfbus.robot.state_publisher import RobotStatePublisher
@@ -161,11 +162,11 @@ def tree_lines(
         name = kind = position = ""
         if edge is not None:
             joint = joint_above[frame]
-            name, kind = printable(joint.name), joint.kind
+            name, kind = joint.name, joint.kind
             if joint.name in resolved:
                 position = _format_position(joint, resolved[joint.name])
                 if joint.mimic is not None and joint.name not in positions:
-                    position += f", mimics {printable(joint.mimic.joint)}"
+                    position += f", mimics {joint.mimic.joint}"
         rows.append((guides, printable(prefix + frame), name, kind, position))
     step, room = _layout(rows, width)
     return table_lines(

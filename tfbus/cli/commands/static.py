@@ -76,7 +76,8 @@ def static(
         for sample in samples:
             what = f"{sample.child!r} in {sample.parent!r} on {link.place}"
             # In two lines, for one is wider than many terminals.
-            say(f"publishing {what}, until Ctrl-C:\n  {format_transform(sample.transform)}")
+            say(f"publishing {what}, until Ctrl-C:")
+            say(f"  {format_transform(sample.transform)}")
         stamp = bus.clock.now()
         await publish_static(bus, [sample.replace(stamp=stamp) for sample in samples])
         await anyio.sleep_forever()

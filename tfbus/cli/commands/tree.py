@@ -14,7 +14,7 @@ from tfbus.cli._graphviz import draw
 from tfbus.cli._replay_clock import ReplayClock
 from tfbus.cli.arguments import Duration, Flag, JsonFlag, Rate
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
-from tfbus.cli.output import print_now, printable, say, write_file
+from tfbus.cli.output import print_now, say, write_file
 from tfbus.stamps import to_seconds
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import to_dot
@@ -128,7 +128,7 @@ def remarks(edges: Sequence[Edge]) -> list[str]:
 
 
 def _names(frames: Sequence[str]) -> str:
-    named = ", ".join(map(printable, frames[:_NAMED]))
+    named = ", ".join(frames[:_NAMED])
     return named + (f" and {len(frames) - _NAMED:,} more" if len(frames) > _NAMED else "")
 
 
