@@ -201,6 +201,11 @@ class View:
         """The number of browsers that show the page."""
         return 0 if self._server is None else len(self._server.get_clients())
 
+    @property
+    def refused(self) -> int:
+        """Requests of other pages, and messages of this one that it does not send, that were refused."""
+        return self._door.refused + (self._server.refused if self._server is not None else 0)
+
     def statistics(self) -> QueueStatistics:
         """The counters of the queue of what people do on the page."""
         return self._controls.statistics()
