@@ -173,4 +173,6 @@ app = Starlette(
 if __name__ == "__main__":
     print("http://127.0.0.1:8000", flush=True)
     # A stream has no end, so the server does not wait for it at its own end.
-    uvicorn.run(app, host="127.0.0.1", port=8000, log_level="warning", limit_concurrency=100, timeout_graceful_shutdown=1)
+    uvicorn.run(
+        app, host="127.0.0.1", port=8000, log_level="warning", limit_concurrency=100, timeout_graceful_shutdown=1
+    )

@@ -35,7 +35,8 @@ def test_addresses_and_own_names_are_hosts(host: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:80", "evillocalhost", "2130706433", "127.1"]
+    "host",
+    ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:80", "evillocalhost", "2130706433", "127.1"],
 )
 def test_a_name_that_was_made_to_lead_here_is_none(host: str) -> None:
     assert status(WebDoor("127.0.0.1"), head(host)) == 403
@@ -100,7 +101,8 @@ def test_the_first_refusal_is_logged_and_no_letter_of_it_is_raw(caplog: pytest.L
 
 
 @pytest.mark.parametrize(
-    ("origins", "error"), [("http://a", TypeError), (["robot"], ValueError), (["http://a/"], ValueError), ([""], ValueError)]
+    ("origins", "error"),
+    [("http://a", TypeError), (["robot"], ValueError), (["http://a/"], ValueError), ([""], ValueError)],
 )
 def test_what_is_no_origin_is_an_error_at_once(origins: Any, error: type[Exception]) -> None:
     with pytest.raises(error):

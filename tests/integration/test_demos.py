@@ -475,7 +475,24 @@ def test_the_web_application_does_not_answer_to_other_names(server: str) -> None
 @pytest.mark.thorough
 def test_the_web_application_has_a_defined_answer_for_every_question(server: str) -> None:
     draw = random.Random(34)
-    pieces = ["9" * 401, "-", "1e308", "nan", "٣", "\0", "map", "base_link", " ", "%", "+", "🤖", "1_0", "'", "..", "x" * 500]
+    pieces = [
+        "9" * 401,
+        "-",
+        "1e308",
+        "nan",
+        "٣",
+        "\0",
+        "map",
+        "base_link",
+        " ",
+        "%",
+        "+",
+        "🤖",
+        "1_0",
+        "'",
+        "..",
+        "x" * 500,
+    ]
 
     def text() -> str:
         return quote("".join(draw.choice(pieces) for _ in range(draw.randrange(1, 4))), safe="")

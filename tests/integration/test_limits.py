@@ -43,10 +43,13 @@ BOUNDS = {
     "links.rosbridge._protocol": "QUEUE",
     "links.dds._carrier": "_DEPTH",
     "links.ros.settings": "_LAST_DOMAIN",
+    "_aio.web_door": "MAX_HEAD HEAD_TIME",
+    "links.foxglove": "MAX_CONNECTIONS",
     "view._controls": "CAPACITY",
     "view._page": "EVENTS_KEPT _MATCHES",
     "view._trails": "SAMPLES",
-    "view._server": "_PORTS_TRIED",
+    "view._server": "_PORTS_TRIED MAX_MESSAGE MAX_TEXT",
+    "view._meshes": "MAX_BYTES MAX_NUMBERS MAX_VERTICES MAX_SHAPES",
     "plot.series": "SAMPLES",
 }
 """The constants of the rows of the page, in their order."""

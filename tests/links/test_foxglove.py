@@ -1,5 +1,4 @@
 import json
-import os
 import random
 import socket
 import struct
@@ -296,11 +295,19 @@ async def test_other_pages_are_named_by_the_user(bus: Bus) -> None:
         FoxgloveServer(bus, 0, origins=["robot.example"])
 
 
+def sockets() -> tuple[list[list[str]], set[str]]:
+    """What the system tells of all sockets, and which are those of this process."""
+    own = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):
+            own.add(str(entry.readlink()))
+    return [row.split() for row in Path("/proc/self/net/tcp").read_text().splitlines()[1:]], own
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells what listens in a file")
 async def test_the_library_itself_listens_where_no_page_finds_it(bus: Bus) -> None:
     async with FoxgloveServer(bus, 0) as server:
-        own = {os.readlink(entry) for entry in Path("/proc/self/fd").iterdir() if entry.is_symlink()}
-        rows = [row.split() for row in Path("/proc/self/net/tcp").read_text().splitlines()[1:]]
+        rows, own = await anyio.to_thread.run_sync(sockets)
         # The state 0A is that of a socket that listens; addresses are in the order of the machine.
         listening = [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own]
         front = f"0100007F:{int(server.address.rpartition(':')[2]):04X}"
@@ -337,12 +344,14 @@ async def test_no_message_of_a_stranger_ends_the_server(bus: Bus) -> None:
     def send_all(address: str) -> None:
         for _ in range(20):
             # It reads nothing, and the server answers each message that is none.
-            with connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None, max_queue=None) as client:
-                with suppress(ConnectionClosed):
-                    for _ in range(20):
-                        client.send(json.dumps({"op": draw.choice(words), draw.choice(words): value(3)}))
-                        client.send(json.dumps(value(3)))
-                        client.send(draw.randbytes(draw.randrange(40)))
+            with (
+                connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None, max_queue=None) as client,
+                suppress(ConnectionClosed),
+            ):
+                for _ in range(20):
+                    client.send(json.dumps({"op": draw.choice(words), draw.choice(words): value(3)}))
+                    client.send(json.dumps(value(3)))
+                    client.send(draw.randbytes(draw.randrange(40)))
 
     async with FoxgloveServer(bus, 0) as server:
         await anyio.to_thread.run_sync(send_all, server.address)

@@ -208,7 +208,10 @@ DOUBLED = "".join(
 HOSTILE: dict[str, tuple[bytes, str]] = {
     "numbers.dae": (collada(ONE, "0 " * 5_000_001), "5000000 numbers"),
     "repeated.dae": (collada(ONE * 20, "0 " * 300_000), "repeated"),
-    "doubled.dae": (collada('<node><instance_node url="#n29"/></node>', nodes=f'<node id="n0">{ONE}</node>{DOUBLED}'), "shapes"),
+    "doubled.dae": (
+        collada('<node><instance_node url="#n29"/></node>', nodes=f'<node id="n0">{ONE}</node>{DOUBLED}'),
+        "shapes",
+    ),
     "endless.dae": (collada('<node id="a"><instance_node url="#a"/></node>'), "shapes"),
     "entities.dae": (collada(ONE, head='<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]>'), "entities"),
     "packed.zae": (zipped(bytes(MAX_BYTES + 1)), "bytes, unpacked"),
@@ -317,7 +320,9 @@ def test_no_mesh_takes_more_than_a_gigabyte(tmp_path: Path) -> None:
     packer = zlib.compressobj(9)
     rows = b"".join(packer.compress(bytes(36_001)) for _ in range(12_000)) + packer.flush()
     parts = ((b"IHDR", struct.pack(">IIBBBBB", 12_000, 12_000, 8, 2, 0, 0, 0)), (b"IDAT", rows), (b"IEND", b""))
-    chunks = (struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts)
+    chunks = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
+    )
     (tmp_path / "big.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
     (tmp_path / "painted.mtl").write_text("newmtl a\nKd 1 0 0\nmap_Kd big.png\n")
     shape = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nusemtl a\nf 1/1 2/1 3/1\n"
@@ -325,7 +330,9 @@ def test_no_mesh_takes_more_than_a_gigabyte(tmp_path: Path) -> None:
     # The largest that are read, or almost.
     (tmp_path / "largest.dae").write_bytes(collada(ONE, "0 1 2 " * 1_660_000))
     count = (MAX_BYTES - 84) // 50
-    (tmp_path / "largest.stl").write_bytes(bytes(80) + struct.pack("<I", count) + random.Random(1).randbytes(50 * count))
+    (tmp_path / "largest.stl").write_bytes(
+        bytes(80) + struct.pack("<I", count) + random.Random(1).randbytes(50 * count)
+    )
     for name in [*HOSTILE, "painted.obj", "largest.dae", "largest.stl"]:
         command = [sys.executable, "-c", PEAK, str(tmp_path), name]
         assert int(subprocess.run(command, capture_output=True, check=True, timeout=120).stdout) < 1_024, name

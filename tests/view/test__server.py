@@ -150,7 +150,9 @@ def test_what_a_page_sends_sets_its_controls() -> None:
     with viser_page() as server:
         page = Controlled(server)
         with browser(server) as client:
-            page.send(client, CAMERA, CLICK, update(page.dropdown, "fast"), update(page.slider, 3), update(page.text, "base"))
+            page.send(
+                client, CAMERA, CLICK, update(page.dropdown, "fast"), update(page.slider, 3), update(page.text, "base")
+            )
             page.send(client, update(page.buttons, "Play"), update(page.button, True))
             assert page.values() == ("fast", 3.0, "base", "Play")
             # A browser may round to a step beyond the end.
@@ -182,7 +184,13 @@ def test_no_message_reaches_more_than_the_value_of_a_control() -> None:
         uuid = page.dropdown._impl.uuid
         messages: list[Any] = [
             {"type": "GuiUpdateMessage", "uuid": uuid, "updates": updates}
-            for updates in ({}, {"update_cb": "x"}, {"sync_cb": 1.0}, {"removed": True}, {"value": "fast", "removed": True})
+            for updates in (
+                {},
+                {"update_cb": "x"},
+                {"sync_cb": 1.0},
+                {"removed": True},
+                {"value": "fast", "removed": True},
+            )
         ]
         messages += [
             {"type": "GuiUpdateMessage", "uuid": "unknown", "updates": {"value": 1}},
@@ -220,7 +228,24 @@ def test_a_long_message_ends_its_own_connection_only() -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_no_changed_message_ends_a_connection_or_gives_a_control_a_value_that_it_cannot_have(seed: int) -> None:
     draw = random.Random(seed)
-    values = [math.nan, math.inf, -1, 2**63, 2**64 - 1, "", "\0", "fast", "Play", None, True, [], {}, b"\xff", 1e308, "x" * 2_000]
+    values = [
+        math.nan,
+        math.inf,
+        -1,
+        2**63,
+        2**64 - 1,
+        "",
+        "\0",
+        "fast",
+        "Play",
+        None,
+        True,
+        [],
+        {},
+        b"\xff",
+        1e308,
+        "x" * 2_000,
+    ]
 
     def changed(message: Any) -> Any:
         message = dict(message)

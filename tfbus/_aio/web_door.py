@@ -10,6 +10,7 @@ import logging
 import re
 import socket
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import NamedTuple
 
 MAX_HEAD = 16_384
@@ -155,10 +156,8 @@ def _origin(found: re.Match[str]) -> tuple[str, _Place]:
 
 def _place(host: str, port: str | None) -> _Place:
     name = host.lower().strip("[]").rstrip(".")
-    try:
+    with suppress(ValueError):
         name = str(ipaddress.ip_address(name))
-    except ValueError:
-        pass
     return _Place(name, None if port is None else int(port))
 
 

@@ -33,7 +33,7 @@ MAX_SHAPES = 10_000
 _KINDS = ("dae", "glb", "gltf", "obj", "off", "ply", "stl", "zae")
 _IMAGES = (".bmp", ".dds", ".gif", ".jpeg", ".jpg", ".ktx2", ".png", ".tga", ".tif", ".tiff", ".webp")
 _SPACE = np.zeros(256, np.bool_)
-_SPACE[list(b" \t\r\n\v\f,;/[]{}:<>=\"")] = True
+_SPACE[list(b' \t\r\n\v\f,;/[]{}:<>="')] = True
 _CHUNK = 1_048_576
 _PLACEHOLDER = 0.05
 """m; the side of the box that stands for a missing mesh."""
@@ -330,8 +330,7 @@ def _check_collada(data: bytes) -> None:
         return node.size
 
     parser = expat.ParserCreate()
-    parser.buffer_text = True
-    parser.buffer_size = 65_536
+    parser.buffer_text, parser.buffer_size = True, 65_536
     parser.StartElementHandler, parser.EndElementHandler = begin, end
     parser.CharacterDataHandler = count
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
