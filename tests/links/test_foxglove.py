@@ -258,7 +258,7 @@ def test_an_invalid_port_is_refused_at_once(bus: Bus, port: Any, error: type[Exc
 
 
 def status_of(address: str, origin: str | None, host: str | None = None) -> int:
-    """What a page of this origin hears when it connects; 101 if it is let in."""
+    """The status that a page of this origin gets when it connects; 101 if it is let in."""
     try:
         socket_ = connect(
             address,
@@ -296,7 +296,7 @@ async def test_other_pages_are_named_by_the_user(bus: Bus) -> None:
 
 
 def sockets() -> tuple[list[list[str]], set[str]]:
-    """What the system tells of all sockets, and which are those of this process."""
+    """The rows of the system's table of sockets, and the names of those of this process."""
     own = set()
     for entry in Path("/proc/self/fd").iterdir():
         with suppress(FileNotFoundError):

@@ -36,14 +36,15 @@ CLICK = {
 @contextmanager
 def browser(server: Server, origin: str | None = None) -> Iterator[ClientConnection]:
     """A connection as that of the page; what the server sends is dropped."""
-    with connect(
+    client: ClientConnection = connect(
         f"ws://127.0.0.1:{server.get_port()}",
         origin=None if origin is None else Origin(origin),
         subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
         proxy=None,
         max_size=None,
         max_queue=None,
-    ) as client:
+    )
+    with client:
         yield client
 
 
@@ -86,8 +87,8 @@ def test_pages_of_other_sites_and_other_names_get_nothing() -> None:
         for origin in ("http://evil.example", "null", f"http://127.0.0.1:{port + 1}", f"http://192.0.2.1:{port}"):
             with pytest.raises(InvalidStatus, match="403"), browser(server, origin):
                 pytest.fail("connected")
-        for origin in (None, f"http://127.0.0.1:{port}", f"http://localhost:{port}"):
-            with browser(server, origin) as client:
+        for own in (None, f"http://127.0.0.1:{port}", f"http://localhost:{port}"):
+            with browser(server, own) as client:
                 assert client.recv(timeout=30.0)
         for host, status in (("evil.example", 403), (f"evil.example:{port}", 403), (f"localhost:{port}", 200)):
             answer = httpx.get(f"http://127.0.0.1:{port}", headers={"Host": host}, trust_env=False)

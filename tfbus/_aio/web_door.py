@@ -1,4 +1,4 @@
-"""Which requests a web server of this machine answers.
+"""The door of a web server: the requests that it answers.
 
 A browser connects to servers of its own machine for any page that asks, and tells them by ``Origin`` which page that
 is. A page whose name was made to lead here (DNS rebinding) asks for another ``Host``. Only browsers send ``Origin``: a

@@ -129,11 +129,12 @@ class FoxgloveServer:
             raise BusClosedError
         self._entered = True
         self._waker.bind()
-        try:
-            listener = await anyio.create_tcp_listener(local_host=self._host, local_port=self._port)
-        except OSError as error:
-            raise OSError(f"cannot listen at {self._host}:{self._port}: {error}") from error
-        self._front = listener
+        # What a thread has started must not be lost to a cancellation.
+        with anyio.CancelScope(shield=True):
+            try:
+                self._front = await anyio.create_tcp_listener(local_host=self._host, local_port=self._port)
+            except OSError as error:
+                raise OSError(f"cannot listen at {self._host}:{self._port}: {error}") from error
         try:
             with anyio.CancelScope(shield=True):
                 self._server = await anyio.to_thread.run_sync(self._start)
@@ -142,7 +143,7 @@ class FoxgloveServer:
         except BaseException:
             await self._stop()
             raise
-        port = listener.extra(anyio.abc.SocketAttribute.local_port)
+        port = self._front.extra(anyio.abc.SocketAttribute.local_port)
         self.address = f"ws://{f'[{self._host}]' if ':' in self._host else self._host}:{port}"
         return self
 
@@ -280,7 +281,7 @@ class _Listener(ServerListener):
 
 
 async def _head_of(stream: anyio.abc.ByteReceiveStream) -> bytes:
-    """What a stream sends first, with the head of a request; without it, if that is too long or comes too late."""
+    """The first bytes of a stream, with the head of a request; without it, if that is too long or comes too late."""
     head = b""
     with anyio.move_on_after(HEAD_TIME):
         while HEAD_END not in head and len(head) <= MAX_HEAD:

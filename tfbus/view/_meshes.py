@@ -171,7 +171,7 @@ def _read_mesh(path: Path) -> tuple[Triangles, tuple[int, int, int] | None]:
     kind = path.suffix.lower()[1:]
     if kind not in _KINDS:
         raise ValueError(f"meshes of the kind .{kind} are not read")
-    files = _Files(path.parent)
+    files: Any = _Files(path.parent)
     data = files.take(path)
     if kind in ("dae", "zae"):
         data, kind = _unpacked(data), "dae"
@@ -197,7 +197,7 @@ def _read_mesh(path: Path) -> tuple[Triangles, tuple[int, int, int] | None]:
 
 
 class _Files:
-    """What trimesh may read beside a mesh: files of its folder, but no images; as a resolver of trimesh."""
+    """The files that trimesh may read beside a mesh: those of its folder, but no images; as a resolver of trimesh."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -232,7 +232,7 @@ def _check(found: int, most: int, what: str) -> None:
 
 
 def _numbers(data: bytes) -> int:
-    """How many words a text has; each number is one."""
+    """The number of words of a text, each number being one."""
     found = 0
     before = True
     for start in range(0, len(data), _CHUNK):

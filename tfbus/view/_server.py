@@ -153,7 +153,7 @@ class _Guarded(viser.infra.WebsockServer):
     guarded = False
 
     @property
-    def _background_event_loop(self) -> Any:  # type: ignore[override]
+    def _background_event_loop(self) -> Any:
         return self.__dict__.get("_loop")
 
     @_background_event_loop.setter
@@ -188,7 +188,7 @@ class Server(viser.ViserServer):
 
     # viser makes it and starts it in one function.
     @property
-    def _websock_server(self) -> Any:  # type: ignore[override]
+    def _websock_server(self) -> Any:
         return self.__dict__["_websockets"]
 
     @_websock_server.setter
