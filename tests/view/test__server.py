@@ -201,6 +201,7 @@ def test_no_message_reaches_more_than_the_value_of_a_control() -> None:
             {"type": "RunJavascriptMessage", "source": "alert(1)"},
             CAMERA | {"position": (math.nan, 0, 0)},
             CAMERA | {"position": (0, 0)},
+            CAMERA | {"position": CAMERA["look_at"]},
             CAMERA | {"image_height": -1},
             CLICK | {"instance_index": -1},
             CLICK | {"more": 1},

@@ -27,6 +27,7 @@ MAX_MESSAGE = 65_536
 MAX_TEXT = 1_000
 """Letters that somebody can type."""
 _MOST = 1e12
+_NEAR = 1e-6
 _console_lock = threading.Lock()
 
 _Number = Annotated[float, msgspec.Meta(ge=-_MOST, le=_MOST)]
@@ -79,6 +80,9 @@ class _Messages:
             if len(raw) > MAX_MESSAGE:
                 raise ValueError("it is too long")
             sent = msgspec.msgpack.decode(raw, type=_Value | _Click | _Camera)
+            if isinstance(sent, _Camera) and math.dist(sent.position, sent.look_at) < _NEAR:
+                # viser would refuse to move such a camera, and with it the picture of all others.
+                raise ValueError("it looks nowhere")
             message = self._reader.deserialize(raw)
             if isinstance(sent, _Value):
                 # All attributes of a control can be set by their names; the page sets this one.
