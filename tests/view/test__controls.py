@@ -56,7 +56,8 @@ async def test_one_that_raises_is_logged_and_the_next_is_called(caplog: pytest.L
     controls.bind()
     controls.put(lambda: 1 / 0)
     controls.put(done.set)
-    await done.wait()
+    with anyio.fail_after(30.0):
+        await done.wait()
     assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [ZeroDivisionError]
 
 
