@@ -6,12 +6,15 @@ The bus, the buffer and a robot that drives in a circle live in the application'
     GET /tree                                       the tree as text
     GET /transforms/map/base_link                   the newest
     GET /transforms/map/base_link?at=1250000000     at a stamp, in ns
-    GET /transforms/map/base_link?timeout=0.2       waits no longer than 0.2 s (by default 1 s)
+    GET /transforms/map/base_link?timeout=0.2       waits no longer than 0.2 s (by default 1 s, at most 60 s)
     GET /changes/map/base_link                      Server-Sent Events: each change, at most 10 in a second
     WebSocket /poses/map/base_link                  each change, at most 20 in a second
 
 A lookup answers 200 with JSON, 404 with close matches for a frame that nobody has published, 504 with the reason when
 the time is up, 400 for a question that can never be answered, and 503 while the service is going down.
+
+A browser connects to this machine for any page that asks it to. So the service answers to its own names only (`HOSTS`),
+and a WebSocket to pages that it has served itself, or that `ORIGINS` names.
 
 Run it with `pip install ".[web]"`, then `python demos/web_app.py`, and open http://127.0.0.1:8000.
 """
@@ -24,12 +27,21 @@ from collections.abc import AsyncIterator
 import anyio
 import uvicorn
 from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 import tfbus
+
+HOSTS = ["127.0.0.1", "localhost"]
+"""The names by which browsers may reach the service; a page can have any other name lead here."""
+ORIGINS: list[str] = []
+"""Other pages that may open a WebSocket, such as https://robot.example."""
+LONGEST_WAIT = 60.0
+"""s; a client that asks for more would hold on to a task of the service."""
 
 PAGE = """<!doctype html>
 <html lang="en">
@@ -104,6 +116,8 @@ async def transform(request: Request) -> Response:
     try:
         at = int(request.query_params["at"]) if "at" in request.query_params else tfbus.LATEST
         timeout = float(request.query_params.get("timeout", 1.0))
+        if timeout > LONGEST_WAIT:
+            raise ValueError(f"a timeout must be at most {LONGEST_WAIT:g} s, got {timeout!r} s")
         found = await buffer_of(request).lookup(target, source, at, timeout=timeout)
     except tfbus.LookupTimeoutError as error:
         missing = error.__cause__
@@ -130,6 +144,11 @@ async def changes(request: Request) -> Response:
 
 async def poses(socket: WebSocket) -> None:
     target, source = socket.path_params["target"], socket.path_params["source"]
+    # Programs that are no browsers send no origin.
+    origin = socket.headers.get("origin")
+    if origin not in (None, f"http://{socket.headers.get('host')}", *ORIGINS):
+        await socket.close()
+        return
     await socket.accept()
     # Whoever has gone is noticed at the next message.
     with contextlib.suppress(WebSocketDisconnect):
@@ -147,10 +166,13 @@ app = Starlette(
         Route("/changes/{target}/{source}", changes),
         WebSocketRoute("/poses/{target}/{source}", poses),
     ],
+    middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=HOSTS, www_redirect=False)],
     lifespan=lifespan,
 )
 
 if __name__ == "__main__":
     print("http://127.0.0.1:8000", flush=True)
     # A stream has no end, so the server does not wait for it at its own end.
-    uvicorn.run(app, host="127.0.0.1", port=8000, log_level="warning", timeout_graceful_shutdown=1)
+    uvicorn.run(
+        app, host="127.0.0.1", port=8000, log_level="warning", limit_concurrency=100, timeout_graceful_shutdown=1
+    )

@@ -53,6 +53,7 @@ EXTRAS = {
     "mcap": ("recording.formats",),
     "mcap_protobuf": ("recording.formats",),
     "pyarrow": ("cli",),
+    "msgspec": ("view",),
     "rich": ("cli", "view"),
     "rosbags": ("recording.formats",),
     "ruamel": ("recording.formats", "recording.static_frames"),

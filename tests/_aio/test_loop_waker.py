@@ -111,6 +111,19 @@ async def test_every_item_queued_before_a_wake_is_processed() -> None:
     assert len(taken) == 8_000
 
 
+async def test_a_callback_that_raises_is_logged_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    answers: list[int] = []
+    waker = LoopWaker(lambda: answers.append(1 // len(answers)))
+    waker.bind()
+    waker.wake()
+    await settle()
+    assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [ZeroDivisionError]
+    answers.append(0)
+    waker.wake()
+    await settle()
+    assert answers == [0, 1]
+
+
 def test_an_unbound_waker_raises() -> None:
     with pytest.raises(RuntimeError, match="bind the waker"):
         LoopWaker(lambda: None).wake()

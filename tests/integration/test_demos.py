@@ -3,6 +3,7 @@
 import cmath
 import json
 import math
+import random
 import re
 import runpy
 import socket
@@ -11,13 +12,16 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import anyio
 import httpx
 import pytest
 from support.processes import new_domain
 from support.programs import Program
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from tfbus import SimulatedClock
 from tfbus.cli import tutorial
@@ -435,6 +439,70 @@ def test_the_web_application_says_404_with_close_matches_for_an_unknown_frame(se
 @pytest.mark.parametrize("question", ["at=5", "timeout=nan", "at=99999999999999999999"])
 def test_the_web_application_says_400_for_a_question_without_an_answer(server: str, question: str) -> None:
     assert get(f"{server}/transforms/map/base_link?{question}").status_code == 400
+
+
+@pytest.mark.parametrize("question", ["timeout=1e308", "timeout=inf", "timeout=60.1", "timeout=1e400"])
+def test_the_web_application_holds_nothing_for_a_client_that_would_wait_for_ever(server: str, question: str) -> None:
+    response = get(f"{server}/transforms/map/nowhere?{question}")
+    assert response.status_code == 400
+    assert "at most 60 s" in response.json()["error"]
+
+
+def test_the_web_application_sends_nothing_to_pages_of_other_sites(server: str) -> None:
+    port = server.rpartition(":")[2]
+    for origin in ("http://evil.example", "null", f"http://127.0.0.1:{int(port) + 1}", f"https://{server}"):
+        with (
+            pytest.raises(InvalidStatus, match="403"),
+            connect(f"ws://{server}/poses/map/base_link", origin=Origin(origin), proxy=None),
+        ):
+            pytest.fail("connected")
+    with connect(f"ws://{server}/poses/map/base_link", origin=Origin(f"http://{server}"), proxy=None) as poses:
+        assert is_on_its_circle(json.loads(poses.recv(timeout=30)))
+
+
+def test_the_web_application_does_not_answer_to_other_names(server: str) -> None:
+    for path in ("", "/tree", "/transforms/map/base_link", "/changes/map/base_link"):
+        response = httpx.get(f"http://{server}{path}", headers={"Host": "evil.example"}, timeout=30, trust_env=False)
+        assert response.status_code == 400
+    evil = {"Host": "evil.example"}
+    with (
+        pytest.raises(InvalidStatus, match="400"),
+        connect(f"ws://{server}/poses/map/base_link", additional_headers=evil, proxy=None),
+    ):
+        pytest.fail("connected")
+
+
+@pytest.mark.thorough
+def test_the_web_application_has_a_defined_answer_for_every_question(server: str) -> None:
+    draw = random.Random(34)
+    pieces = [
+        "9" * 401,
+        "-",
+        "1e308",
+        "nan",
+        "٣",
+        "\0",
+        "map",
+        "base_link",
+        " ",
+        "%",
+        "+",
+        "🤖",
+        "1_0",
+        "'",
+        "..",
+        "x" * 500,
+    ]
+
+    def text() -> str:
+        return quote("".join(draw.choice(pieces) for _ in range(draw.randrange(1, 4))), safe="")
+
+    with httpx.Client(base_url=f"http://{server}", timeout=30, trust_env=False) as client:
+        for _ in range(300):
+            frames = [draw.choice(["map", "base_link", text()]) for _ in range(2)]
+            questions = [f"{draw.choice(['at', 'timeout', text()])}={text()}" for _ in range(draw.randrange(3))]
+            response = client.get(f"/transforms/{'/'.join(frames)}?{'&'.join([*questions, 'timeout=0'])}")
+            assert response.status_code in (200, 400, 404, 504)
 
 
 @pytest.mark.thorough

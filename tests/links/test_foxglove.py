@@ -1,8 +1,11 @@
 import json
+import random
 import socket
 import struct
+import sys
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import anyio
@@ -13,11 +16,12 @@ pytest.importorskip("foxglove", reason="serving Foxglove needs foxglove-sdk")
 
 from support.processes import free_ports, is_free
 from support.samples import moving, static
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
+from websockets.typing import Origin, Subprotocol
 
 from tfbus import SECOND, Bus, BusClosedError, SimulatedClock, Transform, TransformStamped
-from tfbus.links.foxglove import FoxgloveServer
+from tfbus.links.foxglove import MAX_CONNECTIONS, FoxgloveServer
 
 pytestmark = pytest.mark.anyio
 
@@ -248,3 +252,109 @@ async def test_the_bus_of_another_thread_is_not_served(bus: Bus) -> None:
 def test_an_invalid_port_is_refused_at_once(bus: Bus, port: Any, error: type[Exception]) -> None:
     with pytest.raises(error):
         FoxgloveServer(bus, port)
+
+
+# Strangers
+
+
+def status_of(address: str, origin: str | None, host: str | None = None) -> int:
+    """The status that a page of this origin gets when it connects; 101 if it is let in."""
+    try:
+        socket_ = connect(
+            address,
+            origin=None if origin is None else Origin(origin),
+            additional_headers=None if host is None else {"Host": host},
+            subprotocols=[Subprotocol("foxglove.sdk.v1")],
+            proxy=None,
+        )
+    except InvalidStatus as error:
+        return error.response.status_code
+    socket_.close()
+    return 101
+
+
+@pytest.mark.every_loop
+async def test_of_web_pages_only_the_application_may_connect(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0) as server:
+
+        async def status(origin: str | None) -> int:
+            return await anyio.to_thread.run_sync(status_of, server.address, origin)
+
+        for origin in (None, "https://app.foxglove.dev", "file://"):
+            assert await status(origin) == 101
+        for origin in ("http://evil.example", "https://evil.app.foxglove.dev", "http://app.foxglove.dev", "null"):
+            assert await status(origin) == 403
+        assert server.refused == 4
+
+
+async def test_other_pages_are_named_by_the_user(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0, origins=["https://robot.example"]) as server:
+        assert await anyio.to_thread.run_sync(status_of, server.address, "https://robot.example") == 101
+        assert await anyio.to_thread.run_sync(status_of, server.address, "https://app.foxglove.dev") == 403
+    with pytest.raises(ValueError, match=r"robot\.example"):
+        FoxgloveServer(bus, 0, origins=["robot.example"])
+
+
+def sockets() -> tuple[list[list[str]], set[str]]:
+    """The rows of the system's table of sockets, and the names of those of this process."""
+    own = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):
+            own.add(str(entry.readlink()))
+    return [row.split() for row in Path("/proc/self/net/tcp").read_text().splitlines()[1:]], own
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells what listens in a file")
+async def test_the_library_itself_listens_where_no_page_finds_it(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0) as server:
+        rows, own = await anyio.to_thread.run_sync(sockets)
+        # The state 0A is that of a socket that listens; addresses are in the order of the machine.
+        listening = [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in own]
+        front = f"0100007F:{int(server.address.rpartition(':')[2]):04X}"
+        assert front in listening
+        [hidden] = [place for place in listening if place != front]
+        assert hidden[6:8] == "7F"
+        assert hidden[:8] != "0100007F"
+
+
+async def test_connections_have_a_bound_and_those_that_say_nothing_count(bus: Bus) -> None:
+    async with FoxgloveServer(bus, 0) as server, AsyncExitStack() as stack:
+        port = int(server.address.rpartition(":")[2])
+        for _ in range(MAX_CONNECTIONS):
+            await stack.enter_async_context(await anyio.connect_tcp("127.0.0.1", port))
+        last = await stack.enter_async_context(await anyio.connect_tcp("127.0.0.1", port))
+        with pytest.raises(anyio.EndOfStream):
+            await last.receive()
+        assert server.refused == 1
+
+
+async def test_no_message_of_a_stranger_ends_the_server(bus: Bus) -> None:
+    bus.publish(static("base", "lidar", 2.0, stamp=START))
+    draw = random.Random(34)
+    words = ["op", "subscribe", "subscriptions", "id", "channelId", "unsubscribe", "\ud7ff", "getParameters", ""]
+
+    def value(depth: int) -> Any:
+        kind = draw.randrange(6 if depth else 4)
+        if kind < 4:
+            return [draw.choice(words), draw.randrange(-(2**70), 2**70), draw.choice([None, True, 1e308]), -1][kind]
+        if kind == 4:
+            return [value(depth - 1) for _ in range(draw.randrange(4))]
+        return {draw.choice(words): value(depth - 1) for _ in range(draw.randrange(4))}
+
+    def send_all(address: str) -> None:
+        for _ in range(20):
+            # It reads nothing, and the server answers each message that is none.
+            with (
+                connect(address, subprotocols=[Subprotocol("foxglove.sdk.v1")], proxy=None, max_queue=None) as client,
+                suppress(ConnectionClosed),
+            ):
+                for _ in range(20):
+                    client.send(json.dumps({"op": draw.choice(words), draw.choice(words): value(3)}))
+                    client.send(json.dumps(value(3)))
+                    client.send(draw.randbytes(draw.randrange(40)))
+
+    async with FoxgloveServer(bus, 0) as server:
+        await anyio.to_thread.run_sync(send_all, server.address)
+        async with application(server) as app:
+            app.subscribe()
+            assert [each[2] for each in await anyio.to_thread.run_sync(app.transforms)] == ["lidar"]

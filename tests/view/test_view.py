@@ -1,6 +1,7 @@
 import math
 import socket
 from queue import Queue
+from typing import Any
 
 import anyio
 import httpx
@@ -9,9 +10,14 @@ import pytest
 
 pytest.importorskip("viser", reason="the live page needs viser")
 
+import msgspec
+import viser
 from support.browsers import Browser, in_browser
 from support.processes import free_ports
 from support.samples import moving, over, static
+from support.viser_pages import CAMERA
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from tfbus import (
     LATEST,
@@ -165,6 +171,59 @@ async def test_what_happens_is_drawn_while_somebody_looks(
             await anyio.sleep(0.001)
 
 
+@pytest.mark.every_loop
+async def test_what_pages_send_cannot_end_the_program(caplog: pytest.LogCaptureFixture) -> None:
+    shown = Shown()
+    shown.bus.publish([static("map", "dock"), *over("map", "base", [99 * SECOND, 100 * SECOND])])
+
+    def use(address: str) -> None:
+        with connect(
+            address.replace("http", "ws"),
+            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+            proxy=None,
+            max_queue=None,
+        ) as client:
+            client.send(msgspec.msgpack.encode(CAMERA))
+            for label, *values in (
+                ("Speed", "no option", "× 1000", math.nan),
+                ("Mode", "no option", "Stop", True),
+                ("Time [s]", math.nan, math.inf, -1e300, "now"),
+                ("Fixed frame", "nowhere", 1),
+                ("Mode", "Pause"),
+            ):
+                control = next(each for each in controls() if each.label == label)
+                for value in values:
+                    message = {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}}
+                    client.send(msgspec.msgpack.encode(message))
+            assert client.ping().wait(30.0)
+
+    async with View(shown.bus, shown.buffer, 0) as view:
+        assert view._server is not None
+        handles = view._server.gui._gui_input_handle_from_uuid
+
+        def controls() -> list[Any]:
+            return list(handles.values())
+
+        await anyio.to_thread.run_sync(use, view.address)
+        with anyio.fail_after(30.0):
+            # The last one is sound.
+            while view._page.timeline.stamp is None:  # noqa: ASYNC110 - a control sets no event
+                await anyio.sleep(0.01)
+        assert (view._page.timeline.speed, view._page.chosen_fixed) == (1.0, None)
+        assert view.refused == 12
+    assert [record for record in caplog.records if record.levelname == "ERROR"] == []
+
+
+async def test_the_origins_that_may_use_the_page_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    shown = Shown()
+    async with View(shown.bus, shown.buffer, 0, origins=["http://robot.example"]) as view:
+        for host, status in (("robot.example", 200), ("evil.example", 403)):
+            async with httpx.AsyncClient(trust_env=False) as client:
+                assert (await client.get(view.address, headers={"Host": host})).status_code == status
+        assert view.refused == 1
+    assert "evil.example" in caplog.text
+
+
 # Arguments
 
 
@@ -173,6 +232,8 @@ async def test_what_happens_is_drawn_while_somebody_looks(
     [
         ({"port": -1}, ValueError),
         ({"port": 65_536}, ValueError),
+        ({"origins": ["robot"]}, ValueError),
+        ({"origins": "http://robot"}, TypeError),
         ({"port": 80.0}, TypeError),
         ({"port": True}, TypeError),
         ({"rate": 0.0}, ValueError),

@@ -1,5 +1,6 @@
 """Wake-ups of the event loop from other threads."""
 
+import logging
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -14,7 +15,7 @@ class LoopWaker:
     Parameters
     ----------
     callback : callable
-        Called on the loop. It must not raise, and must process everything that has been queued.
+        Called on the loop. It must process everything that has been queued, or wake again. An `Exception` is logged.
 
     Notes
     -----
@@ -65,7 +66,11 @@ class LoopWaker:
 
     def _call(self) -> None:
         self._requested = False
-        self._callback()
+        try:
+            self._callback()
+        except Exception:
+            # No task would hear of it, and it would end the whole run of trio.
+            logging.getLogger("tfbus").exception("a callback of another thread raised")
 
 
 def _never() -> bool:

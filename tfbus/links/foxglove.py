@@ -1,14 +1,23 @@
-"""`FoxgloveServer`, which shows a bus to the Foxglove application."""
+"""`FoxgloveServer`, which shows a bus to the Foxglove application.
 
+The library answers any web page. So it listens at an address of the loopback that no page can guess, and what comes to
+the address of the server goes through a `WebDoor` first.
+"""
+
+import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
 import anyio
+import anyio.abc
 import anyio.to_thread
 
 from tfbus._aio.loop_waker import LoopWaker
+from tfbus._aio.task_groups import close_task_group
+from tfbus._aio.web_door import HEAD_END, HEAD_TIME, MAX_HEAD, WebDoor
 from tfbus.bus.bus import Bus
 from tfbus.errors import BusClosedError, pip_install
 from tfbus.geometry.stamped import Batch, TransformStamped
@@ -24,6 +33,11 @@ try:
 except ImportError as error:
     raise ImportError(f"to serve Foxglove, tfbus needs a package more: {pip_install('foxglove')} ({error})") from error
 
+APPLICATION = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "file://")
+"""The origins of the Foxglove application: in a browser, and on the desktop."""
+MAX_CONNECTIONS = 100
+_CHUNK = 65_536
+"""Bytes that are passed on at once."""
 _STAMP_END = 2**32 * SECOND
 """ns; Foxglove counts the seconds of a stamp in 32 bits, from zero."""
 
@@ -44,6 +58,9 @@ class FoxgloveServer:
         The address to listen at; by default, only programs on this machine can connect.
     topic : str
         The name of the channel.
+    origins : iterable of str
+        The web pages that may connect, such as ``https://robot.example:8443``; by default those of the Foxglove
+        application, `APPLICATION`. ``*`` is for all. A program that is no browser sends no origin, and may connect.
 
     Attributes
     ----------
@@ -53,18 +70,28 @@ class FoxgloveServer:
         Samples that were sent to the applications that had subscribed.
     not_sent : int
         Samples whose stamp Foxglove cannot hold: before 1970, or after 2106.
+    refused : int
+        Connections that were refused: of other pages, or beyond the 100th.
 
     Raises
     ------
     ValueError
-        If the port is out of range.
+        If the port is out of range, or an origin has not the form of one.
     OSError
         On entering, if the address cannot be listened at.
     BusClosedError, RuntimeError
         On entering, if the bus is closed; if it belongs to another thread, or the server was entered before.
     """
 
-    def __init__(self, bus: Bus, port: int = 8765, *, host: str = "127.0.0.1", topic: str = "/tf") -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        port: int = 8765,
+        *,
+        host: str = "127.0.0.1",
+        topic: str = "/tf",
+        origins: Iterable[str] = APPLICATION,
+    ) -> None:
         if isinstance(port, bool) or not isinstance(port, int):
             raise TypeError(f"a port must be an int, not {port!r}")
         if not 0 <= port <= 65_535:
@@ -74,6 +101,9 @@ class FoxgloveServer:
         self.sent = 0
         self.not_sent = 0
         self._host, self._port, self._topic = host, port, topic
+        self._door = WebDoor(host, origins)
+        self._connections = 0
+        self._too_many = 0
         self._entered = False
         self._listener = _Listener(self._wake)
         self._waker = LoopWaker(self._follow_subscriptions)
@@ -84,6 +114,14 @@ class FoxgloveServer:
         self._channel: FrameTransformsChannel
         self._server: WebSocketServer | None = None
         self._never_entered = warn_unless_entered(self)
+        self._inside = ("", 0)
+        self._front: anyio.abc.Listener[anyio.abc.SocketStream]
+        self._tasks: anyio.abc.TaskGroup
+
+    @property
+    def refused(self) -> int:
+        """Connections that were refused."""
+        return self._door.refused + self._too_many
 
     async def __aenter__(self) -> Self:
         if self._entered:
@@ -95,33 +133,87 @@ class FoxgloveServer:
         self.bus._entered.add(self)
         self._never_entered.detach()
         self._waker.bind()
+        # What a thread has started must not be lost to a cancellation.
         with anyio.CancelScope(shield=True):
-            server = self._server = await anyio.to_thread.run_sync(self._start)
-        self.address = f"ws://{f'[{self._host}]' if ':' in self._host else self._host}:{server.port}"
+            try:
+                self._front = await anyio.create_tcp_listener(local_host=self._host, local_port=self._port)
+            except OSError as error:
+                raise OSError(f"cannot listen at {self._host}:{self._port}: {error}") from error
+        try:
+            with anyio.CancelScope(shield=True):
+                self._server = await anyio.to_thread.run_sync(self._start)
+            self._tasks = await anyio.create_task_group().__aenter__()
+            self._tasks.start_soon(self._serve)
+        except BaseException:
+            await self._stop()
+            raise
+        port = self._front.extra(anyio.abc.SocketAttribute.local_port)
+        self.address = f"ws://{f'[{self._host}]' if ':' in self._host else self._host}:{port}"
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self._tasks.cancel_scope.cancel()
+        try:
+            await close_task_group(self._tasks)
+        finally:
+            await self._stop()
+
+    async def _stop(self) -> None:
         self.address = ""
         self.bus._entered.discard(self)
         server, self._server = self._server, None
         self._unsubscribe()
-        if server is not None:
-            with anyio.CancelScope(shield=True):
+        with anyio.CancelScope(shield=True):
+            await self._front.aclose()
+            if server is not None:
                 await anyio.to_thread.run_sync(server.stop)
 
     def _start(self) -> WebSocketServer:
         # The channel and the server do not keep it alive.
         context = self._context = foxglove.Context()
         self._channel = FrameTransformsChannel(self._topic, context=context)
-        try:
-            return foxglove.start_server(
-                name="tfbus", host=self._host, port=self._port, server_listener=self._listener, context=context
-            )
-        except RuntimeError as error:
-            # What the library raises for whatever the system says.
-            raise OSError(f"cannot listen at {self._host}:{self._port}: {error}") from error
+        # Pages can try all ports of an address, but not all of the 16 million addresses of the loopback. A system
+        # that has only the first of them refuses the others.
+        hidden = f"127.{secrets.randbelow(256)}.{secrets.randbelow(256)}.{1 + secrets.randbelow(254)}"
+        for host in (hidden, "127.0.0.1"):
+            try:
+                server = foxglove.start_server(
+                    name="tfbus", host=host, port=0, server_listener=self._listener, context=context
+                )
+            except RuntimeError as error:
+                # What the library raises for whatever the system says.
+                failure = error
+            else:
+                self._inside = host, server.port
+                return server
+        raise OSError(f"cannot listen at the loopback: {failure}") from failure
+
+    async def _serve(self) -> None:
+        await self._front.serve(self._admit)
+
+    async def _admit(self, outside: anyio.abc.SocketStream) -> None:
+        """Judge the head of a connection, and pass on what comes after it, in both directions."""
+        async with outside:
+            if self._connections == MAX_CONNECTIONS:
+                self._too_many += 1
+                return
+            self._connections += 1
+            try:
+                with suppress(anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError, OSError):
+                    head = await _head_of(outside)
+                    answer = self._door.answer(head)
+                    if answer is not None:
+                        await outside.send(answer)
+                        return
+                    async with await anyio.connect_tcp(*self._inside) as inside:
+                        await inside.send(head)
+                        async with anyio.create_task_group() as tasks:
+                            tasks.start_soon(_pass_on, outside, inside, tasks.cancel_scope)
+                            tasks.start_soon(_pass_on, inside, outside, tasks.cancel_scope)
+            finally:
+                self._connections -= 1
 
     def _wake(self) -> None:
         try:
@@ -191,6 +283,25 @@ class _Listener(ServerListener):
         with self._lock:
             self.subscribers -= {client.id}
         self._changed()
+
+
+async def _head_of(stream: anyio.abc.ByteReceiveStream) -> bytes:
+    """The first bytes of a stream, with the head of a request; without it, if that is too long or comes too late."""
+    head = b""
+    with anyio.move_on_after(HEAD_TIME):
+        while HEAD_END not in head and len(head) <= MAX_HEAD:
+            head += await stream.receive(MAX_HEAD)
+    return head
+
+
+async def _pass_on(
+    source: anyio.abc.ByteReceiveStream, target: anyio.abc.ByteSendStream, scope: anyio.CancelScope
+) -> None:
+    """Pass on what a stream sends until one of the two has ended, then end the other direction too."""
+    with suppress(anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError):
+        while True:
+            await target.send(await source.receive(_CHUNK))
+    scope.cancel()
 
 
 def _convert(sample: TransformStamped) -> FrameTransform:

@@ -11,14 +11,14 @@ CAPACITY = 1_000
 
 
 class Controls:
-    """Calls functions on the event loop that other threads hand over, in their order.
+    """Calls functions on the event loop that other threads hand over, in their order, one in each turn of the loop.
 
     When more than `CAPACITY` are pending, the oldest is dropped and counted.
 
     Parameters
     ----------
     called : callable
-        Called on the loop after some functions were called.
+        Called on the loop after a function was called.
     """
 
     def __init__(self, called: Callable[[], object]) -> None:
@@ -59,10 +59,13 @@ class Controls:
         return QueueStatistics("controls", "drop_oldest", CAPACITY, len(self._pending), self.dropped)
 
     def _drain(self) -> None:
-        while True:
-            with self._lock:
-                if not self._pending:
-                    break
-                control = self._pending.popleft()
-            control()
+        with self._lock:
+            if not self._pending:
+                return
+            control = self._pending.popleft()
+            more = bool(self._pending)
+        if more:
+            # A flood of clicks must not hold the program up.
+            self._waker.wake()
+        control()
         self._called()

@@ -1,10 +1,21 @@
-"""The triangles of visible shapes, and the search for mesh files."""
+"""The triangles of visible shapes, and the search for mesh files.
 
+A mesh file comes with a robot that somebody else has described. A few bytes of it can stand for gigabytes: an archive,
+a texture, a scene that repeats a shape. So what it unfolds to is counted before trimesh reads it, and no pixel of a
+texture is decoded, for a shape has one colour.
+"""
+
+import io
+import json
 import logging
+import os
+import struct
+import zipfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
+from xml.parsers import expat
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +24,18 @@ import trimesh
 from tfbus.plain import printable
 from tfbus.robot.visual import Box, Cylinder, Mesh, Shape, Sphere, Visual
 
+MAX_BYTES = 67_108_864
+"""Bytes of a mesh file and of all that it refers to, unpacked."""
+MAX_NUMBERS = 5_000_000
+"""Numbers of a text, of a scene of COLLADA or of glTF with all that it repeats."""
+MAX_VERTICES = 2_000_000
+MAX_SHAPES = 10_000
+"""Shapes of one file, with all that it repeats."""
+_KINDS = ("dae", "glb", "gltf", "obj", "off", "ply", "stl", "zae")
+_IMAGES = (".bmp", ".dds", ".gif", ".jpeg", ".jpg", ".ktx2", ".png", ".tga", ".tif", ".tiff", ".webp")
+_SPACE = np.zeros(256, np.bool_)
+_SPACE[list(b' \t\r\n\v\f,;/[]{}:<>="')] = True
+_CHUNK = 1_048_576
 _PLACEHOLDER = 0.05
 """m; the side of the box that stands for a missing mesh."""
 _PLACEHOLDER_COLOUR = (204, 121, 167)
@@ -39,7 +62,7 @@ class Solid(NamedTuple):
 
 
 class MeshFiles:
-    """Finds and reads mesh files: STL, OBJ, DAE and whatever else trimesh reads.
+    """Finds and reads mesh files: STL, OBJ, DAE, ZAE, glTF, PLY and OFF.
 
     Parameters
     ----------
@@ -81,7 +104,10 @@ class MeshFiles:
         """
         scheme, place, path, _, _ = urlsplit(filename)
         if scheme == "package":
-            inside = unquote(path).lstrip("/")
+            # By its letters: what is a link in a folder may lead out of it, as in every workspace of colcon.
+            inside = os.path.normpath(unquote(path).replace("\\", "/").lstrip("/"))
+            if place in ("", ".", "..") or inside.split("/")[0] == ".." or "\0" in inside or ":" in inside:
+                raise FileNotFoundError("the name leaves its package")
             candidates = [folder / place / inside for folder in self._package_paths]
             candidates += [folder / inside for folder in self._package_paths if folder.resolve().name == place]
         elif scheme == "file":
@@ -143,13 +169,209 @@ def _unit(shape: Shape) -> Triangles:
 
 
 def _read_mesh(path: Path) -> tuple[Triangles, tuple[int, int, int] | None]:
-    mesh = trimesh.load_mesh(path)
-    triangles = _triangles(mesh)
-    if path.suffix.lower() == ".dae":
-        triangles = triangles._replace(vertices=triangles.vertices * np.float32(_metres(mesh.units)))
-    if not len(triangles.faces) or not np.isfinite(triangles.vertices).all():
-        raise ValueError("it has no triangles, or some that are not finite")
-    return triangles, _main_colour(mesh)
+    kind = path.suffix.lower()[1:]
+    if kind not in _KINDS:
+        raise ValueError(f"meshes of the kind .{kind} are not read")
+    files: Any = _Files(path.parent)
+    data = files.take(path)
+    if kind in ("dae", "zae"):
+        data, kind = _unpacked(data), "dae"
+        _check_collada(data)
+    elif kind in ("glb", "gltf"):
+        _check_gltf(data)
+    elif not _is_binary(kind, data):
+        _check(_numbers(data), MAX_NUMBERS, "numbers")
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=files)
+    parts = [scene.graph.get(name) for name in scene.graph.nodes_geometry[: MAX_SHAPES + 1]]
+    _check(len(parts), MAX_SHAPES, "shapes")
+    meshes = [(pose, scene.geometry[name]) for pose, name in parts]
+    meshes = [(pose, mesh) for pose, mesh in meshes if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    _check(sum(len(mesh.vertices) for _, mesh in meshes), MAX_VERTICES, "vertices")
+    if not meshes:
+        raise ValueError("it has no triangles")
+    triangles = _joined(meshes)
+    if kind == "dae":
+        triangles = triangles._replace(vertices=triangles.vertices * np.float32(_metres(scene.units)))
+    if not np.isfinite(triangles.vertices).all():
+        raise ValueError("it has triangles that are not finite")
+    return triangles, _mean_colour([mesh for _, mesh in meshes])
+
+
+class _Files:
+    """The files that trimesh may read beside a mesh: those of its folder, but no images; as a resolver of trimesh."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._taken = 0
+
+    def get(self, name: str) -> bytes:
+        """The content of a file that a mesh names."""
+        inside = os.path.normpath(unquote(name.strip()).replace("\\", "/"))
+        if inside.lower().endswith(_IMAGES):
+            raise FileNotFoundError("textures are not drawn")
+        if inside.startswith(("/", "..")) or ":" in inside or "\0" in inside:
+            raise FileNotFoundError("the name leaves the folder of the mesh")
+        path = self._folder / inside
+        if not path.is_file():
+            raise FileNotFoundError(name)
+        return self.take(path)
+
+    __getitem__ = get
+
+    def take(self, path: Path) -> bytes:
+        """The content of a file, if all that were taken are not too much together."""
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1 - self._taken)
+        self._taken += len(data)
+        _check(self._taken, MAX_BYTES, "bytes")
+        return data
+
+
+def _check(found: int, most: int, what: str) -> None:
+    if found > most:
+        raise ValueError(f"it has more than {most} {what}")
+
+
+def _numbers(data: bytes) -> int:
+    """The number of words of a text, each number being one."""
+    found = 0
+    before = True
+    for start in range(0, len(data), _CHUNK):
+        space = _SPACE[np.frombuffer(data, np.uint8, min(_CHUNK, len(data) - start), start)]
+        found += int(np.count_nonzero(space[:-1] & ~space[1:])) + int(before and not space[0])
+        before = bool(space[-1])
+    return found
+
+
+def _is_binary(kind: str, data: bytes) -> bool:
+    """Whether trimesh will take a file for a binary one."""
+    if kind == "stl":
+        return len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little")
+    return kind == "ply" and b"format binary" in data[:1_000]
+
+
+def _unpacked(data: bytes) -> bytes:
+    """A COLLADA file, which may be in an archive."""
+    if not zipfile.is_zipfile(io.BytesIO(data)):
+        return data
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        scenes = [entry for entry in archive.infolist() if entry.filename.lower().endswith(".dae")]
+        if not scenes:
+            raise ValueError("its archive has no .dae")
+        with archive.open(scenes[0]) as file:
+            # What the archive says of the size may be wrong.
+            unpacked = file.read(MAX_BYTES + 1)
+    _check(len(unpacked), MAX_BYTES, "bytes, unpacked")
+    return unpacked
+
+
+class _Node:
+    """A node of a COLLADA scene: its shapes and other nodes, by name or nested."""
+
+    def __init__(self) -> None:
+        self.shapes: list[str] = []
+        self.named: list[str] = []
+        self.nested: list[_Node] = []
+        self.size: tuple[int, int] | None = None
+        """Shapes and numbers, with all that is repeated."""
+
+
+def _check_collada(data: bytes) -> None:
+    """Refuse a COLLADA file that unfolds to too much. trimesh copies a shape each time that a node names it."""
+    _check(_numbers(data), MAX_NUMBERS, "numbers")
+    nodes: dict[str, _Node] = {}
+    stack: list[_Node] = []
+    roots: list[_Node] = []
+    numbers: dict[str, int] = {}
+    shape = ""
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal shape
+        tag = tag.rpartition(":")[2]
+        if tag in ("node", "visual_scene"):
+            node = _Node()
+            if tag == "visual_scene":
+                roots.append(node)
+            elif stack:
+                stack[-1].nested.append(node)
+            if "id" in attributes:
+                nodes[attributes["id"]] = node
+            stack.append(node)
+        elif tag == "geometry":
+            shape = attributes.get("id", "")
+            numbers.setdefault(shape, 0)
+        elif tag in ("instance_geometry", "instance_controller") and stack:
+            stack[-1].shapes.append(attributes.get("url", "")[1:])
+        elif tag == "instance_node" and stack:
+            stack[-1].named.append(attributes.get("url", "")[1:])
+
+    def end(tag: str) -> None:
+        nonlocal shape
+        tag = tag.rpartition(":")[2]
+        if tag in ("node", "visual_scene"):
+            stack.pop()
+        elif tag == "geometry":
+            shape = ""
+
+    def count(text: str) -> None:
+        if shape:
+            numbers[shape] += len(text.split())
+
+    def refuse(*_: object) -> None:
+        raise ValueError("it declares entities, which COLLADA does not need")
+
+    def size(node: _Node) -> tuple[int, int]:
+        if node.size is None:
+            # A node in itself, by whatever way, has no end.
+            node.size = (MAX_SHAPES + 1, 0)
+            parts = [(1, numbers.get(name, 0)) for name in node.shapes]
+            parts += [size(each) for each in node.nested]
+            parts += [size(nodes[name]) for name in node.named if name in nodes]
+            node.size = sum(part[0] for part in parts), sum(part[1] for part in parts)
+        return node.size
+
+    parser = expat.ParserCreate()
+    parser.buffer_text, parser.buffer_size = True, 65_536
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    parser.CharacterDataHandler = count
+    parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
+    parser.Parse(data, True)
+    for root in roots:
+        shapes, repeated = size(root)
+        _check(shapes, MAX_SHAPES, "shapes, repeated ones included")
+        _check(repeated, MAX_NUMBERS, "numbers, repeated ones included")
+
+
+def _check_gltf(data: bytes) -> None:
+    """Refuse a glTF file that unfolds to too much: its counts are claims, and shapes may name the same numbers."""
+    text = data
+    if data[:4] == b"glTF":
+        (length,) = struct.unpack_from("<I", data, 12)
+        text = data[20 : 20 + length]
+    _check(_numbers(text), MAX_NUMBERS, "words")
+    tree = json.loads(text)
+    counts = [int(each["count"]) for each in tree.get("accessors", [])]
+    primitives = [each for mesh in tree.get("meshes", []) for each in mesh["primitives"]]
+    _check(len(primitives), MAX_SHAPES, "shapes")
+    _check(len(tree.get("nodes", [])), MAX_SHAPES, "nodes")
+    named = [place for each in primitives for place in (*each["attributes"].values(), each.get("indices"))]
+    total = sum(counts) + sum(counts[place] for place in named if place is not None)
+    _check(total, MAX_NUMBERS, "numbers")
+    children = [child for node in tree.get("nodes", []) for child in node.get("children", [])]
+    if len(set(children)) != len(children):
+        raise ValueError("a node of it has several parents")
+
+
+def _joined(meshes: Sequence[tuple[npt.NDArray[np.float64], trimesh.Trimesh]]) -> Triangles:
+    """The triangles of several meshes, each at its pose."""
+    vertices, faces, count = [], [], 0
+    for pose, mesh in meshes:
+        vertices.append((mesh.vertices @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32))
+        # A mirror turns the faces inside out.
+        turned = mesh.faces[:, ::-1] if np.linalg.det(pose[:3, :3]) < 0.0 else mesh.faces
+        faces.append((turned + count).astype(np.uint32))
+        count += len(mesh.vertices)
+    return Triangles(np.concatenate(vertices), np.concatenate(faces))
 
 
 def _metres(units: str | None) -> float:
@@ -163,6 +385,16 @@ def _metres(units: str | None) -> float:
 
 def _triangles(mesh: trimesh.Trimesh) -> Triangles:
     return Triangles(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+
+
+def _mean_colour(meshes: Sequence[trimesh.Trimesh]) -> tuple[int, int, int] | None:
+    """The colour of the meshes of a file, if it gives one: the mean over their faces."""
+    found = [(len(mesh.faces), colour) for mesh in meshes if (colour := _main_colour(mesh)) is not None]
+    if not found:
+        return None
+    faces, colours = zip(*found, strict=True)
+    red, green, blue = np.average(colours, axis=0, weights=faces).round().astype(int).tolist()
+    return red, green, blue
 
 
 def _main_colour(mesh: trimesh.Trimesh) -> tuple[int, int, int] | None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from tfbus._aio.loop_waker import LoopWaker
 from tfbus._aio.task_groups import close_task_group
+from tfbus._aio.web_door import WebDoor
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.bus.delays import Delays
@@ -60,6 +61,10 @@ class View:
     host : str
         The address to listen at. By default, only programs on this machine can connect; whoever can connect sees and
         controls the page.
+    origins : iterable of str
+        Web pages that may use this one beside itself, such as ``https://robot.example:8443``; the page answers to the
+        names of their hosts too. By default there are none, and it answers to addresses, to ``localhost``, to `host`
+        and to the name of this machine. ``*`` stands for all.
     fixed : str, optional
         The frame that stands still; by default the root of the largest tree. It can be changed on the page.
     trails : iterable of str
@@ -83,7 +88,7 @@ class View:
     Raises
     ------
     ValueError
-        If the port, the rate or `stale_after` is out of range.
+        If the port, the rate or `stale_after` is out of range, or an origin has not the form of one.
     InvalidTransformError
         If a frame has a name that no frame can have.
     OSError, InvalidRobotError, ImportError
@@ -99,6 +104,7 @@ class View:
         port: int = 8080,
         *,
         host: str = "127.0.0.1",
+        origins: Iterable[str] = (),
         fixed: str | None = None,
         trails: Iterable[str] = (),
         urdf: str | os.PathLike[str] | None = None,
@@ -124,6 +130,7 @@ class View:
         self.address = ""
         self._buffer = buffer
         self._host, self._port = host, port
+        self._door = WebDoor(host, origins)
         self._urdf = urdf
         self._package_paths = tuple(Path(path) for path in package_paths)
         self._period = 1.0 / rate
@@ -194,6 +201,11 @@ class View:
         """The number of browsers that show the page."""
         return 0 if self._server is None else len(self._server.get_clients())
 
+    @property
+    def refused(self) -> int:
+        """Requests of other pages, and messages of this one that it does not send, that were refused."""
+        return self._door.refused + (self._server.refused if self._server is not None else 0)
+
     def statistics(self) -> QueueStatistics:
         """The counters of the queue of what people do on the page."""
         return self._controls.statistics()
@@ -213,7 +225,7 @@ class View:
         # What a thread has started must not be lost to a cancellation.
         with anyio.CancelScope(shield=True):
             solids = await anyio.to_thread.run_sync(self._read_solids)
-            server = self._server = await anyio.to_thread.run_sync(start_server, self._host, self._port)
+            server = self._server = await anyio.to_thread.run_sync(start_server, self._host, self._port, self._door)
         try:
             self._screen = Screen(server, self._page, solids, self._controls.put)
             self._screen.set_points(self._points)

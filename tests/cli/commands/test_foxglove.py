@@ -36,3 +36,7 @@ def test_a_port_that_is_taken_is_a_usage_error(tfbus: Command) -> None:
 def test_a_port_that_does_not_exist_is_a_usage_error(tfbus: Command) -> None:
     for port in ("-1", "65536"):
         check_wrong_call(tfbus("foxglove", "--port", port), "--port")
+
+
+def test_an_origin_that_is_none_is_a_usage_error(tfbus: Command) -> None:
+    check_wrong_call(tfbus("foxglove", "--origin", "robot.example"), "robot.example")

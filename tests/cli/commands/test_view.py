@@ -53,12 +53,25 @@ def test_a_recording_is_no_live_page_and_has_the_options_of_the_command(
 
     monkeypatch.setattr(view, "View", OccupiedView)
     recording = write_mcap(tmp_path / "run.mcap", [(0, "/tf", [moving("map", "base", 5)])])
-    options = ("--fixed", "map", "--trail", "base", "--rate", "5", "--port", "8081")
+    options = (
+        "--fixed",
+        "map",
+        "--trail",
+        "base",
+        "--rate",
+        "5",
+        "--port",
+        "8081",
+        "--origin",
+        "https://robot.example",
+    )
     check_wrong_call(tfbus("view", recording, *options), "cannot use port 8081: in use")
     (given,) = asked
     assert given == {
         "port": 8081,
         "edges": 1,
+        "host": "127.0.0.1",
+        "origins": ("https://robot.example",),
         "fixed": "map",
         "trails": ("base",),
         "urdf": None,
@@ -84,3 +97,7 @@ def test_what_cannot_be_shown_is_a_usage_error(
 ) -> None:
     recording = write_mcap(tmp_path / "run.mcap", [(0, "/tf", [moving("map", "base", 5)])])
     check_wrong_call(tfbus("view", *(recording if each == "RUN" else each for each in arguments)), why)
+
+
+def test_an_origin_that_is_none_is_a_usage_error(tfbus: Command) -> None:
+    check_wrong_call(tfbus("view", "--origin", "robot.example"), "robot.example")

@@ -2,16 +2,24 @@
 
 import anyio
 
+from tfbus._aio.web_door import WebDoor
 from tfbus.bus.bus import Bus
 from tfbus.cli.arguments import Port, UsageError
 from tfbus.cli.domain import DEFAULT_LINK, LinkOptions
 from tfbus.cli.output import print_now, say
 
 
-def foxglove(*, port: Port = 8765, link: LinkOptions = DEFAULT_LINK) -> None:
+def foxglove(
+    *,
+    port: Port = 8765,
+    host: str = "127.0.0.1",
+    origin: tuple[str, ...] = (),
+    link: LinkOptions = DEFAULT_LINK,
+) -> None:
     """Show the frames of a domain to the Foxglove application, until Ctrl-C.
 
-    The address to open in Foxglove is printed; only programs on this machine can connect.
+    The address to open in Foxglove is printed; only programs on this machine can connect, and of web pages only the
+    Foxglove application.
 
     Example: tfbus foxglove --port 8765
 
@@ -19,14 +27,23 @@ def foxglove(*, port: Port = 8765, link: LinkOptions = DEFAULT_LINK) -> None:
     ----------
     port
         Serve at this port; 0 for any that is free.
+    host
+        Listen at this address; 0.0.0.0 lets all other machines connect.
+    origin
+        Let pages of this other site connect too, such as https://robot.example; may be given several times.
     """
     try:
-        from tfbus.links.foxglove import FoxgloveServer
+        from tfbus.links.foxglove import APPLICATION, FoxgloveServer
     except ImportError as error:
         raise UsageError(str(error)) from None
 
+    try:
+        WebDoor(host, origin)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
     async def serve(bus: Bus) -> None:
-        server = FoxgloveServer(bus, port)
+        server = FoxgloveServer(bus, port, host=host, origins=(*APPLICATION, *origin))
         try:
             await server.__aenter__()
         except OSError as error:

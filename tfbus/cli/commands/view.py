@@ -5,6 +5,7 @@ from pathlib import Path
 
 import anyio
 
+from tfbus._aio.web_door import WebDoor
 from tfbus.buffer.buffer import Buffer
 from tfbus.bus.bus import Bus
 from tfbus.cli._event_loop import run
@@ -25,12 +26,14 @@ def view(
     fixed: str | None = None,
     trail: tuple[str, ...] = (),
     port: Port = 8080,
+    host: str = "127.0.0.1",
+    origin: tuple[str, ...] = (),
     rate: Rate = 30.0,
     link: LinkOptions = DEFAULT_LINK,
 ) -> None:
     """Show the frames of a domain, or of a recording, as a live 3D page in the browser, until Ctrl-C.
 
-    The address of the page is printed; only programs on this machine can open it.
+    The address of the page is printed; only programs on this machine can open it, and no page of another site.
 
     Example: tfbus view run.mcap --urdf robot.urdf --trail base_link
 
@@ -48,6 +51,10 @@ def view(
         Draw where this frame was in the last ten seconds; may be given several times.
     port
         Serve the page at this port, or the next one that is free; 0 for any.
+    host
+        Listen at this address; 0.0.0.0 lets all other machines see and use the page.
+    origin
+        Let pages of this other site use it too, such as https://robot.example; may be given several times.
     rate
         Draw at most so many times per second.
     """
@@ -61,11 +68,18 @@ def view(
     except InvalidTransformError as error:
         raise UsageError(str(error)) from None
 
+    try:
+        WebDoor(host, origin)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
     async def show(bus: Bus, buffer: Buffer, live: bool) -> None:
         page = View(
             bus,
             buffer,
             port,
+            host=host,
+            origins=origin,
             fixed=fixed,
             trails=trail,
             urdf=urdf,

@@ -1,0 +1,134 @@
+"""The guide's page *Security*: each of its statements names the test that holds it; here are those that had none."""
+
+import inspect
+import re
+import sys
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("viser", reason="the servers of all extras are looked at")
+pytest.importorskip("foxglove", reason="the servers of all extras are looked at")
+pytest.importorskip("zenoh", reason="the servers of all extras are looked at")
+pytest.importorskip("cyclonedds", reason="the servers of all extras are looked at")
+pytest.importorskip("cbor2", reason="the servers of all extras are looked at")
+pytest.importorskip("cyclopts", reason="the servers of all extras are looked at")
+
+import httpx
+from support.processes import free_ports, new_domain
+from support.rosbridge import rosbridge_server
+
+from tfbus import Buffer, Bus
+from tfbus.cli.commands.router import router
+from tfbus.links.dds import DdsLink
+from tfbus.links.foxglove import FoxgloveServer
+from tfbus.links.rmw_zenoh import RmwZenohLink
+from tfbus.links.rosbridge import RosbridgeLink
+from tfbus.links.zenoh import BufferServer, ZenohLink, ZenohRouter
+from tfbus.view import View
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "demos" / "guide" / "security.md").read_text(encoding="utf-8")
+
+LOOPBACK = re.compile(r"\w{6}7F|0{24}01000000")
+"""127.x.y.z and ::1 in the byte order of the machine."""
+
+
+def test_each_statement_of_the_page_names_a_test_that_there_is() -> None:
+    prose = PAGE.split("\n## ", 1)[1]
+    statements = re.findall(r"^\* .*?(?=^\* |^\n|\Z)", prose, re.MULTILINE | re.DOTALL)
+    assert len(statements) > 20
+    for statement in statements:
+        held_by = re.findall(r"<!-- (tests/\S+)::(\w+) -->", statement)
+        assert held_by, f"no test holds: {statement}"
+        for file, test in held_by:
+            assert re.search(rf"^(async )?def {test}\(", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE), test
+
+
+def sockets() -> set[str]:
+    """The sockets of this process that others can send to: kind and address."""
+    own = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        # That of this list is gone.
+        with suppress(FileNotFoundError):
+            own.add(str(entry.readlink()))
+    found = set()
+    for kind in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/self/net/{kind}").read_text(encoding="ascii").splitlines()[1:]:
+            fields = line.split()
+            # State 0A is LISTEN; a socket of UDP is always open.
+            if f"socket:[{fields[9]}]" in own and (kind.startswith("udp") or fields[3] == "0A"):
+                found.add(f"{kind} {fields[1]}")
+    return found
+
+
+Made = Callable[[Bus, Buffer], AbstractAsyncContextManager[Any]]
+SERVERS: dict[str, Made] = {
+    "View": lambda bus, buffer: View(bus, buffer, 0),
+    "FoxgloveServer": lambda bus, _: FoxgloveServer(bus, 0),
+    "ZenohLink": lambda bus, _: ZenohLink(bus, new_domain()),
+    "BufferServer": lambda _, buffer: BufferServer(buffer, new_domain()),
+}
+
+
+async def opened_by(made: AbstractAsyncContextManager[Any]) -> set[str]:
+    before = sockets()
+    async with made:
+        return sockets() - before
+
+
+def is_of_this_machine(place: str) -> bool:
+    return LOOPBACK.fullmatch(place.split()[1].partition(":")[0]) is not None
+
+
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells what listens in a file")
+
+
+@pytest.mark.anyio
+@on_linux
+@pytest.mark.parametrize("name", [*SERVERS, "RosbridgeLink", "RmwZenohLink"])
+async def test_by_default_only_this_machine_reaches(name: str) -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        if name == "RosbridgeLink":
+            async with rosbridge_server() as server:
+                assert await opened_by(RosbridgeLink(bus, server.url)) == set()
+        elif name == "RmwZenohLink":
+            address = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+            async with ZenohRouter(address):
+                assert await opened_by(RmwZenohLink(bus, address, 87)) == set()
+        else:
+            opened = await opened_by(SERVERS[name](bus, buffer))
+            assert opened
+            assert all(map(is_of_this_machine, opened)), opened
+
+
+@pytest.mark.anyio
+@on_linux
+async def test_dds_has_ports_open_at_all_addresses_although_it_looks_for_this_machine_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for variable in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "CYCLONEDDS_URI"):
+        monkeypatch.delenv(variable, raising=False)
+    with Bus() as bus:
+        opened = await opened_by(DdsLink(bus, 87))
+    assert {place.split()[0] for place in opened} == {"udp"}
+    assert not all(map(is_of_this_machine, opened))
+
+
+def test_a_router_listens_at_the_loopback_unless_it_is_told_otherwise() -> None:
+    for made in (ZenohRouter, router):
+        listen = inspect.signature(made).parameters["listen"].default
+        assert re.fullmatch(r"tcp/127\.0\.0\.1:\d+", listen if isinstance(listen, str) else "".join(listen))
+
+
+@pytest.mark.anyio
+async def test_a_page_that_is_opened_to_the_network_still_asks_which_site_uses_it() -> None:
+    with Bus() as bus, Buffer(bus) as buffer:
+        async with View(bus, buffer, 0, host="0.0.0.0") as view:
+            address = f"http://127.0.0.1:{view.address.rpartition(':')[2]}"
+            for host, status in (("192.0.2.7", 200), ("evil.example", 403)):
+                async with httpx.AsyncClient(trust_env=False) as client:
+                    assert (await client.get(address, headers={"Host": host})).status_code == status
