@@ -180,3 +180,28 @@ class ParticipantEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::Pa
 
     gid: Gid
     node_entities_info_seq: sequence[NodeEntitiesInfo]
+
+
+@dataclass
+class RawEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"):
+    """`ParticipantEntitiesInfo`, which stays bytes when it comes, so that one that cannot be read spoils no others."""
+
+    gid: Gid
+    node_entities_info_seq: sequence[NodeEntitiesInfo]
+    payload = b""
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
+        """The message of the bytes that have come."""
+        message = cls.__new__(cls)
+        message.payload = bytes(data)
+        return message
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
+        """An empty message, for a writer that has gone."""
+        return cls.deserialize(b"")
+
+    def read(self) -> ParticipantEntitiesInfo:
+        """What the bytes say; whatever they lead to is raised."""
+        return ParticipantEntitiesInfo.deserialize(self.payload)
