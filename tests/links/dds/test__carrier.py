@@ -33,6 +33,7 @@ from tfbus.links.dds._types import (
     NodeEntitiesInfo,
     ParticipantEntitiesInfo,
     RawClock,
+    RawEntitiesInfo,
     RawJointState,
     RawString,
     RawTFMessage,
@@ -179,6 +180,22 @@ async def test_joints_the_time_and_a_description_come_from_topics_of_their_own(d
     }
 
 
+async def test_a_burst_of_many_writers_loses_no_message(domain_number: int) -> None:
+    items: list[Received] = []
+    carrier = DdsCarrier(domain_number, CONFIG, settings_of({"send": False, "authority": "ros"}))
+    await carrier.open(items.append, SendReport(print))
+    node = Node(domain_number)
+    await until(lambda: len(items) == 1)
+    payloads = [encode([moving("map", f"f{number}", 5)]) for number in range(2_000)]
+    for payload in payloads:
+        # It keeps the interpreter lock, so the thread of the readers takes nothing meanwhile but every few ms.
+        node.say(payload)
+    await until(lambda: len(items) == 2_001)
+    node.end()
+    await carrier.close()
+    assert [item.content.payload for item in items[1:2_001]] == payloads
+
+
 class Reader:
     """A reader as the thread of the readers has it: its messages, and the writers that it knows."""
 
@@ -223,7 +240,10 @@ def test_all_messages_that_wait_are_taken_and_the_library_is_asked_once_for_each
     payloads = [b"%d" % number for number in range(250)]
     reader = Reader(*(each for payload in payloads for each in (GONE, said(payload))))
     reader.writers[1] = ("writer", "driver")
-    carrier._take(False, reader)
+    turns = 1
+    while carrier._take(False, reader):
+        turns += 1
+    assert turns > 2, "other readers have their turn"
     assert [item.content.payload for item in items] == payloads
     assert {(item.sender, item.moving) for item in items} == {("driver", True)}
     assert reader.asked == [1]
@@ -242,7 +262,8 @@ def test_without_an_authority_messages_wait_for_the_names_of_their_nodes() -> No
     assert items == []
     one, two = (SimpleNamespace(data=[17 * number] * 16) for number in (0, 1))
     node = SimpleNamespace(node_namespace="/robot/", node_name="a", writer_gid_seq=[two])
-    carrier._take_nodes(Reader(GONE, SimpleNamespace(gid=one, node_entities_info_seq=[node])))
+    info = SimpleNamespace(gid=one, node_entities_info_seq=[node])
+    carrier._take_nodes(Reader(GONE, SimpleNamespace(payload=b"", read=lambda: info)))
     assert items[0].content == RosMessage(b"first", static=False, authority="/robot/a")
 
 
@@ -281,12 +302,81 @@ def test_a_writer_is_asked_for_anew_when_the_writers_have_changed() -> None:
     assert [item.sender for item in items if isinstance(item.content, RosMessage)] == ["driver", "another"]
 
 
-def test_what_the_library_cannot_read_is_a_malformed_message_with_the_begin_of_its_error() -> None:
+def test_a_list_of_writers_that_grew_while_it_was_read_is_read_again() -> None:
     carrier, items = unopened()
-    carrier._misread(ValueError("x" * 1_000))
+
+    class Growing(Reader):
+        def get_matched_publications(self) -> list[int]:
+            if not self.asked:
+                self.asked.append(0)
+                # As the library does when another writer comes between its two calls.
+                raise IndexError("invalid index")
+            return super().get_matched_publications()
+
+    reader = Growing()
+    reader.writers[1] = ("writer", "driver")
+    again = carrier._match(0, reader)
+    assert again is not None
+    assert items == [], "nothing is told as malformed"
+    assert carrier._match(0, reader) is None
+    assert items == [Received("driver", Presence.JOINED)]
+
+
+def test_one_message_that_cannot_be_taken_keeps_no_other_from_being_taken() -> None:
+    carrier, items = unopened(authority="ros")
+    reader = Reader(said(b"first", 1), said(b"second", 2))
+    reader.writers[2] = ("writer", "driver")
+    named = reader.get_matched_publication_data
+
+    def publication(handle: int) -> Any:
+        if handle == 1:
+            raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "a stranger's name")
+        return named(handle)
+
+    reader.get_matched_publication_data = publication  # type: ignore[method-assign]
+    carrier._take(False, reader)
+    assert [(item.sender, item.content.payload) for item in items if isinstance(item.content, RosMessage)] == [
+        ("", b"first"),
+        ("driver", b"second"),
+    ]
+    reader.writers[1] = ("other", "stranger")
+    carrier._match(0, reader)
+    assert items[-1] == Received("driver", Presence.JOINED)
+
+
+def test_names_of_nodes_that_cannot_be_read_are_malformed_and_spoil_no_others() -> None:
+    carrier, items = unopened()
+    bad, large = RawEntitiesInfo.deserialize(b"\0\1\0\0" + b"\xff" * 40), RawEntitiesInfo.deserialize(bytes(2**22 + 1))
+    one: Any = Gid([1] * 16)  # type: ignore[arg-type]
+    make: Any = NodeEntitiesInfo
+    good = RawEntitiesInfo.deserialize(
+        bytes(ParticipantEntitiesInfo(one, [make("/", "a", [], [Gid([2] * 16)])]).serialize())  # type: ignore[arg-type]
+    )
+    reader = Reader(said(b"waits"))
+    reader.writers[1] = ("02" * 16, "01" * 16)
+    carrier._take(False, reader)
+    carrier._take_nodes(Reader(bad, large, good))
+    *refused, message = items
+    assert [item.content.reason for item in refused] == ["encoding", "oversized"]
+    assert message.content.authority == "/a"
+
+
+def test_as_many_messages_in_a_row_as_dds_keeps_are_told_as_an_overrun() -> None:
+    carrier, items = unopened(joint_states=print)
+    reader = Reader(*(said(b"x") for _ in range(_carrier._DEPTH)))
+    reader.topic = SimpleNamespace(name="rt/joint_states")  # type: ignore[attr-defined]
+    while carrier._take_other("joints", reader):
+        assert items
+    told = [str(item.content) for item in items if isinstance(item.content, MalformedMessageError)]
+    assert told == ["messages of /joint_states come faster than they are taken, some may be lost"]
+
+
+def test_what_keeps_messages_from_being_read_is_counted_and_not_called_malformed() -> None:
+    carrier, items = unopened()
+    carrier._failed(ValueError("x" * 1_000))
     (item,) = items
-    assert isinstance(item.content, MalformedMessageError)
-    assert item.content.reason == "encoding"
+    assert item.content.reason == "not read"
+    assert "no message" not in str(item.content)
     assert 100 < str(item.content).count("x") < 200
 
 

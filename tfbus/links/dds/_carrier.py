@@ -1,6 +1,6 @@
 """The carrier of links over DDS."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from threading import Thread
@@ -86,7 +86,8 @@ class DdsCarrier(RosCarrier):
         self._participants: BuiltinDataReader | None = None
         self._writers: dict[int, tuple[str, str]] = {}
         self._matched: dict[int, frozenset[str]] = {}
-        self._behind: dict[int, int] = {}
+        self._greetings: dict[int, Greeting] = {}
+        self._behind: dict[DataReader[Any], int] = {}
         self._present: frozenset[str] = frozenset()
         self._moving_writer: DataWriter[RawTFMessage]
         self._static_writer: DataWriter[RawTFMessage]
@@ -126,11 +127,10 @@ class DdsCarrier(RosCarrier):
             for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
                 static = number < len(self.settings.tf_static)
                 reader = self._reader(participant, topics[name], _STATICS if static else _HEARD)
-                greeting = None
                 if not static:
-                    greeting = Greeting(partial(DataReader, participant, topics[name], _SECOND))
-                    self._open.callback(greeting.close)
-                thread.watch(reader, partial(self._take, static), partial(self._match, number, greeting))
+                    self._greetings[number] = Greeting(partial(DataReader, participant, topics[name], _SECOND))
+                    self._open.callback(self._greetings[number].close)
+                thread.watch(reader, partial(self._take, static), partial(self._match, number))
             thread.start()
             self._open.callback(thread.stop)
         except DDSException as error:
@@ -189,28 +189,37 @@ class DdsCarrier(RosCarrier):
                     except Exception as error:  # noqa: BLE001 - the others are taken all the same
                         self._failed(error)
             if len(messages) < _AT_ONCE:
-                self._behind.pop(id(reader), None)
+                self._count_waiting(reader, count)
+                self._behind.pop(reader, None)
                 return False
-        self._fall_behind(reader, count)
+        self._count_waiting(reader, count)
         return True
 
-    def _fall_behind(self, reader: DataReader[Any], count: int) -> None:
+    def _count_waiting(self, reader: DataReader[Any], count: int) -> None:
         """Tell when as many messages have waited in a row as DDS keeps, for it does not tell what it overwrites."""
-        behind = self._behind.get(id(reader), 0) + count
+        behind = self._behind.get(reader, 0) + count
         if behind >= _DEPTH:
             behind = 0
             topic = reader.topic.name.removeprefix("rt")
             detail = f"messages of {topic} come faster than they are taken, some may be lost"
             self._receive(Received("", ReadingError("overrun", detail)))
-        self._behind[id(reader)] = behind
+        self._behind[reader] = behind
 
     def _find(self, reader: DataReader[RawTFMessage], handle: int) -> tuple[str, str]:
-        publication = reader.get_matched_publication_data(handle)
+        publication = self._publication(reader, handle)
         if publication is None:
-            # It has gone since.
             return "", ""
         self._writers[handle] = found = publication.key.hex, publication.participant_key.hex
         return found
+
+    def _publication(self, reader: DataReader[RawTFMessage], handle: int) -> Any:
+        """What the library tells of a writer; None if it has gone since, or the library cannot read it."""
+        try:
+            return reader.get_matched_publication_data(handle)
+        except UnicodeDecodeError as error:
+            # A stranger has given the writer such a name.
+            self._failed(error)
+            return None
 
     def _is_of_ros(self, participant: str) -> bool:
         """Whether a participant has the user data that ROS 2 gives it."""
@@ -241,14 +250,15 @@ class DdsCarrier(RosCarrier):
         other = {kind: True}
         self._pass_on(_OTHERS, RosMessage(message.payload, static=False, authority="", **other))
 
-    def _match(self, number: int, greeting: Greeting | None, reader: DataReader[RawTFMessage]) -> float | None:
+    def _match(self, number: int, reader: DataReader[RawTFMessage]) -> float | None:
         try:
             handles = reader.get_matched_publications()
         except IndexError:
             # Another writer has come between the two calls that the library makes for this.
             return RETRY
         self._writers.clear()
-        publications = list(self._publications(reader, handles))
+        found = (self._publication(reader, handle) for handle in handles)
+        publications = [each for each in found if each is not None]
         self._matched[number] = frozenset(each.participant_key.hex for each in publications)
         present = frozenset().union(*self._matched.values())
         self._publishers.keep_only(set(present))
@@ -257,18 +267,8 @@ class DdsCarrier(RosCarrier):
         for participant in sorted(self._present - present):
             self._receive(Received(participant, Presence.LEFT))
         self._present = present
+        greeting = self._greetings.get(number)
         return None if greeting is None else greeting.update(frozenset(each.key.hex for each in publications))
-
-    def _publications(self, reader: DataReader[RawTFMessage], handles: Sequence[int]) -> Iterator[Any]:
-        for handle in handles:
-            try:
-                publication = reader.get_matched_publication_data(handle)
-            except UnicodeDecodeError as error:
-                # A stranger has given the writer such a name.
-                self._failed(error)
-            else:
-                if publication is not None:
-                    yield publication
 
     def _failed(self, error: Exception) -> None:
         """Count and tell what has kept messages from being read, which is none of their faults."""
