@@ -1,3 +1,4 @@
+import struct
 from threading import Event
 from threading import enumerate as enumerate_threads
 from types import SimpleNamespace
@@ -15,11 +16,16 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.joint_messages import joint_state
 from support.processes import until
 from support.samples import moving, static
 
-from tfbus import SimulatedClock
+from tfbus import Bus, SimulatedClock
 from tfbus.links._carrier import Carrier, SendReport
+from tfbus.links._clock_follower import ClockFollower
+from tfbus.links._endpoint import Endpoint
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
@@ -359,6 +365,59 @@ def test_names_of_nodes_that_cannot_be_read_are_malformed_and_spoil_no_others() 
     *refused, message = items
     assert [item.content.reason for item in refused] == ["encoding", "oversized"]
     assert message.content.authority == "/a"
+
+
+def _check_garbage(payload: bytes) -> None:
+    """Whatever bytes come on any topic, they are handed on or refused, and what comes behind them is taken."""
+    clock = SimulatedClock()
+    with Bus(clock) as bus:
+        options: RosOptions = {"joint_states": print, "robot_description": len, "clock": clock, "authority": "ros"}
+        carrier = DdsCarrier(0, CONFIG, settings_of(options))
+        endpoint = Endpoint(bus, "dds", carrier, lambda: None, follower=ClockFollower(clock))
+        carrier._receive, carrier._report = endpoint.handle, SendReport(print)
+        endpoint.attach()
+        last = encode([moving("end", "last", 9)])
+        carrier._take_nodes(Reader(RawEntitiesInfo.deserialize(payload)))
+        for kind in ("joints", "clock", "description"):
+            carrier._take_other(kind, Reader(said(payload)))  # type: ignore[arg-type]
+        for static_frames in (True, False):
+            carrier._take(static_frames, Reader(said(payload), said(last)))
+        assert bus.statistics().frames >= 1
+        assert "not read" not in endpoint.peers.rejected
+        assert "not published" not in endpoint.peers.rejected
+
+
+_GOOD = (
+    encode([moving("map", "base", 5, 1.0), moving("base", "arm", 6)]),
+    joint_state(5, {"a": 0.5, "b": 1.5}),
+    b"\0\1\0\0" + struct.pack("<iI", 100, 5),
+    b"\0\1\0\0" + struct.pack("<I", 9) + b"<robot/>\0",
+    b"\0\1\0\0" + bytes(16) + struct.pack("<III", 1, 2, 0x2F) + struct.pack("<II", 0, 0),
+)
+_garbage = st.one_of(
+    st.binary(max_size=200),
+    st.sampled_from(_GOOD).flatmap(
+        lambda good: st.builds(
+            lambda at, bytes_, cut: (good[:at] + bytes_ + good[at + len(bytes_) :])[: len(good) - cut],
+            st.integers(0, len(good)),
+            st.binary(min_size=1, max_size=8),
+            st.integers(0, 8),
+        )
+    ),
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(_garbage)
+def test_garbage_on_any_topic_is_refused_and_what_comes_behind_it_is_taken(payload: bytes) -> None:
+    _check_garbage(payload)
+
+
+@pytest.mark.thorough
+@settings(max_examples=2_000, deadline=None)
+@given(_garbage)
+def test_much_garbage_on_any_topic_is_refused_and_what_comes_behind_it_is_taken(payload: bytes) -> None:
+    _check_garbage(payload)
 
 
 def test_as_many_messages_in_a_row_as_dds_keeps_are_told_as_an_overrun() -> None:
