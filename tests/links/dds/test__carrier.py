@@ -30,7 +30,7 @@ from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds import _carrier
-from tfbus.links.dds._carrier import _MOVING, _STATIC, _STATICS, DdsCarrier, _nodes_of
+from tfbus.links.dds._carrier import _MOVING, _STATIC, _STATICS, DdsCarrier
 from tfbus.links.dds._domains import configuration, domain
 from tfbus.links.dds._publishers import PATIENCE, Publishers
 from tfbus.links.dds._types import (
@@ -266,9 +266,7 @@ def test_without_an_authority_messages_wait_for_the_names_of_their_nodes() -> No
     reader.writers[1] = ("1" * 32, "0" * 32)
     carrier._take(False, reader)
     assert items == []
-    one, two = (SimpleNamespace(data=[17 * number] * 16) for number in (0, 1))
-    node = SimpleNamespace(node_namespace="/robot/", node_name="a", writer_gid_seq=[two])
-    info = SimpleNamespace(gid=one, node_entities_info_seq=[node])
+    info = "0" * 32, [("/robot/a", ["1" * 32])]
     carrier._take_nodes(Reader(GONE, SimpleNamespace(payload=b"", read=lambda: info)))
     assert items[0].content == RosMessage(b"first", static=False, authority="/robot/a")
 
@@ -532,10 +530,3 @@ async def test_a_domain_that_cannot_be_left_is_not_waited_for(monkeypatch: pytes
 
 async def test_a_carrier_that_never_opened_closes(domain_number: int) -> None:
     await DdsCarrier(domain_number, CONFIG, settings_of({})).close()
-
-
-def test_the_nodes_of_a_participant_are_read_from_its_info() -> None:
-    one, two = (SimpleNamespace(data=[0] * 15 + [number]) for number in (1, 2))
-    node = SimpleNamespace(node_namespace="/", node_name="a", writer_gid_seq=[two])
-    info = SimpleNamespace(gid=one, node_entities_info_seq=[node])
-    assert _nodes_of(info) == ("0" * 31 + "1", [("/a", ["0" * 31 + "2"])])

@@ -1,5 +1,6 @@
 """The carrier of links over DDS."""
 
+import struct
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -236,12 +237,12 @@ class DdsCarrier(RosCarrier):
             self._receive(Received("", MalformedMessageError("oversized", detail)))
             return
         try:
-            info = message.read()
-        except Exception as error:  # noqa: BLE001 - the library raises whatever the bytes lead to
-            detail = f"the library cannot read names of nodes: {error!r}"[:200]
+            participant, nodes = message.read()
+        except (ValueError, struct.error) as error:
+            detail = f"no names of nodes: {error!r}"[:200]
             self._receive(Received("", MalformedMessageError("encoding", detail)))
         else:
-            self._publishers.nodes(*_nodes_of(info))
+            self._publishers.nodes(participant, nodes)
 
     def _take_other(self, kind: Literal["joints", "clock", "description"], reader: DataReader[Any]) -> bool:
         return self._take_each(reader, partial(self._pass_other, kind))
@@ -276,14 +277,3 @@ class DdsCarrier(RosCarrier):
 
     def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
         self._pass_on(participant, RosMessage(payload, static, authority))
-
-
-def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:
-    """The id of a participant, and its nodes, each with its publishers."""
-    return bytes(info.gid.data).hex(), [
-        (
-            f"{node.node_namespace.rstrip('/')}/{node.node_name}",
-            [bytes(publisher.data).hex() for publisher in node.writer_gid_seq],
-        )
-        for node in info.node_entities_info_seq
-    ]
