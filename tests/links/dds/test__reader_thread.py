@@ -136,8 +136,8 @@ def test_only_what_is_served_wakes_the_thread(domain_number: int) -> None:
         topic = Topic(participant, "rt/text", RawString)
         readers: list[DataReader[Any]] = [DataReader(participant, topic) for _ in range(2)]
         thread = ReaderThread(participant, print)
-        thread.watch(readers[0], print)
-        thread.watch(readers[1], print, print)
+        thread.watch(readers[0], bool)
+        thread.watch(readers[1], bool, print)
         thread.start()
         masks = [reader.get_status_mask() for reader in readers]
         thread.stop()
