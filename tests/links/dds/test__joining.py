@@ -19,7 +19,17 @@ from support.both_sides import node
 from tfbus.links.dds import _joining
 from tfbus.links.dds._carrier import _STATICS
 from tfbus.links.dds._domains import configuration, domain
-from tfbus.links.dds._joining import ANSWER_TIME, QUIET_TIME, WRITERS_TIME, delete, is_of_ros, join, read
+from tfbus.links.dds._joining import (
+    ANSWER_TIME,
+    GREETING_TIME,
+    QUIET_TIME,
+    WRITERS_TIME,
+    Greeting,
+    delete,
+    is_of_ros,
+    join,
+    read,
+)
 from tfbus.links.dds._types import RawTFMessage
 
 CONFIG = configuration("localhost", (), None)
@@ -117,3 +127,39 @@ def test_whoever_joins_knows_the_writers_of_ros_at_once(domain_number: int, monk
         reader: DataReader[Any] = DataReader(participant, Topic(participant, "rt/tf_static", RawTFMessage), _STATICS)
         stack.callback(delete, reader)
         assert len(reader.get_matched_publications()) == 1
+
+
+def test_new_writers_of_other_vendors_greet_a_second_reader_that_stays_a_while() -> None:
+    now = 0.0
+    readers: list[list[str]] = []
+
+    def make() -> Any:
+        events = ["made"]
+        readers.append(events)
+        return SimpleNamespace(__del__=lambda: events.append("deleted"))
+
+    greeting = Greeting(make, lambda: now)
+    cyclone, fast, late = "0110" + "a" * 28, "010f" + "b" * 28, "010f" + "c" * 28
+    assert greeting.update(frozenset({cyclone})) is None
+    assert greeting.update(frozenset({cyclone, fast})) == GREETING_TIME
+    now = 0.1
+    # It may have come too late for the reader that is there.
+    assert greeting.update(frozenset({cyclone, fast, late})) == pytest.approx(GREETING_TIME - 0.1)
+    assert readers == [["made"]]
+    now = GREETING_TIME
+    assert greeting.update(frozenset({cyclone, fast, late})) == GREETING_TIME
+    assert readers == [["made", "deleted"], ["made"]]
+    now = 2 * GREETING_TIME
+    assert greeting.update(frozenset({cyclone, late})) is None
+    greeting.update(frozenset({fast}))
+    greeting.close()
+    greeting.close()
+    assert readers == [["made", "deleted"]] * 3
+
+
+def test_a_participant_whose_name_is_no_text_keeps_nobody_from_joining() -> None:
+    def fail(**_: object) -> Any:
+        raise UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")
+
+    reader: Any = SimpleNamespace(read=fail)
+    assert read(reader) == []

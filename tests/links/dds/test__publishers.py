@@ -2,7 +2,7 @@ import pytest
 from support.wires import size_of
 
 from tfbus.links.dds import _publishers
-from tfbus.links.dds._publishers import MOST_WAITING, NODE_PATIENCE, PATIENCE, Publishers
+from tfbus.links.dds._publishers import MOST_BYTES, MOST_WAITING, NODE_PATIENCE, PATIENCE, Publishers
 
 
 class Hall:
@@ -76,6 +76,18 @@ def test_so_many_messages_wait_and_then_none_does() -> None:
     assert len(hall.delivered) == MOST_WAITING + 1
 
 
+def test_so_many_bytes_of_all_publishers_wait_and_then_no_more() -> None:
+    hall = Hall()
+    large = bytes(MOST_BYTES // 4)
+    for number in range(10):
+        hall.say(f"w{number}", large)
+    assert 10 - len(hall.delivered) == 4
+    hall.publishers.nodes("p", [("/a", [f"w{number}" for number in range(4)])])
+    assert [name for _, name, _, _ in hall.delivered[6:]] == ["/a"] * 4
+    hall.say("w20", large)
+    assert len(hall.delivered) == 10, "there is room again"
+
+
 def test_publishers_that_have_gone_are_forgotten_and_what_waits_is_delivered() -> None:
     hall = Hall()
     hall.say("w1")
@@ -126,6 +138,19 @@ def test_the_names_of_so_many_participants_are_remembered(monkeypatch: pytest.Mo
         hall.publishers.message(f"{name}1", name, b"x", False)
     names = {participant: node for participant, node, _, _ in hall.delivered}
     assert names == {"a": "a", "b": "/b", "c": "/c", "d": "/d"}
+
+
+def test_one_participant_may_name_as_many_publishers_as_all_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 3)
+    hall = Hall()
+    for _ in range(2):
+        hall.publishers.nodes("p", [("/a", ["w1", "w2"])])
+        hall.publishers.nodes("q", [("/b", [f"w{number}" for number in range(4)])])
+    hall.say("w1")
+    assert hall.delivered == [], "none is remembered"
+    hall.publishers.nodes("p", [("/a", ["w1", "w2"])])
+    hall.say("w2")
+    assert hall.delivered == [("p", "/a", b"x", False)] * 2
 
 
 @pytest.mark.thorough

@@ -15,11 +15,11 @@ from cyclonedds.core import DDSStatus
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from support.both_sides import node
 
-from tfbus.links.dds import _reader_thread
 from tfbus.links.dds._domains import configuration, domain
 from tfbus.links.dds._reader_thread import ReaderThread
 from tfbus.links.dds._types import RawString
@@ -34,23 +34,24 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(
     domain_number: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told: list[Any] = []
-    serve, rounds = _reader_thread._serve, list[None]()
+    serve, rounds = ReaderThread._serve, list[None]()
 
-    def count(watched: Any) -> None:
+    def count(thread: ReaderThread, watched: Any) -> None:
         rounds.append(None)
-        serve(watched)
+        serve(thread, watched)
 
-    monkeypatch.setattr(_reader_thread, "_serve", count)
+    monkeypatch.setattr(ReaderThread, "_serve", count)
     errors: list[str] = []
     woken = Event()
 
-    def take(reader: DataReader[Any]) -> None:
+    def take(reader: DataReader[Any]) -> bool:
         # A sample without data tells of a writer that has gone.
         new = [decode_text(each.payload) for each in reader.take(N=10) if not isinstance(each, InvalidSample)]
         told.extend(new)
         woken.set()
         if "bad" in new:
             raise ValueError(*new)
+        return False
 
     def wait_for(count: int) -> None:
         while len(told) + len(errors) < count:
@@ -93,6 +94,41 @@ def test_data_and_new_writers_are_told_in_the_thread_and_no_error_ends_it(
     assert errors == ["bad"]
 
 
+def test_data_are_taken_though_the_writers_cannot_be_read_and_these_are_read_again(domain_number: int) -> None:
+    taken, errors, matched = list[str](), list[str](), list[int]()
+    done = Event()
+
+    def match(reader: DataReader[Any]) -> float | None:
+        matched.append(len(reader.get_matched_publications()))
+        if len(matched) < 3:
+            raise IndexError("invalid index")
+        done.set()
+        return None
+
+    def take(reader: DataReader[Any]) -> bool:
+        taken.extend(decode_text(each.payload) for each in reader.take(N=1) if not isinstance(each, InvalidSample))
+        return len(taken) < 3
+
+    with domain(domain_number, CONFIG), ExitStack() as stack:
+        participant = DomainParticipant(domain_number)
+        stack.callback(participant.__del__)
+        topic = Topic(participant, "rt/text", RawString)
+        reader: DataReader[Any] = DataReader(participant, topic, Qos(Policy.History.KeepAll))
+        writer = DataWriter(participant, topic, Qos(Policy.History.KeepAll))
+        thread = ReaderThread(participant, lambda error: errors.append(str(error)))
+        thread.watch(reader, take, match)
+        for text in "abc":
+            writer.write(RawString(text))
+        thread.start()
+        assert done.wait(PATIENCE)
+        thread.stop()
+        for entity in (writer, reader):
+            entity.__del__()
+    # One event told of all three, and nothing came after it.
+    assert taken == ["a", "b", "c"]
+    assert (matched, errors) == ([1, 1, 1], ["invalid index"] * 2)
+
+
 def test_only_what_is_served_wakes_the_thread(domain_number: int) -> None:
     with domain(domain_number, CONFIG), ExitStack() as stack:
         participant = DomainParticipant(domain_number)
@@ -100,8 +136,8 @@ def test_only_what_is_served_wakes_the_thread(domain_number: int) -> None:
         topic = Topic(participant, "rt/text", RawString)
         readers: list[DataReader[Any]] = [DataReader(participant, topic) for _ in range(2)]
         thread = ReaderThread(participant, print)
-        thread.watch(readers[0], print)
-        thread.watch(readers[1], print, print)
+        thread.watch(readers[0], bool)
+        thread.watch(readers[1], bool, print)
         thread.start()
         masks = [reader.get_status_mask() for reader in readers]
         thread.stop()

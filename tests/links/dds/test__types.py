@@ -7,8 +7,12 @@ from support.samples import moving, static
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
 from tfbus.links.dds._types import (
+    Gid,
     Header,
+    NodeEntitiesInfo,
+    ParticipantEntitiesInfo,
     Quaternion,
+    RawEntitiesInfo,
     RawJointState,
     RawTFMessage,
     Time,
@@ -49,3 +53,17 @@ def test_positions_of_joints_come_as_the_bytes_that_rosbags_reads() -> None:
     assert (read.name, read.position) == (["a", "b"], [0.5, 1.5])
     assert RawJointState.deserialize(payload).payload == payload
     assert RawJointState.deserialize_key(b"").payload == b""
+
+
+def test_the_nodes_of_a_participant_are_read_as_the_library_writes_them() -> None:
+    gids: list[Any] = [Gid([number] * 16) for number in range(5)]  # type: ignore[arg-type]
+    make: Any = NodeEntitiesInfo
+    nodes: Any = [make("/robot", "driver", gids[1:2], gids[2:4]), make("/", "a", [], gids[4:])]
+    written = bytes(ParticipantEntitiesInfo(gids[0], nodes).serialize())
+    own, second, third, fourth = (f"{number:02d}" * 16 for number in (0, 2, 3, 4))
+    assert RawEntitiesInfo.deserialize(written).read() == (own, [("/robot/driver", [second, third]), ("/a", [fourth])])
+
+
+def test_a_false_count_of_publishers_ends_at_once() -> None:
+    with pytest.raises(ValueError, match="4294967295 entries in 4 bytes"):
+        RawEntitiesInfo.deserialize(b"\0\1\0\0" + bytes(16) + b"\xff" * 4 + bytes(4)).read()

@@ -1,6 +1,7 @@
 """The carrier of links over DDS."""
 
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from threading import Thread
@@ -22,31 +23,47 @@ from tfbus._aio.threads import wait_for_all
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.dds._domains import domain
-from tfbus.links.dds._joining import delete, is_of_ros, join, read
+from tfbus.links.dds._joining import Greeting, delete, is_of_ros, join, read
 from tfbus.links.dds._publishers import PATIENCE, Publishers
-from tfbus.links.dds._reader_thread import ReaderThread
-from tfbus.links.dds._types import ParticipantEntitiesInfo, RawClock, RawJointState, RawString, RawTFMessage
-from tfbus.links.ros._carrier import RosCarrier, RosMessage
+from tfbus.links.dds._reader_thread import RETRY, ReaderThread
+from tfbus.links.dds._types import RawClock, RawEntitiesInfo, RawJointState, RawString, RawTFMessage
+from tfbus.links.ros._carrier import MAX_SIZE, RosCarrier, RosMessage
 from tfbus.links.ros.settings import RosSettings
 from tfbus.tf_message import MalformedMessageError, encode
 
 _CLOSING_TIME = 1.0
-_DEPTH = 100
+_DEPTH = 5_000
+"""So many messages wait in DDS for their reader. The topics have no keys, so all writers of a topic share them."""
+_KEPT = 100
+"""So many of its own messages a writer repeats when they were lost, as tf2's broadcasters do."""
 _OTHERS = "other topics"
 """The authority of joint positions and of the time."""
-_AT_ONCE = 100
+_AT_ONCE = 16
+_BYTES_AT_ONCE = 2**20
+_BATCHES = 10
+"""So many of these, within so many bytes, are taken of a reader before others have their turn."""
 # A writer never waits for a reader that is frozen: the event loop would.
 _RELIABLE = (
     Policy.Reliability.Reliable(duration(seconds=0)),
     Policy.IgnoreLocal.Participant,
     Policy.DataRepresentation(use_cdrv0_representation=True),
 )
-_MOVING = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH))
+_MOVING = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(_KEPT))
+_HEARD = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH))
+# A second reader only listens, and nobody takes what comes.
+_SECOND = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(1))
 _STATIC = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
 # Each publisher has its own last message.
 _STATICS = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(_DEPTH))
 # Drivers of joints and simulations may be best effort.
 _ANY = Qos(Policy.Reliability.BestEffort, Policy.IgnoreLocal.Participant, Policy.History.KeepLast(_DEPTH))
+
+
+class ReadingError(MalformedMessageError):
+    """Something that has kept messages from being read; it is counted as they are, but nothing in them is malformed."""
+
+    def __str__(self) -> str:
+        return self.detail
 
 
 class DdsCarrier(RosCarrier):
@@ -70,6 +87,8 @@ class DdsCarrier(RosCarrier):
         self._participants: BuiltinDataReader | None = None
         self._writers: dict[int, tuple[str, str]] = {}
         self._matched: dict[int, frozenset[str]] = {}
+        self._greetings: dict[int, Greeting] = {}
+        self._behind: dict[DataReader[Any], int] = {}
         self._present: frozenset[str] = frozenset()
         self._moving_writer: DataWriter[RawTFMessage]
         self._static_writer: DataWriter[RawTFMessage]
@@ -90,11 +109,11 @@ class DdsCarrier(RosCarrier):
                 self._static_writer = DataWriter(participant, topics[self.settings.tf_static[0]], _STATIC)
                 for writer in (self._moving_writer, self._static_writer):
                     self._open.callback(delete, writer)
-            thread = ReaderThread(participant, self._misread)
+            thread = ReaderThread(participant, self._failed)
             if self.settings.authority is None:
                 self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
                 self._open.callback(delete, self._participants)
-                info = Topic(participant, "ros_discovery_info", ParticipantEntitiesInfo)
+                info = Topic(participant, "ros_discovery_info", RawEntitiesInfo)
                 thread.watch(self._reader(participant, info, _STATICS), self._take_nodes)
             for name in self.settings.joint_topic:
                 joints = Topic(participant, f"rt{name}", RawJointState)
@@ -108,7 +127,10 @@ class DdsCarrier(RosCarrier):
                 thread.watch(self._reader(participant, text, _STATICS), partial(self._take_other, "description"))
             for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
                 static = number < len(self.settings.tf_static)
-                reader = self._reader(participant, topics[name], _STATICS if static else _MOVING)
+                reader = self._reader(participant, topics[name], _STATICS if static else _HEARD)
+                if not static:
+                    self._greetings[number] = Greeting(partial(DataReader, participant, topics[name], _SECOND))
+                    self._open.callback(self._greetings[number].close)
                 thread.watch(reader, partial(self._take, static), partial(self._match, number))
             thread.start()
             self._open.callback(thread.stop)
@@ -142,29 +164,63 @@ class DdsCarrier(RosCarrier):
 
     # What follows is called in the thread of the readers.
 
-    def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> None:
-        while True:
+    def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> bool:
+        return self._take_each(reader, partial(self._take_transforms, static, reader))
+
+    def _take_transforms(self, static: bool, reader: DataReader[RawTFMessage], message: Any) -> None:
+        handle = message.sample_info.publication_handle
+        publisher, participant = self._writers.get(handle) or self._find(reader, handle)
+        if self.settings.authority is None:
+            self._publishers.message(publisher, participant, message.payload, static)
+        else:
+            self._deliver(participant, "", message.payload, static)
+
+    def _take_each(self, reader: DataReader[Any], take: Callable[[Any], object]) -> bool:
+        """Call a function with each of some messages that wait; returns whether more may wait."""
+        count = size = 0
+        while count < _BATCHES * _AT_ONCE and size < _BYTES_AT_ONCE:
             messages: list[Any] = reader.take(N=_AT_ONCE)
+            count += len(messages)
             for message in messages:
-                if isinstance(message, InvalidSample):
-                    # It tells of a writer that has gone.
-                    continue
-                handle = message.sample_info.publication_handle
-                publisher, participant = self._writers.get(handle) or self._find(reader, handle)
-                if self.settings.authority is None:
-                    self._publishers.message(publisher, participant, message.payload, static)
-                else:
-                    self._deliver(participant, "", message.payload, static)
+                # One without data tells of a writer that has gone.
+                if not isinstance(message, InvalidSample):
+                    size += len(message.payload)
+                    try:
+                        take(message)
+                    except Exception as error:  # noqa: BLE001 - the others are taken all the same
+                        self._failed(error)
             if len(messages) < _AT_ONCE:
-                return
+                self._count_waiting(reader, count)
+                self._behind.pop(reader, None)
+                return False
+        self._count_waiting(reader, count)
+        return True
+
+    def _count_waiting(self, reader: DataReader[Any], count: int) -> None:
+        """Tell when as many messages have waited in a row as DDS keeps, for it does not tell what it overwrites."""
+        behind = self._behind.get(reader, 0) + count
+        if behind >= _DEPTH:
+            behind = 0
+            topic = reader.topic.name.removeprefix("rt")
+            detail = f"messages of {topic} come faster than they are taken, some may be lost"
+            self._receive(Received("", ReadingError("overrun", detail)))
+        self._behind[reader] = behind
 
     def _find(self, reader: DataReader[RawTFMessage], handle: int) -> tuple[str, str]:
-        publication = reader.get_matched_publication_data(handle)
+        publication = self._publication(reader, handle)
         if publication is None:
-            # It has gone since.
             return "", ""
         self._writers[handle] = found = publication.key.hex, publication.participant_key.hex
         return found
+
+    def _publication(self, reader: DataReader[RawTFMessage], handle: int) -> Any:
+        """What the library tells of a writer; None if it has gone since, or the library cannot read it."""
+        try:
+            return reader.get_matched_publication_data(handle)
+        except UnicodeDecodeError as error:
+            # A stranger has given the writer such a name.
+            self._failed(error)
+            return None
 
     def _is_of_ros(self, participant: str) -> bool:
         """Whether a participant has the user data that ROS 2 gives it."""
@@ -172,23 +228,39 @@ class DdsCarrier(RosCarrier):
             return False
         return any(is_of_ros(each) for each in read(self._participants) if each.key.hex == participant)
 
-    def _take_nodes(self, reader: DataReader[ParticipantEntitiesInfo]) -> None:
-        messages: list[Any] = reader.take(N=_AT_ONCE)
-        for message in messages:
-            if not isinstance(message, InvalidSample):
-                self._publishers.nodes(*_nodes_of(message))
+    def _take_nodes(self, reader: DataReader[RawEntitiesInfo]) -> bool:
+        return self._take_each(reader, self._take_node)
 
-    def _take_other(self, kind: Literal["joints", "clock", "description"], reader: DataReader[Any]) -> None:
-        messages: list[Any] = reader.take(N=_AT_ONCE)
-        for message in messages:
-            if not isinstance(message, InvalidSample):
-                other = {kind: True}
-                self._pass_on(_OTHERS, RosMessage(message.payload, static=False, authority="", **other))
+    def _take_node(self, message: RawEntitiesInfo) -> None:
+        if len(message.payload) > MAX_SIZE:
+            detail = f"{len(message.payload)} bytes of names of nodes, more than {MAX_SIZE}"
+            self._receive(Received("", MalformedMessageError("oversized", detail)))
+            return
+        try:
+            participant, nodes = message.read()
+        except (ValueError, struct.error) as error:
+            detail = f"no names of nodes: {error!r}"[:200]
+            self._receive(Received("", MalformedMessageError("encoding", detail)))
+        else:
+            self._publishers.nodes(participant, nodes)
 
-    def _match(self, number: int, reader: DataReader[RawTFMessage]) -> None:
+    def _take_other(self, kind: Literal["joints", "clock", "description"], reader: DataReader[Any]) -> bool:
+        return self._take_each(reader, partial(self._pass_other, kind))
+
+    def _pass_other(self, kind: Literal["joints", "clock", "description"], message: Any) -> None:
+        other = {kind: True}
+        self._pass_on(_OTHERS, RosMessage(message.payload, static=False, authority="", **other))
+
+    def _match(self, number: int, reader: DataReader[RawTFMessage]) -> float | None:
+        try:
+            handles = reader.get_matched_publications()
+        except IndexError:
+            # Another writer has come between the two calls that the library makes for this.
+            return RETRY
         self._writers.clear()
-        publications = map(reader.get_matched_publication_data, reader.get_matched_publications())
-        self._matched[number] = frozenset(each.participant_key.hex for each in publications if each is not None)
+        found = (self._publication(reader, handle) for handle in handles)
+        publications = [each for each in found if each is not None]
+        self._matched[number] = frozenset(each.participant_key.hex for each in publications)
         present = frozenset().union(*self._matched.values())
         self._publishers.keep_only(set(present))
         for participant in sorted(present - self._present):
@@ -196,21 +268,12 @@ class DdsCarrier(RosCarrier):
         for participant in sorted(self._present - present):
             self._receive(Received(participant, Presence.LEFT))
         self._present = present
+        greeting = self._greetings.get(number)
+        return None if greeting is None else greeting.update(frozenset(each.key.hex for each in publications))
 
-    def _misread(self, error: Exception) -> None:
-        """Count a message that the library itself could not read."""
-        self._receive(Received("", MalformedMessageError("encoding", f"the library cannot read it: {error!r}"[:200])))
+    def _failed(self, error: Exception) -> None:
+        """Count and tell what has kept messages from being read, which is none of their faults."""
+        self._receive(Received("", ReadingError("not read", f"DDS cannot be read: {error!r}"[:200])))
 
     def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
         self._pass_on(participant, RosMessage(payload, static, authority))
-
-
-def _nodes_of(info: Any) -> tuple[str, list[tuple[str, list[str]]]]:
-    """The id of a participant, and its nodes, each with its publishers."""
-    return bytes(info.gid.data).hex(), [
-        (
-            f"{node.node_namespace.rstrip('/')}/{node.node_name}",
-            [bytes(publisher.data).hex() for publisher in node.writer_gid_seq],
-        )
-        for node in info.node_entities_info_seq
-    ]

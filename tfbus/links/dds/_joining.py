@@ -4,6 +4,8 @@ As soon as a participant of Fast DDS hears of another one, it tells of its write
 it sends what is latched. Cyclone DDS drops both while it does not know their sender, and Fast DDS repeats them only
 with its next heartbeat, after 3 s. So a participant without readers makes itself heard first. When those who answer are
 known, a second one joins, to which all is told once more; and it gets its readers when it knows the writers.
+
+The writers of a program that comes later meet readers which are there already: `Greeting` is for these.
 """
 
 from collections.abc import Callable
@@ -16,6 +18,7 @@ from cyclonedds.core import Entity
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.internal import InvalidSample
 from cyclonedds.qos import Policy
+from cyclonedds.sub import DataReader
 
 ANSWER_TIME = 0.06
 """s; whoever has not answered by then is met later."""
@@ -23,9 +26,13 @@ QUIET_TIME = 0.02
 """s; if nobody else answers for so long, all have."""
 WRITERS_TIME = 1.5
 """s; the longest that the writers of those are waited for."""
+GREETING_TIME = 0.5
+"""s; for so long there is a second reader, which new writers greet."""
 _PERIOD = 0.002
 _MOST = 10_000
 _OF_ROS = b"enclave="
+_CYCLONE = "0110"
+"""The ids of whatever Cyclone DDS has made begin so; it greets until it is understood."""
 
 
 def join(number: int, stack: ExitStack) -> DomainParticipant:
@@ -49,8 +56,12 @@ def join(number: int, stack: ExitStack) -> DomainParticipant:
 
 
 def read(reader: BuiltinDataReader) -> list[Any]:
-    """All that the library tells of, such as participants."""
-    found: list[Any] = reader.read(N=_MOST)
+    """All that the library tells of, such as participants; nothing while a name among them is no text."""
+    try:
+        found: list[Any] = reader.read(N=_MOST)
+    except UnicodeDecodeError:
+        # A stranger has called a participant so. The library reads all of them or none.
+        return []
     return [each for each in found if not isinstance(each, InvalidSample)]
 
 
@@ -58,6 +69,50 @@ def is_of_ros(participant: Any) -> bool:
     """Whether a participant, as the library tells of it, has the user data that ROS 2 gives it."""
     data: bytes = participant.qos[Policy.Userdata].data if Policy.Userdata in participant.qos else b""
     return data.startswith(_OF_ROS)
+
+
+class Greeting:
+    """Has the first message of a new writer come whole, however large it is.
+
+    A writer greets a new reader: its heartbeat tells where its messages begin. Fast DDS does so once, as soon as it has
+    heard of the reader, and Cyclone DDS often does not know the writer by then. Then the next heartbeat counts as the
+    greeting, and what came before it is dropped unless it is whole; Fast DDS sends that heartbeat between the parts of
+    the first large message. A second reader has the writer greet once more, and that counts for all readers of the
+    participant.
+
+    Parameters
+    ----------
+    make : callable
+        Makes a second reader of the same topic and quality.
+    now : callable
+        Returns a monotonic time in s.
+    """
+
+    def __init__(self, make: Callable[[], DataReader[Any]], now: Callable[[], float] = monotonic) -> None:
+        self._make = make
+        self._now = now
+        self._met: frozenset[str] = frozenset()
+        self._wanted = False
+        self._second: DataReader[Any] | None = None
+        self._until = 0.0
+
+    def update(self, writers: frozenset[str]) -> float | None:
+        """Take the ids of all writers that there are; returns after how many seconds to call this again, if at all."""
+        self._wanted |= any(not writer.startswith(_CYCLONE) for writer in writers - self._met)
+        self._met = writers
+        if self._second is not None and self._now() >= self._until:
+            self.close()
+        if self._second is None and self._wanted:
+            self._second = self._make()
+            self._wanted = False
+            self._until = self._now() + GREETING_TIME
+        return None if self._second is None else max(0.0, self._until - self._now())
+
+    def close(self) -> None:
+        """Delete the second reader, if there is one."""
+        if self._second is not None:
+            delete(self._second)
+            self._second = None
 
 
 def delete(entity: Entity) -> None:

@@ -10,6 +10,8 @@ PATIENCE = 0.5
 NODE_PATIENCE = 5.0
 """s; and so long if its participant is known to be of ROS 2: what was lost while two meet is sent again after 3."""
 MOST_WAITING = 1_000
+MOST_BYTES = 2**24
+"""Bytes of all messages that wait; beyond that, none of their publisher does."""
 _MOST_PUBLISHERS = 10_000
 
 Deliver = Callable[[str, str, bytes, bool], object]
@@ -50,6 +52,8 @@ class Publishers:
         self._lock = Lock()
         self._publishers: dict[str, _Publisher] = {}
         self._names: dict[str, dict[str, str]] = {}
+        self._named = 0
+        self._bytes = 0
 
     def message(self, publisher: str, participant: str, payload: bytes, static: bool) -> None:
         """Take a message of a publisher."""
@@ -62,18 +66,19 @@ class Publishers:
                 known = self._publishers[publisher] = _Publisher(participant, self._now() + patience)
                 known.name = self._names.get(participant, {}).get(publisher, "")
             known.waiting.append((payload, static))
-            if known.name or len(known.waiting) > MOST_WAITING:
+            self._bytes += len(payload)
+            if known.name or len(known.waiting) > MOST_WAITING or self._bytes > MOST_BYTES:
                 self._flush(known)
 
     def nodes(self, participant: str, names: Iterable[tuple[str, Iterable[str]]]) -> None:
         """Take the names of all nodes of a participant, each with its publishers."""
         with self._lock:
             known = {publisher: name for name, publishers in names for publisher in publishers}
-            self._names.pop(participant, None)
+            self._named += len(known) - len(self._names.pop(participant, ()))
             if known:
                 self._names[participant] = known
-            if len(self._names) > _MOST_PUBLISHERS:
-                del self._names[next(iter(self._names))]
+            while self._named > _MOST_PUBLISHERS:
+                self._named -= len(self._names.pop(next(iter(self._names))))
             for id_, name in known.items():
                 publisher = self._publishers.get(id_)
                 if publisher is not None and publisher.waiting:
@@ -96,5 +101,6 @@ class Publishers:
     def _flush(self, publisher: _Publisher) -> None:
         publisher.name = publisher.name or publisher.participant
         waiting, publisher.waiting = publisher.waiting, []
+        self._bytes -= sum(len(payload) for payload, _ in waiting)
         for payload, static in waiting:
             self._deliver(publisher.participant, publisher.name, payload, static)

@@ -7,7 +7,9 @@ one process to one domain, and a third program, would sooner or later wait for e
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 from threading import Thread
+from time import monotonic, sleep
 from typing import Any
 
 from cyclonedds.core import DDSStatus, GuardCondition, WaitSet
@@ -18,17 +20,26 @@ from cyclonedds.util import duration
 from tfbus.links.dds._joining import delete
 
 _FOR_EVER = duration(infinite=True)
+RETRY = 0.05
+"""s; after so long, a function that has raised is called again."""
+
+Take = Callable[[DataReader[Any]], bool]
+Match = Callable[[DataReader[Any]], float | None]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Watched:
     reader: DataReader[Any]
-    take: Callable[[DataReader[Any]], object]
-    match: Callable[[DataReader[Any]], object] | None
+    take: Take
+    match: Match | None
+    has_data: bool = False
+    match_at: float = inf
 
 
 class ReaderThread:
     """Waits for the readers of a participant, and calls functions, in a thread of its own.
+
+    Nothing that a function raises ends the thread, or keeps another function from being called.
 
     Parameters
     ----------
@@ -45,13 +56,12 @@ class ReaderThread:
         self._waiting.attach(self._stopped)
         self._thread = Thread(target=self._run, name="tfbus dds", daemon=True)
 
-    def watch(
-        self,
-        reader: DataReader[Any],
-        take: Callable[[DataReader[Any]], object],
-        match: Callable[[DataReader[Any]], object] | None = None,
-    ) -> None:
-        """Call `take` when a reader has data, and `match` when its writers have changed; before `start`."""
+    def watch(self, reader: DataReader[Any], take: Take, match: Match | None = None) -> None:
+        """Call `take` when a reader has data, and `match` when its writers have changed; before `start`.
+
+        `take` takes some messages, and returns whether more of them wait: other readers have their turn first. `match`
+        may return after how many seconds it is to be called again; one that has raised is called again in any case.
+        """
         matched = 0 if match is None else DDSStatus.SubscriptionMatched
         reader.set_status_mask(DDSStatus.DataAvailable | matched)
         self._waiting.attach(reader)
@@ -73,20 +83,40 @@ class ReaderThread:
 
     def _run(self) -> None:
         while True:
-            self._waiting.wait(_FOR_EVER)
-            if self._stopped.read():
-                return
+            try:
+                self._waiting.wait(self._timeout())
+                if self._stopped.read():
+                    return
+            except Exception as error:  # noqa: BLE001 - the library may fail once
+                self._failed(error)
+                sleep(RETRY)
             for watched in self._watched:
-                try:
-                    _serve(watched)
-                except Exception as error:  # noqa: BLE001 - nothing that others send may end the thread
-                    self._failed(error)
+                self._serve(watched)
 
+    def _timeout(self) -> int:
+        if any(watched.has_data for watched in self._watched):
+            return 0
+        due = min((watched.match_at for watched in self._watched), default=inf)
+        return _FOR_EVER if due == inf else duration(seconds=max(0.0, due - monotonic()))
 
-def _serve(watched: _Watched) -> None:
-    # Before the data are taken: what comes later is told again.
-    told = watched.reader.take_status()
-    if watched.match is not None and told & DDSStatus.SubscriptionMatched:
-        watched.match(watched.reader)
-    if told & DDSStatus.DataAvailable:
-        watched.take(watched.reader)
+    def _serve(self, watched: _Watched) -> None:
+        try:
+            # Before the data are taken: what comes later is told again.
+            told = watched.reader.take_status()
+        except Exception as error:  # noqa: BLE001 - then it is told the next time
+            self._failed(error)
+            told = 0
+        watched.has_data |= bool(told & DDSStatus.DataAvailable)
+        if watched.match is not None and (told & DDSStatus.SubscriptionMatched or monotonic() >= watched.match_at):
+            watched.match_at = monotonic() + RETRY
+            try:
+                again = watched.match(watched.reader)
+                watched.match_at = inf if again is None else monotonic() + again
+            except Exception as error:  # noqa: BLE001 - it is called again, and what has come is taken all the same
+                self._failed(error)
+        if watched.has_data:
+            watched.has_data = False
+            try:
+                watched.has_data = watched.take(watched.reader)
+            except Exception as error:  # noqa: BLE001 - nothing that others send may end the thread
+                self._failed(error)

@@ -4,11 +4,16 @@ What links send and hear stays bytes: `tfbus.tf_message` reads and writes them m
 What is declared here is what DDS tells others of the type.
 """
 
+import struct
 from dataclasses import dataclass
 from typing import Any, Self
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, bounded_str, float64, int32, sequence, uint8, uint32
+
+_GID = 16
+_LEAST_NODE = 16
+"""Bytes of four lengths."""
 
 
 @dataclass
@@ -180,3 +185,60 @@ class ParticipantEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::Pa
 
     gid: Gid
     node_entities_info_seq: sequence[NodeEntitiesInfo]
+
+
+@dataclass
+class RawEntitiesInfo(IdlStruct, typename="rmw_dds_common::msg::dds_::ParticipantEntitiesInfo_"):
+    """`ParticipantEntitiesInfo`, which stays bytes when it comes, so that one that cannot be read spoils no others."""
+
+    gid: Gid
+    node_entities_info_seq: sequence[NodeEntitiesInfo]
+    payload = b""
+
+    @classmethod
+    def deserialize(cls, data: bytes, *_: Any, **__: Any) -> Self:
+        """The message of the bytes that have come."""
+        message = cls.__new__(cls)
+        message.payload = bytes(data)
+        return message
+
+    @classmethod
+    def deserialize_key(cls, data: bytes, *_: Any, **__: Any) -> Self:  # noqa: ARG003 - the type has no key
+        """An empty message, for a writer that has gone."""
+        return cls.deserialize(b"")
+
+    def read(self) -> tuple[str, list[tuple[str, list[str]]]]:
+        """The id of the participant, and its nodes, each with its publishers.
+
+        The library itself would believe a false count of four billion publishers.
+
+        Raises
+        ------
+        ValueError, struct.error
+            If the bytes are no such message.
+        """
+        body = self.payload[4:]
+        number = struct.Struct(">I" if self.payload[1:2] == b"\0" else "<I")
+        at = _GID
+        own = body[:at].hex()
+
+        def count(size: int) -> int:
+            nonlocal at
+            at += -at % 4
+            (found,) = number.unpack_from(body, at)
+            at += 4
+            if found * size > len(body) - at:
+                raise ValueError(f"{found} entries in {len(body) - at} bytes")
+            return int(found)
+
+        def take(size: int) -> bytes:
+            nonlocal at
+            at += size
+            return body[at - size : at]
+
+        nodes: list[tuple[str, list[str]]] = []
+        for _ in range(count(_LEAST_NODE)):
+            namespace, name = (take(count(1)).rstrip(b"\0").decode() for _ in range(2))
+            take(_GID * count(_GID))
+            nodes.append((f"{namespace.rstrip('/')}/{name}", [take(_GID).hex() for _ in range(count(_GID))]))
+        return own, nodes
