@@ -203,6 +203,7 @@ MUTABLE = {
     "links._inbox.ReceivedMessage",
     "links._outbox.Turn",
     "links.dds._publishers._Publisher",
+    "links.dds._reader_thread._Watched",
     "links.zenoh._dialing._Lost",
     "links.zenoh._hearing._Check",
     "links.zenoh._unmet._Look",

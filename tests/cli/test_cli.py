@@ -77,9 +77,9 @@ def test_the_help_of_a_command_has_an_example_and_every_option(
         ("compare", ["0.01", "1"]),
         ("demo", ["inf", "100.0", "1.0"]),
         ("echo", ["1.0", "inf"]),
-        ("foxglove", ["8765", "tf"]),
+        ("foxglove", ["8765", "127.0.0.1", "tf"]),
         ("robot", ["10.0"]),
-        ("view", ["8080", "30.0", "tf"]),
+        ("view", ["8080", "127.0.0.1", "30.0", "tf"]),
     ],
 )
 def test_the_help_tells_the_defaults(

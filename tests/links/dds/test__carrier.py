@@ -366,7 +366,7 @@ def test_names_of_nodes_that_cannot_be_read_are_malformed_and_spoil_no_others() 
 
 
 def _check_garbage(payload: bytes) -> None:
-    """Whatever bytes come on any topic, they are handed on or refused, and what comes behind them is taken."""
+    """Any bytes on any topic are handed on or refused, and the messages behind them are taken."""
     clock = SimulatedClock()
     with Bus(clock) as bus:
         options: RosOptions = {"joint_states": print, "robot_description": len, "clock": clock, "authority": "ros"}

@@ -214,7 +214,7 @@ class DdsCarrier(RosCarrier):
         return found
 
     def _publication(self, reader: DataReader[RawTFMessage], handle: int) -> Any:
-        """What the library tells of a writer; None if it has gone since, or the library cannot read it."""
+        """The data that the library has of a writer; None if it has gone since, or the library cannot read it."""
         try:
             return reader.get_matched_publication_data(handle)
         except UnicodeDecodeError as error:
