@@ -4,7 +4,7 @@ from support.recorded import write_mcap
 from support.samples import moving, static
 
 from tfbus.recording import RecordedMessage, open_recording
-from tfbus.recording._blocks import Block, DecodedBlock
+from tfbus.recording.recording import Block, DecodedBlock
 
 
 def test_blocks_have_all_messages_decoded_at_once_or_one_by_one(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from support.allocations import peak_of
 
 from tfbus import SECOND
-from tfbus.recording._durations import _SINGLE, Durations
+from tfbus.recording.summary import _SINGLE, Durations
 
 delays = st.lists(st.integers(-(10**15), 10**15), min_size=1, max_size=300)
 

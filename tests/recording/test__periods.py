@@ -6,8 +6,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tfbus import SECOND
-from tfbus.recording import _periods
-from tfbus.recording._periods import Periods
+from tfbus.recording import summary
+from tfbus.recording.summary import Periods
 
 columns = st.lists(st.lists(st.integers(0, 10**4), max_size=60), max_size=4)
 
@@ -20,7 +20,7 @@ columns = st.lists(st.lists(st.integers(0, 10**4), max_size=60), max_size=4)
 @example(columns=[[3, 0], [9, 12, 10]], at_once=10**6)
 def test_the_periods_are_those_of_all_different_stamps(columns: list[list[int]], at_once: int) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_periods, "_AT_ONCE", at_once)
+        patch.setattr(summary, "_AT_ONCE", at_once)
         periods = Periods([array("q", [stamp * SECOND for stamp in column]) for column in columns])
     stamps = sorted({stamp for column in columns for stamp in column})
     differences = np.diff(stamps)

@@ -5,7 +5,7 @@ import pytest
 from support.asking import settle
 
 from tfbus.recording import RecordedMessage
-from tfbus.recording._read_ahead import ReadAhead
+from tfbus.recording.player import ReadAhead
 
 pytestmark = pytest.mark.anyio
 

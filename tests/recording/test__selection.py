@@ -2,8 +2,8 @@ from typing import Any
 
 import pytest
 
-from tfbus.recording._selection import Choice, Selection, looks_like_transforms
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.recording import Choice, Selection, looks_like_transforms
 
 TF = "tf2_msgs/msg/TFMessage"
 

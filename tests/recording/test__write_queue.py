@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 from support.samples import any_samples, moving, static
 
 from tfbus import QueueStatistics, TransformStamped
-from tfbus.recording._write_queue import WriteQueue
+from tfbus.recording.recorder import WriteQueue
 
 
 def slice_sizes(queue: WriteQueue, size: int) -> list[int]:

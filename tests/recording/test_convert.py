@@ -18,8 +18,8 @@ from support.samples import moving, static
 
 from tfbus import RecordingError
 from tfbus.recording import Conversion, Edits, convert, load, open_recording
-from tfbus.recording.formats._raw_transforms import RawTransform, parser_of, write_cdr, write_ros1
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import RawTransform, parser_of, write_cdr, write_ros1
 from tfbus.recording.load import MAX_DETAILS
 from tfbus.recording.recording import open_storage
 from tfbus.tf_message import encode

@@ -3,7 +3,7 @@ from dataclasses import FrozenInstanceError
 import pytest
 
 from tfbus.recording import Edits
-from tfbus.recording.formats._raw_transforms import RawTransform
+from tfbus.recording.formats.transforms import RawTransform
 
 SLASHED = RawTransform(1, 2, b"/odom", b"/base", bytes(56))
 

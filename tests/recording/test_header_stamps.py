@@ -8,7 +8,7 @@ from support.recorded import Line, real, write_mcap
 
 from tfbus import RecordingError
 from tfbus.recording import header_stamps
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.storage import Channel
 from tfbus.recording.header_stamps import begins_with_header
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)

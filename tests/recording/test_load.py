@@ -27,7 +27,7 @@ from tfbus import (
     UnknownFrameError,
 )
 from tfbus.recording import load, open_recording
-from tfbus.recording.formats._mcap_output import McapOutput
+from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.recording.load import MAX_DETAILS, Problems, fill
 from tfbus.tf_message import MalformedMessageError
 from tfbus.tree.tree import forest_of
@@ -315,7 +315,7 @@ def test_samples_that_change_no_edge_are_stored_at_once_unless_one_is_beyond_the
 
 def test_each_sample_of_a_block_is_inserted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Each message has a block of its own, and the first one names the frames.
-    monkeypatch.setattr("tfbus.recording.formats._mcap_reading._FIRST_BLOCK", 1)
+    monkeypatch.setattr("tfbus.recording.formats.mcap._FIRST_BLOCK", 1)
     stamps = [1, 2, 3, 4, 4, 5]
     lines = [(at, "/tf", [moving("a", "b", stamp), moving("b", "c", stamp)]) for at, stamp in enumerate(stamps)]
     tree = load(write_mcap(tmp_path / "run.mcap", lines, chunk_size=1))

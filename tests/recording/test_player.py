@@ -35,7 +35,7 @@ from tfbus import (
 from tfbus.bus.queues import TimedBatch
 from tfbus.geometry.stamped import Batch
 from tfbus.recording import Player, Recorder, load
-from tfbus.recording.formats._mcap_output import McapOutput
+from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.stamps import STAMP_MAX
 
 pytestmark = pytest.mark.anyio

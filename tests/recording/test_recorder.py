@@ -40,7 +40,7 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.bus.queues import TimedBatch
-from tfbus.recording.formats._mcap_output import McapOutput
+from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.recording.load import load
 from tfbus.recording.recorder import _SLICE, Recorder
 from tfbus.recording.recording import open_recording

@@ -13,8 +13,8 @@ from support.samples import any_samples, moving, static
 
 from tfbus import TransformStamped
 from tfbus.recording import FrameSummary, RecordedMessage, RecordingSummary, load, open_recording, summarise
-from tfbus.recording.formats import _mcap_reading
-from tfbus.recording.formats._mcap_output import McapOutput
+from tfbus.recording.formats import mcap
+from tfbus.recording.formats.mcap_output import McapOutput
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 SECOND = 1_000_000_000
@@ -94,7 +94,7 @@ def test_a_frame_with_static_and_moving_samples_has_both_kinds(tmp_path: Path) -
 def test_samples_of_each_kind_are_counted_in_whatever_block_they_come(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kinds: str
 ) -> None:
-    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", 1)
+    monkeypatch.setattr(mcap, "_FIRST_BLOCK", 1)
     samples = [static("a", "b") if kind == "s" else moving("a", "b", at) for at, kind in enumerate(kinds)]
     lines = [(at, "/tf_static" if sample.static else "/tf", [sample]) for at, sample in enumerate(samples)]
     # Each has a block of its own.
@@ -161,8 +161,8 @@ def test_the_newest_parent_of_a_frame_decides_what_closes_a_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: list[TransformStamped], loops: int
 ) -> None:
     # Each message is a block of its own.
-    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", 1)
-    monkeypatch.setattr(_mcap_reading, "_BLOCK", 1)
+    monkeypatch.setattr(mcap, "_FIRST_BLOCK", 1)
+    monkeypatch.setattr(mcap, "_BLOCK", 1)
     sent = [(k, "/tf_static" if sample.static else "/tf", [sample]) for k, sample in enumerate(lines)]
     path = write_mcap(tmp_path / "run.mcap", sent, chunk_size=1)
     counted: list[int] = []

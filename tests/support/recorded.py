@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from tfbus import TransformStamped
 from tfbus.recording import Recording, open_recording
-from tfbus.recording.message import RecordedMessage
+from tfbus.recording.recording import RecordedMessage
 from tfbus.tf_message import encode
 
 SMALL = Path(__file__).parents[1] / "recordings" / "small.bag"

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.recording.message import RecordedMessage
+from tfbus.recording.recording import RecordedMessage
 from tfbus.stamps import SECOND, Stamps, time_between
 
 Floats = npt.NDArray[np.float64]

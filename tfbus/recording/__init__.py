@@ -7,19 +7,16 @@ formats are in `tfbus.recording.formats`.
 """
 
 from tfbus.errors import RecordingError
-from tfbus.recording.convert import Conversion, StaticTransform, convert
-from tfbus.recording.edits import Edits
+from tfbus.recording.convert import Conversion, Edits, StaticTransform, convert
 from tfbus.recording.examine import examine
 from tfbus.recording.header_stamps import HeaderStamps, header_stamps
 from tfbus.recording.joint_states import load_joint_states
 from tfbus.recording.load import load
-from tfbus.recording.message import RecordedMessage
 from tfbus.recording.player import Player
 from tfbus.recording.recorder import Recorder
-from tfbus.recording.recording import RecordedTopic, Recording, open_recording
-from tfbus.recording.spread import Spread
+from tfbus.recording.recording import RecordedMessage, RecordedTopic, Recording, open_recording
 from tfbus.recording.static_frames import load_static, save_static
-from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
+from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, Spread, summarise
 
 __all__ = [
     "Conversion",

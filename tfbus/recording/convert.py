@@ -4,7 +4,7 @@ import heapq
 import os
 import struct
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -14,11 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-from tfbus.errors import RecordingError, pip_install
+from tfbus.errors import InvalidTransformError, RecordingError, pip_install
+from tfbus.frames import check_frame
 from tfbus.plain import printable
-from tfbus.recording.edits import Edits
-from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
-from tfbus.recording.formats._copies import (
+from tfbus.recording.formats.copies import (
     BagCopy,
     CannotWriteError,
     Copy,
@@ -28,19 +27,86 @@ from tfbus.recording.formats._copies import (
     transform_channel,
     write_transforms,
 )
-from tfbus.recording.formats._decoder import ChannelDecoder
-from tfbus.recording.formats._raw_transforms import (
+from tfbus.recording.formats.storage import (
+    AUTHORITIES,
+    MAX_OTHER_MESSAGE,
+    Channel,
+    Storage,
+    StoredMessage,
+    UnfoldError,
+    Wanted,
+    unfold,
+)
+from tfbus.recording.formats.transforms import (
     COMPRESSED,
+    ChannelDecoder,
     RawTransform,
     bounded,
     holds_transforms,
     parser_of,
 )
-from tfbus.recording.formats._storage import AUTHORITIES, Channel, Storage, StoredMessage, Wanted
-from tfbus.recording.formats._unfold import UnfoldError, unfold
 from tfbus.recording.load import MAX_DETAILS
 from tfbus.recording.recording import open_storage
 from tfbus.tf_message import MalformedMessageError
+
+
+@dataclass(frozen=True, slots=True)
+class Edits:
+    """The changes that `convert` makes to transforms; numbers and stamps stay.
+
+    Parameters
+    ----------
+    frames : collection of str, optional
+        Only the transforms of these child frames stay, by the names in the recording.
+    rename : mapping of str to str
+        New names of frames.
+    prefix : str
+        Put before the names of all frames that are not renamed.
+    drop_static : bool
+        Whether static transforms are left out.
+
+    Raises
+    ------
+    ValueError
+        If a new name or the prefix is empty or starts with a slash; an empty prefix is none.
+    """
+
+    frames: Collection[str] | None = None
+    rename: Mapping[str, str] = field(default_factory=dict)
+    prefix: str = ""
+    drop_static: bool = False
+
+    def __post_init__(self) -> None:
+        try:
+            for name in (*self.rename.values(), *((self.prefix,) if self.prefix else ())):
+                check_frame(name)
+        except InvalidTransformError as error:
+            raise ValueError(str(error)) from None
+
+    @property
+    def changes_messages(self) -> bool:
+        """Whether messages with transforms change; static ones that are left out do not count."""
+        return self.frames is not None or bool(self.rename) or bool(self.prefix)
+
+    def keeps(self, transform: RawTransform) -> bool:
+        """Whether a transform stays."""
+        return self.frames is None or _bare(transform.child) in self.frames
+
+    def apply(self, transform: RawTransform) -> RawTransform:
+        """A transform with the new names of its frames."""
+        if not (self.rename or self.prefix):
+            return transform
+        return transform._replace(parent=self._rename(transform.parent), child=self._rename(transform.child))
+
+    def _rename(self, name: bytes) -> bytes:
+        bare = _bare(name)
+        new = self.rename.get(bare, self.prefix + bare)
+        return name if new == bare else new.encode(errors="surrogateescape")
+
+
+def _bare(name: bytes) -> str:
+    return name.decode(errors="surrogateescape").lstrip("/")
+
 
 _COPIES: dict[str, Callable[[Path, str], Copy]] = {".mcap": McapCopy, ".bag": BagCopy, ".db3": SqliteCopy}
 _NUMBERS = struct.Struct("<7d")

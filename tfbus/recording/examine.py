@@ -8,10 +8,9 @@ from contextlib import suppress
 from tfbus.analysis.examiner import Examiner
 from tfbus.analysis.finding import Finding
 from tfbus.analysis.limits import Limits
-from tfbus.recording._blocks import Block
-from tfbus.recording.formats._raw_transforms import RawTransform, bounded, parser_of
-from tfbus.recording.formats._storage import Channel
-from tfbus.recording.recording import Recording
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import RawTransform, bounded, parser_of
+from tfbus.recording.recording import Block, Recording
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MalformedMessageError
 

@@ -9,11 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tfbus.errors import RecordingError
-from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
-from tfbus.recording.formats._raw_transforms import COMPRESSED
-from tfbus.recording.formats._storage import Channel
-from tfbus.recording.formats._types import MessageTypes, types_with_header
-from tfbus.recording.formats._unfold import UnfoldError, unfold
+from tfbus.recording.formats.copies import MessageTypes, types_with_header
+from tfbus.recording.formats.storage import MAX_OTHER_MESSAGE, Channel, UnfoldError, unfold
+from tfbus.recording.formats.transforms import COMPRESSED
 from tfbus.recording.recording import open_storage
 from tfbus.stamps import SECOND
 

@@ -5,8 +5,8 @@ from collections import Counter
 from pathlib import Path
 
 from tfbus.errors import InvalidTransformError, RecordingError
-from tfbus.recording.formats._raw_transforms import bounded
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import bounded
 from tfbus.recording.load import Problems
 from tfbus.recording.recording import open_storage
 from tfbus.robot.joint_state_message import decode_joint_state

@@ -1,23 +1,181 @@
 """`open_recording`, which reads the transforms of a file of ROS 1, ROS 2 or tfbus message by message, by log time."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, NamedTuple, Self, TypeAlias
 
-from tfbus.errors import MissingRecordingError, RecordingError, pip_install
-from tfbus.geometry.stamped import TransformStamped
+from tfbus.errors import InvalidTransformError, MissingRecordingError, RecordingError, pip_install
+from tfbus.frames import is_frame
+from tfbus.geometry.stamped import Batch, TransformStamped
 from tfbus.plain import printable
-from tfbus.recording._blocks import Block, DecodedBlock
-from tfbus.recording._selection import Selection, Topics, looks_like_transforms
-from tfbus.recording.formats._columns import ColumnDecoder
-from tfbus.recording.formats._decoder import ChannelDecoder
-from tfbus.recording.formats._packed import blocks_of
-from tfbus.recording.formats._storage import Channel, Storage, StoredMessage
-from tfbus.recording.message import RecordedMessage
+from tfbus.recording.formats.storage import Channel, Packed, Storage, Stored, StoredMessage, blocks_of, pack
+from tfbus.recording.formats.transforms import (
+    FOXGLOVE_TYPES,
+    TF_TYPES,
+    ChannelDecoder,
+    ColumnDecoder,
+    Columns,
+    holds_transforms,
+)
 from tfbus.tf_message import MalformedMessageError
+
+
+class RecordedMessage(NamedTuple):
+    """The transforms of one message of a recording."""
+
+    received: int
+    """The log time in ns: the time of recording, not a stamp."""
+    batch: Batch
+    """The valid transforms."""
+    errors: tuple[InvalidTransformError | MalformedMessageError, ...]
+    """The reason why others were refused; with ``"damaged"``, the part of the file that is lost here, and with
+    ``"unfinished"``, why messages may be missing at the end."""
+
+    @property
+    def is_report(self) -> bool:
+        """Whether it stands for no message of the file, but for what is missing there."""
+        return any(error.reason in ("damaged", "unfinished") for error in self.errors)
+
+
+MOVING_TOPIC: Final = "tf"
+STATIC_TOPIC: Final = "tf_static"
+
+Topics: TypeAlias = str | Iterable[str] | Mapping[str, str] | None
+
+
+class Choice(NamedTuple):
+    """The way in which a channel is read."""
+
+    static: bool
+    prefix: str
+
+
+class Selection:
+    """Decides which channels are read.
+
+    Parameters
+    ----------
+    topics : str, iterable of str, or mapping of str to str, optional
+        Topics, with a prefix for each if it is a mapping. By default ``/tf``, ``/tf_static``, and all topics with
+        Foxglove's transforms outside of namespaces.
+    prefix : str
+        Put before the names of all frames.
+    namespaces : bool
+        Whether ``tf`` and ``tf_static`` in all namespaces are read, each under the prefix of its namespace.
+
+    Raises
+    ------
+    ValueError
+        If both `topics` and `namespaces` are given, or a prefix begins with a slash.
+    TypeError
+        If a topic or a prefix is no string.
+    """
+
+    def __init__(self, topics: Topics = None, prefix: str = "", namespaces: bool = False) -> None:
+        if topics is not None and namespaces:
+            raise ValueError("topics and namespaces are two ways to choose: give one of them")
+        if isinstance(topics, str):
+            topics = (topics,)
+        pairs = topics.items() if isinstance(topics, Mapping) else ((topic, "") for topic in topics or ())
+        self._prefixes: dict[str, str] | None = None if topics is None else {}
+        for topic, its_prefix in pairs:
+            if not isinstance(topic, str):
+                raise TypeError(f"a topic must be a str, not {topic!r}")
+            assert self._prefixes is not None
+            self._prefixes[topic.removeprefix("/")] = its_prefix
+        self._prefix = prefix
+        self._namespaces = namespaces
+        for each in (prefix, *(self._prefixes or {}).values()):
+            if each != "" and not is_frame(each):
+                raise ValueError(f"a prefix must not start with '/', got {each!r}")
+
+    @property
+    def topics(self) -> list[str]:
+        """The topics that were asked for by their names, without leading slashes."""
+        return list(self._prefixes or ())
+
+    def choose(self, channel: Channel) -> Choice | None:
+        """The way in which a channel is read; None if it is not."""
+        if not holds_transforms(channel):
+            return None
+        name = channel.topic.removeprefix("/")
+        namespace, _, last = name.rpartition("/")
+        static = last == STATIC_TOPIC or (last.endswith("_static") and channel.type in TF_TYPES)
+        own = last in (MOVING_TOPIC, STATIC_TOPIC)
+        if self._prefixes is not None:
+            return Choice(static, self._prefix + self._prefixes[name]) if name in self._prefixes else None
+        if self._namespaces:
+            inner = f"{namespace}/" if namespace else ""
+            return Choice(static, self._prefix + inner) if own and not inner.startswith("/") else None
+        if name in (MOVING_TOPIC, STATIC_TOPIC) or (channel.type in FOXGLOVE_TYPES and not own):
+            return Choice(static, self._prefix)
+        return None
+
+
+def looks_like_transforms(channel: Channel) -> bool:
+    """Whether a user may expect transforms on a channel: by its type, or by its name."""
+    last = channel.topic.rpartition("/")[2]
+    return channel.type in TF_TYPES or channel.type in FOXGLOVE_TYPES or last in (MOVING_TOPIC, STATIC_TOPIC)
+
+
+class Block:
+    """Some successive messages.
+
+    Parameters
+    ----------
+    content : Packed or list of StoredMessage
+    columns : ColumnDecoder
+    decode : callable
+        Decodes one message.
+    """
+
+    def __init__(
+        self,
+        content: Stored,
+        columns: ColumnDecoder,
+        decode: Callable[[StoredMessage], RecordedMessage],
+    ) -> None:
+        self._content = content
+        self._columns = columns
+        self._decode = decode
+
+    def __len__(self) -> int:
+        return self._content.size if isinstance(self._content, Packed) else len(self._content)
+
+    @property
+    def stored(self) -> list[StoredMessage]:
+        """The messages as they are in the file."""
+        return self._content.stored() if isinstance(self._content, Packed) else self._content
+
+    def columns(self) -> list[Columns] | None:
+        """All samples, by frame and authority; None if the messages have to be decoded one by one."""
+        packed = self._content if isinstance(self._content, Packed) else pack(self._content)
+        return None if packed is None else self._columns.decode(packed)
+
+    def messages(self) -> Iterator[RecordedMessage]:
+        """All messages, one by one."""
+        return map(self._decode, self.stored)
+
+
+class DecodedBlock:
+    """Messages that are decoded already, such as those with the static transforms from before a reading."""
+
+    def __init__(self, messages: Iterable[RecordedMessage]) -> None:
+        self._messages = messages
+
+    def __len__(self) -> int:
+        return len(self._messages) if isinstance(self._messages, Sequence) else 0
+
+    def columns(self) -> None:
+        """None: they are decoded already."""
+
+    def messages(self) -> Iterator[RecordedMessage]:
+        """All messages, one by one."""
+        return iter(self._messages)
+
 
 _FIRST_BYTES: Final = 16
 _SHOWN: Final = 10
@@ -293,19 +451,19 @@ def open_storage(file: Path) -> Storage:
 
 def _open_storage(path: Path, folders: bool = False) -> Storage:
     if folders and path.is_dir():
-        from tfbus.recording.formats._folder import FolderStorage
+        from tfbus.recording.formats.folder import FolderStorage
 
         return FolderStorage(path, _open_storage)
     with path.open("rb") as file:
         first = file.read(_FIRST_BYTES)
     if not first:
         raise RecordingError("the file is empty", path=str(path), reason="empty")
-    from tfbus.recording.formats import _mcap, _mcap_records, _ros1, _sqlite
+    from tfbus.recording.formats import folder, mcap, mcap_records, ros1
 
     formats: list[tuple[bytes, Callable[[Path], Storage]]] = [
-        (_mcap_records.MAGIC, _mcap.McapStorage),
-        (_sqlite.MAGIC, _sqlite.SqliteStorage),
-        (_ros1.MAGIC, _ros1.Ros1Storage),
+        (mcap_records.MAGIC, mcap.McapStorage),
+        (folder.MAGIC, folder.SqliteStorage),
+        (ros1.MAGIC, ros1.Ros1Storage),
     ]
     for magic, storage in formats:
         if first.startswith(magic):

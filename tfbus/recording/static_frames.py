@@ -12,7 +12,7 @@ from typing import Any, Final
 from tfbus.errors import InvalidTransformError, MissingRecordingError, RecordingError, pip_install
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.geometry.transform import Transform
-from tfbus.recording.formats._bounds import MAX_INDEX, MAX_METADATA
+from tfbus.recording.formats.storage import MAX_INDEX, MAX_METADATA
 from tfbus.stamps import is_real
 
 _SIZES = {"xyz": 3, "rpy": 3, "rpy_deg": 3, "quaternion": 4}

@@ -3,21 +3,179 @@
 The recording is read once and not kept: only one stamp, 8 bytes, of each moving transform stays in memory.
 """
 
+import math
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
 
 from tfbus.geometry.stamped import Batch
-from tfbus.recording._blocks import Block, DecodedBlock
-from tfbus.recording._durations import Durations
-from tfbus.recording._periods import Periods
-from tfbus.recording.formats._columns import Columns
+from tfbus.recording.formats.transforms import Columns
 from tfbus.recording.load import Problems, sound_samples
-from tfbus.recording.message import RecordedMessage
-from tfbus.recording.recording import RecordedTopic, Recording
-from tfbus.recording.spread import Spread
-from tfbus.stamps import SECOND, time_between
+from tfbus.recording.recording import Block, DecodedBlock, RecordedMessage, RecordedTopic, Recording
+from tfbus.stamps import SECOND, STAMP_MAX, time_between, to_seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """The mean of some durations, the one that 99 % of them do not exceed, and the greatest; in s.
+
+    The one that 99 % do not exceed is known to 1 %.
+    """
+
+    mean: float
+    p99: float
+    max: float
+
+
+_GROWTH: Final = math.log(1.01)
+_SINGLE: Final = 1_000
+"""Durations that come in few are counted so many at once."""
+
+
+class Durations:
+    """Counts durations by their size; mean and maximum are exact."""
+
+    def __init__(self) -> None:
+        self._single = array("q")
+        self._count = 0
+        self._total = 0.0
+        self._max = -math.inf
+        self._buckets: Counter[int] = Counter()
+
+    @classmethod
+    def joined(cls, parts: Iterable["Durations"]) -> "Durations":
+        """The durations of all parts."""
+        whole = cls()
+        for part in parts:
+            part._count_single()
+            whole._count += part._count
+            whole._total += part._total
+            whole._max = max(whole._max, part._max)
+            whole._buckets.update(part._buckets)
+        return whole
+
+    def add_one(self, duration: int) -> None:
+        """Count a duration in ns; one that does not fit 64 bits as the longest that does."""
+        self._single.append(max(-STAMP_MAX, min(duration, STAMP_MAX)))
+        if len(self._single) >= _SINGLE:
+            self._count_single()
+
+    def add(self, durations: npt.NDArray[np.int64]) -> None:
+        """Count durations in ns; there is at least one."""
+        if len(durations) < _SINGLE:
+            self._single.frombytes(durations.astype(np.int64, copy=False).tobytes())
+            if len(self._single) >= _SINGLE:
+                self._count_single()
+        else:
+            self._count_all(durations)
+
+    def _count_single(self) -> None:
+        if self._single:
+            single, self._single = self._single, array("q")
+            self._count_all(np.array(single, np.int64))
+
+    def _count_all(self, durations: npt.NDArray[np.int64]) -> None:
+        self._count += len(durations)
+        self._total += float(durations.sum(dtype=np.float64)) / SECOND
+        self._max = max(self._max, to_seconds(int(durations.max())))
+        # The number of a bucket is the logarithm of its upper end, with the sign of the durations; 0 ns has its own.
+        sizes = np.ceil(np.log(np.maximum(np.abs(durations.astype(np.float64)), 1.0)) / _GROWTH).astype(np.int64) + 1
+        buckets, counts = np.unique(np.sign(durations) * sizes, return_counts=True)
+        for bucket, count in zip(buckets.tolist(), counts.tolist(), strict=True):
+            self._buckets[bucket] += count
+
+    def spread(self) -> Spread | None:
+        """Their spread; None if there are none."""
+        self._count_single()
+        if not self._count:
+            return None
+        rank = math.ceil(0.99 * self._count)
+        for bucket in sorted(self._buckets):
+            rank -= self._buckets[bucket]
+            if rank <= 0:
+                break
+        size = math.exp((abs(bucket) - 1) * _GROWTH) / SECOND if bucket else 0.0
+        return Spread(self._total / self._count, min(math.copysign(size, bucket), self._max), self._max)
+
+
+_AT_ONCE: Final = 50_000
+"""So many stamps are merged at once, roughly."""
+
+
+class Periods:
+    """The periods of all stamps together.
+
+    Parameters
+    ----------
+    arrays : sequence of array of int
+        Stamps in ns, in any order; they are sorted in place.
+
+    Attributes
+    ----------
+    oldest, newest : int or None
+        ns; None without any stamp.
+    longest : float or None
+        The longest period, in s; None for fewer than two different stamps.
+    """
+
+    def __init__(self, arrays: Sequence["array[int]"]) -> None:
+        columns = [np.frombuffer(stamps, np.int64) for stamps in arrays if stamps]
+        for column in columns:
+            if (column[1:] < column[:-1]).any():
+                column.sort()
+        self.oldest = min((int(column[0]) for column in columns), default=None)
+        self.newest = max((int(column[-1]) for column in columns), default=None)
+        self._durations = Durations()
+        self._different = 0
+        total = sum(map(len, columns))
+        longest = max(columns, key=len, default=np.empty(0, np.int64))
+        # Windows that end at stamps of the longest one hold about as many stamps of all others.
+        step = max(1, _AT_ONCE * len(longest) // max(total, 1))
+        ends = [*longest[step::step].tolist(), None] if columns else []
+        firsts = [0] * len(columns)
+        before: int | None = None
+        for end in ends:
+            parts = []
+            for at, column in enumerate(columns):
+                first = firsts[at]
+                firsts[at] = len(column) if end is None else int(np.searchsorted(column, end))
+                parts.append(column[first : firsts[at]])
+            merged = np.sort(np.concatenate(parts))
+            before = self._add(merged[np.append(True, merged[1:] != merged[:-1])] if len(merged) else merged, before)
+        maximum = None if self._different < 2 else self._durations.spread()
+        self.longest = None if maximum is None else maximum.max
+
+    def _add(self, stamps: npt.NDArray[np.int64], before: int | None) -> int | None:
+        """Count the periods of different stamps that ascend; returns the last stamp."""
+        if not len(stamps):
+            return before
+        self._different += len(stamps)
+        ends = stamps if before is None else np.concatenate(([np.int64(before)], stamps))
+        periods = time_between(ends[:-1], ends[1:])
+        if len(periods):
+            self._durations.add(periods)
+        return int(stamps[-1])
+
+    @property
+    def rate(self) -> float | None:
+        """Different stamps per second; None for fewer than two."""
+        if self._different < 2 or self.oldest is None or self.newest is None:
+            return None
+        return (self._different - 1) * SECOND / (self.newest - self.oldest)
+
+    def spread(self) -> Spread | None:
+        """Their spread; None for fewer than two different stamps."""
+        spread = self._durations.spread()
+        if spread is None or self.oldest is None or self.newest is None:
+            return None
+        # The mean of the histogram has rounding errors.
+        return replace(spread, mean=to_seconds(self.newest - self.oldest) / (self._different - 1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,8 @@ from itertools import permutations
 import pytest
 from support.bag_bytes import chunk, field, message, record
 
-from tfbus.recording.formats import _bag_records
-from tfbus.recording.formats._bag_records import (
+from tfbus.recording.formats import ros1
+from tfbus.recording.formats.ros1 import (
     CHUNK,
     DAMAGE,
     CutOffError,
@@ -57,7 +57,7 @@ def test_a_damaged_header_is_read_behind_a_good_one_of_its_length_as_it_is_alone
 
 
 def test_a_chunk_holds_messages_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_bag_records, "MAX_CHUNK_MESSAGES", 2)
+    monkeypatch.setattr(ros1, "MAX_CHUNK_MESSAGES", 2)
     data = message(1, 2, b"x") + message(1, 3, b"y")
     assert (len(split_chunk(data).messages), split_chunk(data).damage) == (2, "")
     for order in ("cot", "toc"):
@@ -122,7 +122,7 @@ def test_a_record_that_claims_more_than_its_bound_is_not_read() -> None:
 @pytest.mark.parametrize(("bound", "fits"), [(0, True), (-1, False)])
 def test_a_header_is_read_up_to_its_bound(monkeypatch: pytest.MonkeyPatch, bound: int, fits: bool) -> None:
     (length,) = struct.unpack_from("<I", CHUNK_RECORD)
-    monkeypatch.setattr(_bag_records, "_MAX_HEADER", length + bound)
+    monkeypatch.setattr(ros1, "_MAX_HEADER", length + bound)
     if fits:
         assert read_record(io.BytesIO(CHUNK_RECORD), 0).kind == CHUNK
     else:
@@ -131,7 +131,7 @@ def test_a_header_is_read_up_to_its_bound(monkeypatch: pytest.MonkeyPatch, bound
 
 
 def test_a_chunk_is_unfolded_up_to_its_bound_and_has_the_size_that_it_claims(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_bag_records, "MAX_CHUNK", 3)
+    monkeypatch.setattr(ros1, "MAX_CHUNK", 3)
 
     def content(size: int, data: bytes, torn: bool = False) -> bytes:
         file = io.BytesIO(chunk(data, size))

@@ -1,8 +1,8 @@
 import re
 
 from tfbus.recording import open_recording
-from tfbus.recording.formats import _bounds
-from tfbus.recording.formats._bounds import MIB, max_unpacked
+from tfbus.recording.formats import storage
+from tfbus.recording.formats.storage import MIB, max_unpacked
 
 
 def test_a_small_file_unfolds_to_64_mib_and_a_large_one_to_100_times_its_size() -> None:
@@ -22,9 +22,9 @@ def test_the_bounds_are_those_that_open_recording_tells() -> None:
         "MAX_OVERLAPPING",
     )
     assert [int(number) * 2**20 for number in re.findall(r"(\d+) MiB", text)] == [
-        getattr(_bounds, name) for name in names
+        getattr(storage, name) for name in names
     ]
-    assert _bounds.MAX_CHUNK == _bounds.MAX_OTHER_MESSAGE
+    assert storage.MAX_CHUNK == storage.MAX_OTHER_MESSAGE
     assert "a million messages" in text
-    assert _bounds.MAX_CHUNK_MESSAGES == 1_000_000
-    assert f"at most {_bounds.MAX_FACTOR} times" in text
+    assert storage.MAX_CHUNK_MESSAGES == 1_000_000
+    assert f"at most {storage.MAX_FACTOR} times" in text

@@ -5,7 +5,7 @@ import pytest
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 from rosbags.rosbag2.metadata import parse_qos
 
-from tfbus.recording.formats._channels import _MAX_RUNS, MAX_CHANNELS, MAX_SHARED_CHANNELS, Channels, Runs
+from tfbus.recording.formats.mcap_output import _MAX_RUNS, MAX_CHANNELS, MAX_SHARED_CHANNELS, Channels, Runs
 
 
 @dataclass

@@ -2,8 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.recording.formats._chunks import ChunkPlace, merge_chunks, separate
-from tfbus.recording.formats._storage import Channel, StoredMessage
+from tfbus.recording.formats.storage import Channel, ChunkPlace, StoredMessage, merge_chunks, separate
 
 CHANNEL = Channel("/tf", "", "cdr")
 

@@ -9,11 +9,15 @@ from rosbags.typesys import Stores, get_typestore
 from support.samples import moving, static
 
 from tfbus import TransformStamped
-from tfbus.recording.formats._columns import ColumnDecoder, Columns
-from tfbus.recording.formats._decoder import ChannelDecoder
-from tfbus.recording.formats._packed import Packed, pack
-from tfbus.recording.formats._raw_transforms import RawTransform, write_cdr, write_ros1
-from tfbus.recording.formats._storage import Channel, StoredMessage
+from tfbus.recording.formats.storage import Channel, Packed, StoredMessage, pack
+from tfbus.recording.formats.transforms import (
+    ChannelDecoder,
+    ColumnDecoder,
+    Columns,
+    RawTransform,
+    write_cdr,
+    write_ros1,
+)
 from tfbus.tf_message import MAX_NAME, encode
 
 TYPES = get_typestore(Stores.ROS2_HUMBLE)
@@ -245,7 +249,7 @@ def test_names_are_decoded_at_once_up_to_the_longest(channel: Channel) -> None:
 def test_messages_are_decoded_at_once_up_to_their_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     size = len(GOOD[2])
     for bound, valid in ((size, True), (size - 1, False)):
-        monkeypatch.setattr("tfbus.recording.formats._columns.MAX_MESSAGE", bound)
+        monkeypatch.setattr("tfbus.recording.formats.transforms.MAX_MESSAGE", bound)
         assert (both([GOOD])[0] is not None) == valid
 
 
@@ -259,7 +263,7 @@ def test_many_frames_that_take_turns_are_decoded_at_once(names: list[str]) -> No
 
 def test_a_channel_with_more_layouts_than_are_kept_is_left_to_the_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
     stored: list[StoredMessage] = [(k, CDR, encode([moving("map", f"f{k}", k)])) for k in range(4)]
-    monkeypatch.setattr("tfbus.recording.formats._columns._MAX_LAYOUTS", 3)
+    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_LAYOUTS", 3)
     assert both(stored[:3])[0] is not None
     assert both(stored)[0] is None
 
@@ -273,6 +277,6 @@ def test_messages_of_one_size_with_more_structures_than_are_kept_are_left_to_the
         for k in range(4)
     ]
     assert len({len(payload) for _, _, payload in stored}) == 1
-    monkeypatch.setattr("tfbus.recording.formats._columns._MAX_STRUCTURES", 3)
+    monkeypatch.setattr("tfbus.recording.formats.transforms._MAX_STRUCTURES", 3)
     assert both(stored[:3])[0] is not None
     assert both(stored)[0] is None

@@ -11,8 +11,8 @@ from support.open_files import is_open
 from support.recorded import messages_in
 from support.samples import moving
 
-from tfbus.recording.formats._channels import TYPE_HASH
-from tfbus.recording.formats._copies import (
+from tfbus.recording.formats.copies import (
+    FRAME_TRANSFORMS,
     BagCopy,
     CannotWriteError,
     FoxgloveCopy,
@@ -20,8 +20,8 @@ from tfbus.recording.formats._copies import (
     SqliteCopy,
     transform_channel,
 )
-from tfbus.recording.formats._foxglove import FRAME_TRANSFORMS
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.mcap_output import TYPE_HASH
+from tfbus.recording.formats.storage import Channel
 from tfbus.tf_message import encode
 
 TF = Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr")

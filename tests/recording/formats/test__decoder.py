@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 from support.samples import moving, static
 
-from tfbus.recording.formats._decoder import ChannelDecoder
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import ChannelDecoder
 from tfbus.tf_message import MalformedMessageError, encode
 
 METADATA = {"tfbus.authorities": '[["odometry", 1]]'}

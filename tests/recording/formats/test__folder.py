@@ -12,7 +12,7 @@ from support.samples import moving, static
 
 from tfbus import RecordingError
 from tfbus.recording import RecordedMessage, open_recording
-from tfbus.recording.formats._folder import _nameless_file
+from tfbus.recording.formats.folder import _nameless_file
 
 ZSTD = {"fmt": CompressionFormat.ZSTD}
 LINES = [(time, "/tf", [moving("odom", "base", time)]) for time in range(30)]
@@ -229,7 +229,7 @@ def test_metadata_are_read_up_to_a_bound(tmp_path: Path, monkeypatch: pytest.Mon
         (size, "stray.mcap is ignored: metadata.yaml does not name it"),
         (size - 1, f"metadata.yaml is ignored, as it cannot be read: {why}"),
     ):
-        monkeypatch.setattr("tfbus.recording.formats._folder.MAX_METADATA", bound)
+        monkeypatch.setattr("tfbus.recording.formats.folder.MAX_METADATA", bound)
         with open_recording(tmp_path) as recording:
             assert recording.remarks == (remark,)
 
@@ -244,7 +244,7 @@ def test_an_error_without_words_is_told_by_its_name_and_a_long_one_is_cut(
         def fail(_: bytes, error: Exception = error) -> None:
             raise error
 
-        monkeypatch.setattr("tfbus.recording.formats._folder._as_yaml", fail)
+        monkeypatch.setattr("tfbus.recording.formats.folder._as_yaml", fail)
         with open_recording(tmp_path) as recording:
             assert recording.remarks == (f"metadata.yaml is ignored, as it cannot be read: {told}",)
 

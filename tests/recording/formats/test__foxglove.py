@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.strategies import CHARACTERS
 
-from tfbus.recording.formats._foxglove import foxglove_channel, write_protobuf
-from tfbus.recording.formats._raw_transforms import RawTransform, parser_of
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.copies import foxglove_channel, write_protobuf
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import RawTransform, parser_of
 from tfbus.tf_message import MalformedMessageError
 
 CHANNEL = foxglove_channel(Channel("/tf", "tf2_msgs/msg/TFMessage", "cdr"), {})

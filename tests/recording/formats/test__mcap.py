@@ -19,7 +19,7 @@ from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import RecordedMessage, open_recording
-from tfbus.recording.formats import _mcap_reading, _mcap_records
+from tfbus.recording.formats import mcap, mcap_records
 from tfbus.stamps import STAMP_MAX
 from tfbus.tf_message import encode
 
@@ -113,7 +113,7 @@ def test_an_index_is_used_up_to_its_bound(write: Write, monkeypatch: pytest.Monk
     # The footer says where the index begins.
     size = len(data) - int.from_bytes(data[-28:-20], "little")
     for bound, count in ((size, COUNT + 1), (size - 1, None)):
-        monkeypatch.setattr("tfbus.recording.formats._mcap.MAX_INDEX", bound)
+        monkeypatch.setattr("tfbus.recording.formats.mcap.MAX_INDEX", bound)
         with open_recording(path) as recording:
             assert recording.count == count
 
@@ -255,7 +255,7 @@ def test_damage_before_a_range_is_reported_at_the_start_of_the_range(write: Writ
 def test_each_message_of_a_part_comes_once_in_blocks_of_any_size(
     write: Write, monkeypatch: pytest.MonkeyPatch, enough: int, count: int
 ) -> None:
-    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", enough)
+    monkeypatch.setattr(mcap, "_FIRST_BLOCK", enough)
     times = (0, 1, 2, 3, STAMP_MAX)
     path = write([(time, "/tf", [moving("a", "b", place)]) for place, time in enumerate(times)], chunk_size=1)
     for since in (None, *times):
@@ -384,7 +384,7 @@ def test_a_record_of_an_unknown_kind_or_beyond_its_bound_is_told_with_its_place(
     path = write(LINES[:1], finish=False)
     chunk = next(place for place, opcode in records_in(path.read_bytes()) if opcode == Opcode.CHUNK)
     path.write_bytes(path.read_bytes() + write(LINES[1:2], finish=False, use_chunking=False).read_bytes()[8:])
-    monkeypatch.setitem(_mcap_records._BOUND, Opcode.CHUNK, 50)
+    monkeypatch.setitem(mcap_records._BOUND, Opcode.CHUNK, 50)
     (lost,) = errors_in(messages_in(path))
     assert lost.endswith(f"the chunk at byte {chunk}: it exceeds its bound")
 

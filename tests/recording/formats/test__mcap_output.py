@@ -19,8 +19,7 @@ from support.strategies import samples
 
 from tfbus import Transform, TransformStamped
 from tfbus.bus.queues import TimedBatch
-from tfbus.recording.formats._channels import TYPE_HASH
-from tfbus.recording.formats._mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, McapOutput
+from tfbus.recording.formats.mcap_output import CHUNK_SIZE, SCHEMA, SCHEMA_NAME, TYPE_HASH, McapOutput
 from tfbus.stamps import SECOND
 from tfbus.tf_message import decode
 

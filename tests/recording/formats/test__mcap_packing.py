@@ -7,11 +7,8 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from support.samples import moving
 
-from tfbus.recording.formats._chunks import ChunkPlace
-from tfbus.recording.formats._mcap import McapStorage
-from tfbus.recording.formats._mcap_packing import ChunkPacker, OpenChunk
-from tfbus.recording.formats._packed import Packed
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.mcap import ChunkPacker, McapStorage, OpenChunk
+from tfbus.recording.formats.storage import Channel, ChunkPlace, Packed
 from tfbus.tf_message import encode
 
 

@@ -3,8 +3,7 @@ from pathlib import Path
 from support.recorded import write_mcap
 from support.samples import moving
 
-from tfbus.recording.formats._mcap import McapStorage
-from tfbus.recording.formats._mcap_reading import McapReading
+from tfbus.recording.formats.mcap import McapReading, McapStorage
 from tfbus.stamps import STAMP_MAX
 
 

@@ -9,8 +9,8 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, McapRecord
 
-from tfbus.recording.formats import _mcap_records
-from tfbus.recording.formats._mcap_records import (
+from tfbus.recording.formats import mcap_records
+from tfbus.recording.formats.mcap_records import (
     DAMAGE,
     Chunk,
     parse_record,
@@ -19,8 +19,7 @@ from tfbus.recording.formats._mcap_records import (
     split_chunk,
     split_message,
 )
-from tfbus.recording.formats._storage import Channel
-from tfbus.recording.formats._unfold import UnfoldError
+from tfbus.recording.formats.storage import Channel, UnfoldError
 
 TF = Channel("/tf", "", "cdr")
 
@@ -67,8 +66,8 @@ def record(opcode: int, content: bytes) -> bytes:
 
 
 def test_records_are_read_up_to_their_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_mcap_records, "_BOUND", {Opcode.CHUNK: 5, Opcode.MESSAGE: 4})
-    monkeypatch.setattr(_mcap_records, "MAX_INDEX", 3)
+    monkeypatch.setattr(mcap_records, "_BOUND", {Opcode.CHUNK: 5, Opcode.MESSAGE: 4})
+    monkeypatch.setattr(mcap_records, "MAX_INDEX", 3)
     for opcode, bound in ((Opcode.CHUNK, 5), (Opcode.MESSAGE, 4), (Opcode.SCHEMA, 3), (Opcode.STATISTICS, 3)):
         within, beyond = bytes(bound), bytes(bound + 1)
         data = record(opcode, within) + record(opcode, beyond) + record(opcode, b"") + record(Opcode.FOOTER, b"")
@@ -98,7 +97,7 @@ def test_the_part_of_a_record_that_there_is_comes_with_the_end_of_the_file(monke
                 next(found)
             assert raised.value.args == end
     # Of a huge one, no more than of a chunk.
-    monkeypatch.setattr(_mcap_records, "MAX_CHUNK", 2)
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK", 2)
     with pytest.raises(EndOfFile) as raised:
         next(read_records(BytesIO(record(Opcode.MESSAGE, bytes(9))[:-1]), 17))
     assert raised.value.args == ((Opcode.MESSAGE, bytes(2)),)
@@ -140,7 +139,7 @@ def test_a_channel_is_asked_for_again_behind_a_record_that_may_describe_it() -> 
 
 
 def test_a_chunk_holds_wanted_messages_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_mcap_records, "MAX_CHUNK_MESSAGES", 2)
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK_MESSAGES", 2)
     data = message(3, 10, b"x") + message(4, 11, b"y") + message(3, 12, b"z")
     assert split(data) == ([(10, TF, b"x"), (12, TF, b"z")], {3: 2, 4: 1})
     with pytest.raises(ValueError, match="it has more than 2 messages, which is the bound"):
@@ -206,7 +205,7 @@ def test_a_chunk_has_the_size_and_the_checksum_that_it_claims() -> None:
 
 
 def test_a_chunk_of_the_largest_size_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_mcap_records, "MAX_CHUNK", 3)
+    monkeypatch.setattr(mcap_records, "MAX_CHUNK", 3)
     assert Chunk.parse(chunk(b"abc", 3)).unfold() == b"abc"
     with pytest.raises(UnfoldError, match="it claims 4 bytes, and 3 is the bound"):
         Chunk.parse(chunk(b"abcd", 4)).unfold()

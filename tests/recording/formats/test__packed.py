@@ -8,17 +8,25 @@ from hypothesis import strategies as st
 from support.recorded import SMALL, write_mcap
 from support.samples import moving
 
-from tfbus.recording.formats import _mcap, _mcap_reading, _packed
-from tfbus.recording.formats._mcap import McapStorage
-from tfbus.recording.formats._packed import Packed, batches, blocks_of, in_order, pack
-from tfbus.recording.formats._storage import Channel, StoredMessage, lost_message
+from tfbus.recording.formats import mcap, storage
+from tfbus.recording.formats.mcap import McapStorage
+from tfbus.recording.formats.storage import (
+    Channel,
+    Packed,
+    StoredMessage,
+    batches,
+    blocks_of,
+    in_order,
+    lost_message,
+    pack,
+)
 from tfbus.recording.recording import open_storage
 
 A, B = Channel("/a", "A", "cdr"), Channel("/b", "B", "cdr")
 messages = st.lists(st.tuples(st.integers(0, 50), st.sampled_from([A, B]), st.binary(max_size=9)), max_size=20)
 
 
-def unpacked(blocks: Iterator[_packed.Stored]) -> list[StoredMessage]:
+def unpacked(blocks: Iterator[storage.Stored]) -> list[StoredMessage]:
     return [stored for block in blocks for stored in (block.stored() if isinstance(block, Packed) else block)]
 
 
@@ -47,8 +55,8 @@ def test_a_log_time_that_is_no_stamp_comes_last_and_one_by_one() -> None:
 
 
 def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_packed, "BLOCK", 3)
-    monkeypatch.setattr(_packed, "BLOCK_BYTES", 10)
+    monkeypatch.setattr(storage, "BLOCK", 3)
+    monkeypatch.setattr(storage, "BLOCK_BYTES", 10)
     stored: list[StoredMessage] = [(k, A, bytes(size)) for k, size in enumerate((1, 1, 1, 9, 1, 30, 1))]
     assert [[len(payload) for _, _, payload in block] for block in batches(iter(stored))] == [
         [1, 1, 1],
@@ -66,8 +74,8 @@ def test_batches_are_bounded_by_number_and_by_bytes(monkeypatch: pytest.MonkeyPa
 def test_a_file_whose_chunks_overlap_is_packed_in_the_order_of_log_times(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, together: int, span: tuple[int | None, int | None]
 ) -> None:
-    monkeypatch.setattr(_mcap_reading, "_FIRST_BLOCK", together)
-    monkeypatch.setattr(_mcap_reading, "_BLOCK", together)
+    monkeypatch.setattr(mcap, "_FIRST_BLOCK", together)
+    monkeypatch.setattr(mcap, "_BLOCK", together)
     # Each chunk ends behind the beginning of the next one.
     times = [k + (15 if k % 10 == 9 else 0) for k in range(120)]
     path = write_mcap(
@@ -80,7 +88,7 @@ def test_a_file_whose_chunks_overlap_is_packed_in_the_order_of_log_times(
         assert [received for received, _, _ in expected] == sorted(received for received, _, _ in expected)
         assert unpacked(storage.packed(lambda _: True, *span)) == expected
         assert unpacked(storage.packed(lambda _: False, *span)) == list(storage.messages(lambda _: False, *span))
-        monkeypatch.setattr(_mcap, "_MOST_OVERLAPPING", 1)
+        monkeypatch.setattr(mcap, "_MOST_OVERLAPPING", 1)
         assert unpacked(storage.packed(lambda _: True, *span)) == expected
     finally:
         storage.close()

@@ -7,8 +7,9 @@ import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfbus.recording.formats import _raw_transforms
-from tfbus.recording.formats._raw_transforms import (
+from tfbus.recording.formats import transforms
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import (
     RawTransform,
     bounded,
     holds_transforms,
@@ -16,7 +17,6 @@ from tfbus.recording.formats._raw_transforms import (
     write_cdr,
     write_ros1,
 )
-from tfbus.recording.formats._storage import Channel
 from tfbus.tf_message import MalformedMessageError
 
 NUMBERS = struct.pack("<7d", 1, 2, 3, 0, 0, 0, 1)
@@ -209,7 +209,7 @@ def test_of_a_long_text_the_error_shows_the_beginning() -> None:
 
 
 def test_a_message_is_bounded_compressed_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_raw_transforms, "MAX_MESSAGE", 300)
+    monkeypatch.setattr(transforms, "MAX_MESSAGE", 300)
     compress = zstandard.compress
     assert bounded(bytes(300)) == bounded(compress(bytes(300))) == bytes(300)
     for payload, reason in (

@@ -15,10 +15,9 @@ from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import open_recording
-from tfbus.recording.formats._bag_records import find_chunk, read_record
-from tfbus.recording.formats._raw_transforms import write_ros1
-from tfbus.recording.formats._ros1 import Ros1Storage
-from tfbus.recording.formats._storage import Channel
+from tfbus.recording.formats.ros1 import Ros1Storage, find_chunk, read_record
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import write_ros1
 from tfbus.tf_message import encode
 
 SECOND = 1_000_000_000
@@ -287,7 +286,7 @@ def test_an_index_is_used_up_to_its_bound(tmp_path: Path, monkeypatch: pytest.Mo
     data = write_bag(path)
     size = len(data) - int.from_bytes(data[data.index(b"index_pos=") + 10 :][:8], "little")
     for bound, finished in ((size, True), (size - 1, False)):
-        monkeypatch.setattr("tfbus.recording.formats._ros1.MAX_INDEX", bound)
+        monkeypatch.setattr("tfbus.recording.formats.ros1.MAX_INDEX", bound)
         with open_recording(path) as recording:
             assert recording.finished == finished
         assert read(path) == (EXPECTED, [])

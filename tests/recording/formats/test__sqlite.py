@@ -17,8 +17,8 @@ from support.samples import moving, static
 
 from tfbus import RecordingError, TransformStamped
 from tfbus.recording import load, open_recording
-from tfbus.recording.formats._bounds import MAX_OTHER_MESSAGE
-from tfbus.recording.formats._sqlite import _BLOCK, SqliteStorage
+from tfbus.recording.formats.folder import _BLOCK, SqliteStorage
+from tfbus.recording.formats.storage import MAX_OTHER_MESSAGE
 from tfbus.recording.load import Problems
 from tfbus.tf_message import encode
 

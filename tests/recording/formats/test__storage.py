@@ -1,6 +1,6 @@
 from collections import Counter
 
-from tfbus.recording.formats._storage import Channel, StoredMessage, lost_message, select, shortfalls
+from tfbus.recording.formats.storage import Channel, StoredMessage, lost_message, select, shortfalls
 from tfbus.stamps import STAMP_MAX
 
 TF, OTHER, STATIC = Channel("/tf", "", "cdr"), Channel("/tf", "", "cdr"), Channel("/tf_static", "", "cdr")

@@ -2,8 +2,8 @@ from hashlib import md5
 
 import pytest
 
-from tfbus.recording.formats._storage import Channel
-from tfbus.recording.formats._types import MessageTypes, types_with_header
+from tfbus.recording.formats.copies import MessageTypes, types_with_header
+from tfbus.recording.formats.storage import Channel
 
 
 @pytest.mark.parametrize(("kind", "name"), [("a/B", "a/msg/B"), ("a/msg/B", "a/msg/B")])

@@ -8,7 +8,7 @@ import lz4.frame
 import pytest
 import zstandard
 
-from tfbus.recording.formats._unfold import _BLOCK, UnfoldError, unfold, unfold_file
+from tfbus.recording.formats.storage import _BLOCK, UnfoldError, unfold, unfold_file
 
 DATA = bytes(range(256)) * 256
 FOLD: dict[str, Callable[[bytes], bytes]] = {

@@ -8,9 +8,8 @@ from cyclopts import Parameter
 
 from tfbus.cli.arguments import Flag, Instant, UsageError
 from tfbus.cli.output import format_counts, progress, say, warn, write_file
-from tfbus.recording.convert import StaticTransform
+from tfbus.recording.convert import Edits, StaticTransform
 from tfbus.recording.convert import convert as convert_recordings
-from tfbus.recording.edits import Edits
 from tfbus.recording.recording import open_recording
 from tfbus.tree.rendering import quoted
 

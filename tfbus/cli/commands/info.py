@@ -12,8 +12,7 @@ from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import DEFAULT_TOPICS, Flag, JsonFlag, TopicOptions
 from tfbus.cli.output import format_counts, format_seconds, progress
 from tfbus.recording.recording import RecordedTopic
-from tfbus.recording.spread import Spread
-from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, summarise
+from tfbus.recording.summary import FrameSummary, RecordingSummary, SenderSummary, Spread, summarise
 from tfbus.stamps import SECOND, format_duration, from_seconds
 
 _SPREADS = tuple(

@@ -6,22 +6,172 @@ A payload is written as it is where the format can hold its encoding. Else it is
 
 import json
 import sqlite3
+import struct
 from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import IO, Any, Final, Protocol
 
-from tfbus.recording.formats._channels import TYPE_HASH
-from tfbus.recording.formats._foxglove import (
-    FRAME_TRANSFORMS,
-    foxglove_channel,
-    transforms_schema,
-    write_protobuf,
-)
-from tfbus.recording.formats._mcap_output import SCHEMA
-from tfbus.recording.formats._raw_transforms import RawTransform, write_cdr, write_ros1
-from tfbus.recording.formats._storage import Channel
-from tfbus.recording.formats._types import MessageTypes
+from tfbus.recording.formats.mcap_output import SCHEMA, TYPE_HASH
+from tfbus.recording.formats.storage import Channel
+from tfbus.recording.formats.transforms import RawTransform, write_cdr, write_ros1
+from tfbus.tf_message import MalformedMessageError
+
+# Writing Foxglove's ``FrameTransforms`` in Protocol Buffers, bit by bit.
+#
+# The numbers of a message stay bytes, as in the other formats, so that a transform keeps every bit. The wire format is
+# that of Protocol Buffers' "Encoding" page; the numbers of the fields are those of Foxglove's schemas.
+
+
+FRAME_TRANSFORMS: Final = "foxglove.FrameTransforms"
+_VARINT, _FIXED64, _BYTES = 0, 1, 2
+_SECONDS: Final = range(-(2**63), 2**63)
+
+
+def write_protobuf(transforms: Sequence[RawTransform]) -> bytes:
+    """A ``foxglove.FrameTransforms``.
+
+    Raises
+    ------
+    MalformedMessageError
+        If a name is no UTF-8, or a stamp does not fit.
+    """
+    return b"".join(_field(1, _transform(each)) for each in transforms)
+
+
+def transforms_schema() -> bytes:
+    """The definition of ``foxglove.FrameTransforms``; `ImportError` without the extra."""
+    from foxglove.messages import FrameTransforms
+
+    return bytes(FrameTransforms.get_schema().data)
+
+
+def foxglove_channel(source: Channel, metadata: dict[str, str]) -> Channel:
+    """The channel for transforms of another channel, in Foxglove's schema."""
+    return Channel(source.topic, FRAME_TRANSFORMS, "protobuf", "protobuf", transforms_schema(), metadata)
+
+
+def _transform(transform: RawTransform) -> bytes:
+    seconds, nanoseconds, parent, child, numbers = transform
+    if seconds not in _SECONDS:
+        raise MalformedMessageError("stamp", f"{seconds} s does not fit the stamp of a message")
+    for name in (parent, child):
+        try:
+            name.decode()
+        except UnicodeDecodeError:
+            raise MalformedMessageError("text", f"the name {name[:40]!r} is no UTF-8") from None
+    values = struct.unpack("8s8s8s8s8s8s8s", numbers)
+    return b"".join(
+        (
+            _field(1, _number(1, seconds) + _number(2, nanoseconds)),
+            _field(2, parent),
+            _field(3, child),
+            _field(4, _doubles(values[:3])),
+            _field(5, _doubles(values[3:])),
+        )
+    )
+
+
+def _doubles(values: Sequence[bytes]) -> bytes:
+    return b"".join(bytes([number << 3 | _FIXED64]) + value for number, value in enumerate(values, 1))
+
+
+def _number(field: int, value: int) -> bytes:
+    return bytes([field << 3 | _VARINT]) + _varint(value % 2**64)
+
+
+def _field(field: int, content: bytes) -> bytes:
+    return bytes([field << 3 | _BYTES]) + _varint(len(content)) + content
+
+
+def _varint(value: int) -> bytes:
+    parts = bytearray()
+    while value > 0x7F:
+        parts.append(value & 0x7F | 0x80)
+        value >>= 7
+    parts.append(value)
+    return bytes(parts)
+
+
+_HEADER: Final = "std_msgs/msg/Header"
+_HEADER_OF_ROS1: Final = "uint32 seq\ntime stamp\nstring frame_id\n"
+
+
+class MessageTypes:
+    """The types of the messages of some channels: those of ROS 2 Humble, and those that files define."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._store: Any = get_typestore(Stores.ROS2_HUMBLE)
+        self._known: set[Channel] = set()
+
+    @staticmethod
+    def name(kind: str) -> str:
+        """The name of a type in ROS 2; raises `ValueError` if it has no package."""
+        package, _, last = kind.rpartition("/")
+        if not package:
+            raise ValueError(f"{kind!r} is no name of a type of ROS")
+        return f"{package.removesuffix('/msg')}/msg/{last}"
+
+    def convert(self, channel: Channel, payload: bytes) -> bytes:
+        """A payload in the other of the two encodings.
+
+        Raises
+        ------
+        ValueError
+            If the type is not known, or the payload is none of that type.
+        """
+        self._register(channel)
+        kind = self.name(channel.type)
+        try:
+            convert = self._store.ros1_to_cdr if channel.encoding == "ros1" else self._store.cdr_to_ros1
+            return bytes(convert(payload, kind))
+        # For damaged bytes and definitions, rosbags raises more than its own errors.
+        except Exception as error:  # noqa: BLE001
+            raise ValueError(f"a message of type {channel.type} cannot be converted: {error!r}"[:200]) from None
+
+    def ros1_definition(self, channel: Channel) -> tuple[str, str]:
+        """The definition of a channel's type in ROS 1, and its MD5 sum; raises `ValueError` if it is not known."""
+        digest = channel.metadata.get("md5sum")
+        if channel.schema_encoding == "ros1msg" and digest:
+            return channel.schema.decode(errors="replace"), digest
+        self._register(channel)
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        store: Any = get_typestore(Stores.EMPTY)
+        # The payloads that `convert` gives have the number too.
+        store.fielddefs.update(self._store.fielddefs, **get_types_from_msg(_HEADER_OF_ROS1, _HEADER))
+        try:
+            definition, digest = store.generate_msgdef(self.name(channel.type), ros_version=1)
+        except Exception as error:  # noqa: BLE001
+            raise ValueError(f"the type {channel.type} has no definition: {error!r}"[:200]) from None
+        return definition, digest
+
+    def _register(self, channel: Channel) -> None:
+        """Add the types that the definition of a channel has and the store does not."""
+        if channel in self._known:
+            return
+        self._known.add(channel)
+        if channel.schema_encoding in ("ros1msg", "ros2msg") and channel.schema:
+            from rosbags.typesys import get_types_from_msg
+
+            try:
+                found = get_types_from_msg(channel.schema.decode(errors="replace"), self.name(channel.type))
+                self._store.register({name: each for name, each in found.items() if name not in self._store.fielddefs})
+            except Exception as error:  # noqa: BLE001
+                raise ValueError(f"the definition of {channel.type} cannot be read: {error!r}"[:200]) from None
+
+
+@cache
+def types_with_header() -> frozenset[str]:
+    """The types of ROS 2 Humble that begin with a header."""
+    from rosbags.typesys import Stores, get_typestore
+
+    definitions = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+    return frozenset(kind for kind, (_, fields) in definitions.items() if fields and _HEADER in str(fields[0]))
+
 
 TF_TYPE: Final = "tf2_msgs/msg/TFMessage"
 _CHUNK: Final = 2**20

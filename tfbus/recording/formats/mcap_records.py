@@ -17,9 +17,16 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 
-from tfbus.recording.formats._bounds import MAX_CHUNK, MAX_CHUNK_MESSAGES, MAX_INDEX, MAX_OTHER_MESSAGE
-from tfbus.recording.formats._storage import Channel, StoredMessage
-from tfbus.recording.formats._unfold import UnfoldError, unfold
+from tfbus.recording.formats.storage import (
+    MAX_CHUNK,
+    MAX_CHUNK_MESSAGES,
+    MAX_INDEX,
+    MAX_OTHER_MESSAGE,
+    Channel,
+    StoredMessage,
+    UnfoldError,
+    unfold,
+)
 
 DAMAGE: Final = (
     McapError,
