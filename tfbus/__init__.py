@@ -7,8 +7,7 @@ seen from another, and lets a lookup wait for data that are still on their way. 
 from importlib import import_module
 
 _NAMES_IN = {
-    "analysis.diagnose": ("diagnose",),
-    "analysis.finding": ("Finding",),
+    "analysis.examiner": ("Finding", "diagnose"),
     "buffer.buffer": ("Buffer",),
     "buffer.watch": ("Watch",),
     "bus.broadcaster": ("TransformBroadcaster",),
@@ -76,8 +75,7 @@ _NAMES_IN = {
     "geometry.transform_array": ("TransformArray",),
     "message_filter.message_filter": ("MessageFilter",),
     "registration": ("Registration",),
-    "robot.joint": ("Joint", "Mimic"),
-    "robot.model": ("LimitViolation", "RobotModel"),
+    "robot.model": ("Joint", "LimitViolation", "Mimic", "RobotModel"),
     "robot.state_publisher": ("RobotStatePublisher",),
     "stamps": ("LATEST", "Latest", "SECOND", "format_stamp", "from_seconds", "to_seconds"),
     "statistics": (

@@ -5,8 +5,8 @@ from tfbus import data as data
 from tfbus import recording as recording
 from tfbus import robot as robot
 from tfbus import testing as testing
-from tfbus.analysis.diagnose import diagnose as diagnose
-from tfbus.analysis.finding import Finding as Finding
+from tfbus.analysis.examiner import Finding as Finding
+from tfbus.analysis.examiner import diagnose as diagnose
 from tfbus.buffer.buffer import Buffer as Buffer
 from tfbus.buffer.watch import Watch as Watch
 from tfbus.bus.broadcaster import TransformBroadcaster as TransformBroadcaster
@@ -72,9 +72,9 @@ from tfbus.geometry.transform import Transform as Transform
 from tfbus.geometry.transform_array import TransformArray as TransformArray
 from tfbus.message_filter.message_filter import MessageFilter as MessageFilter
 from tfbus.registration import Registration as Registration
-from tfbus.robot.joint import Joint as Joint
-from tfbus.robot.joint import Mimic as Mimic
+from tfbus.robot.model import Joint as Joint
 from tfbus.robot.model import LimitViolation as LimitViolation
+from tfbus.robot.model import Mimic as Mimic
 from tfbus.robot.model import RobotModel as RobotModel
 from tfbus.robot.state_publisher import RobotStatePublisher as RobotStatePublisher
 from tfbus.stamps import LATEST as LATEST

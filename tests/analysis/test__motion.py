@@ -3,8 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from tfbus.analysis._motion import MovingSamples
-from tfbus.analysis.limits import Limits
+from tfbus.analysis.examiner import Limits, MovingSamples
 
 ROW = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 

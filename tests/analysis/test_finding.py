@@ -1,7 +1,7 @@
 import pytest
 
 from tfbus import Finding
-from tfbus.analysis.finding import ADVICE
+from tfbus.analysis.examiner import ADVICE
 
 
 def test_a_finding_says_which_frame_what_how_often_the_worst_and_when() -> None:

@@ -336,9 +336,9 @@ def test_messages_of_rosbags_as_they_come_from_a_bag_become_data_and_messages_ag
 @pytest.mark.thorough
 def test_messages_of_cyclone_dds_become_data_and_messages_again() -> None:
     pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
-    from tfbus.links.dds import _types
+    from tfbus.links.dds import types
 
-    make: Any = _types
+    make: Any = types
     place, turn = make.Vector3(1.5, 0.0, 0.0), make.Quaternion(0.0, 0.0, 0.0, 1.0)
     made = make.TransformStamped(make.Header(make.Time(5, 7), "map"), "base", make.Transform(place, turn))
     # As it comes over the network.

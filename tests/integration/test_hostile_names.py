@@ -527,7 +527,7 @@ def htmls_with(name: str) -> Iterator[str]:
     tree = tree_with([name])
     yield tree._repr_html_()
     pytest.importorskip("viser", reason="the live page needs viser")
-    from tfbus.view._page import Page
+    from tfbus.view.page import Page
 
     page = Page(tree, fixed=name)
     page.select(f"{name}'")
@@ -542,9 +542,8 @@ def test_the_labels_and_the_options_of_the_page_are_printable_and_choose_the_fra
     pytest.importorskip("viser", reason="the live page needs viser")
     from support.viser_pages import viser_page
 
-    from tfbus.view._canvas import Canvas
-    from tfbus.view._page import Page
-    from tfbus.view._panel import Panel
+    from tfbus.view.page import Page
+    from tfbus.view.screen import Canvas, Panel
 
     page = Page(tree_with(NAMES))
     page.labels = "all"

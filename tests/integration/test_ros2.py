@@ -54,7 +54,7 @@ def peer(domain: int, seconds: float = SECONDS, x: float = 0.5) -> AbstractConte
 
 def cyclone_peer(domain: int, seconds: float = SECONDS, x: float = 0.5) -> AbstractContextManager[Node]:
     """A node of ROS 2 with Cyclone DDS, ``/cyclone``, which needs no ROS."""
-    from tfbus.links.dds._domains import configuration
+    from tfbus.links.dds.dds_link import configuration
 
     # As on a robot with both kinds, which Cyclone DDS has to be told of.
     settings = {**environment(domain), "CYCLONEDDS_URI": configuration("localhost", (), None)}

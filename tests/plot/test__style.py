@@ -4,7 +4,7 @@ pytest.importorskip("matplotlib", reason="plots need matplotlib")
 
 from matplotlib.figure import Figure
 
-from tfbus.plot._style import line_styles, new_figure
+from tfbus.plot.plots import line_styles, new_figure
 
 
 def test_a_given_figure_is_drawn_in_and_otherwise_there_is_a_new_one() -> None:

@@ -8,7 +8,7 @@ from matplotlib.patches import Rectangle
 
 from tfbus import SECOND
 from tfbus.plot import Reception, plot_gaps
-from tfbus.plot.gaps import spans_heard
+from tfbus.plot.plots import spans_heard
 
 
 def heard(*seconds: float, static: bool = False, delay: float = 0.5) -> Reception:

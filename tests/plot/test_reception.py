@@ -1,7 +1,7 @@
 from support.samples import moving, static
 
 from tfbus import SECOND
-from tfbus.plot.reception import read_reception
+from tfbus.plot.plots import read_reception
 from tfbus.recording import RecordedMessage
 
 

@@ -4,7 +4,7 @@ from support.samples import moving, over, static, tree_of
 
 from tfbus import SECOND, Transform, TransformStamped, TransformTree
 from tfbus.errors import UnknownFrameError
-from tfbus.plot.series import read_series
+from tfbus.plot.plots import read_series
 
 
 def test_the_angles_are_roll_pitch_and_yaw_in_degrees() -> None:

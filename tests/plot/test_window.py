@@ -5,7 +5,7 @@ pytest.importorskip("matplotlib", reason="plots need matplotlib")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-from tfbus.plot.window import show_in_window
+from tfbus.plot.plots import show_in_window
 
 
 @pytest.mark.parametrize(("display", "why"), [("", "there is no display"), (":0", "has no window here")])

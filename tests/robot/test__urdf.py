@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tfbus import InvalidRobotError, Joint, Mimic, Transform
-from tfbus.robot._urdf import MAX_DEPTH, read_urdf
+from tfbus.robot.model import MAX_DEPTH, read_urdf
 
 LINKS = '<link name="a"/><link name="b"/>'
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from support.strategies import angles, transforms, unit_vectors, vectors
 
 from tfbus import InvalidRobotError, InvalidTransformError, Joint, Mimic, Transform
-from tfbus.robot.joint import KINDS
+from tfbus.robot.model import KINDS
 from tfbus.rows import Vector
 
 Matrix = npt.NDArray[np.float64]

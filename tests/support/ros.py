@@ -9,7 +9,7 @@ from tfbus.links._carrier import SendReport
 from tfbus.links._endpoint import Endpoint
 from tfbus.links._receive_queue import Received
 from tfbus.links.ros import RosOptions
-from tfbus.links.ros._carrier import RosCarrier, RosMessage
+from tfbus.links.ros.ros_link import RosCarrier, RosMessage
 from tfbus.links.ros.settings import settings_of
 from tfbus.tf_message import encode
 

@@ -22,7 +22,7 @@ from wsproto.events import (
 from wsproto.utilities import LocalProtocolError
 
 from tfbus import TransformStamped
-from tfbus.links.ros._transforms import as_mapping, decode_mapping
+from tfbus.links.ros.messages import as_mapping, decode_mapping
 from tfbus.tf_message import encode
 
 _GONE = (anyio.EndOfStream, anyio.BrokenResourceError, anyio.ClosedResourceError, LocalProtocolError)

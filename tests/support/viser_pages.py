@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from tfbus.view._server import Server, start_server, stop_server
+from tfbus.view.server import Server, start_server, stop_server
 
 CAMERA = {
     "type": "ViewerCameraMessage",

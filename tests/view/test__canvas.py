@@ -10,15 +10,15 @@ from support.samples import moving, static, tree_of
 from support.viser_pages import viser_page
 
 from tfbus import LATEST, PointCloud
-from tfbus.view import _meshes
-from tfbus.view._canvas import HIGHLIGHT, TRAIL, Canvas
-from tfbus.view._page import Page
+from tfbus.view import meshes
+from tfbus.view.page import Page
+from tfbus.view.screen import HIGHLIGHT, TRAIL, Canvas
 
 
 def test_what_stands_out_has_colours_of_the_palette_of_okabe_and_ito() -> None:
     orange, purple = tuple(bytes.fromhex("e69f00")), tuple(bytes.fromhex("cc79a7"))
-    assert (orange, purple, purple) == (HIGHLIGHT, TRAIL, _meshes._PLACEHOLDER_COLOUR)
-    assert len(set(_meshes._NO_COLOUR)) == 1, "it is a grey"
+    assert (orange, purple, purple) == (HIGHLIGHT, TRAIL, meshes._PLACEHOLDER_COLOUR)
+    assert len(set(meshes._NO_COLOUR)) == 1, "it is a grey"
 
 
 def test_axes_dots_and_lines_are_where_the_scene_has_them() -> None:

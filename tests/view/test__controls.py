@@ -5,7 +5,7 @@ import anyio
 import pytest
 from anyio.lowlevel import checkpoint
 
-from tfbus.view._controls import CAPACITY, Controls
+from tfbus.view.server import CAPACITY, Controls
 
 pytestmark = pytest.mark.anyio
 

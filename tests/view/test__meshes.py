@@ -17,7 +17,7 @@ import pytest
 trimesh = pytest.importorskip("trimesh", reason="reading meshes needs trimesh")
 
 from tfbus.robot import Box, Cylinder, Mesh, Sphere, Visual  # noqa: E402
-from tfbus.view._meshes import MAX_BYTES, MeshFiles, Solid, solids_of  # noqa: E402
+from tfbus.view.meshes import MAX_BYTES, MeshFiles, Solid, solids_of  # noqa: E402
 
 
 @pytest.fixture
@@ -302,7 +302,7 @@ def test_a_mirrored_part_keeps_its_faces_outward(tmp_path: Path) -> None:
 PEAK = """
 import resource, sys
 from pathlib import Path
-from tfbus.view._meshes import MeshFiles
+from tfbus.view.meshes import MeshFiles
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 files = MeshFiles((), Path(sys.argv[1]))
 for name in sys.argv[2:]:

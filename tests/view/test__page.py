@@ -5,7 +5,7 @@ from support.samples import moving, over, static, tree_of
 
 from tfbus import SECOND, Buffer, Bus, SimulatedClock, TransformTree
 from tfbus.events import FrameRemoved
-from tfbus.view._page import EVENTS_KEPT, Page, Texts
+from tfbus.view.page import EVENTS_KEPT, Page, Texts
 
 
 def line(end: int = 10) -> TransformTree:

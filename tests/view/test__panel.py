@@ -11,8 +11,8 @@ from support.samples import over, static, tree_of
 from support.viser_pages import viser_page
 
 from tfbus import SECOND
-from tfbus.view._page import Page
-from tfbus.view._panel import LARGEST, NONE, Panel
+from tfbus.view.page import Page
+from tfbus.view.screen import LARGEST, NONE, Panel
 
 
 class Used:

@@ -8,7 +8,7 @@ from tfbus import LATEST, SECOND, Latest, Transform, TransformStamped, Transform
 from tfbus.errors import UnknownFrameError
 from tfbus.tree.history import EdgeState
 from tfbus.tree.tree import forest_of
-from tfbus.view._scene import NO_SCENE, Scene, SceneReader, largest_root
+from tfbus.view.page import NO_SCENE, Scene, SceneReader, largest_root
 
 
 def read(

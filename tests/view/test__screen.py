@@ -7,8 +7,8 @@ from support.samples import moving, static, tree_of
 from support.viser_pages import viser_page
 
 from tfbus import LATEST, SECOND, PointCloud
-from tfbus.view._page import Page
-from tfbus.view._screen import Points, Screen
+from tfbus.view.page import Page
+from tfbus.view.screen import Points, Screen
 
 
 def shown(page: Page, server: object) -> Screen:

@@ -3,7 +3,7 @@ import math
 from support.samples import moving, over, static, tree_of
 
 from tfbus import LATEST, SECOND, Transform, TransformStamped
-from tfbus.view._selection import selection_facts
+from tfbus.view.page import selection_facts
 
 
 def test_the_pose_is_in_m_degrees_and_a_quaternion_with_w_last() -> None:

@@ -19,7 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
 from tfbus._aio.web_door import WebDoor
-from tfbus.view._server import MAX_MESSAGE, MAX_TEXT, Server, start_server, stop_server
+from tfbus.view.server import MAX_MESSAGE, MAX_TEXT, Server, start_server, stop_server
 
 CLICK = {
     "type": "SceneNodeClickMessage",

@@ -10,9 +10,9 @@ from support.viser_pages import viser_page
 
 from tfbus import Transform, TransformStamped
 from tfbus.robot import Box, Sphere, Visual
-from tfbus.view._meshes import MeshFiles, solids_of
-from tfbus.view._page import Page
-from tfbus.view._solids import Solids
+from tfbus.view.meshes import MeshFiles, solids_of
+from tfbus.view.page import Page
+from tfbus.view.screen import Solids
 
 VISUALS = [
     Visual("base", Box((1.0, 2.0, 3.0)), Transform((0.0, 0.0, 0.5)), (1.0, 0.0, 0.0, 1.0)),

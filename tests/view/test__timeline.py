@@ -3,7 +3,7 @@ from support.samples import moving, over, static, tree_of
 
 from tfbus import SECOND
 from tfbus.tree.tree import forest_of
-from tfbus.view._timeline import Timeline, span_of
+from tfbus.view.page import Timeline, span_of
 
 SPAN = (10 * SECOND, 20 * SECOND)
 

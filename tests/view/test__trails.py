@@ -3,7 +3,7 @@ import pytest
 from support.samples import moving, over, static, tree_of
 
 from tfbus import SECOND
-from tfbus.view._trails import SAMPLES, trail
+from tfbus.view.page import SAMPLES, trail
 
 
 def test_a_trail_ends_at_the_newest_answer_and_begins_a_duration_before() -> None:

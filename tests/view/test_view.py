@@ -35,7 +35,7 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.view import View
-from tfbus.view._screen import Screen, Sight
+from tfbus.view.screen import Screen, Sight
 
 pytestmark = pytest.mark.anyio
 

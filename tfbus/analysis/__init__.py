@@ -5,14 +5,9 @@ a tree does not keep, such as duplicates and stamps that go back. `compare` give
 error of a frame between two trees, as the benchmarks for SLAM define them. `Arrivals` measures rates and delays.
 """
 
-from tfbus.analysis.alignment import Alignment
 from tfbus.analysis.arrivals import Arrival, Arrivals
-from tfbus.analysis.compare import Comparison, compare
-from tfbus.analysis.diagnose import diagnose
-from tfbus.analysis.examiner import Examiner
-from tfbus.analysis.finding import Finding
-from tfbus.analysis.limits import Limits
-from tfbus.analysis.pose_errors import PoseErrors, Statistics
+from tfbus.analysis.compare import Alignment, Comparison, PoseErrors, Statistics, compare
+from tfbus.analysis.examiner import Examiner, Finding, Limits, diagnose
 
 __all__ = [
     "Alignment",

@@ -1,16 +1,119 @@
 """`compare`, which compares the trajectory of a frame in one tree with that in another."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from tfbus.analysis.alignment import Alignment
-from tfbus.analysis.pose_errors import PoseErrors
+from tfbus.geometry.transform import Transform
 from tfbus.rows import Columns, compose, invert
 from tfbus.stamps import STAMP_MAX, STAMP_MIN, as_duration, from_seconds, time_between
 from tfbus.tree.tree import TransformTree, forest_of
+
+_Points = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """A motion with a scale: ``transform`` after ``scale``.
+
+    Parameters
+    ----------
+    transform : Transform
+    scale : float
+    """
+
+    transform: Transform
+    scale: float
+
+    @classmethod
+    def between(cls, points: _Points, reference: _Points, with_scale: bool = False) -> "Alignment":
+        """The alignment with the least squared distances.
+
+        The method is Umeyama's, "Least-squares estimation of transformation parameters between two point patterns",
+        IEEE PAMI 13(4), 1991, equations 34 to 43.
+
+        Parameters
+        ----------
+        points, reference : float64 arrays of shape (n, 3)
+            m.
+        with_scale : bool
+            Whether the points are scaled as well; else the scale is 1.
+
+        Raises
+        ------
+        ValueError
+            If the points do not determine a rotation, because all of them are on a line.
+        """
+        mean, mean_reference = points.mean(axis=0), reference.mean(axis=0)
+        centred = points - mean
+        u, d, v = np.linalg.svd((reference - mean_reference).T @ centred / len(points))
+        if np.count_nonzero(d > np.finfo(np.float64).eps * max(1.0, float(d[0]))) < 2:
+            raise ValueError("the trajectories cannot be aligned: their points lie on a line")
+        signs = np.array([1.0, 1.0, math.copysign(1.0, np.linalg.det(u) * np.linalg.det(v))])
+        rotation = u * signs @ v
+        scale = float((d * signs).sum() / (centred**2).sum(axis=1).mean()) if with_scale else 1.0
+        matrix = np.eye(4)
+        matrix[:3, :3] = rotation
+        matrix[:3, 3] = mean_reference - scale * rotation @ mean
+        return cls(Transform.from_matrix(matrix), scale)
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Statistics of errors, in m or rad; the standard deviation is that of the population."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseErrors:
+    """The error of each pose, or of each step between two poses.
+
+    Parameters
+    ----------
+    stamps : int64 array of shape (n,)
+        The stamps in the reference, in ns; of a step, that of its end.
+    translation : float64 array of shape (n,)
+        m.
+    rotation : float64 array of shape (n,)
+        rad, from 0 to pi.
+    """
+
+    stamps: npt.NDArray[np.int64]
+    translation: npt.NDArray[np.float64]
+    rotation: npt.NDArray[np.float64]
+
+    def statistics(self) -> tuple[Statistics, Statistics]:
+        """The statistics of translation and rotation.
+
+        Raises
+        ------
+        ValueError
+            If there are no errors, because there is only one pose.
+        """
+        if not len(self.stamps):
+            raise ValueError("there are no errors: a step needs two poses")
+        return _statistics(self.translation), _statistics(self.rotation)
+
+
+def _statistics(values: npt.NDArray[np.float64]) -> Statistics:
+    return Statistics(
+        float(np.sqrt(np.mean(values**2))),
+        float(np.mean(values)),
+        float(np.median(values)),
+        float(np.std(values)),
+        float(np.min(values)),
+        float(np.max(values)),
+    )
+
 
 _Rows = npt.NDArray[np.float64]
 _Stamps = npt.NDArray[np.int64]

@@ -3,15 +3,279 @@
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from itertools import repeat
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from tfbus.analysis._motion import MovingSamples
-from tfbus.analysis.finding import Finding
-from tfbus.analysis.limits import Limits
 from tfbus.geometry.stamped import TransformStamped
+from tfbus.plain import printable
 from tfbus.rows import Row
-from tfbus.stamps import SECOND
+from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN, format_stamp, is_real, time_between, to_seconds
+from tfbus.tree.history import Edge, FrameHistory, Samples
+from tfbus.tree.tree import TransformTree, forest_of
+
+ADVICE = {
+    "translation": "no robot is there: look for an uninitialised or diverged estimate at its sender",
+    "jump": "the sender has reset, or mixes two estimates: look at it, or leave these out with max_speed=",
+    "turn": "the sender has reset, or two estimates disagree: look at what it does then",
+    "stamps go back": "messages overtake each other, or a clock was set back: use one sender, and one clock",
+    "ahead": "the clock of the sender is ahead of that of the recorder: synchronise them",
+    "duplicate stamps": "the last one wins: give each transform a stamp of its own, or send it once",
+    "gap": "lookups interpolate across it: look for what stopped the sender, or refuse with max_gap=",
+    "rate": "the sender is overloaded, or messages are lost on the way",
+    "two authorities": "each overwrites the other: let one of them send the frame",
+    "two parents": "a frame has one parent: give it one, or a name for each",
+    "rotation": "normalise quaternions before they are sent",
+    "static changes": "a static transform is sent once: send it as a moving one",
+    "two kinds": "a frame is static or moving: the last kind wins, and drops the history of the other",
+    "never moves": "if it is fixed, send it once as a static transform; if it only stood still, all is well",
+    "disconnected": "nothing can be looked up between these trees: a transform is missing",
+    "refused": "these are left out",
+    "unfinished": "copy the file again; if its writer was killed, this is what can be read",
+}
+"""The advice for each kind of finding."""
+HINTS = frozenset(("never moves",))
+"""The kinds that may be as they are meant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is wrong.
+
+    Parameters
+    ----------
+    kind : str
+        The kind, such as ``"jump"``.
+    frame : str or None
+        The child frame; None for the whole tree.
+    count : int
+        How often it happens.
+    first : int or None
+        The stamp of the first time, in ns.
+    worst : float or None
+        The worst case, in `unit`.
+    unit : str
+        ``"m"``, ``"s"``, ``"m/s"``, ``"rad/s"``, ``"Hz"``, or empty.
+    detail : str
+        What happens, in words.
+    at : int or None
+        The stamp of the worst case, in ns.
+    """
+
+    kind: str
+    frame: str | None
+    count: int
+    first: int | None
+    worst: float | None
+    unit: str
+    detail: str
+    at: int | None = None
+
+    @property
+    def is_hint(self) -> bool:
+        """Whether it may be as it is meant, rather than wrong."""
+        return self.kind in HINTS
+
+    @property
+    def advice(self) -> str:
+        """The advice for this kind of finding."""
+        return ADVICE[self.kind]
+
+    def __str__(self) -> str:
+        name = "" if self.frame is None else f"{self.frame!r}: "
+        worst = "" if self.worst is None else f", worst {self.worst:.4g} {self.unit}".rstrip()
+        at = "" if self.at is None or self.worst is None else f" at {format_stamp(self.at)}"
+        first = "" if self.first is None else f", first at {format_stamp(self.first)}"
+        return printable(f"{name}{self.detail}, {self.count:,} x{worst}{at}{first}")
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The bounds of an examination.
+
+    Parameters
+    ----------
+    translation : float
+        The longest translation, in m. The default is larger than the Earth, for frames at its centre.
+    speed : float
+        The highest speed of a frame in its parent, in m/s.
+    turn_rate : float
+        The highest angular speed of a frame in its parent, in rad/s.
+    ahead : float
+        How far a stamp may lie ahead of the time at which it arrives, in s.
+    gap : float
+        The shortest time between two stamps that counts as a gap, in s; it must also be ten times the usual one.
+    norm : float
+        How far the norm of a quaternion may be from one.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If one of them is not a number greater than zero.
+    """
+
+    translation: float = 1e8
+    speed: float = 100.0
+    turn_rate: float = 100.0
+    ahead: float = 0.05
+    gap: float = 0.5
+    norm: float = 1e-4
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if not is_real(value):
+                raise TypeError(f"{each.name} must be a number, not {value!r}")
+            if not value > 0:
+                raise ValueError(f"{each.name} must be greater than zero, got {value!r}")
+
+
+_OUTLIER = 20.0
+"""The least speed of a jump, as a multiple of the median speed of its frame."""
+_MIN_MOVES = 20
+"""The number of moves from which the median is taken for usual."""
+_MIN_STEP = 0.1
+_MIN_TURN = 0.5
+"""m and rad; a smaller one is no jump, unless its speed is beyond the bound."""
+_WINDOWS = 10
+_MIN_IN_WINDOW = 5
+_GAP = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class MovingSamples:
+    """The moving samples of a frame in the order of their arrival, or of their stamps.
+
+    Parameters
+    ----------
+    frame : str
+    stamps : int64 array of shape (n,)
+        ns.
+    rows : float64 array of shape (n, 7)
+    parents : int array of shape (n,)
+        The number of the parent of each.
+    authorities : int array of shape (n,)
+    received : int64 array of shape (n,), optional
+        When each arrived, in ns; None if they are in the order of their stamps.
+    """
+
+    frame: str
+    stamps: npt.NDArray[np.int64]
+    rows: npt.NDArray[np.float64]
+    parents: npt.NDArray[np.int64]
+    authorities: npt.NDArray[np.int64]
+    received: npt.NDArray[np.int64] | None
+
+    def findings(self, limits: Limits) -> Iterator[Finding]:
+        """All that is wrong."""
+        yield from self._arrivals(limits)
+        order = np.argsort(self.stamps, kind="stable")
+        stamps, rows, parents = self.stamps[order], self.rows[order], self.parents[order]
+        with np.errstate(over="ignore", invalid="ignore"):
+            lengths = np.sqrt((rows[:, :3] ** 2).sum(axis=1))
+        far = ~(lengths <= limits.translation)
+        yield from self._at("translation", far, stamps, lengths, "m", f"farther than {limits.translation:g} m")
+        last = np.append(stamps[1:] != stamps[:-1], True)
+        yield from self._at("duplicate stamps", ~last, stamps, None, "", "stamps that came before")
+        # Of one stamp, the last sample holds. What is far off anyway is no jump.
+        good = last & ~far
+        stamps, rows, parents = stamps[good], rows[good], parents[good]
+        # The difference of stamps that are centuries apart does not fit.
+        if len(stamps) < 2 or int(stamps[-1]) - int(stamps[0]) > STAMP_MAX:
+            return
+        yield from self._jumps(limits, stamps, rows, parents)
+        yield from self._rates(limits, stamps)
+
+    def _arrivals(self, limits: Limits) -> Iterator[Finding]:
+        if self.received is None:
+            return
+        newest = np.maximum.accumulate(self.stamps)
+        back = time_between(self.stamps, newest)
+        yield from self._at("stamps go back", back > 0, self.stamps, back / SECOND, "s", "older than one before")
+        ahead = time_between(self.received, self.stamps) / SECOND
+        yield from self._at("ahead", ahead > limits.ahead, self.stamps, ahead, "s", "stamped ahead of its arrival")
+
+    def _jumps(
+        self,
+        limits: Limits,
+        stamps: npt.NDArray[np.int64],
+        rows: npt.NDArray[np.float64],
+        parents: npt.NDArray[np.int64],
+    ) -> Iterator[Finding]:
+        # Another parent means other coordinates.
+        same = parents[1:] == parents[:-1]
+        times = (np.diff(stamps) / SECOND)[same]
+        after = stamps[1:][same]
+        steps = np.sqrt((np.diff(rows[:, :3], axis=0) ** 2).sum(axis=1))[same]
+        cosine = np.abs((rows[1:, 3:] * rows[:-1, 3:]).sum(axis=1))[same]
+        # The distance of the quaternions is exact for small angles, where the cosine is not.
+        difference = np.minimum(
+            ((rows[1:, 3:] - rows[:-1, 3:]) ** 2).sum(axis=1), ((rows[1:, 3:] + rows[:-1, 3:]) ** 2).sum(axis=1)
+        )[same]
+        angles = np.where(cosine < 0.9, 2 * np.arccos(np.minimum(cosine, 1.0)), 4 * np.arcsin(np.sqrt(difference) / 2))
+        for kind, moves, least, bound, unit, what in (
+            ("jump", steps, _MIN_STEP, limits.speed, "m/s", "moves faster than it can"),
+            ("turn", angles, _MIN_TURN, limits.turn_rate, "rad/s", "turns faster than it can"),
+        ):
+            speeds = moves / times
+            usual = speeds[speeds > 0]
+            outlying = np.zeros(len(speeds), bool)
+            if len(usual) >= _MIN_MOVES:
+                outlying = (speeds > _OUTLIER * np.median(usual)) & (moves > least)
+            yield from self._at(kind, (speeds > bound) | outlying, after, speeds, unit, what)
+
+    def _rates(self, limits: Limits, stamps: npt.NDArray[np.int64]) -> Iterator[Finding]:
+        times = np.diff(stamps) / SECOND
+        usual = float(np.median(times))
+        pauses = times > _GAP * usual
+        yield from self._at(
+            "gap",
+            pauses & (times > limits.gap),
+            stamps[:-1],
+            times,
+            "s",
+            f"no sample for long, usually every {usual:.4g} s",
+        )
+        counts, edges = np.histogram(stamps - stamps[0], _WINDOWS)
+        width = to_seconds(int(stamps[-1] - stamps[0])) / _WINDOWS
+        expected = float(np.median(counts))
+        # A window that a pause explains is not told twice.
+        lost = np.zeros(_WINDOWS)
+        for start, length in zip(stamps[:-1][pauses], times[pauses], strict=True):
+            first = to_seconds(int(start - stamps[0])) / width
+            for window in range(int(first), min(_WINDOWS, int(first + length / width) + 1)):
+                lost[window] += max(0.0, min(window + 1, first + length / width) - max(window, first))
+        low = (counts < expected / 2 * (1 - lost)) & (expected >= _MIN_IN_WINDOW) & (lost < 0.9)
+        if low.any():
+            worst = int(np.argmin(np.where(low, counts, expected)))
+            first = int(stamps[0] + edges[int(np.argmax(low))])
+            detail = f"its rate breaks down from {expected / width:.4g} Hz for a tenth of the time"
+            at = int(stamps[0] + edges[worst])
+            yield Finding("rate", self.frame, int(low.sum()), first, float(counts[worst]) / width, "Hz", detail, at)
+
+    def _at(
+        self,
+        kind: str,
+        wrong: npt.NDArray[np.bool_],
+        stamps: npt.NDArray[np.int64],
+        values: npt.NDArray[np.float64] | None,
+        unit: str,
+        detail: str,
+    ) -> Iterator[Finding]:
+        """The finding for the samples that are wrong, if there are any."""
+        places = np.flatnonzero(wrong)
+        if not len(places):
+            return
+        first = int(stamps[places[0]])
+        if values is None:
+            yield Finding(kind, self.frame, len(places), first, None, unit, detail)
+            return
+        worst = int(places[np.argmax(values[places])])
+        yield Finding(kind, self.frame, len(places), first, float(values[worst]), unit, detail, int(stamps[worst]))
+
 
 _SHOWN = 5
 _MANY = 10
@@ -174,3 +438,63 @@ class _Frame:
 def _number(numbers: dict[str, int], name: str) -> int:
     """The number of a name; the 65,536th and all further names share one."""
     return numbers.setdefault(name, min(len(numbers), 65_535))
+
+
+def diagnose(tree: TransformTree, limits: Limits | None = None) -> list[Finding]:
+    """Examine a tree: translations and speeds that cannot be, gaps, rates that break down, senders that disagree.
+
+    A tree keeps the samples of a frame in the order of their stamps, one for each stamp, and its last static value. So
+    duplicates, changes of statics and stamps that go back are found only while samples arrive: see
+    `tfbus.analysis.Examiner`, and ``tfbus check``.
+
+    Parameters
+    ----------
+    tree : TransformTree
+    limits : Limits, optional
+
+    Returns
+    -------
+    list of Finding
+        Empty if nothing is wrong.
+    """
+    examiner = Examiner(limits)
+    forest = forest_of(tree)
+    with forest.lock:
+        frames = [_Seen.of(history) for history in forest.frames.values()]
+    examiner.add([sample for frame in frames for sample in frame.samples()])
+    return examiner.findings()
+
+
+class _Seen(NamedTuple):
+    """The samples of one frame as they were at one moment."""
+
+    edge: Edge
+    static: TransformStamped | None
+    moving: Samples
+
+    @classmethod
+    def of(cls, history: FrameHistory) -> "_Seen":
+        """The samples as they are now; nothing is copied that numpy can copy later."""
+        edge, static = history.edge(), None
+        if edge.static and history.static_stamp is not None:
+            row = history.static_row
+            static = _sample(edge.parent, edge.child, history.static_stamp, row, edge.authority, static=True)
+        return cls(edge, static, history.samples_between(STAMP_MIN, STAMP_MAX))
+
+    def samples(self) -> Iterator[TransformStamped]:
+        """The static sample, or the moving ones in the order of their stamps."""
+        if self.static is not None:
+            yield self.static
+        moving = self.moving
+        parents = repeat(self.edge.parent) if moving.parents is None else moving.parents
+        authorities = repeat(self.edge.authority) if moving.authorities is None else moving.authorities
+        columns = zip(moving.stamps.tolist(), moving.rows.tolist(), parents, authorities, strict=False)
+        for stamp, (x, y, z, i, j, k, w), parent, authority in columns:
+            yield _sample(parent, self.edge.child, stamp, (x, y, z, i, j, k, w), authority, static=False)
+
+
+def _sample(parent: str, child: str, stamp: int, row: Row, authority: str, static: bool) -> TransformStamped:
+    # The samples of a tree are valid.
+    sample = TransformStamped.__new__(TransformStamped)
+    sample._fields = parent, child, stamp, row, authority, static
+    return sample

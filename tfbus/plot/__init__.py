@@ -7,17 +7,12 @@ heard; each returns matplotlib's own figure. `sparklines` draws with letters. Ne
 from tfbus.errors import pip_install
 
 try:
-    from tfbus.plot.gaps import plot_gaps
-    from tfbus.plot.path import plot_path
-    from tfbus.plot.transforms import plot_transforms
-    from tfbus.plot.window import show_in_window
+    from tfbus.plot.plots import plot_gaps, plot_path, plot_transforms, show_in_window
 except ImportError as error:
     if error.name is None or error.name.startswith("tfbus"):
         raise
     raise ImportError(f"for plots, tfbus needs a package more: {pip_install('plot')} ({error})") from error
-from tfbus.plot.reception import Reception, read_reception
-from tfbus.plot.series import Series, read_series
-from tfbus.plot.sparklines import sparklines
+from tfbus.plot.plots import Reception, Series, read_reception, read_series, sparklines
 
 __all__ = [
     "Reception",

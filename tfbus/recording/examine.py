@@ -5,9 +5,7 @@ import struct
 from collections.abc import Callable
 from contextlib import suppress
 
-from tfbus.analysis.examiner import Examiner
-from tfbus.analysis.finding import Finding
-from tfbus.analysis.limits import Limits
+from tfbus.analysis.examiner import Examiner, Finding, Limits
 from tfbus.recording.formats.storage import Channel
 from tfbus.recording.formats.transforms import RawTransform, bounded, parser_of
 from tfbus.recording.recording import Block, Recording

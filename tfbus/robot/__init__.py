@@ -4,10 +4,19 @@ A `RobotModel` is a tree of links and joints, read from a URDF file or built by 
 its transforms on a bus. `read_visuals` reads the visible shapes of the links, which only pictures need.
 """
 
-from tfbus.robot.joint import Joint, Mimic
-from tfbus.robot.model import LimitViolation, RobotModel
+from tfbus.robot.model import (
+    Box,
+    Cylinder,
+    Joint,
+    LimitViolation,
+    Mesh,
+    Mimic,
+    RobotModel,
+    Sphere,
+    Visual,
+    read_visuals,
+)
 from tfbus.robot.state_publisher import RobotStatePublisher
-from tfbus.robot.visual import Box, Cylinder, Mesh, Sphere, Visual, read_visuals
 
 __all__ = [
     "Box",

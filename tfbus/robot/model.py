@@ -1,17 +1,595 @@
 """`RobotModel`, a robot as a tree of links and joints."""
 
+import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from xml.etree import ElementTree as ET
+from xml.etree.ElementTree import Element
 
-from tfbus.errors import InvalidRobotError
+from tfbus.errors import InvalidRobotError, InvalidTransformError, pip_install
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped
-from tfbus.geometry.transform import from_row
-from tfbus.robot._urdf import read_urdf
-from tfbus.robot.joint import Joint, Position, element
+from tfbus.geometry.transform import Transform, from_row
+from tfbus.rows import Numbers, Quaternion, Row, Vector, as_vector, compose, rotate
 from tfbus.stamps import StampLike
+
+JointKind: TypeAlias = Literal["fixed", "revolute", "continuous", "prismatic", "planar", "floating"]
+Position: TypeAlias = float | Sequence[float] | Transform
+
+KINDS: tuple[JointKind, ...] = get_args(JointKind)
+
+
+@dataclass(frozen=True, slots=True)
+class Mimic:
+    """A joint that follows another: its position is `multiplier` times that of `joint`, plus `offset` (rad or m)."""
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """A joint between a parent link and a child link, as in URDF.
+
+    Parameters
+    ----------
+    name : str
+    kind : {"fixed", "revolute", "continuous", "prismatic", "planar", "floating"}
+    parent, child : str
+        The links, whose names are those of their frames.
+    origin : Transform
+        The pose of the child in the parent at position zero.
+    axis : tuple of 3 floats
+        The axis of rotation, the direction of sliding, or the normal of the plane, in the coordinates of the child at
+        position zero. Any length but zero; it is normalised. Fixed and floating joints ignore it.
+    lower, upper : float, optional
+        The limits of the position, in rad or m. Violations are reported, never prevented.
+    mimic : Mimic, optional
+        The joint that this one follows when it has no position of its own.
+
+    Raises
+    ------
+    InvalidRobotError
+        If the kind is unknown, the axis is zero or not finite, or a limit or a number of the mimic is NaN.
+
+    Notes
+    -----
+    A planar joint has the coordinates x and y in m and an angle in rad about the axis. URDF does not define the
+    directions of x and y: here they are those of the child at position zero, rotated by the shortest rotation that
+    takes z to the axis. So for the usual axis z they are just x and y.
+    """
+
+    name: str
+    kind: JointKind
+    parent: str
+    child: str
+    origin: Transform = field(default_factory=Transform)
+    axis: Vector = (1.0, 0.0, 0.0)
+    lower: float | None = None
+    upper: float | None = None
+    mimic: Mimic | None = None
+    # The part of the rotation that is multiplied by the sine of half the angle; the axis in the parent's frame.
+    _sine_part: Quaternion = field(init=False, repr=False, compare=False)
+    _axis_in_parent: Vector = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise self._invalid(f"type {self.kind!r} is none of {', '.join(KINDS)}")
+        numbers = [self.lower, self.upper] + ([self.mimic.multiplier, self.mimic.offset] if self.mimic else [])
+        if any(number is not None and math.isnan(number) for number in numbers):
+            raise self._invalid("a limit or the mimic is NaN")
+        axis = (1.0, 0.0, 0.0) if self.kind in ("fixed", "floating") else self._unit(self.axis)
+        object.__setattr__(self, "axis", axis)
+        x, y, z = axis
+        turn = (0.0, 0.0, 0.0, *self.origin.rotation)
+        object.__setattr__(self, "_sine_part", compose(turn, (0.0, 0.0, 0.0, x, y, z, 0.0))[3:])
+        object.__setattr__(self, "_axis_in_parent", rotate(self.origin.rotation, x, y, z))
+
+    @property
+    def element(self) -> str:
+        """The label of the joint in errors: ``<joint name="elbow">``."""
+        return element("joint", self.name)
+
+    @property
+    def zero(self) -> Position:
+        """The position in which the pose of the child is the joint's origin."""
+        if self.kind == "planar":
+            return 0.0, 0.0, 0.0
+        return Transform() if self.kind == "floating" else 0.0
+
+    def transform(self, position: Position = 0.0) -> Transform:
+        """The pose of the child in the parent.
+
+        Parameters
+        ----------
+        position : float, sequence of floats, or Transform
+            rad for a revolute or continuous joint, m for a prismatic one; (x, y, angle) for a planar one;
+            (x, y, z, qx, qy, qz, qw) or a transform for a floating one. A fixed joint ignores it.
+
+        Raises
+        ------
+        InvalidTransformError
+            If the position is not finite, has a wrong length, or holds no unit quaternion. The message has the joint's
+            name.
+        TypeError
+            If the position has a type that the kind of joint does not accept.
+        """
+        return from_row(self.row(position))
+
+    def row(self, position: Position) -> Row:
+        """The row of `transform`; faster for many joints."""
+        kind = self.kind
+        x, y, z, i, j, k, w = self.origin._row
+        if kind == "revolute" or kind == "continuous":
+            half = 0.5 * self.number(position)
+            sine, cosine = math.sin(half), math.cos(half)
+            a, b, c, d = self._sine_part
+            return (
+                x,
+                y,
+                z,
+                cosine * i + sine * a,
+                cosine * j + sine * b,
+                cosine * k + sine * c,
+                cosine * w + sine * d,
+            )
+        if kind == "fixed":
+            return self.origin._row
+        if kind == "prismatic":
+            length = self.number(position)
+            a, b, c = self._axis_in_parent
+            row = (x + length * a, y + length * b, z + length * c, i, j, k, w)
+        else:
+            row = compose(self.origin._row, self._planar(position) if kind == "planar" else self._floating(position))
+        if not all(map(math.isfinite, row[:3])):
+            raise self._bad_position(f"position {position!r} takes it further than a float can tell", "not finite")
+        return row
+
+    def number(self, position: Position) -> float:
+        """Convert a position to one finite number.
+
+        Raises
+        ------
+        InvalidTransformError, TypeError
+            As `transform`.
+        """
+        if type(position) is not float:
+            if not isinstance(position, Real):
+                raise TypeError(f"joint {self.name!r}: position must be a number, not {position!r}")
+            try:
+                position = float(position)
+            except OverflowError:
+                position = math.inf
+        if not math.isfinite(position):
+            raise self._bad_position(f"position {position!r} is not finite", "not finite")
+        return position
+
+    def _planar(self, position: Position) -> Row:
+        try:
+            x, y, angle = as_vector(position, "position")
+        except (TypeError, InvalidTransformError) as error:
+            raise self._named(error) from None
+        i, j, k = self.axis
+        sine = math.sin(0.5 * angle)
+        return (*rotate(_from_z(self.axis), x, y, 0.0), sine * i, sine * j, sine * k, math.cos(0.5 * angle))
+
+    def _floating(self, position: Position) -> Row:
+        if isinstance(position, Transform):
+            return position._row
+        try:
+            numbers = tuple(position)  # type: ignore[arg-type]  # the TypeError is caught below
+            return Transform(numbers[:3], numbers[3:])._row
+        except TypeError:
+            raise TypeError(
+                f"joint {self.name!r}: position must be a Transform or 7 numbers, not {position!r}"
+            ) from None
+        except InvalidTransformError as error:
+            raise self._named(error) from None
+
+    def _unit(self, axis: Numbers) -> Vector:
+        try:
+            x, y, z = as_vector(axis, "axis")
+        except InvalidTransformError as error:
+            raise self._invalid(str(error)) from None
+        length = math.hypot(x, y, z)
+        if length == 0.0:
+            raise self._invalid(f"axis {(x, y, z)} has no direction")
+        return x / length, y / length, z / length
+
+    def _invalid(self, problem: str) -> InvalidRobotError:
+        return InvalidRobotError(problem, element=self.element)
+
+    def _bad_position(self, problem: str, reason: str) -> InvalidTransformError:
+        return InvalidTransformError(
+            f"joint {self.name!r}: {problem}", reason=reason, parent=self.parent, child=self.child
+        )
+
+    def _named(self, error: TypeError | InvalidTransformError) -> TypeError | InvalidTransformError:
+        if isinstance(error, InvalidTransformError):
+            return self._bad_position(str(error), error.reason)
+        return TypeError(f"joint {self.name!r}: {error}")
+
+
+def element(tag: str, name: str | None) -> str:
+    """The label of a URDF element in errors, on one line."""
+    if name is None:
+        return f"<{tag}>"
+    quoted = repr(name)[1:-1].replace('"', '\\"')
+    return f'<{tag} name="{quoted}">'
+
+
+def _from_z(axis: Vector) -> Quaternion:
+    """The shortest rotation that takes z to a unit vector; for -z, the half turn about x."""
+    x, y, z = axis
+    # Near -z, 1 + z would lose its digits; x and y keep theirs.
+    w = 1.0 + z if z > 0.0 else (x * x + y * y) / (1.0 - z)
+    norm = math.hypot(x, y, w)
+    return (-y / norm, x / norm, 0.0, w / norm) if norm else (1.0, 0.0, 0.0, 0.0)
+
+
+# Reading URDF, the description of a robot as links and joints.
+#
+# urdf-parser-py interprets the elements, but prints a complaint to standard error for each unknown one, and fails at
+# the legacy transmissions of real robots. So this module passes it one element at a time, reduced to the parts that it
+# knows. The XML itself is parsed here, with limits, because files may come from untrusted sources.
+
+
+MAX_DEPTH = 100
+"""The deepest accepted nesting of elements; URDF needs less than ten."""
+
+READ_ELEMENTS = ("link", "joint", "material")
+KNOWN_PARTS = {
+    "robot": "name version",
+    "link": "name, inertial visual collision",
+    "joint": "name type, origin axis parent child limit dynamics safety_controller calibration mimic",
+    "material": "name, color texture",
+    "inertial": ", origin mass inertia",
+    "visual": "name, origin geometry material",
+    "collision": "name, origin geometry",
+    "geometry": ", box cylinder sphere mesh",
+    "origin": "xyz rpy",
+    "axis": "xyz",
+    "parent": "link",
+    "child": "link",
+    "limit": "effort lower upper velocity",
+    "dynamics": "damping friction",
+    "safety_controller": "k_velocity k_position soft_lower_limit soft_upper_limit",
+    "calibration": "rising falling",
+    "mimic": "joint multiplier offset",
+    "mass": "value",
+    "inertia": "ixx ixy ixz iyy iyz izz",
+    "box": "size",
+    "cylinder": "radius length",
+    "sphere": "radius",
+    "mesh": "filename scale",
+    "color": "rgba",
+    "texture": "filename",
+}
+"""The attributes of each element that urdf-parser-py reads, and after a comma the elements inside of it."""
+
+REPEATABLE = {"visual", "collision"}
+REQUIRED_ATTRIBUTES = {"parent": "link", "child": "link", "axis": "xyz", "mass": "value"}
+"""Attributes that must be there, although urdf-parser-py does not check it."""
+
+XACRO_TAGS = {"arg", "attribute", "call", "element", "if", "include", "insert_block", "macro", "property", "unless"}
+
+
+class Urdf(NamedTuple):
+    """The links and joints of a URDF, in the order of the file."""
+
+    name: str
+    links: tuple[str, ...]
+    joints: tuple[Joint, ...]
+
+
+class Described(NamedTuple):
+    """One element of a robot, as urdf-parser-py interprets it."""
+
+    tag: str
+    label: str
+    """For errors."""
+    value: Any
+
+
+def read_urdf(source: str | os.PathLike[str]) -> Urdf:
+    """Read the links and joints of a URDF; the source and the errors are those of `read_elements`."""
+    name, elements = read_elements(source)
+    links = tuple(each.value.name for each in elements if each.tag == "link")
+    return Urdf(name, links, tuple(_joint(each.value, each.label) for each in elements if each.tag == "joint"))
+
+
+def read_elements(source: str | os.PathLike[str]) -> tuple[str, list[Described]]:
+    """Read the name of a robot, and its links, joints and materials in the order of the file.
+
+    Parameters
+    ----------
+    source : str or path
+        The text itself if it is a string with a ``<`` in it, otherwise the path of the file.
+
+    Raises
+    ------
+    InvalidRobotError
+        If the source is not XML or not URDF, or an element is malformed. The message names the element.
+    OSError
+        If the file cannot be read.
+    ImportError
+        If urdf-parser-py is not installed.
+    """
+    try:
+        from urdf_parser_py import urdf
+    except ImportError as error:
+        raise ImportError(f"to read URDF, tfbus needs a package more: {pip_install('urdf')}") from error
+    text = source if isinstance(source, str) and "<" in source else Path(source).read_bytes()
+    robot = _parse(text)
+    if robot.tag != "robot":
+        raise InvalidRobotError(f"a URDF is a <robot>, but this is a <{robot.tag}>")
+    _check_expanded(robot)
+    name = _interpret(urdf, robot, element("robot", robot.get("name"))).name
+    elements = []
+    for part, label in _parts(robot):
+        if part.tag == "material" and part.find("color") is None and part.find("texture") is None:
+            raise InvalidRobotError("it has neither a color nor a texture", element=label)
+        elements.append(Described(part.tag, label, _interpret(urdf, part, label)))
+    return name, elements
+
+
+def transform_of(origin: Any, label: str) -> Transform:
+    """The transform of an ``<origin>``; identity if there is none.
+
+    Raises
+    ------
+    InvalidRobotError
+        If it is not finite.
+    """
+    if origin is None:
+        return Transform()
+    try:
+        return Transform.from_xyz_rpy(origin.xyz, origin.rpy)
+    except InvalidTransformError as error:
+        raise InvalidRobotError(f"origin: {error}", element=label) from None
+
+
+def _parse(text: str | bytes) -> Element:
+    """Parse a document, and return its root without the namespace of unprefixed names."""
+    parser = ET.XMLParser(target=_Builder())
+    try:
+        parser.feed(text)
+        root: Element = parser.close()
+    except InvalidRobotError:
+        raise
+    except (ET.ParseError, LookupError, ValueError) as error:
+        raise InvalidRobotError(f"it is not well-formed XML: {error}") from None
+    namespace = root.tag[: root.tag.rfind("}") + 1]
+    for node in root.iter():
+        node.tag = node.tag.removeprefix(namespace)
+    return root
+
+
+class _Builder(ET.TreeBuilder):
+    """Builds the tree of elements, and refuses deep nesting and a document type, which can exhaust the memory."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._depth = 0
+
+    def start(self, tag: Any, attrs: Any, /) -> Element:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise InvalidRobotError(f"its elements are nested more than {MAX_DEPTH} deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> Element:
+        self._depth -= 1
+        return super().end(tag)
+
+    def doctype(self, *_: object) -> None:
+        raise InvalidRobotError("it has a <!DOCTYPE>, which can define entities without end: URDF needs none")
+
+
+def _check_expanded(robot: Element) -> None:
+    """Raise `InvalidRobotError` if the file still needs xacro.
+
+    Some real files contain calls of unknown macros as elements of the robot; those are ignored.
+    """
+    for part in robot:
+        read = part.tag in READ_ELEMENTS
+        for node in part.iter() if read else (part,):
+            namespace, _, tag = node.tag.rpartition("}")
+            if "xacro" in namespace and (read or tag in XACRO_TAGS):
+                raise InvalidRobotError(
+                    "this is still to be expanded: run xacro on the file first",
+                    element=element(f"xacro:{tag}", node.get("name")),
+                )
+            for value in node.attrib.values() if read else ():
+                if "${" in value or "$(" in value:
+                    raise InvalidRobotError(
+                        f"{value!r} is still to be expanded: run xacro on the file first",
+                        element=element(part.tag, part.get("name")),
+                    )
+
+
+def _parts(robot: Element) -> Iterator[tuple[Element, str]]:
+    """The elements of a robot that are read, each with its label for errors; those without a name are numbered."""
+    seen: Counter[str] = Counter()
+    for part in robot:
+        if part.tag in READ_ELEMENTS:
+            seen[part.tag] += 1
+            name = part.get("name")
+            yield part, element(part.tag, name) + (f" number {seen[part.tag]}" if name is None else "")
+
+
+def _interpret(parser: Any, part: Element, label: str) -> Any:
+    """Interpret one element with urdf-parser-py."""
+    known = _reduce(part, label)
+    path = parser.xmlr.Path(part.tag)
+    try:
+        return getattr(parser, part.tag.capitalize()).from_xml(known, path)
+    except Exception as error:  # noqa: BLE001 - urdf-parser-py raises plain Exceptions
+        # Errors of urdf-parser-py have the path of the element, but span several lines.
+        where = str(getattr(error, "path", path)).removeprefix(str(path)).strip("/")
+        text = " ".join(str(getattr(error, "e", error)).split()) or type(error).__name__
+        raise InvalidRobotError(f"{where}: {text}" if where else text, element=label) from None
+
+
+def _reduce(node: Element, label: str) -> Element:
+    """A copy of an element with only the parts that urdf-parser-py knows."""
+    attributes, _, inside = (names.split() for names in KNOWN_PARTS[node.tag].partition(","))
+    if REQUIRED_ATTRIBUTES.get(node.tag, "") not in ("", *node.attrib):
+        raise InvalidRobotError(f"<{node.tag}> has no {REQUIRED_ATTRIBUTES[node.tag]}", element=label)
+    copy = Element(node.tag, {name: value for name, value in node.attrib.items() if name in attributes})
+    for child in node:
+        shape = child.find("geometry/*")
+        # Some programs have more shapes, such as capsules; the shape of a link does not matter here.
+        if child.tag not in inside or (shape is not None and shape.tag not in KNOWN_PARTS):
+            continue
+        if child.tag not in REPEATABLE and copy.find(child.tag) is not None:
+            raise InvalidRobotError(f"there is more than one <{child.tag}>", element=label)
+        copy.append(_reduce(child, label))
+    return copy
+
+
+def _joint(found: Any, label: str) -> Joint:
+    """Convert a joint of urdf-parser-py to a `Joint`."""
+    mimic = None
+    if found.mimic is not None:
+        multiplier, offset = found.mimic.multiplier, found.mimic.offset
+        mimic = Mimic(found.mimic.joint, 1.0 if multiplier is None else multiplier, 0.0 if offset is None else offset)
+    limited = found.limit is not None and found.type in ("revolute", "prismatic")
+    return Joint(
+        name=found.name,
+        kind=found.type,
+        parent=found.parent,
+        child=found.child,
+        origin=transform_of(found.origin, label),
+        axis=(1.0, 0.0, 0.0) if found.axis is None else tuple(found.axis),
+        lower=found.limit.lower if limited else None,
+        upper=found.limit.upper if limited else None,
+        mimic=mimic,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A box about its origin, with its length along x, y and z in m."""
+
+    size: Vector
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """A cylinder about its origin, along z; in m."""
+
+    radius: float
+    length: float
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A sphere about its origin; in m."""
+
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A mesh in a file, as the URDF names it (``package://...``, ``file://...`` or a path), scaled along x, y and z."""
+
+    filename: str
+    scale: Vector = (1.0, 1.0, 1.0)
+
+
+Shape = Box | Cylinder | Sphere | Mesh
+
+
+@dataclass(frozen=True, slots=True)
+class Visual:
+    """One visible shape of a link.
+
+    Parameters
+    ----------
+    link : str
+        The link, and the frame of that name.
+    shape : Box, Cylinder, Sphere or Mesh
+    origin : Transform
+        Maps coordinates of the shape into the link.
+    colour : (float, float, float, float), optional
+        Red, green, blue and opacity from 0 to 1; None if the URDF gives none.
+    """
+
+    link: str
+    shape: Shape
+    origin: Transform = field(default_factory=Transform)
+    colour: tuple[float, float, float, float] | None = None
+
+
+def read_visuals(source: str | os.PathLike[str]) -> list[Visual]:
+    """Read the visible shapes of a URDF, in the order of the file.
+
+    Shapes that URDF does not define, such as capsules, are left out.
+
+    Parameters
+    ----------
+    source : str or path
+        The text itself if it is a string with a ``<`` in it, otherwise the path of the file.
+
+    Raises
+    ------
+    InvalidRobotError
+        If the source is not XML or not URDF, or an element is malformed. The message names the element.
+    OSError
+        If the file cannot be read.
+    ImportError
+        If urdf-parser-py is not installed.
+    """
+    _, elements = read_elements(source)
+    colours = {each.value.name: _colour(each.value, each.label) for each in elements if each.tag == "material"}
+    visuals = []
+    for each in elements:
+        if each.tag != "link":
+            continue
+        for found in each.value.visuals:
+            if found.geometry is None:
+                continue
+            colour = None
+            if found.material is not None:
+                colour = _colour(found.material, each.label) or colours.get(found.material.name)
+            origin = transform_of(found.origin, each.label)
+            visuals.append(Visual(each.value.name, _shape(found.geometry, each.label), origin, colour))
+    return visuals
+
+
+def _shape(found: Any, label: str) -> Shape:
+    """The shape of a ``<geometry>`` that urdf-parser-py has interpreted."""
+    kind = type(found).__name__
+    if kind == "Mesh":
+        x, y, z = _numbers(found.scale or (1.0, 1.0, 1.0), "scale", label)
+        return Mesh(found.filename, (x, y, z))
+    if kind == "Box":
+        x, y, z = _numbers(found.size, "size", label)
+        return Box((x, y, z))
+    if kind == "Sphere":
+        return Sphere(*_numbers([found.radius], "radius", label))
+    return Cylinder(*_numbers([found.radius, found.length], "radius and length", label))
+
+
+def _colour(material: Any, label: str) -> tuple[float, float, float, float] | None:
+    if material.color is None or material.color.rgba is None:
+        return None
+    red, green, blue, opacity = (min(max(part, 0.0), 1.0) for part in _numbers(material.color.rgba, "color", label))
+    return red, green, blue, opacity
+
+
+def _numbers(values: Any, name: str, label: str) -> list[float]:
+    numbers = [float(value) for value in values]
+    if not all(map(math.isfinite, numbers)):
+        raise InvalidRobotError(f"{name} {numbers} is not finite", element=label)
+    return numbers
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,7 @@ import numpy.typing as npt
 from tfbus.bus.bus import Bus
 from tfbus.bus.subscribers import OnceLogger
 from tfbus.frames import as_prefix
-from tfbus.robot.joint import Position
-from tfbus.robot.model import RobotModel
+from tfbus.robot.model import Position, RobotModel
 from tfbus.stamps import StampLike
 from tfbus.statistics import RobotStatistics
 

@@ -27,15 +27,14 @@ from tfbus.errors import BusClosedError
 from tfbus.events import FrameAdded
 from tfbus.frames import check_frame
 from tfbus.geometry.stamped import Batch
-from tfbus.robot.visual import read_visuals
+from tfbus.robot.model import read_visuals
 from tfbus.stamps import as_duration, is_real
 from tfbus.statistics import QueueStatistics
 from tfbus.tree.history import STALE_AFTER
-from tfbus.view._controls import Controls
-from tfbus.view._meshes import MeshFiles, Solid, solids_of
-from tfbus.view._page import Page
-from tfbus.view._screen import Points, Screen, Sight
-from tfbus.view._server import Server, start_server, stop_server
+from tfbus.view.meshes import MeshFiles, Solid, solids_of
+from tfbus.view.page import Page
+from tfbus.view.screen import Points, Screen, Sight
+from tfbus.view.server import Controls, Server, start_server, stop_server
 
 _FEW = 100
 _DELAYS_EVERY = 500_000_000

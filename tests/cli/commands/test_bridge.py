@@ -11,7 +11,7 @@ from support.samples import moving, static
 from support.wires import latched
 
 from tfbus import Bus, PeerLost, PeerRejected
-from tfbus.links.ros._transforms import as_mapping
+from tfbus.links.ros.messages import as_mapping
 
 
 @pytest.mark.thorough

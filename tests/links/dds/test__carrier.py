@@ -29,11 +29,10 @@ from tfbus.links._endpoint import Endpoint
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.dds import _carrier
-from tfbus.links.dds._carrier import _MOVING, _STATIC, _STATICS, DdsCarrier
-from tfbus.links.dds._domains import configuration, domain
-from tfbus.links.dds._publishers import PATIENCE, Publishers
-from tfbus.links.dds._types import (
+from tfbus.links.dds import dds_link
+from tfbus.links.dds.dds_link import _MOVING, _STATIC, _STATICS, DdsCarrier, configuration, domain
+from tfbus.links.dds.readers import PATIENCE, Publishers
+from tfbus.links.dds.types import (
     Gid,
     Header,
     NodeEntitiesInfo,
@@ -45,7 +44,7 @@ from tfbus.links.dds._types import (
     RawTFMessage,
     Time,
 )
-from tfbus.links.ros._carrier import RosMessage
+from tfbus.links.ros.ros_link import RosMessage
 from tfbus.links.ros.settings import RosOptions, settings_of
 from tfbus.tf_message import MalformedMessageError, encode
 
@@ -420,7 +419,7 @@ def test_much_garbage_on_any_topic_is_refused_and_what_comes_behind_it_is_taken(
 
 def test_as_many_messages_in_a_row_as_dds_keeps_are_told_as_an_overrun() -> None:
     carrier, items = unopened(joint_states=print)
-    reader = Reader(*(said(b"x") for _ in range(_carrier._DEPTH)))
+    reader = Reader(*(said(b"x") for _ in range(dds_link._DEPTH)))
     reader.topic = SimpleNamespace(name="rt/joint_states")  # type: ignore[attr-defined]
     while carrier._take_other("joints", reader):
         assert items
@@ -514,7 +513,7 @@ async def test_all_that_a_carrier_has_made_is_deleted_at_its_end_though_somebody
 
 
 async def test_a_domain_that_cannot_be_left_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_carrier, "_CLOSING_TIME", 0.01)
+    monkeypatch.setattr(dds_link, "_CLOSING_TIME", 0.01)
     carrier, _ = unopened()
     going_on, left = Event(), Event()
     carrier._open.callback(left.set)

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
-from tfbus.links.dds._domains import Discovery, _open, configuration, domain
+from tfbus.links.dds.dds_link import Discovery, _open, configuration, domain
 
 HERE = configuration("localhost", (), None)
 

@@ -16,10 +16,9 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from support.both_sides import node
 
-from tfbus.links.dds import _joining
-from tfbus.links.dds._carrier import _STATICS
-from tfbus.links.dds._domains import configuration, domain
-from tfbus.links.dds._joining import (
+from tfbus.links.dds import readers
+from tfbus.links.dds.dds_link import _STATICS, configuration, domain
+from tfbus.links.dds.readers import (
     ANSWER_TIME,
     GREETING_TIME,
     QUIET_TIME,
@@ -30,7 +29,7 @@ from tfbus.links.dds._joining import (
     join,
     read,
 )
-from tfbus.links.dds._types import RawTFMessage
+from tfbus.links.dds.types import RawTFMessage
 
 CONFIG = configuration("localhost", (), None)
 CYCLONE_PEER = Path(__file__).parents[2] / "support" / "cyclone_peer.py"
@@ -41,7 +40,7 @@ def test_a_participant_of_ros_is_known_by_its_user_data(
     domain_number: int, user_data: bytes, of_ros: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # It has no writers.
-    monkeypatch.setattr(_joining, "WRITERS_TIME", 0.05)
+    monkeypatch.setattr(readers, "WRITERS_TIME", 0.05)
     with domain(domain_number, CONFIG), ExitStack() as stack:
         other = DomainParticipant(domain_number, Qos(Policy.Userdata(user_data)))
         stack.callback(delete, other)
@@ -67,11 +66,11 @@ class Times:
         self.now = 0.0
         self.deleted: list[Any] = []
         self.found = found
-        monkeypatch.setattr(_joining, "monotonic", lambda: self.now)
-        monkeypatch.setattr(_joining, "sleep", self._sleep)
-        monkeypatch.setattr(_joining, "BuiltinDataReader", lambda *_: "reader")
-        monkeypatch.setattr(_joining, "read", lambda _: [each for when, each in self.found if when <= self.now])
-        monkeypatch.setattr(_joining, "delete", self.deleted.append)
+        monkeypatch.setattr(readers, "monotonic", lambda: self.now)
+        monkeypatch.setattr(readers, "sleep", self._sleep)
+        monkeypatch.setattr(readers, "BuiltinDataReader", lambda *_: "reader")
+        monkeypatch.setattr(readers, "read", lambda _: [each for when, each in self.found if when <= self.now])
+        monkeypatch.setattr(readers, "delete", self.deleted.append)
 
     def _sleep(self, seconds: float) -> None:
         self.now += seconds
@@ -86,11 +85,11 @@ def test_programs_of_ros_are_waited_for_until_no_more_of_them_answer(monkeypatch
     own, first, second = program("own"), ANSWER_TIME - 0.005, ANSWER_TIME + 0.01
     others = [(first, program("other", of_ros=False)), (first, program("a")), (second, program("b"))]
     times = Times(monkeypatch, [(0.0, own), *others, (second + QUIET_TIME + 0.01, program("late"))])
-    assert _joining._answering(own) == {"a", "b"}
+    assert readers._answering(own) == {"a", "b"}
     assert second + QUIET_TIME <= times.now <= second + QUIET_TIME + 0.005
     assert times.deleted == ["reader"]
     times.now, times.found = 0.0, [(0.0, own)]
-    assert _joining._answering(own) == set()
+    assert readers._answering(own) == set()
     assert ANSWER_TIME <= times.now <= ANSWER_TIME + 0.005, "nobody is there"
 
 
@@ -102,8 +101,8 @@ def test_who_joins_waits_until_a_writer_of_each_program_is_known(
     writers.append((known_at, SimpleNamespace(participant_key=SimpleNamespace(hex="b"))))
     times = Times(monkeypatch, writers)
     made: Iterator[Any] = iter(["first", "second"])
-    monkeypatch.setattr(_joining, "DomainParticipant", lambda _: next(made))
-    monkeypatch.setattr(_joining, "_answering", lambda _: {"a", "b"})
+    monkeypatch.setattr(readers, "DomainParticipant", lambda _: next(made))
+    monkeypatch.setattr(readers, "_answering", lambda _: {"a", "b"})
     with ExitStack() as stack:
         joined: Any = join(5, stack)
         assert joined == "second"
@@ -115,8 +114,8 @@ def test_who_joins_waits_until_a_writer_of_each_program_is_known(
 @pytest.mark.thorough
 def test_whoever_joins_knows_the_writers_of_ros_at_once(domain_number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     # However busy the machine is.
-    monkeypatch.setattr(_joining, "ANSWER_TIME", 20.0)
-    monkeypatch.setattr(_joining, "WRITERS_TIME", 20.0)
+    monkeypatch.setattr(readers, "ANSWER_TIME", 20.0)
+    monkeypatch.setattr(readers, "WRITERS_TIME", 20.0)
     variables = {"ROS_DOMAIN_ID": f"{domain_number}", "CYCLONEDDS_URI": CONFIG}
     with (
         node([sys.executable, str(CYCLONE_PEER)], variables, 60.0),

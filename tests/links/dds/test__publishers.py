@@ -1,8 +1,8 @@
 import pytest
 from support.wires import size_of
 
-from tfbus.links.dds import _publishers
-from tfbus.links.dds._publishers import MOST_BYTES, MOST_WAITING, NODE_PATIENCE, PATIENCE, Publishers
+from tfbus.links.dds import readers
+from tfbus.links.dds.readers import MOST_BYTES, MOST_WAITING, NODE_PATIENCE, PATIENCE, Publishers
 
 
 class Hall:
@@ -103,7 +103,7 @@ def test_publishers_that_have_gone_are_forgotten_and_what_waits_is_delivered() -
 
 
 def test_of_too_many_publishers_the_first_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 3)
+    monkeypatch.setattr(readers, "_MOST_PUBLISHERS", 3)
     hall = Hall()
     for name in ("w1", "w2", "w3"):
         hall.say(name)
@@ -121,7 +121,7 @@ def test_of_too_many_publishers_the_first_is_forgotten(monkeypatch: pytest.Monke
 
 
 def test_what_waits_of_a_publisher_that_is_forgotten_is_delivered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 1)
+    monkeypatch.setattr(readers, "_MOST_PUBLISHERS", 1)
     hall = Hall()
     hall.say("w1")
     assert hall.delivered == []
@@ -130,7 +130,7 @@ def test_what_waits_of_a_publisher_that_is_forgotten_is_delivered(monkeypatch: p
 
 
 def test_the_names_of_so_many_participants_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 3)
+    monkeypatch.setattr(readers, "_MOST_PUBLISHERS", 3)
     hall = Hall()
     for name in "abcd":
         hall.publishers.nodes(name, [(f"/{name}", [f"{name}1"])])
@@ -141,7 +141,7 @@ def test_the_names_of_so_many_participants_are_remembered(monkeypatch: pytest.Mo
 
 
 def test_one_participant_may_name_as_many_publishers_as_all_may(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_publishers, "_MOST_PUBLISHERS", 3)
+    monkeypatch.setattr(readers, "_MOST_PUBLISHERS", 3)
     hall = Hall()
     for _ in range(2):
         hall.publishers.nodes("p", [("/a", ["w1", "w2"])])

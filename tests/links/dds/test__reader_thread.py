@@ -20,10 +20,10 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from support.both_sides import node
 
-from tfbus.links.dds._domains import configuration, domain
-from tfbus.links.dds._reader_thread import ReaderThread
-from tfbus.links.dds._types import RawString
-from tfbus.links.ros._text_message import decode_text
+from tfbus.links.dds.dds_link import configuration, domain
+from tfbus.links.dds.readers import ReaderThread
+from tfbus.links.dds.types import RawString
+from tfbus.links.ros.messages import decode_text
 
 CONFIG = configuration("localhost", (), None)
 CYCLONE_PEER = Path(__file__).parents[2] / "support" / "cyclone_peer.py"

@@ -6,7 +6,7 @@ from support.samples import moving, static
 
 pytest.importorskip("cyclonedds", reason='pip install "tfbus[dds]"')
 
-from tfbus.links.dds._types import (
+from tfbus.links.dds.types import (
     Gid,
     Header,
     NodeEntitiesInfo,

@@ -20,8 +20,8 @@ from cyclonedds.util import duration
 
 from tfbus import Bus, PeerJoined, PeerLost, PeerRejected, SimulatedClock
 from tfbus.links.dds import DdsLink
-from tfbus.links.dds._types import Header, RawClock, RawJointState, RawString, RawTFMessage, Time
-from tfbus.links.ros._carrier import MAX_SIZE
+from tfbus.links.dds.types import Header, RawClock, RawJointState, RawString, RawTFMessage, Time
+from tfbus.links.ros.ros_link import MAX_SIZE
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio

@@ -11,9 +11,8 @@ from support.samples import moving, static
 
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Received
-from tfbus.links.rmw_zenoh import _carrier
-from tfbus.links.rmw_zenoh._carrier import RmwZenohCarrier
-from tfbus.links.rmw_zenoh._wire import (
+from tfbus.links.rmw_zenoh import rmw_zenoh_link
+from tfbus.links.rmw_zenoh.rmw_zenoh_link import (
     CLOCK_HASH,
     CLOCK_TYPE,
     JOINT_HASH,
@@ -21,6 +20,7 @@ from tfbus.links.rmw_zenoh._wire import (
     TEXT_HASH,
     TEXT_TYPE,
     Attachment,
+    RmwZenohCarrier,
     endpoint_token,
     node_token,
     other_token,
@@ -28,7 +28,7 @@ from tfbus.links.rmw_zenoh._wire import (
     topic_expression,
     topic_key,
 )
-from tfbus.links.ros._carrier import MAX_SIZE, RosMessage
+from tfbus.links.ros.ros_link import MAX_SIZE, RosMessage
 from tfbus.links.ros.settings import settings_of
 from tfbus.links.zenoh._settings import settings
 from tfbus.tf_message import MalformedMessageError, encode
@@ -188,7 +188,7 @@ def test_a_session_that_does_not_close_in_time_is_told(monkeypatch: pytest.Monke
     async def wait(_: object) -> TimeoutError:
         return late
 
-    monkeypatch.setattr(_carrier, "wait_until_closed", wait)
+    monkeypatch.setattr(rmw_zenoh_link, "wait_until_closed", wait)
     anyio.run(made.close)
     assert errors == [late]
 

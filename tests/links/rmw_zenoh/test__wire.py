@@ -1,7 +1,7 @@
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from tfbus.links.rmw_zenoh._wire import (
+from tfbus.links.rmw_zenoh.rmw_zenoh_link import (
     CLOCK_HASH,
     HASH,
     JOINT_HASH,

@@ -20,8 +20,7 @@ from support.wires import latched
 
 from tfbus import SECOND, Buffer, Bus, PeerRejected
 from tfbus.links.rmw_zenoh import RmwZenohLink
-from tfbus.links.rmw_zenoh._wire import HASH, JOINT_HASH, JOINT_TYPE, TEXT_HASH, TEXT_TYPE, TYPE
-from tfbus.links.rmw_zenoh.rmw_zenoh_link import _config
+from tfbus.links.rmw_zenoh.rmw_zenoh_link import HASH, JOINT_HASH, JOINT_TYPE, TEXT_HASH, TEXT_TYPE, TYPE, _config
 from tfbus.links.zenoh import ZenohRouter
 from tfbus.tf_message import encode
 

@@ -8,7 +8,7 @@ from support.samples import moving, static
 from tfbus import PeerRejected
 from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._receive_queue import Received
-from tfbus.links.ros._carrier import MOST_TRANSFORMS, RosMessage
+from tfbus.links.ros.ros_link import MOST_TRANSFORMS, RosMessage
 from tfbus.links.ros.settings import settings_of
 from tfbus.tf_message import encode
 

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 from support.joint_messages import TYPES
 
-from tfbus.links.ros._clock_message import decode_clock
+from tfbus.links.ros.messages import decode_clock
 from tfbus.tf_message import MalformedMessageError
 
 KIND = "rosgraph_msgs/msg/Clock"

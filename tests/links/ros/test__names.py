@@ -4,7 +4,7 @@ import pytest
 from support.samples import moving
 
 from tfbus import InvalidTransformError
-from tfbus.links.ros._names import FrameNames, as_topics
+from tfbus.links.ros.settings import FrameNames, as_topics
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from tfbus.links.ros._text_message import decode_text
+from tfbus.links.ros.messages import decode_text
 from tfbus.tf_message import MalformedMessageError
 
 URDF = "<robot name='\u00e4'/>"

@@ -9,7 +9,7 @@ from support.ros import ros1, ros1_of
 from support.samples import moving
 
 from tfbus import Transform, TransformStamped
-from tfbus.links.ros._transforms import as_mapping, decode_mapping, decode_ros1
+from tfbus.links.ros.messages import as_mapping, decode_mapping, decode_ros1
 from tfbus.tf_message import MAX_NAME, MalformedMessageError
 
 SAMPLES = [

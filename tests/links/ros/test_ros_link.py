@@ -8,7 +8,7 @@ from support.samples import moving, static
 from tfbus import Bus, SimulatedClock, from_seconds
 from tfbus.links._receive_queue import Presence, Received
 from tfbus.links.ros import RosLink, RosOptions
-from tfbus.links.ros._carrier import RosMessage
+from tfbus.links.ros.ros_link import RosMessage
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio

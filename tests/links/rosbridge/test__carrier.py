@@ -18,12 +18,12 @@ from tfbus.links._carrier import Carrier, SendReport
 from tfbus.links._entries import OutgoingBatch
 from tfbus.links._outbox import Turn
 from tfbus.links._receive_queue import Presence, Received
-from tfbus.links.ros._carrier import RosMessage
-from tfbus.links.ros._transforms import as_mapping
+from tfbus.links.ros.messages import as_mapping
+from tfbus.links.ros.ros_link import RosMessage
 from tfbus.links.ros.settings import settings_of
-from tfbus.links.rosbridge import _carrier
-from tfbus.links.rosbridge._carrier import Encoding, RosbridgeCarrier
-from tfbus.links.rosbridge._protocol import Incoming
+from tfbus.links.rosbridge import rosbridge_link
+from tfbus.links.rosbridge.protocol import Incoming
+from tfbus.links.rosbridge.rosbridge_link import Encoding, RosbridgeCarrier
 from tfbus.tf_message import MalformedMessageError
 
 AS_A_CARRIER: type[Carrier] = RosbridgeCarrier
@@ -33,8 +33,8 @@ pytestmark = pytest.mark.anyio
 
 
 async def test_a_server_that_falls_silent_is_left_and_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_carrier, "SILENCE", 0.2)
-    monkeypatch.setattr(_carrier, "FIRST_PAUSE", 0.01)
+    monkeypatch.setattr(rosbridge_link, "SILENCE", 0.2)
+    monkeypatch.setattr(rosbridge_link, "FIRST_PAUSE", 0.01)
     items: list[Received] = []
     errors: list[Exception] = []
     async with rosbridge_server() as server:
@@ -110,8 +110,8 @@ class Alone:
         async def found(*_: object) -> object:
             return object()
 
-        monkeypatch.setattr(_carrier, "monotonic", lambda: now)
-        monkeypatch.setattr(_carrier, "WebSocket", SimpleNamespace(connect=found))
+        monkeypatch.setattr(rosbridge_link, "monotonic", lambda: now)
+        monkeypatch.setattr(rosbridge_link, "WebSocket", SimpleNamespace(connect=found))
         await self.carrier._connect()
 
     def encodings(self) -> dict[str, str]:
@@ -214,14 +214,14 @@ async def test_after_a_break_moving_frames_are_held_back_while_ros_2_has_the_for
     await alone.connect(monkeypatch, 155.0)
     assert alone.carrier._publish(sample, static=False) is not held
     # What a server of ROS 2 gives at first may be of this link itself.
-    for later, still in ((_carrier.ECHO_TIME, held), (_carrier.ECHO_TIME + 0.1, False)):
-        monkeypatch.setattr(_carrier, "monotonic", lambda now=155.0 + later: now)
+    for later, still in ((rosbridge_link.ECHO_TIME, held), (rosbridge_link.ECHO_TIME + 0.1, False)):
+        monkeypatch.setattr(rosbridge_link, "monotonic", lambda now=155.0 + later: now)
         alone.carrier._take(STATIC, 7)
         alone.carrier._take(MOVING, 7)
         assert alone.carrier._publish(sample, static=False) is not still
 
 
-@pytest.mark.parametrize("waits", [_carrier.LINGER_TIME - 0.1, _carrier.LINGER_TIME])
+@pytest.mark.parametrize("waits", [rosbridge_link.LINGER_TIME - 0.1, rosbridge_link.LINGER_TIME])
 async def test_moving_frames_are_held_back_for_so_long_after_the_break(
     waits: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,7 +232,7 @@ async def test_moving_frames_are_held_back_for_so_long_after_the_break(
     alone.carrier._broken_at = 150.0
     await alone.connect(monkeypatch, 150.0 + waits)
     taken = alone.carrier._publish([moving("map", "a", 1)], static=False)
-    assert taken is (waits >= _carrier.LINGER_TIME)
+    assert taken is (waits >= rosbridge_link.LINGER_TIME)
 
 
 async def test_a_server_is_pinged_until_it_has_been_silent_for_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -244,14 +244,14 @@ async def test_a_server_is_pinged_until_it_has_been_silent_for_too_long(monkeypa
 
     def pass_time() -> float:
         nonlocal now
-        now += _carrier.SILENCE / 4
+        now += rosbridge_link.SILENCE / 4
         return now
 
-    monkeypatch.setattr(_carrier, "monotonic", pass_time)
+    monkeypatch.setattr(rosbridge_link, "monotonic", pass_time)
     socket: Any = SimpleNamespace(heard=1_000.0, ping=ping)
     with pytest.raises(ConnectionResetError, match="nothing has come for 10 s"):
         await alone.carrier._keep_alive(socket)
-    assert alone.pauses == [_carrier.SILENCE / 4] * 5
+    assert alone.pauses == [rosbridge_link.SILENCE / 4] * 5
     assert len(pings) == 4
 
 
@@ -292,8 +292,8 @@ async def test_what_waits_is_sent_at_the_end_of_a_cancelled_link_too() -> None:
 
 
 async def test_a_carrier_talks_until_its_link_ends_and_then_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_carrier, "_CLOSING_TIME", 1_000.0)
-    monkeypatch.setattr(_carrier, "_MISS_PERIODS", (0.0, 1_000.0))
+    monkeypatch.setattr(rosbridge_link, "_CLOSING_TIME", 1_000.0)
+    monkeypatch.setattr(rosbridge_link, "_MISS_PERIODS", (0.0, 1_000.0))
     carrier, socket = RosbridgeCarrier("ws://127.0.0.1:1", settings_of({}), lookup_waits=lambda: True), Socket()
     opened: Any = socket
     carrier._socket = opened
@@ -331,12 +331,12 @@ async def test_moving_frames_are_refused_while_the_server_is_away_or_hides_other
     assert ["is not connected" in str(alone.errors[0]), "which hides others" in str(alone.errors[1])] == [True, True]
     alone.carrier._held_until = -math.inf
     # The topic is advertised with the first ones; the oldest give way.
-    for _ in range(_carrier.MOST_QUEUED):
+    for _ in range(rosbridge_link.MOST_QUEUED):
         assert alone.carrier._publish(samples, static=False) is True
     assert (alone.requests(), len(alone.errors)) == ([("advertise", "/tf")], 2)
     assert alone.carrier._publish(samples[:1], static=False) is True
     assert alone.report.not_sent["congested"] == 2
-    assert [count for _, count in alone.carrier._moving] == [2] * (_carrier.MOST_QUEUED - 1) + [1]
+    assert [count for _, count in alone.carrier._moving] == [2] * (rosbridge_link.MOST_QUEUED - 1) + [1]
     assert alone.carrier._socket is socket
 
 
@@ -368,7 +368,7 @@ async def test_the_time_of_holding_back_ends_with_a_new_subscription(monkeypatch
     alone = Alone(monkeypatch)
     await alone.carrier._end_holding()
     assert (alone.pauses, alone.requests()) == ([0.0], [])
-    monkeypatch.setattr(_carrier, "monotonic", lambda: 100.0)
+    monkeypatch.setattr(rosbridge_link, "monotonic", lambda: 100.0)
     alone.carrier._held_until = 107.5
     await alone.carrier._end_holding()
     assert (alone.pauses[1:], alone.requests()) == ([7.5], again("/tf"))

@@ -10,14 +10,14 @@ from support.rosbridge import RosbridgeServer, rosbridge_server
 from support.samples import static
 
 from tfbus import Bus
-from tfbus.links.rosbridge import RosbridgeLink, _carrier, _confirmation
+from tfbus.links.rosbridge import RosbridgeLink, rosbridge_link
 
 pytestmark = pytest.mark.anyio
 
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_confirmation, "CONFIRM_TIME", 0.05)
+    monkeypatch.setattr(rosbridge_link, "CONFIRM_TIME", 0.05)
 
 
 def published(server: RosbridgeServer) -> Callable[[int], bool]:
@@ -85,7 +85,7 @@ async def test_after_a_break_what_the_former_publisher_left_at_a_server_of_ros_2
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name, value in (("FIRST_PAUSE", 0.01), ("LINGER_TIME", 0.3)):
-        monkeypatch.setattr(_carrier, name, value)
+        monkeypatch.setattr(rosbridge_link, name, value)
     async with rosbridge_server() as server:
         lidar = static("map", "lidar", 1.0, 3)
         with Bus() as bus:

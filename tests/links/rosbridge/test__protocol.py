@@ -16,8 +16,8 @@ pytest.importorskip("cbor2", reason='pip install "tfbus[rosbridge]"')
 
 import cbor2
 
-from tfbus.links.ros._transforms import as_mapping
-from tfbus.links.rosbridge._protocol import (
+from tfbus.links.ros.messages import as_mapping
+from tfbus.links.rosbridge.protocol import (
     JOINT_TYPE,
     advertise,
     decode_content,

@@ -11,7 +11,7 @@ from support.rosbridge import rosbridge_server
 from wsproto import ConnectionType, WSConnection
 from wsproto.events import AcceptConnection, BytesMessage, CloseConnection, Ping, Request, TextMessage
 
-from tfbus.links.rosbridge._websocket import WebSocket, check_url
+from tfbus.links.rosbridge.websocket import WebSocket, check_url
 
 pytestmark = pytest.mark.anyio
 

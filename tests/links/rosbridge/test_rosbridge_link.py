@@ -15,9 +15,9 @@ from support.samples import moving, static
 from support.wires import latched
 
 from tfbus import Buffer, Bus, PeerJoined, PeerLost, SimulatedClock
-from tfbus.links.ros._transforms import as_mapping
-from tfbus.links.rosbridge import RosbridgeLink, _carrier
-from tfbus.links.rosbridge._websocket import WebSocket
+from tfbus.links.ros.messages import as_mapping
+from tfbus.links.rosbridge import RosbridgeLink, rosbridge_link
+from tfbus.links.rosbridge.websocket import WebSocket
 from tfbus.tf_message import encode
 
 pytestmark = pytest.mark.anyio
@@ -258,7 +258,7 @@ async def test_after_a_break_ros_2_forgets_the_former_publisher_before_moving_fr
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name, value in (("FIRST_PAUSE", 0.01), ("LINGER_TIME", 0.2), ("ECHO_TIME", 60.0)):
-        monkeypatch.setattr(_carrier, name, value)
+        monkeypatch.setattr(rosbridge_link, name, value)
     async with rosbridge_server() as server:
         with Bus() as bus:
             async with RosbridgeLink(bus, server.url, encoding="cbor-raw") as link:
@@ -281,7 +281,7 @@ async def test_after_a_break_ros_2_forgets_the_former_publisher_before_moving_fr
 
 async def test_after_a_break_moving_frames_go_out_when_those_of_ros_2_come_in(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in (("FIRST_PAUSE", 0.01), ("LINGER_TIME", 60.0), ("ECHO_TIME", 0.0)):
-        monkeypatch.setattr(_carrier, name, value)
+        monkeypatch.setattr(rosbridge_link, name, value)
     async with rosbridge_server() as server:
         with Bus() as bus:
             async with RosbridgeLink(bus, server.url, encoding="cbor-raw") as link:

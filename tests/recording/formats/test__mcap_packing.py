@@ -55,7 +55,7 @@ def test_all_messages_are_counted_and_those_of_wanted_channels_are_packed_by_tim
 def test_the_messages_of_the_good_chunks_are_counted_beside_a_damaged_one(
     monkeypatch: pytest.MonkeyPatch, damaged: bytes, why: str
 ) -> None:
-    for module in ("_mcap_packing", "_mcap_records"):
+    for module in ("mcap", "mcap_records"):
         monkeypatch.setattr(f"tfbus.recording.formats.{module}.MAX_CHUNK_MESSAGES", 2)
     good = message(3, 7, b"x") + message(8, 1, b"")
     lost = f"the chunk at byte 1: {why}"

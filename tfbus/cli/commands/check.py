@@ -9,9 +9,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tfbus.analysis.examiner import Examiner
-from tfbus.analysis.finding import Finding
-from tfbus.analysis.limits import Limits
+from tfbus.analysis.examiner import Examiner, Finding, Limits
 from tfbus.bus.bus import Bus
 from tfbus.cli._width import terminal_width, wrapped
 from tfbus.cli.arguments import (

@@ -21,8 +21,7 @@ from tfbus.errors import InvalidRobotError, InvalidTransformError
 from tfbus.geometry.stamped import MAX_TRANSLATION, check_translations
 from tfbus.geometry.transform import Transform
 from tfbus.plain import printable
-from tfbus.robot.joint import Joint, Position
-from tfbus.robot.model import RobotModel
+from tfbus.robot.model import Joint, Position, RobotModel
 from tfbus.robot.state_publisher import RobotStatePublisher
 from tfbus.tree.history import Edge
 from tfbus.tree.rendering import Branch, branches

@@ -1,14 +1,367 @@
 """A link to ROS 2 over DDS: the transforms of a ROS 2 system on a bus, and those of the bus there."""
 
 import os
-from collections.abc import Iterable
-from typing import Unpack, get_args
+import struct
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from threading import Lock, Thread
+from typing import Any, Literal, Unpack, get_args
+from xml.sax.saxutils import quoteattr
 
+import anyio
+import anyio.to_thread
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
+from cyclonedds.core import DDSException
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.internal import InvalidSample
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from tfbus._aio.loops import wait_for_all
 from tfbus.bus.bus import Bus
-from tfbus.links.dds._carrier import DdsCarrier
-from tfbus.links.dds._domains import Discovery, configuration
-from tfbus.links.ros.ros_link import RosLink
-from tfbus.links.ros.settings import RosOptions, as_domain, settings_of
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._receive_queue import Presence, Received
+from tfbus.links.dds.readers import PATIENCE, RETRY, Greeting, Publishers, ReaderThread, delete, is_of_ros, join, read
+from tfbus.links.dds.types import RawClock, RawEntitiesInfo, RawJointState, RawString, RawTFMessage
+from tfbus.links.ros.ros_link import MAX_SIZE, RosCarrier, RosLink, RosMessage
+from tfbus.links.ros.settings import RosOptions, RosSettings, as_domain, settings_of
+from tfbus.tf_message import MalformedMessageError, encode
+
+# The DDS domains of this process, and their configuration.
+#
+# The library has one domain of a number in a process, with one configuration. So links to the same domain share it, and
+# the last of them that ends deletes it.
+
+
+Discovery = Literal["localhost", "subnet"]
+
+_FAST_DDS = "1.15"
+_PARTICIPANTS = 32
+"""So many on one machine are found; as many as ROS 2 looks for by default."""
+
+# Fast DDS 3 sends type information that Cyclone DDS takes for malformed, and then refuses to talk.
+_COMPATIBILITY = f"<Compatibility><IgnoreTypeInformation>{_FAST_DDS}</IgnoreTypeInformation></Compatibility>"
+_LOOPBACK = (
+    '<General><Interfaces><NetworkInterface name="lo" multicast="false"/></Interfaces>'
+    "<AllowMulticast>false</AllowMulticast></General>"
+)
+
+
+def configuration(discovery: Discovery, peers: Iterable[str], own: str | None) -> str:
+    """The configuration of Cyclone DDS, as its documentation describes it.
+
+    Parameters
+    ----------
+    discovery : {"localhost", "subnet"}
+        Where others are looked for.
+    peers : iterable of str
+        Further machines to look at.
+    own : str or None
+        A configuration in place of the two, XML or the URL of a file.
+    """
+    if own is not None:
+        return f'{own},<CycloneDDS><Domain id="any">{_COMPATIBILITY}</Domain></CycloneDDS>'
+    machines = (*(("127.0.0.1",) if discovery == "localhost" else ()), *peers)
+    addresses = "".join(f"<Peer address={quoteattr(machine)}/>" for machine in machines)
+    found = (
+        "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>{_PARTICIPANTS}</MaxAutoParticipantIndex>"
+        f"{f'<Peers>{addresses}</Peers>' if addresses else ''}</Discovery>"
+    )
+    network = _LOOPBACK if discovery == "localhost" else ""
+    return f'<CycloneDDS><Domain id="any">{network}{found}{_COMPATIBILITY}</Domain></CycloneDDS>'
+
+
+class _SharedDomain:
+    def __init__(self, number: int, config: str) -> None:
+        self.config = config
+        self.users = 0
+        self.domain = Domain(number, config)
+
+
+_lock = Lock()
+_open: dict[int, _SharedDomain] = {}
+
+
+@contextmanager
+def domain(number: int, config: str) -> Iterator[None]:
+    """Have a domain open with a configuration.
+
+    Raises
+    ------
+    OSError
+        If it cannot be opened, or is open in this process with another configuration.
+    """
+    with _lock:
+        shared = _open.get(number)
+        if shared is None:
+            try:
+                shared = _open[number] = _SharedDomain(number, config)
+            except DDSException as error:
+                raise OSError(f"cannot open the DDS domain {number}: {error}") from None
+        elif shared.config != config:
+            raise OSError(f"the DDS domain {number} is open in this process with another configuration")
+        shared.users += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            shared.users -= 1
+            if not shared.users:
+                del _open[number]
+                shared.domain.__del__()
+
+
+_CLOSING_TIME = 1.0
+_DEPTH = 5_000
+"""So many messages wait in DDS for their reader. The topics have no keys, so all writers of a topic share them."""
+_KEPT = 100
+"""So many of its own messages a writer repeats when they were lost, as tf2's broadcasters do."""
+_OTHERS = "other topics"
+"""The authority of joint positions and of the time."""
+_AT_ONCE = 16
+_BYTES_AT_ONCE = 2**20
+_BATCHES = 10
+"""So many of these, within so many bytes, are taken of a reader before others have their turn."""
+# A writer never waits for a reader that is frozen: the event loop would.
+_RELIABLE = (
+    Policy.Reliability.Reliable(duration(seconds=0)),
+    Policy.IgnoreLocal.Participant,
+    Policy.DataRepresentation(use_cdrv0_representation=True),
+)
+_MOVING = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(_KEPT))
+_HEARD = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(_DEPTH))
+# A second reader only listens, and nobody takes what comes.
+_SECOND = Qos(*_RELIABLE, Policy.Durability.Volatile, Policy.History.KeepLast(1))
+_STATIC = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
+# Each publisher has its own last message.
+_STATICS = Qos(*_RELIABLE, Policy.Durability.TransientLocal, Policy.History.KeepLast(_DEPTH))
+# Drivers of joints and simulations may be best effort.
+_ANY = Qos(Policy.Reliability.BestEffort, Policy.IgnoreLocal.Participant, Policy.History.KeepLast(_DEPTH))
+
+
+class ReadingError(MalformedMessageError):
+    """Something that has kept messages from being read; it is counted as they are, but nothing in them is malformed."""
+
+    def __str__(self) -> str:
+        return self.detail
+
+
+class DdsCarrier(RosCarrier):
+    """Reads and writes the topics of a DDS domain; see `RosCarrier`.
+
+    Parameters
+    ----------
+    number : int
+        The domain.
+    config : str
+        Of Cyclone DDS.
+    settings : RosSettings
+    """
+
+    def __init__(self, number: int, config: str, settings: RosSettings) -> None:
+        super().__init__(f"dds:{number}", settings)
+        self._number = number
+        self._config = config
+        self._open = ExitStack()
+        self._publishers = Publishers(self._deliver, self._is_of_ros)
+        self._participants: BuiltinDataReader | None = None
+        self._writers: dict[int, tuple[str, str]] = {}
+        self._matched: dict[int, frozenset[str]] = {}
+        self._greetings: dict[int, Greeting] = {}
+        self._behind: dict[DataReader[Any], int] = {}
+        self._present: frozenset[str] = frozenset()
+        self._moving_writer: DataWriter[RawTFMessage]
+        self._static_writer: DataWriter[RawTFMessage]
+
+    async def _connect(self) -> None:
+        await anyio.to_thread.run_sync(self._join)
+
+    def _join(self) -> None:
+        try:
+            self._open.enter_context(domain(self._number, self._config))
+            participant = join(self._number, self._open)
+            topics = {
+                name: Topic(participant, f"rt{name}", RawTFMessage)
+                for name in (*self.settings.tf, *self.settings.tf_static)
+            }
+            if self.settings.send:
+                self._moving_writer = DataWriter(participant, topics[self.settings.tf[0]], _MOVING)
+                self._static_writer = DataWriter(participant, topics[self.settings.tf_static[0]], _STATIC)
+                for writer in (self._moving_writer, self._static_writer):
+                    self._open.callback(delete, writer)
+            thread = ReaderThread(participant, self._failed)
+            if self.settings.authority is None:
+                self._participants = BuiltinDataReader(participant, BuiltinTopicDcpsParticipant)
+                self._open.callback(delete, self._participants)
+                info = Topic(participant, "ros_discovery_info", RawEntitiesInfo)
+                thread.watch(self._reader(participant, info, _STATICS), self._take_nodes)
+            for name in self.settings.joint_topic:
+                joints = Topic(participant, f"rt{name}", RawJointState)
+                thread.watch(self._reader(participant, joints, _ANY), partial(self._take_other, "joints"))
+            for name in self.settings.clock_topic:
+                clock = Topic(participant, f"rt{name}", RawClock)
+                thread.watch(self._reader(participant, clock, _ANY), partial(self._take_other, "clock"))
+            for name in self.settings.description_topic:
+                # Latched, as static frames are.
+                text = Topic(participant, f"rt{name}", RawString)
+                thread.watch(self._reader(participant, text, _STATICS), partial(self._take_other, "description"))
+            for number, name in enumerate((*self.settings.tf_static, *self.settings.tf)):
+                static = number < len(self.settings.tf_static)
+                reader = self._reader(participant, topics[name], _STATICS if static else _HEARD)
+                if not static:
+                    self._greetings[number] = Greeting(partial(DataReader, participant, topics[name], _SECOND))
+                    self._open.callback(self._greetings[number].close)
+                thread.watch(reader, partial(self._take, static), partial(self._match, number))
+            thread.start()
+            self._open.callback(thread.stop)
+        except DDSException as error:
+            raise OSError(f"cannot join the DDS domain {self._number}: {error}") from None
+
+    def _reader(self, participant: DomainParticipant, topic: Topic[Any], qos: Qos) -> DataReader[Any]:
+        reader: DataReader[Any] = DataReader(participant, topic, qos)
+        self._open.callback(delete, reader)
+        return reader
+
+    async def run(self) -> None:
+        """Let no message wait for the name of its node for ever."""
+        while True:
+            await anyio.sleep(PATIENCE / 2)
+            self._publishers.expire()
+
+    async def close(self) -> None:
+        """Leave the domain, or give up waiting for that."""
+        closing = Thread(target=self._open.close, name="tfbus dds close", daemon=True)
+        closing.start()
+        await wait_for_all([closing], _CLOSING_TIME)
+
+    def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
+        try:
+            (self._static_writer if static else self._moving_writer).write(RawTFMessage.of(encode(samples)))
+        except DDSException as error:
+            self._report.failed(error)
+            return False
+        return True
+
+    # What follows is called in the thread of the readers.
+
+    def _take(self, static: bool, reader: DataReader[RawTFMessage]) -> bool:
+        return self._take_each(reader, partial(self._take_transforms, static, reader))
+
+    def _take_transforms(self, static: bool, reader: DataReader[RawTFMessage], message: Any) -> None:
+        handle = message.sample_info.publication_handle
+        publisher, participant = self._writers.get(handle) or self._find(reader, handle)
+        if self.settings.authority is None:
+            self._publishers.message(publisher, participant, message.payload, static)
+        else:
+            self._deliver(participant, "", message.payload, static)
+
+    def _take_each(self, reader: DataReader[Any], take: Callable[[Any], object]) -> bool:
+        """Call a function with each of some messages that wait; returns whether more may wait."""
+        count = size = 0
+        while count < _BATCHES * _AT_ONCE and size < _BYTES_AT_ONCE:
+            messages: list[Any] = reader.take(N=_AT_ONCE)
+            count += len(messages)
+            for message in messages:
+                # One without data tells of a writer that has gone.
+                if not isinstance(message, InvalidSample):
+                    size += len(message.payload)
+                    try:
+                        take(message)
+                    except Exception as error:  # noqa: BLE001 - the others are taken all the same
+                        self._failed(error)
+            if len(messages) < _AT_ONCE:
+                self._count_waiting(reader, count)
+                self._behind.pop(reader, None)
+                return False
+        self._count_waiting(reader, count)
+        return True
+
+    def _count_waiting(self, reader: DataReader[Any], count: int) -> None:
+        """Tell when as many messages have waited in a row as DDS keeps, for it does not tell what it overwrites."""
+        behind = self._behind.get(reader, 0) + count
+        if behind >= _DEPTH:
+            behind = 0
+            topic = reader.topic.name.removeprefix("rt")
+            detail = f"messages of {topic} come faster than they are taken, some may be lost"
+            self._receive(Received("", ReadingError("overrun", detail)))
+        self._behind[reader] = behind
+
+    def _find(self, reader: DataReader[RawTFMessage], handle: int) -> tuple[str, str]:
+        publication = self._publication(reader, handle)
+        if publication is None:
+            return "", ""
+        self._writers[handle] = found = publication.key.hex, publication.participant_key.hex
+        return found
+
+    def _publication(self, reader: DataReader[RawTFMessage], handle: int) -> Any:
+        """The data that the library has of a writer; None if it has gone since, or the library cannot read it."""
+        try:
+            return reader.get_matched_publication_data(handle)
+        except UnicodeDecodeError as error:
+            # A stranger has given the writer such a name.
+            self._failed(error)
+            return None
+
+    def _is_of_ros(self, participant: str) -> bool:
+        """Whether a participant has the user data that ROS 2 gives it."""
+        if self._participants is None:
+            return False
+        return any(is_of_ros(each) for each in read(self._participants) if each.key.hex == participant)
+
+    def _take_nodes(self, reader: DataReader[RawEntitiesInfo]) -> bool:
+        return self._take_each(reader, self._take_node)
+
+    def _take_node(self, message: RawEntitiesInfo) -> None:
+        if len(message.payload) > MAX_SIZE:
+            detail = f"{len(message.payload)} bytes of names of nodes, more than {MAX_SIZE}"
+            self._receive(Received("", MalformedMessageError("oversized", detail)))
+            return
+        try:
+            participant, nodes = message.read()
+        except (ValueError, struct.error) as error:
+            detail = f"no names of nodes: {error!r}"[:200]
+            self._receive(Received("", MalformedMessageError("encoding", detail)))
+        else:
+            self._publishers.nodes(participant, nodes)
+
+    def _take_other(self, kind: Literal["joints", "clock", "description"], reader: DataReader[Any]) -> bool:
+        return self._take_each(reader, partial(self._pass_other, kind))
+
+    def _pass_other(self, kind: Literal["joints", "clock", "description"], message: Any) -> None:
+        other = {kind: True}
+        self._pass_on(_OTHERS, RosMessage(message.payload, static=False, authority="", **other))
+
+    def _match(self, number: int, reader: DataReader[RawTFMessage]) -> float | None:
+        try:
+            handles = reader.get_matched_publications()
+        except IndexError:
+            # Another writer has come between the two calls that the library makes for this.
+            return RETRY
+        self._writers.clear()
+        found = (self._publication(reader, handle) for handle in handles)
+        publications = [each for each in found if each is not None]
+        self._matched[number] = frozenset(each.participant_key.hex for each in publications)
+        present = frozenset().union(*self._matched.values())
+        self._publishers.keep_only(set(present))
+        for participant in sorted(present - self._present):
+            self._receive(Received(participant, Presence.JOINED))
+        for participant in sorted(self._present - present):
+            self._receive(Received(participant, Presence.LEFT))
+        self._present = present
+        greeting = self._greetings.get(number)
+        return None if greeting is None else greeting.update(frozenset(each.key.hex for each in publications))
+
+    def _failed(self, error: Exception) -> None:
+        """Count and tell what has kept messages from being read, which is none of their faults."""
+        self._receive(Received("", ReadingError("not read", f"DDS cannot be read: {error!r}"[:200])))
+
+    def _deliver(self, participant: str, authority: str, payload: bytes, static: bool) -> None:
+        self._pass_on(participant, RosMessage(payload, static, authority))
 
 
 class DdsLink(RosLink):

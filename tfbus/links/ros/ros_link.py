@@ -1,11 +1,235 @@
 """`RosLink`, the base of all links to ROS."""
 
-from typing import Unpack
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Unpack
 
 from tfbus.bus.bus import Bus
+from tfbus.errors import InvalidTransformError
+from tfbus.geometry.stamped import TransformStamped
+from tfbus.links._carrier import SendReport
+from tfbus.links._entries import OutgoingBatch
+from tfbus.links._inbox import ReceivedBatch, ReceivedMessage
+from tfbus.links._outbox import Turn
+from tfbus.links._provenance import ReceivedTransform
+from tfbus.links._receive_queue import Received
 from tfbus.links.link import Link
-from tfbus.links.ros._carrier import RosCarrier
-from tfbus.links.ros.settings import RosOptions
+from tfbus.links.ros.messages import decode_clock, decode_text
+from tfbus.links.ros.settings import RosOptions, RosSettings
+from tfbus.robot.joint_state_message import decode_joint_state
+from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts, refusal
+
+# The half of a carrier that all links to ROS share: what goes to which topic, and what comes from there.
+#
+# A publisher of ROS keeps its last message on ``/tf_static`` for late joiners. So each message that goes there holds
+# all static frames that this link sends. ROS has no message that removes a frame: a static one is missing in the next
+# message, which late joiners get, and of a moving one nobody is told.
+
+
+MAX_SIZE = 2**22
+"""The largest message that is received, in bytes."""
+MAX_OTHER_SIZE = 2**15
+"""The largest message of joints or of the time, in bytes."""
+AT_ONCE = 2**13
+"""A message of transforms beyond so many bytes or characters is read in parts."""
+PART = 40
+"""So many transforms of a large message are decoded and published at once."""
+MOST_TRANSFORMS = 1_000
+"""So many moving transforms go into one message."""
+
+
+@dataclass(frozen=True, slots=True)
+class RosMessage:
+    """One message from a topic, as it came.
+
+    Attributes
+    ----------
+    payload : Any
+        Bytes of CDR, or `Decoded` for a part of a large message; a carrier with other messages decodes them itself.
+    static : bool
+        Whether the topic is one of static frames.
+    authority : str
+        The node that has published it, or what is known of it.
+    joints, clock, description : bool
+        Whether it has positions of joints, the time, or the URDF of a robot, rather than transforms.
+    continues : bool
+        Whether it is a later part of a large message.
+    """
+
+    payload: Any
+    static: bool
+    authority: str
+    joints: bool = False
+    clock: bool = False
+    description: bool = False
+    continues: bool = False
+
+    @property
+    def has_transforms(self) -> bool:
+        """Whether it has transforms."""
+        return not (self.joints or self.clock or self.description)
+
+
+class RosCarrier:
+    """A carrier to ROS, see `tfbus.links._carrier.Carrier`; a subclass connects, publishes and closes.
+
+    Parameters
+    ----------
+    id : str
+        The name of this end.
+    settings : RosSettings
+    """
+
+    def __init__(self, id: str, settings: RosSettings) -> None:  # noqa: A002 - the protocol calls it so
+        self.id = id
+        self.settings = settings
+        self._receive: Callable[[Received], object]
+        self._report: SendReport
+        self._statics: dict[str, TransformStamped] = {}
+
+    async def open(self, receive: Callable[[Received], object], report: SendReport) -> None:
+        """Connect; raises `OSError` if there is no connection."""
+        self._receive, self._report = receive, report
+        await self._connect()
+
+    def send(self, turn: Turn) -> None:
+        """Publish the moving frames of a turn, and all static ones if any of them has changed."""
+        if not self.settings.send:
+            return
+        moving: list[TransformStamped] = []
+        for entry in turn.entries:
+            if isinstance(entry, OutgoingBatch):
+                moving += filter(None, (self._outgoing(sample) for sample in entry.samples if not sample.static))
+            elif entry.frame not in self._statics and self.settings.names.is_local(entry.frame):
+                error = ValueError(f"ROS cannot be told that the moving frame {entry.frame!r} was removed")
+                self._report.refused("removal", error)
+        for first in range(0, len(moving), MOST_TRANSFORMS):
+            self._put(moving[first : first + MOST_TRANSFORMS], static=False)
+        changed = False
+        for frame, change in turn.statics.items():
+            sample = self._outgoing(change.samples[0]) if isinstance(change, OutgoingBatch) else None
+            if sample is not None:
+                self._statics[frame] = sample
+                changed = True
+            elif self._statics.pop(frame, None) is not None:
+                changed = True
+        if changed:
+            self._put(list(self._statics.values()), static=True)
+
+    def split(self, content: Any) -> Iterator[Any]:
+        """The parts of a large message of transforms, each of `PART` of them; anything else is its only part."""
+        if not isinstance(content, RosMessage) or not content.has_transforms or not self._is_large(content.payload):
+            yield content
+            return
+        continues = False
+        for decoded in self._decode_in_parts(content.payload):
+            yield replace(content, payload=decoded, continues=continues)
+            continues = True
+
+    def read(self, content: RosMessage) -> ReceivedMessage:
+        """The samples of a message by their names on the bus, or the time; positions of joints are handed on."""
+        if (content.clock or content.joints) and isinstance(content.payload, bytes):
+            size = len(content.payload)
+            if size > MAX_OTHER_SIZE:
+                raise MalformedMessageError("oversized", f"{size} bytes, more than {MAX_OTHER_SIZE}")
+        if content.clock:
+            return ReceivedMessage([], time=decode_clock(content.payload))
+        if content.joints:
+            stamp, positions = self._decode_joints(content.payload)
+            if self.settings.joint_states is not None:
+                self.settings.joint_states(positions, stamp)
+            return ReceivedMessage([])
+        if content.description:
+            description = decode_text(content.payload)
+            if self.settings.robot_description is not None:
+                self.settings.robot_description(description)
+            return ReceivedMessage([])
+        decoded = content.payload if isinstance(content.payload, Decoded) else self._decode(content.payload)
+        self._heard(decoded.samples, content.static)
+        errors = decoded.errors
+        samples: list[ReceivedTransform] = []
+        authority = content.authority if self.settings.authority is None else self.settings.authority
+        for error in errors:
+            error.authority = authority
+        for sample in decoded.samples:
+            if sample is None:
+                continue
+            sample._fields = *sample._fields[:4], authority, content.static
+            try:
+                self.settings.names.put_on_bus(sample)
+            except InvalidTransformError as error:
+                errors.append(error.with_traceback(None))
+            else:
+                samples.append(sample)
+        entries: list[Any] = [ReceivedBatch(samples, {authority})] if samples else []
+        return ReceivedMessage(entries, errors=errors, continues=content.continues)
+
+    async def run(self) -> None:
+        """Do nothing that takes time."""
+
+    async def close(self) -> None:
+        """Disconnect."""
+        raise NotImplementedError
+
+    async def _connect(self) -> None:
+        """Connect, and subscribe; raises `OSError` if there is no connection."""
+        raise NotImplementedError
+
+    def _publish(self, samples: Sequence[TransformStamped], static: bool) -> bool:
+        """Publish one message, without blocking; returns whether the network took it, and reports it if not."""
+        raise NotImplementedError
+
+    def _decode(self, payload: Any) -> Decoded[ReceivedTransform]:
+        """The transforms of a message; raises `MalformedMessageError`."""
+        return decode(payload, kind=ReceivedTransform, bare_names=True)
+
+    def _is_large(self, payload: Any) -> bool:
+        """Whether a message of transforms takes too long for one turn."""
+        return len(payload) > AT_ONCE
+
+    def _decode_in_parts(self, payload: Any) -> Iterator[Decoded[ReceivedTransform]]:
+        """The transforms of a large message, `PART` at a time; raises `MalformedMessageError` at the first fault."""
+        return decode_in_parts(payload, PART, ReceivedTransform, bare_names=True)
+
+    def _heard(self, samples: Sequence[ReceivedTransform | None], static: bool) -> None:
+        """Take note of transforms by their names in ROS."""
+
+    def _decode_joints(self, payload: Any) -> tuple[int, dict[str, float]]:
+        """The stamp and the positions of joints of a message; raises `MalformedMessageError`."""
+        return decode_joint_state(payload, ros1=False)
+
+    def _pass_on(self, sender: str, message: RosMessage) -> None:
+        """Hand a message of bytes to the link, or the refusal of one that is too large; any thread may call this."""
+        size = len(message.payload)
+        if size > MAX_SIZE:
+            error = MalformedMessageError("oversized", f"{size} bytes, more than {MAX_SIZE}")
+            self._receive(Received(sender, error))
+        else:
+            # What is latched comes once.
+            moving = not (message.static or message.description)
+            self._receive(Received(sender, message, size, moving=moving))
+
+    def _publish_statics(self) -> None:
+        """Publish the static frames once more, for whoever has come or come back."""
+        if self._statics:
+            self._put(list(self._statics.values()), static=True)
+
+    def _put(self, samples: Sequence[TransformStamped], static: bool) -> None:
+        if self._publish(samples, static):
+            self._report.sent(len(samples))
+
+    def _outgoing(self, sample: TransformStamped) -> TransformStamped | None:
+        """A sample with its names in ROS; None if it is another robot's, or a message cannot hold it."""
+        if not self.settings.names.is_local(sample.child):
+            return None
+        error = refusal(sample)
+        if error is None:
+            try:
+                return self.settings.names.localise(sample)
+            except InvalidTransformError as no_name:
+                error = no_name.with_traceback(None)
+        self._report.refused(error.reason, error)
+        return None
 
 
 class RosLink(Link):

@@ -20,8 +20,8 @@ import cbor2
 
 from tfbus.geometry.stamped import TransformStamped
 from tfbus.links._provenance import ReceivedTransform
-from tfbus.links.ros._carrier import AT_ONCE, MAX_SIZE, PART
-from tfbus.links.ros._transforms import as_mapping, decode_mapping, decode_ros1, decode_ros1_in_parts, stamp_of
+from tfbus.links.ros.messages import as_mapping, decode_mapping, decode_ros1, decode_ros1_in_parts, stamp_of
+from tfbus.links.ros.ros_link import AT_ONCE, MAX_SIZE, PART
 from tfbus.robot.joint_state_message import decode_joint_state
 from tfbus.tf_message import Decoded, MalformedMessageError, decode, decode_in_parts
 

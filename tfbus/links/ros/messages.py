@@ -1,8 +1,4 @@
-"""The transforms of messages that are no CDR: those of ROS 1, and those of JSON and CBOR.
-
-A message of ROS 1 is ``tf2_msgs/TFMessage``: the number of transforms, then for each ``uint32 seq, sec, nsec``, two
-strings of a length and UTF-8, and seven ``float64``; everything is little endian, and nothing is aligned.
-"""
+"""The message ``std_msgs/String``, in which a robot is described."""
 
 import struct
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,6 +11,12 @@ from tfbus.geometry.transform import Transform
 from tfbus.links._provenance import ReceivedTransform
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError
+
+# The transforms of messages that are no CDR: those of ROS 1, and those of JSON and CBOR.
+#
+# A message of ROS 1 is ``tf2_msgs/TFMessage``: the number of transforms, then for each ``uint32 seq, sec, nsec``, two
+# strings of a length and UTF-8, and seven ``float64``; everything is little endian, and nothing is aligned.
+
 
 _COUNT = struct.Struct("<I")
 _HEAD = struct.Struct("<4xII")
@@ -148,3 +150,65 @@ def _bare(name: object) -> str | None:
         return name.lstrip("/") if len(name.encode()) <= MAX_NAME else None
     except UnicodeEncodeError:
         return None
+
+
+_ROS1 = struct.Struct("<II")
+_CDR = {b"\0\1": struct.Struct("<4xiI"), b"\0\0": struct.Struct(">4xiI")}
+
+
+def decode_clock(content: Any) -> int:
+    """The time in ns of a message, in bytes of either ROS or as a mapping.
+
+    Raises
+    ------
+    MalformedMessageError
+        If it holds none.
+    """
+    if isinstance(content, bytes):
+        # Only that of ROS 1 has no header.
+        layout = _ROS1 if len(content) == _ROS1.size else _CDR.get(content[:2])
+        if layout is None or len(content) < layout.size:
+            raise MalformedMessageError("truncated", f"{len(content)} bytes are no time")
+        seconds, nanoseconds = layout.unpack_from(content)
+        return int(seconds * SECOND + nanoseconds)
+    try:
+        return stamp_of(content["clock"])
+    except (LookupError, TypeError) as error:
+        raise MalformedMessageError("encoding", f"it has not the fields of a Clock: {error!r}"[:200]) from None
+
+
+_HEADERS = {b"\0\1": "<", b"\0\0": ">"}
+_SIZE = 4
+
+
+def decode_text(content: Any) -> str:
+    """The text of a message, in bytes of either ROS or as a mapping.
+
+    Raises
+    ------
+    MalformedMessageError
+        If it holds none.
+    """
+    if isinstance(content, bytes):
+        # That of ROS 1 is its length and as many bytes; that of ROS 2 has a header, and a zero at the end.
+        if len(content) >= _SIZE and struct.unpack_from("<I", content)[0] == len(content) - _SIZE:
+            return _as_text(content[_SIZE:])
+        order = _HEADERS.get(content[:2])
+        if order is None or len(content) < 2 * _SIZE:
+            raise MalformedMessageError("truncated", f"{len(content)} bytes are no text")
+        (length,) = struct.unpack_from(f"{order}I", content, _SIZE)
+        held = content[2 * _SIZE : 2 * _SIZE + length]
+        if len(held) < length:
+            raise MalformedMessageError("truncated", f"{len(content)} bytes cannot hold a text of {length}")
+        return _as_text(held.removesuffix(b"\0"))
+    text = content.get("data") if isinstance(content, dict) else None
+    if not isinstance(text, str):
+        raise MalformedMessageError("encoding", f"it has not the field of a String: {content!r}"[:200])
+    return text
+
+
+def _as_text(content: bytes) -> str:
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        raise MalformedMessageError("encoding", f"the text is no UTF-8: {error}"[:200]) from None

@@ -22,7 +22,7 @@ import numpy.typing as npt
 import trimesh
 
 from tfbus.plain import printable
-from tfbus.robot.visual import Box, Cylinder, Mesh, Shape, Sphere, Visual
+from tfbus.robot.model import Box, Cylinder, Mesh, Shape, Sphere, Visual
 
 MAX_BYTES = 67_108_864
 """Bytes of a mesh file and of all that it refers to, unpacked."""

@@ -1,14 +1,10 @@
-"""The web server of the page: viser's, for this machine only and without a word on standard output.
-
-viser answers any page, and sets whatever attribute of a control a message names. Here its server is given a door: the
-head of each request goes through a `WebDoor` before viser sees it, and each message through `_Messages`, which lets
-pass what the page itself sends.
-"""
+"""The queue of what people do in the browser; the callbacks come in other threads."""
 
 import asyncio
 import math
 import socket
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -19,7 +15,16 @@ import rich
 import viser
 import viser.infra
 
+from tfbus._aio.loops import LoopWaker
 from tfbus._aio.web_door import HEAD_END, HEAD_TIME, MAX_HEAD, WebDoor
+from tfbus.statistics import QueueStatistics
+
+# The web server of the page: viser's, for this machine only and without a word on standard output.
+#
+# viser answers any page, and sets whatever attribute of a control a message names. Here its server is given a door: the
+# head of each request goes through a `WebDoor` before viser sees it, and each message through `_Messages`, which lets
+# pass what the page itself sends.
+
 
 _PORTS_TRIED = 100
 MAX_MESSAGE = 65_536
@@ -282,3 +287,67 @@ def _silent() -> Iterator[None]:
             yield
         finally:
             console.quiet = before
+
+
+CAPACITY = 1_000
+
+
+class Controls:
+    """Calls functions on the event loop that other threads hand over, in their order, one in each turn of the loop.
+
+    When more than `CAPACITY` are pending, the oldest is dropped and counted.
+
+    Parameters
+    ----------
+    called : callable
+        Called on the loop after a function was called.
+    """
+
+    def __init__(self, called: Callable[[], object]) -> None:
+        self.dropped = 0
+        self._called = called
+        self._pending: deque[Callable[[], object]] = deque()
+        self._lock = threading.Lock()
+        self._waker = LoopWaker(self._drain)
+        self._ended = False
+
+    def bind(self) -> None:
+        """Use the running event loop."""
+        self._waker.bind()
+
+    def put(self, control: Callable[[], object]) -> None:
+        """Hand a function over, from any thread; after `end`, or without the loop, nothing happens."""
+        with self._lock:
+            if self._ended:
+                return
+            if len(self._pending) == CAPACITY:
+                self._pending.popleft()
+                self.dropped += 1
+            self._pending.append(control)
+        try:
+            self._waker.wake()
+        except RuntimeError:
+            # The event loop has ended before the server.
+            self.end()
+
+    def end(self) -> None:
+        """Drop what is pending, and take no more."""
+        with self._lock:
+            self._ended = True
+            self._pending.clear()
+
+    def statistics(self) -> QueueStatistics:
+        """The queue's counters."""
+        return QueueStatistics("controls", "drop_oldest", CAPACITY, len(self._pending), self.dropped)
+
+    def _drain(self) -> None:
+        with self._lock:
+            if not self._pending:
+                return
+            control = self._pending.popleft()
+            more = bool(self._pending)
+        if more:
+            # A flood of clicks must not hold the program up.
+            self._waker.wake()
+        control()
+        self._called()
