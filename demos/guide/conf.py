@@ -54,12 +54,12 @@ nitpick_ignore = [
 ]
 nitpick_ignore_regex = [
     ("py:class", r"(ArrayLike|NDArray|(collections\.abc|numpy)\.\w+)"),
-    # What a recording's messages may have as errors, beside those that are public.
+    # The error of a message of a recording that cannot be read.
     ("py:class", r"tfbus\..*\.MalformedMessageError"),
-    # What the methods of a recording for those who read it in blocks have.
-    ("py:class", r"tfbus\.recording\.(_blocks|formats\._raw_transforms)\.\w+"),
-    # What a link is made of, and what can follow the time besides a clock.
-    ("py:class", r"tfbus\.links\.(_clock_follower\.HearsTime|ros\._carrier\.RosCarrier|ros\.settings\.RosOptions)"),
+    # The parts of a recording for code that reads it in blocks.
+    ("py:class", r"tfbus\.recording\.(recording\.(Decoded)?Block|formats\.\w+\.RawTransform)"),
+    # The parts of a link, and a follower of the time that is no clock.
+    ("py:class", r"tfbus\.links\.(_clock_follower\.HearsTime|ros\.\w+\.(RosCarrier|RosOptions))"),
     # Sphinx splits the parameters of such types.
     ("py:class", r"[\w.]+\[\w+"),
 ]

@@ -60,7 +60,7 @@ class FoxgloveServer:
         The name of the channel.
     origins : iterable of str
         The web pages that may connect, such as ``https://robot.example:8443``; by default those of the Foxglove
-        application, `APPLICATION`. ``*`` is for all. A program that is no browser sends no origin, and may connect.
+        application, ``APPLICATION``. ``*`` is for all. A program that is no browser sends no origin, and may connect.
 
     Attributes
     ----------

@@ -62,7 +62,7 @@ class View:
         controls the page.
     origins : iterable of str
         Web pages that may use this one beside itself, such as ``https://robot.example:8443``; the page answers to the
-        names of their hosts too. By default there are none, and it answers to addresses, to ``localhost``, to `host`
+        names of their hosts too. By default there are none, and it answers to addresses, to ``localhost``, to ``host``
         and to the name of this machine. ``*`` stands for all.
     fixed : str, optional
         The frame that stands still; by default the root of the largest tree. It can be changed on the page.
