@@ -156,7 +156,7 @@ anyio.run(enter)
 
 def test_each_link_that_was_made_and_never_entered_is_told_of_in_one_line_and_no_other() -> None:
     program = f"""{BEGIN}
-from tfbus.links.dds import DdsLink
+from tfbus.links.rmw_zenoh import RmwZenohLink
 from tfbus.links.rosbridge import RosbridgeLink
 async def enter(link):
     async with link:
@@ -166,7 +166,7 @@ anyio.run(enter, entered)
 tell(anyio.run, enter, ZenohLink(Bus(), config={{"mode": "client"}}, connect="tcp/127.0.0.1:1"))
 tell(ZenohLink, Bus(), "no domain")
 # One that goes at once, and those that the program keeps to its end; the copies of a child are no others.
-DdsLink(Bus())
+RmwZenohLink(Bus())
 kept = [ZenohLink(Bus()), RosbridgeLink(Bus(), "ws://127.0.0.1:9090"), BufferServer(Buffer(Bus())), BufferClient()]
 in_a_child(lambda: sys.exit())
 """
@@ -175,5 +175,5 @@ in_a_child(lambda: sys.exit())
     assert [line.split()[0] for line in done.stdout.splitlines()] == ["OSError", "ValueError"]
     assert sorted(done.stderr.splitlines()) == [
         f"a {name} was made and never entered, so it has done nothing: write `async with {name}(...)`"
-        for name in ("BufferClient", "BufferServer", "DdsLink", "RosbridgeLink", "ZenohLink")
+        for name in ("BufferClient", "BufferServer", "RmwZenohLink", "RosbridgeLink", "ZenohLink")
     ]
