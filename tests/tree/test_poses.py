@@ -31,7 +31,8 @@ def check_against_lookups(tree: TransformTree, poses: Poses, fixed: str, at: int
             assert not poses.answered[place], frame
         else:
             assert poses.answered[place], frame
-            assert poses.columns[:, place] == pytest.approx(found.transform._row, abs=1e-12)
+            row = *found.transform.translation, *found.transform.rotation
+            assert poses.columns[:, place] == pytest.approx(row, abs=1e-12)
 
 
 @given(st.lists(any_samples("abcdef", last=10), max_size=15), STAMPS)
