@@ -100,14 +100,7 @@ def test_a_sample_cannot_be_changed(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [
-        ("parent", "odom"),
-        ("child", "tool0"),
-        ("stamp", 8),
-        ("transform", Transform()),
-        ("authority", "slam"),
-        ("static", True),
-    ],
+    {"parent": "odom", "child": "b", "stamp": 8, "transform": Transform(), "authority": "me", "static": True}.items(),
 )
 def test_a_changed_copy_differs_in_that_field_only(name: str, value: Any) -> None:
     sample = TransformStamped("map", "base_link", 7, MOVE, "odometry")

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from support.strategies import angles, rotations, small_angles, transforms, unit_vectors, vectors
 from transforms3d import affines, axangles, euler, quaternions
 
-from tfbus import InvalidTransformError, Transform, TransformError
+from tfbus import InvalidTransformError, Transform
 from tfbus.rows import Columns, Quaternion, Row, Vector, as_rotation, as_vector, compose, interpolate, invert
 
 HALF = math.sqrt(0.5)
@@ -88,13 +88,6 @@ def test_matrices_are_those_of_transforms3d_and_come_back(a: Transform, b: Trans
     assert angle_between(Transform.from_matrix(matrix_of(a)).as_wxyz(), expected) <= 1e-14
 
 
-@given(rotations(), rotations())
-def test_rotations_compose_as_quaternions_do_sign_included(a: Quaternion, b: Quaternion) -> None:
-    product = Transform(rotation=a) @ Transform(rotation=b)
-    expected = quaternions.qmult((a[3], *a[:3]), (b[3], *b[:3]))
-    np.testing.assert_allclose(product.as_wxyz(), expected, rtol=0, atol=1e-15)
-
-
 @given(unit_vectors(), angles(), vectors())
 def test_an_axis_and_an_angle_are_those_of_transforms3d(axis: Vector, angle: float, translation: Vector) -> None:
     t = Transform.from_axis_angle(axis, angle, translation)
@@ -107,14 +100,6 @@ def test_roll_pitch_and_yaw_are_the_fixed_axes_of_transforms3d(xyz: Vector, rpy:
     t = Transform.from_xyz_rpy(xyz, rpy)
     np.testing.assert_allclose(t.matrix()[:3, :3], euler.euler2mat(*rpy, "sxyz"), rtol=0, atol=1e-14)
     assert t.translation == xyz
-
-
-@given(vectors(4.0))
-def test_roll_pitch_and_yaw_are_read_as_transforms3d_does(rpy: Vector) -> None:
-    t = Transform.from_xyz_rpy((0, 0, 0), rpy)
-    if abs(math.cos(rpy[1])) > 0.01:
-        apart = np.subtract(t.as_rpy(), euler.quat2euler(t.as_wxyz(), "sxyz"))
-        np.testing.assert_allclose(np.sin(apart / 2.0), 0.0, rtol=0, atol=1e-12)
 
 
 # Conversions both ways
@@ -280,11 +265,6 @@ def test_an_axis_without_a_direction_is_refused() -> None:
     assert caught.value.reason == "zero axis"
 
 
-def test_invalid_transform_error_is_a_value_error_and_a_transform_error() -> None:
-    assert issubclass(InvalidTransformError, ValueError)
-    assert issubclass(InvalidTransformError, TransformError)
-
-
 # Interpolation
 
 
@@ -427,11 +407,6 @@ def test_equality_is_exact() -> None:
     assert hash(Transform((0.0, 0.0, 0.0))) == hash(Transform((-0.0, 0.0, 0.0)))
     assert Transform((1, 2, 3)) != Transform((1, 2, math.nextafter(3, 4)))
     assert Transform() == Transform.identity()
-
-
-def test_a_transform_equals_nothing_else() -> None:
-    assert Transform() != (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    assert Transform() != None  # noqa: E711 - the operator is what is tested
 
 
 @pytest.mark.parametrize("other", [2.0, None, (1.0, 2.0, 3.0), "map"])

@@ -12,18 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.histories import moving_edge, static_edge
 from support.samples import moving, static
-from support.strategies import transforms
 
 from tfbus import (
     LATEST,
     DisconnectedError,
     FutureExtrapolationError,
-    PastExtrapolationError,
     Transform,
     TransformStamped,
     TransformTree,
 )
-from tfbus.geometry.transform import from_row
 from tfbus.rows import IDENTITY
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tree.forest import Forest, Path, PathCache, find_path, path_at
@@ -43,25 +40,6 @@ def static_frames(parents: dict[str, str]) -> Frames:
 
 
 # Search
-
-TREE = {"b": "a", "c": "b", "d": "c", "e": "b", "f": "e", "g": "a"}
-
-
-@pytest.mark.parametrize(
-    ("target", "source", "frames"),
-    [
-        ("a", "a", "a"),
-        ("a", "d", "abcd"),
-        ("d", "a", "dcba"),
-        ("b", "c", "bc"),
-        ("d", "f", "dcbef"),
-        ("f", "d", "febcd"),
-        ("g", "d", "gabcd"),
-        ("c", "e", "cbe"),
-    ],
-)
-def test_a_path_goes_through_the_lowest_common_ancestor(target: str, source: str, frames: str) -> None:
-    assert "".join(find_path(static_frames(TREE), target, source, None).frames) == frames
 
 
 def test_the_search_climbs_above_the_common_ancestor_no_further_than_the_shorter_side() -> None:
@@ -107,25 +85,6 @@ def ancestors(parent_of: dict[str, str], frame: str) -> set[str]:
     while (frame := parent_of.get(frame, frame)) not in seen:
         seen.add(frame)
     return seen
-
-
-@given(st.lists(st.tuples(transforms(10.0), st.booleans()), min_size=1, max_size=6), st.integers(0, 6), st.data())
-def test_the_row_of_a_path_is_the_product_of_its_edges(
-    edges: list[tuple[Transform, bool]], split: int, data: st.DataObject
-) -> None:
-    frames: Frames = {}
-    expected = {"root": Transform.identity()}
-    for number, (pose, is_static) in enumerate(edges):
-        parent = data.draw(st.sampled_from(sorted(expected)))
-        child = f"frame {number}"
-        frames[child] = static_edge(parent, child, pose) if is_static else moving_edge(parent, child, [(split, pose)])
-        expected[child] = expected[parent] @ pose
-    target, source = data.draw(st.tuples(st.sampled_from(sorted(expected)), st.sampled_from(sorted(expected))))
-    found = from_row(find_path(frames, target, source, split).row_at(split))
-    # The product goes through the root, the path only to the common ancestor.
-    assert found.is_close(
-        expected[target].inverse() @ expected[source], translation_tolerance=1e-11, rotation_tolerance=1e-11
-    )
 
 
 # The edge that decides
@@ -177,26 +136,6 @@ def test_of_two_ways_round_a_loop_the_one_with_samples_counts(at: int) -> None:
         path = at_stamp(frames, target, source, at)
         assert path.frames == (target, source)
         assert [edge.child for edge in path.moving] == ["a"]
-
-
-def test_without_samples_on_either_way_both_may_still_help() -> None:
-    frames = loop_of(a_on_b=(0, 10), b_on_a=(5, 20))
-    for edge in frames.values():
-        edge.clear()
-    frames["a"].insert("b", 10, IDENTITY, "")
-    frames["b"].insert("a", 10, IDENTITY, "")
-    path = path_at(frames, "a", "b", 20, None)
-    back = path_at(frames, "b", "a", 20, None)
-    assert path.rival is not None
-    assert {path.moving, path.rival.moving} == {(frames["a"],), (frames["b"],)}
-    assert back.moving == path.moving
-    error = path.deciding_error(20)
-    assert isinstance(error, FutureExtrapolationError)
-    assert {error.child, *error.others} == {"a", "b"}
-    frames["a"].insert("b", 30, IDENTITY, "")
-    frames["a"].insert("b", 40, IDENTITY, "")
-    early = path_at(frames, "a", "b", 5, None)
-    assert isinstance(early.deciding_error(5), PastExtrapolationError)
 
 
 def test_waiting_helps_if_it_helps_on_one_of_two_ways() -> None:
@@ -299,28 +238,6 @@ def test_the_version_is_another_one_after_each_change() -> None:
 
 
 # All frames at one moment
-
-
-def test_frames_that_change_while_others_are_read_are_read_again() -> None:
-    known = forest(*(moving("root", f"f{number}", 0) for number in range(250)))
-    seen: list[str] = []
-
-    def newest(history: FrameHistory) -> int | None:
-        seen.append(history.child)
-        if len(seen) in (150, 250):
-            # Another thread cannot do this here, because the lock is held; it does so between two parts.
-            known.lock.release()
-            known.commit((moving("root", "f0", len(seen)), moving("root", "new", len(seen))))
-            if len(seen) == 250:
-                known.remove("f1")
-            known.lock.acquire()
-        return history.newest
-
-    found = known.read_all(newest)
-    assert (found["f0"], found["new"], found["f249"]) == (250, 250, 0)
-    assert found.keys() == known.frames.keys()
-    assert "f1" not in found
-    assert len(seen) <= 254
 
 
 @pytest.mark.parametrize(

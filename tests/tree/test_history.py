@@ -156,16 +156,6 @@ def test_samples_between_are_read_by_numpy_as_inserted(order: list[int], one: in
     assert taken.parents is None
 
 
-def test_samples_between_are_copies() -> None:
-    samples = history(stamps=[10, 20, 30])
-    taken = samples.samples_between(10, 30)
-    stamps, rows = taken.stamps, taken.rows
-    samples.insert("parent", 40, row(40.0), "")
-    samples.insert("parent", 20, row(-1.0), "")
-    samples.clear()
-    assert (stamps.tolist(), rows[:, 0].tolist()) == ([10, 20, 30], [10.0, 20.0, 30.0])
-
-
 def test_samples_between_have_their_authorities_as_long_as_there_are_several_in_the_window() -> None:
     samples = history(keep=20)
     for stamp, authority in ((10, "first"), (20, "second"), (30, "second")):

@@ -5,13 +5,12 @@ import math
 import pickle
 import re
 from functools import partial
-from itertools import permutations, product
+from itertools import permutations
 from typing import Any
 
 import numpy as np
 import pytest
 from support.samples import moving, over, static, tree_of, x_of
-from support.strategies import TODAY
 
 from tfbus import (
     LATEST,
@@ -25,7 +24,6 @@ from tfbus import (
     Latest,
     PastExtrapolationError,
     PointStamped,
-    Question,
     Transform,
     TransformLookupError,
     TransformStamped,
@@ -162,41 +160,6 @@ def test_an_unknown_frame_raises_before_any_leg_is_looked_up(names: tuple[str, s
     with pytest.raises(UnknownFrameError) as caught:
         find_in_time_travel(forest(moving("a", "b", 5)), target, source, -1, 99, fixed, None)
     assert caught.value.frame == "nobody"
-
-
-# The configurations of tf2's own tests: each child with its parent and its distance from it
-
-
-CONFIGURATIONS = {
-    "one link": {"2": ("1", 1.0)},
-    "i": {"b": ("a", 1.0), "c": ("b", 2.0)},
-    "v": {"b": ("a", 1.0), "c": ("b", 2.0), "f": ("a", 4.0), "g": ("f", 8.0)},
-    "y": {"b": ("a", 1.0), "c": ("b", 2.0), "d": ("b", 4.0), "e": ("d", 8.0)},
-}
-
-
-def positions(edges: dict[str, tuple[str, float]]) -> dict[str, float]:
-    """The distance of each frame from the root."""
-    places: dict[str, float] = {}
-    for child, (parent, distance) in edges.items():
-        places[child] = places.setdefault(parent, 0.0) + distance
-    return places
-
-
-@pytest.mark.parametrize("name", CONFIGURATIONS)
-@pytest.mark.parametrize("stamp", [0, SECOND, 10 * SECOND, TODAY])
-@pytest.mark.parametrize("space", [2, 1_000, 2 * SECOND])
-def test_every_pair_of_frames_is_answered_between_two_samples(name: str, stamp: int, space: int) -> None:
-    edges = CONFIGURATIONS[name]
-    tree = TransformTree()
-    for child, (parent, distance) in edges.items():
-        tree.insert(moving(parent, child, stamp - space // 2, distance - 0.5))
-        tree.insert(moving(parent, child, stamp + space // 2, distance + 0.5))
-    places = positions(edges)
-    for target, source in product(places, places):
-        found = tree.lookup(target, source, stamp)
-        assert (found.parent, found.child, found.stamp) == (target, source, stamp)
-        assert_close(found, Transform((places[source] - places[target], 0.0, 0.0)))
 
 
 # A carriage climbs at 0.5 m/s; on it an arm of 2 m turns at 0.3 rad/s: its tip moves on a helix
@@ -377,15 +340,6 @@ def test_old_stamps_have_the_old_parent_and_its_last_value_is_held_until_the_new
     assert tree.chain("root", "b") == ["root", "right", "b"]
 
 
-def test_a_parent_in_another_tree_answers_only_at_its_own_stamps() -> None:
-    tree = tree_of(*over("old", "b", [0, 10]), *over("new", "b", [20, 30]))
-    assert x_of(tree, "old", "b", 5) == 5.0
-    for at in (LATEST, 25):
-        with pytest.raises(DisconnectedError) as caught:
-            tree.lookup("old", "b", at)
-        assert caught.value.roots == ("old", "new")
-
-
 # Static edges
 
 
@@ -422,13 +376,6 @@ def test_the_error_names_an_unknown_target_before_an_unknown_source(
     assert not tree.can_transform(target, source, at)
 
 
-def test_the_error_of_an_unknown_frame_has_similar_names() -> None:
-    tree = tree_of(moving("base_link", "base_laser", 0))
-    with pytest.raises(UnknownFrameError, match="did you mean") as caught:
-        tree.lookup("base_link", "base_lasr")
-    assert caught.value.close_matches[0] == "base_laser"
-
-
 def test_two_trees_are_disconnected_at_stamps_outside_their_windows_too() -> None:
     tree = tree_of(*over("a", "b", [0, 10]), *over("x", "y", [0, 10]))
     for at in (-100, 5, 100, LATEST):
@@ -446,7 +393,7 @@ def test_any_text_is_a_frame_name_also_one_that_tf2_reserves() -> None:
 
 @pytest.mark.parametrize("at", [LATEST, 5])
 def test_the_chain_lists_the_frames_from_target_to_source(at: int | Latest) -> None:
-    tree = tree_of(*(moving(parent, child, 5) for child, (parent, _) in CONFIGURATIONS["v"].items()))
+    tree = tree_of(*(moving(parent, child, 5) for parent, child in ("ab", "bc", "af", "fg")))
     assert tree.chain("c", "g", at) == ["c", "b", "a", "f", "g"]
     assert tree.chain("a", "c", at) == ["a", "b", "c"]
     assert tree.chain("c", "b", at) == ["c", "b"]
@@ -542,9 +489,6 @@ def test_the_latest_answer_goes_the_way_that_an_answer_at_its_stamp_goes() -> No
     assert x_of(tree, "c", "tool") == x_of(tree, "c", "tool", 97) == 12.0
 
 
-POLICY = Policy(tolerance=5)
-
-
 class Smell:
     """Data with a frame and a stamp, of a type that is not registered."""
 
@@ -572,16 +516,6 @@ def _(data: Note, transform: TransformStamped) -> Note:  # noqa: ARG001
 @do_transform.register
 def _(data: Message, transform: TransformStamped) -> Message:  # noqa: ARG001
     return data
-
-
-@pytest.mark.parametrize(("at", "stamp"), [(5, 2), (LATEST, 2), (5, LATEST)])
-@pytest.mark.parametrize(("max_age", "policy"), [(None, None), (0.5, POLICY)])
-def test_data_at_another_stamp_are_looked_up_through_the_fixed_frame(
-    at: int | Latest, stamp: int | Latest, max_age: float | None, policy: Policy | None
-) -> None:
-    point = PointStamped("laser", stamp, (1.0, 0.0, 0.0))
-    expected = Question("base", "laser", at, source_at=stamp, fixed="map", max_age=max_age, policy=policy)
-    assert question_of(point, "base", at, "map", max_age, policy) == expected
 
 
 POINT = PointStamped("laser", 2, (1.0, 0.0, 0.0))

@@ -20,8 +20,6 @@ import tfbus
 from tfbus import (
     LATEST,
     SECOND,
-    Buffer,
-    Bus,
     DisconnectedError,
     FutureExtrapolationError,
     Latest,
@@ -373,20 +371,6 @@ def test_a_policy_is_checked_although_no_stamp_needs_it() -> None:
     for options in wrong:
         with pytest.raises(ValueError, match=next(iter(options))):
             tree.lookup_many("map", "cart", [10, 25], **options)
-
-
-def test_a_subscriber_can_look_up_the_samples_of_its_batch() -> None:
-    bus = Bus()
-    seen: list[list[float]] = []
-
-    def ask(batch: tuple[TransformStamped, ...]) -> None:
-        found = buffer.tree.lookup_many("a", "b", [sample.stamp for sample in batch])
-        seen.append(found.translations[:, 0].tolist())
-
-    with Buffer(bus) as buffer, bus.subscribe(ask):
-        bus.publish(over("a", "b", [1, 2, 3]))
-        bus.publish(over("a", "b", range(10, 100)))
-    assert seen == [[1.0, 2.0, 3.0], [float(stamp) for stamp in range(10, 100)]]
 
 
 # Clouds from a moving sensor

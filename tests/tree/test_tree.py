@@ -30,7 +30,6 @@ from tfbus import (
     DisconnectedError,
     Edge,
     FutureExtrapolationError,
-    GapError,
     Hold,
     InvalidTransformError,
     Latest,
@@ -380,28 +379,6 @@ def test_the_repr_is_one_line_with_frames_samples_and_span() -> None:
     assert repr(TransformTree()) == "<TransformTree of 0 frames, 0 samples>"
     tree = tree_of(*over("map", "base", [SECOND, 2 * SECOND]), static("base", "lidar"))
     assert repr(tree) == "<TransformTree of 3 frames, 3 samples, 1.000 s to 2.000 s>"
-
-
-def test_each_option_alone_is_heeded_for_many_stamps() -> None:
-    # Two samples 10 s apart.
-    tree = tree_of(moving("map", "base", 0), moving("map", "base", 10 * SECOND, 1.0), keep=None)
-
-    def x(at: int, **options: Any) -> float:
-        found = tree.lookup_many("map", "base", [at], **options)
-        return float(found.translations[0, 0])
-
-    assert x(5 * SECOND) == 0.5
-    with pytest.raises(GapError):
-        x(5 * SECOND, max_gap=1.0)
-    with pytest.raises(FutureExtrapolationError):
-        x(11 * SECOND)
-    assert x(11 * SECOND, tolerance=2.0) == 1.0
-    assert x(11 * SECOND, extrapolate=Hold(2.0)) == 1.0
-    # Of the base at 5 s, seen from the map at 11 s through itself.
-    assert x(11 * SECOND, fixed="map", source_at=[5 * SECOND]) == 0.5
-    assert np.isnan(x(11 * SECOND, out_of_range="nan"))
-    with pytest.raises(ValueError, match="out_of_range"):
-        x(5 * SECOND, out_of_range="zero")
 
 
 COPIES: list[Callable[[TransformTree], TransformTree]] = [

@@ -413,20 +413,6 @@ def test_outside_the_window_the_errors_are_those_of_lookup(frame: str, reference
         assert (caught.value.child, caught.value.stamp) == ("body", at)
 
 
-def gap(axes_first: bool) -> TransformTree:
-    """One of two frames has stopped before the other began."""
-    early, late = ("axes", "body") if axes_first else ("body", "axes")
-    first = [moving("map", early, second * SECOND) for second in (0, 1)]
-    return tree_of(*first, *(moving("map", late, second * SECOND) for second in (5, 6)))
-
-
-@pytest.mark.parametrize("axes_first", [True, False])
-def test_latest_without_a_common_stamp_waits_for_the_lagging_frame(axes_first: bool) -> None:
-    with pytest.raises(FutureExtrapolationError) as caught:
-        gap(axes_first).twist("body", "map", expressed_in="axes")
-    assert (caught.value.child, caught.value.stamp) == ("axes" if axes_first else "body", 5 * SECOND)
-
-
 @pytest.mark.parametrize("at", [1.5, True, "now", None])
 def test_a_stamp_is_an_integer_or_latest(at: object) -> None:
     with pytest.raises(TypeError, match="a stamp is an int of nanoseconds"):

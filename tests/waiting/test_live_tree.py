@@ -12,7 +12,6 @@ from support.samples import any_samples, moving, static
 
 from tfbus import (
     LATEST,
-    ClockResetError,
     Edge,
     ExtrapolationError,
     FutureExtrapolationError,
@@ -88,31 +87,6 @@ def test_removing_a_frame_wakes_the_waiters_for_it_and_its_descendants() -> None
     assert tree_over(live).frames() == ["b", "c"]
 
 
-def test_a_reset_drops_moving_samples_keeps_static_ones_and_wakes_every_waiter() -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("map", "a", 5), static("a", "camera")))
-    park(live, "map", "a", 9, woken)
-    live.reset(5, 2)
-    assert woken == ["a"]
-    error = live.last_reset
-    assert isinstance(error, ClockResetError)
-    assert (error.before, error.after) == (5, 2)
-    assert tree_over(live).can_transform("a", "camera", 5)
-    with pytest.raises(FutureExtrapolationError):
-        tree_over(live).lookup("map", "a", 5)
-
-
-def test_the_end_wakes_every_waiter_and_keeps_its_first_reason() -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    park(live, "map", "a", 9, woken)
-    live.end("the buffer is closed")
-    live.end("the bus is closed")
-    assert woken == ["a"]
-    assert live.end_reason == "the buffer is closed"
-
-
 STAMPS: tuple[int | Latest, ...] = (LATEST, 5, 15)
 QUESTIONS = [
     *(Question(target, source, at) for target, source, at in product("abcd", "abcd", STAMPS)),
@@ -178,11 +152,14 @@ def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     assert len(live.waiting) == 100
 
 
+TWO_EDGES = [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)]
+
+
 @pytest.mark.parametrize(
     ("before", "question", "harmless", "then"),
     [
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            TWO_EDGES,
             Question("map", "b", 5),
             moving("a", "b", 10),
             moving("a", "b", 11),
@@ -196,21 +173,21 @@ def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
             id="another edge that lags jumps over the stamp",
         ),
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9), moving("map", "other", 500)],
+            [*TWO_EDGES, moving("map", "other", 500)],
             Question("map", "b", 5),
             moving("map", "other", 600),
             moving("a", "b", 11),
             id="other frames are far ahead",
         ),
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            TWO_EDGES,
             Question("map", "b", 30, 5, "a"),
             moving("map", "a", 9),
             moving("a", "b", 11),
             id="the other half of time travel slides past its stamp",
         ),
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            TWO_EDGES,
             Question("map", "b", 5, policy=Policy(tolerance=4)),
             moving("a", "b", 15),
             moving("a", "b", 20),

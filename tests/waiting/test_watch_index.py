@@ -61,27 +61,6 @@ def test_a_change_of_parent_off_the_path_does_not_make_a_watch_outdated() -> Non
     assert (watcher.woken, watcher.state.outdated) == (0, False)
 
 
-def test_only_watches_that_ask_for_a_frame_and_have_no_permanent_path_are_marked_for_it() -> None:
-    live = live_tree(None)
-    live.insert((moving("map", "a", 1),))
-    watchers = [Watcher(live, *ends) for ends in (("map", "a"), ("map", "x"), ("x", "map"), ("y", "x"), ("x", "x"))]
-    for watcher in watchers:
-        watcher.read()
-        watcher.state.outdated = False
-    answered, source_named, target_named, neither, both = watchers
-    live.watching.add(outdated := WatchState("map", "x", list))
-    assert live.watching.mark_asking_for({"map"}) == [source_named.state, target_named.state]
-    assert [watcher.state.outdated for watcher in (answered, source_named, target_named, neither, both)] == [
-        False,
-        True,
-        True,
-        False,
-        False,
-    ]
-    assert live.watching.mark_asking_for({"map", "x"}) == [neither.state, both.state]
-    assert (outdated.outdated, outdated.updates) == (True, 0)
-
-
 def test_a_reset_makes_every_watch_outdated_and_keeps_it_registered() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 5),))
