@@ -238,8 +238,8 @@ _unpack = _RECORD.unpack_from
 _unpack_pair = struct.Struct("q7dq7d").unpack_from
 
 Columns = tuple[Any, int, Any, int, int, int]
-"""A buffer and the byte at which stamps begin in it; a buffer and the byte at which rows begin; their width, the number
-of floats from one row to the next, of which the last seven are the row; and the number of samples."""
+"""A buffer and the byte at which stamps begin in it; a buffer and the byte at which rows begin; their width, the
+number of floats from one row to the next (the last seven are the row); and the number of samples."""
 
 
 class History:
@@ -386,7 +386,7 @@ class History:
         return max(first - start, 0), min(end, len(stamps)) - start
 
     def stamp(self, index: int) -> int:
-        """The stamp of a sample, in ns; the errors are those of `sample`."""
+        """The stamp of a sample, in ns; raises as `sample` does."""
         at = self._start + index
         if index < 0 or at >= len(self.stamps):
             raise IndexError("no sample has this index")

@@ -1,4 +1,4 @@
-"""The choice between the compiled kernel and its twin in Python; whatever has a twin is imported from here.
+"""The choice between the compiled kernel and its twin in Python. Other modules import every twin from here.
 
 The environment variable ``TFBUS_KERNEL`` asks for ``python`` or ``compiled``. Without it, the compiled one runs where
 it was built and can be loaded.

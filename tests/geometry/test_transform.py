@@ -1,8 +1,11 @@
+""""""
+
 import copy
 import json
 import math
 import pickle
 from collections.abc import Sequence
+from decimal import Decimal, localcontext
 from itertools import permutations
 from typing import Any
 
@@ -14,8 +17,8 @@ from hypothesis import strategies as st
 from support.strategies import angles, rotations, small_angles, transforms, unit_vectors, vectors
 from transforms3d import affines, axangles, euler, quaternions
 
-from tfbus import InvalidTransformError, Transform, TransformError
-from tfbus.rows import NORM_TOLERANCE, ROUNDING, Quaternion, Vector
+from tfbus import InvalidTransformError, Transform
+from tfbus.rows import Columns, Quaternion, Row, Vector, as_rotation, as_vector, compose, interpolate, invert
 
 HALF = math.sqrt(0.5)
 QUARTER_TURN_ABOUT_Z: Quaternion = (0.0, 0.0, HALF, HALF)
@@ -85,13 +88,6 @@ def test_matrices_are_those_of_transforms3d_and_come_back(a: Transform, b: Trans
     assert angle_between(Transform.from_matrix(matrix_of(a)).as_wxyz(), expected) <= 1e-14
 
 
-@given(rotations(), rotations())
-def test_rotations_compose_as_quaternions_do_sign_included(a: Quaternion, b: Quaternion) -> None:
-    product = Transform(rotation=a) @ Transform(rotation=b)
-    expected = quaternions.qmult((a[3], *a[:3]), (b[3], *b[:3]))
-    np.testing.assert_allclose(product.as_wxyz(), expected, rtol=0, atol=1e-15)
-
-
 @given(unit_vectors(), angles(), vectors())
 def test_an_axis_and_an_angle_are_those_of_transforms3d(axis: Vector, angle: float, translation: Vector) -> None:
     t = Transform.from_axis_angle(axis, angle, translation)
@@ -104,14 +100,6 @@ def test_roll_pitch_and_yaw_are_the_fixed_axes_of_transforms3d(xyz: Vector, rpy:
     t = Transform.from_xyz_rpy(xyz, rpy)
     np.testing.assert_allclose(t.matrix()[:3, :3], euler.euler2mat(*rpy, "sxyz"), rtol=0, atol=1e-14)
     assert t.translation == xyz
-
-
-@given(vectors(4.0))
-def test_roll_pitch_and_yaw_are_read_as_transforms3d_does(rpy: Vector) -> None:
-    t = Transform.from_xyz_rpy((0, 0, 0), rpy)
-    if abs(math.cos(rpy[1])) > 0.01:
-        apart = np.subtract(t.as_rpy(), euler.quat2euler(t.as_wxyz(), "sxyz"))
-        np.testing.assert_allclose(np.sin(apart / 2.0), 0.0, rtol=0, atol=1e-12)
 
 
 # Conversions both ways
@@ -145,33 +133,6 @@ def test_roll_pitch_and_yaw_come_back_at_and_near_the_gimbal_lock(
     assert_same(Transform.from_xyz_rpy((0, 0, 0), t.as_rpy()), t)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_at_the_gimbal_lock_yaw_is_zero_and_roll_has_it_all(sign: float) -> None:
-    roll, pitch, yaw = Transform.from_xyz_rpy((0, 0, 0), (0.7, sign * math.pi / 2, 0.3)).as_rpy()
-    assert yaw == 0.0
-    assert pitch == pytest.approx(sign * math.pi / 2, abs=1e-15)
-    assert roll == pytest.approx(0.7 - sign * 0.3, abs=1e-14)
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_gimbal_lock_reaches_as_far_as_the_rounding(sign: float) -> None:
-    def looking_up(off: float) -> Transform:
-        return Transform(rotation=(off, sign * math.sqrt(0.5), 0.0, math.sqrt(0.5)))
-
-    within, beyond = looking_up(ROUNDING), looking_up(math.nextafter(ROUNDING, 1.0))
-    assert within.as_rpy() == pytest.approx((0.0, sign * math.pi / 2, 0.0), abs=1e-14)
-    assert beyond.as_rpy() == pytest.approx((math.pi / 2, sign * math.pi / 2, sign * math.pi / 2), abs=1e-14)
-
-
-def test_roll_is_applied_first_and_yaw_last() -> None:
-    t = Transform.from_xyz_rpy((1, 2, 3), (0.1, 0.2, 0.3))
-    about_x, about_y, about_z = (
-        Transform.from_axis_angle(axis, angle) for axis, angle in (((1, 0, 0), 0.1), ((0, 1, 0), 0.2), ((0, 0, 1), 0.3))
-    )
-    assert_same(t, Transform((1, 2, 3)) @ about_z @ about_y @ about_x)
-    assert t.as_rpy() == pytest.approx((0.1, 0.2, 0.3), abs=1e-15)
-
-
 @given(unit_vectors(), st.one_of(small_angles(), st.floats(0.0, math.pi)))
 def test_axis_and_angle_come_back(axis: Vector, angle: float) -> None:
     found_axis, found_angle = Transform.from_axis_angle(axis, angle).as_axis_angle()
@@ -187,10 +148,6 @@ def test_the_angle_is_the_shorter_way_round_and_the_axis_is_a_unit_vector(q: Qua
     assert 0.0 <= angle <= math.pi
     assert math.hypot(*axis) == pytest.approx(1.0, abs=1e-15)
     assert angle_between(Transform.from_axis_angle(axis, angle).rotation, q) <= 1e-14
-
-
-def test_no_rotation_has_an_axis_too() -> None:
-    assert Transform.identity().as_axis_angle() == ((1.0, 0.0, 0.0), 0.0)
 
 
 @pytest.mark.parametrize("tiny", [5e-324, 1e-310])
@@ -213,12 +170,6 @@ def test_a_matrix_within_one_percent_is_projected_on_a_rotation(a: Transform, sc
     t = Transform.from_matrix(matrix.tolist())
     assert_same(t, a)
     assert math.hypot(*t.rotation) == pytest.approx(1.0, abs=1e-15)
-
-
-def test_a_matrix_is_a_new_one_each_time() -> None:
-    t = Transform((1, 2, 3))
-    t.matrix()[:] = 0.0
-    np.testing.assert_array_equal(t.matrix()[:3, 3], (1.0, 2.0, 3.0))
 
 
 # What is not a transform
@@ -263,28 +214,6 @@ def test_every_part_of_a_quaternion_counts_in_its_norm(kind: type) -> None:
         for one, other in ((1.25, 0.75), (0.5, 0.0), (-0.5, 0.0)):
             with pytest.raises(InvalidTransformError, match="not a unit quaternion"):
                 turned(one, other)
-
-
-@pytest.mark.parametrize("off", [NORM_TOLERANCE, -NORM_TOLERANCE])
-@pytest.mark.parametrize("place", range(3))
-def test_the_last_row_of_a_matrix_may_be_off_by_just_the_tolerance(place: int, off: float) -> None:
-    matrix = np.eye(4)
-    matrix[3, place] = off
-    assert Transform.from_matrix(matrix) == Transform()
-    matrix[3, place] = np.nextafter(off, 2.0 * off)
-    with pytest.raises(InvalidTransformError, match="last row"):
-        Transform.from_matrix(matrix)
-
-
-def test_the_axes_of_a_matrix_may_be_off_a_right_angle_by_just_twice_the_tolerance() -> None:
-    def leaning(cosine: float) -> npt.NDArray[np.float64]:
-        matrix = np.eye(4)
-        matrix[1, :2] = cosine, math.sqrt(1.0 - cosine**2)
-        return matrix
-
-    assert Transform.from_matrix(leaning(2.0 * NORM_TOLERANCE)).translation == (0.0, 0.0, 0.0)
-    with pytest.raises(InvalidTransformError, match="rigid"):
-        Transform.from_matrix(leaning(math.nextafter(2.0 * NORM_TOLERANCE, 1.0)))
 
 
 SHEARED = np.eye(4)
@@ -336,11 +265,6 @@ def test_an_axis_without_a_direction_is_refused() -> None:
     assert caught.value.reason == "zero axis"
 
 
-def test_invalid_transform_error_is_a_value_error_and_a_transform_error() -> None:
-    assert issubclass(InvalidTransformError, ValueError)
-    assert issubclass(InvalidTransformError, TransformError)
-
-
 # Interpolation
 
 
@@ -366,14 +290,6 @@ def test_interpolation_is_the_same_whichever_sign_the_quaternions_have(
     # Half a turn has two shorter arcs.
     assume(abs(sum(p * q for p, q in zip(a.rotation, b.rotation, strict=True))) > 1e-15)
     assert_same(a.interpolate(flipped, fraction), a.interpolate(b, fraction))
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_from_170_to_190_degrees_is_over_180(sign: float) -> None:
-    a = Transform(rotation=rotation(math.radians(170.0)))
-    b = Transform(rotation=[sign * part for part in rotation(math.radians(-170.0))])
-    assert_same(a.interpolate(b, 0.5), Transform(rotation=(0.0, 0.0, 1.0, 0.0)))
-    assert_same(a.interpolate(b, 0.25), Transform(rotation=rotation(math.radians(175.0))))
 
 
 @pytest.mark.parametrize("fraction", [-1e-12, 1.0 + 1e-12, math.nan, math.inf, -math.inf])
@@ -421,19 +337,6 @@ def test_float32_stays_and_integers_become_float64(given_type: type[Any], return
     moved = Transform((0.5, 0.0, 0.0), QUARTER_TURN_ABOUT_Z).apply(points)
     assert moved.dtype == returned
     np.testing.assert_allclose(moved, [[-1.5, 1.0, 3.0], [-4.5, 4.0, 6.0]], rtol=0, atol=1e-6)
-
-
-def test_points_are_not_changed_in_place() -> None:
-    points = np.ones((4, 3))
-    moved = Transform((1, 0, 0)).apply(points)
-    assert not np.shares_memory(points, moved)
-    np.testing.assert_array_equal(points, 1.0)
-
-
-def test_a_strided_view_is_read_right() -> None:
-    columns = np.arange(12.0).reshape(3, 4)
-    moved = Transform((1, 0, 0), QUARTER_TURN_ABOUT_Z).apply(columns.T)
-    np.testing.assert_allclose(moved, np.stack([1.0 - columns[1], columns[0], columns[2]], axis=1), atol=1e-14)
 
 
 def test_a_missing_point_stays_missing_and_spoils_no_other() -> None:
@@ -506,11 +409,6 @@ def test_equality_is_exact() -> None:
     assert Transform() == Transform.identity()
 
 
-def test_a_transform_equals_nothing_else() -> None:
-    assert Transform() != (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    assert Transform() != None  # noqa: E711 - the operator is what is tested
-
-
 @pytest.mark.parametrize("other", [2.0, None, (1.0, 2.0, 3.0), "map"])
 def test_a_transform_composes_with_transforms_only(other: Any) -> None:
     with pytest.raises(TypeError):
@@ -565,3 +463,95 @@ def test_the_plain_data_of_a_transform_are_two_lists() -> None:
     for wrong in ({"rotation": [0.0, 0.0, 1.0]}, {"rotation": [0.0] * 4}, {"translation": "123"}, {"stamp": 1}):
         with pytest.raises(ValueError, match=r"rotation|translation|stamp"):
             Transform.from_dict({**data, **wrong})
+
+
+def row_of(transform: Transform) -> Row:
+    return (*transform.translation, *transform.rotation)
+
+
+def columns_of(rows: Sequence[Row]) -> Columns:
+    x, y, z, qx, qy, qz, qw = np.array(rows).T
+    return x, y, z, qx, qy, qz, qw
+
+
+def rows_of(columns: Columns) -> list[Row]:
+    return [(x, y, z, i, j, k, w) for x, y, z, i, j, k, w in np.array(columns).T.tolist()]
+
+
+# Rows and columns
+
+
+@given(st.lists(st.tuples(transforms(), transforms()), min_size=1, max_size=4))
+def test_columns_compose_and_invert_to_the_bit_as_rows_do(both: list[tuple[Transform, Transform]]) -> None:
+    left, right = [row_of(a) for a, _ in both], [row_of(b) for _, b in both]
+    products = [compose(a, b) for a, b in zip(left, right, strict=True)]
+    assert rows_of(compose(columns_of(left), columns_of(right))) == products
+    assert rows_of(invert(columns_of(left))) == [invert(a) for a in left]
+
+
+# Interpolation
+
+
+def exact_slerp(a: Quaternion, b: Quaternion, bits: Sequence[bool]) -> list[Decimal]:
+    """Slerp at a binary fraction in 50 digits: the middle of an arc is the normalised sum of its ends."""
+
+    def unit(q: Sequence[Decimal]) -> list[Decimal]:
+        norm = sum(part * part for part in q).sqrt()  # type: ignore[union-attr]
+        return [part / norm for part in q]
+
+    low, high = unit([Decimal(part) for part in a]), unit([Decimal(part) for part in b])
+    if sum(p * q for p, q in zip(low, high, strict=True)) < 0:
+        high = [-part for part in high]
+    for bit in bits:
+        middle = unit([p + q for p, q in zip(low, high, strict=True)])
+        low, high = (middle, high) if bit else (low, middle)
+    return low
+
+
+@given(
+    rotations(),
+    unit_vectors(),
+    st.one_of(
+        st.floats(-9.0, math.log10(3.0)).map(lambda exponent: 10.0**exponent),
+        st.floats(0.0, 3.0),
+        st.floats(-9.0, -1.0).map(lambda exponent: math.pi - 10.0**exponent),
+    ),
+    st.booleans(),
+    st.lists(st.booleans(), min_size=1, max_size=20),
+)
+def test_slerp_is_right_to_a_billionth_of_a_rad_at_every_angle(
+    start: Quaternion, axis: Vector, angle: float, flipped: bool, bits: list[bool]
+) -> None:
+    a = Transform(rotation=start)
+    b = a @ Transform.from_axis_angle(axis, angle)
+    if flipped:
+        b = Transform(rotation=[-part for part in b.rotation])
+    fraction = sum(bit / 2.0**place for place, bit in enumerate(bits, 1))
+    found = interpolate(row_of(a), row_of(b), fraction)[3:]
+    with localcontext(prec=50):
+        expected = exact_slerp(a.rotation, b.rotation, bits)
+        chord = sum((Decimal(p) - q) ** 2 for p, q in zip(found, expected, strict=True)).sqrt()  # type: ignore[union-attr]
+    assert 2.0 * float(chord) <= 1e-12
+
+
+# Numbers that are checked
+
+
+@pytest.mark.parametrize("norm", [0.9899, 1.0101, 1e-100, 0.5, 2.0, 1e200])
+def test_a_norm_that_is_off_by_more_than_one_percent_is_refused(norm: float) -> None:
+    with pytest.raises(InvalidTransformError, match=r"^turn .* is not a unit quaternion") as caught:
+        as_rotation([part * norm for part in (0.5, -0.5, 0.5, 0.5)], "turn")
+    assert caught.value.reason == "not a unit quaternion"
+
+
+@given(rotations(), st.floats(0.9901, 1.0099))
+def test_a_norm_within_one_percent_is_normalised_once_and_the_sign_stays(q: Quaternion, norm: float) -> None:
+    unit = as_rotation([part * norm for part in q], "turn")
+    assert unit == pytest.approx(q, rel=1e-15, abs=1e-15)
+    assert as_rotation(unit, "turn") == unit
+
+
+@pytest.mark.parametrize("bad", [None, 1.0, "123", b"123", {1, 2, 3}, ("1", "2", "3"), (None, 0, 0), (1j, 0, 0)])
+def test_other_types_than_numbers_are_a_type_error(bad: Any) -> None:
+    with pytest.raises(TypeError, match=r"^shift must be 3 numbers, not "):
+        as_vector(bad, "shift")

@@ -1,3 +1,5 @@
+""""""
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -9,7 +11,9 @@ from hypothesis import strategies as st
 from support.samples import any_samples, moving, newest_samples, static
 
 from tfbus import TransformStamped
-from tfbus.tree.cycles import admit
+from tfbus.stamps import STAMP_MIN
+from tfbus.tree.cycles import Loop, admit, past_loop
+from tfbus.tree.forest import Forest
 
 
 @dataclass(frozen=True)
@@ -20,6 +24,16 @@ class KnownEdge:
     static: bool = False
     newest: int | None = None
     authority: str = ""
+
+
+class CountedEdges(dict[str, Any]):
+    """Counts how often an edge is looked up."""
+
+    reads = 0
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.reads += 1
+        return super().get(key, default)
 
 
 def edges_of(*stored: TransformStamped) -> dict[str, KnownEdge]:
@@ -175,13 +189,6 @@ def test_a_batch_is_admitted_whole_exactly_if_the_newest_parents_after_it_form_a
 
 
 def test_a_batch_under_a_long_chain_is_judged_in_linear_time() -> None:
-    class CountedEdges(dict[str, Any]):
-        reads = 0
-
-        def get(self, key: str, default: Any = None) -> Any:
-            self.reads += 1
-            return super().get(key, default)
-
     links = 2_000
     edges = CountedEdges(edges_of(*(moving(f"f{i}", f"f{i + 1}", 0) for i in range(links))))
     leaves = [moving(f"f{links}", f"leaf {i}", 0) for i in range(links)]
@@ -192,13 +199,6 @@ def test_a_batch_under_a_long_chain_is_judged_in_linear_time() -> None:
 
 
 def test_a_chain_that_grows_at_its_end_is_not_climbed() -> None:
-    class CountedEdges(dict[str, Any]):
-        reads = 0
-
-        def get(self, key: str, default: Any = None) -> Any:
-            self.reads += 1
-            return super().get(key, default)
-
     edges = CountedEdges(edges_of(*(moving(f"f{i}", f"f{i + 1}", 0) for i in range(2_000))))
     parents = parents_of(edges)
     for batch in ([moving("f2000", "a", 0)], [moving("f2000", "a", 0), moving("a", "b", 0), moving("b", "c", 0)]):
@@ -211,3 +211,52 @@ def test_names_that_are_no_longer_parents_do_no_harm() -> None:
     edges = edges_of(moving("a", "b", 0))
     assert admit(edges, [moving("b", "c", 0)], {"a", "c", "former"})[1] == []
     assert len(admit(edges, [moving("b", "a", 0)], {"a", "c", "former"})[1]) == 1
+
+
+def forest_with(*batch: TransformStamped) -> Forest:
+    made = Forest(None)
+    for sample in batch:
+        made.insert_judged(sample)
+    return made
+
+
+ON_A_FROM_5_TO_9 = [moving("b", "a", 5), moving("c", "a", 9)]
+ON_C_THEN = [moving("c", "a", 0), *ON_A_FROM_5_TO_9]
+ROUND = ("b", "a", "b")
+
+
+@pytest.mark.parametrize(
+    ("others", "sample", "loop"),
+    [
+        pytest.param(ON_C_THEN, moving("a", "b", 5), Loop(5, ROUND), id="both hold at the stamp"),
+        pytest.param(ON_C_THEN, moving("a", "b", 3), Loop(5, ROUND), id="the other one begins later"),
+        pytest.param(ON_C_THEN, moving("a", "b", 9), None, id="it has ended"),
+        pytest.param([*ON_C_THEN, moving("d", "b", 5)], moving("a", "b", 3), None, id="the sample has ended"),
+        pytest.param(
+            [moving("c", "a", 0), moving("b", "a", 7), moving("c", "a", 9), moving("a", "b", 7)],
+            moving("a", "b", 3),
+            None,
+            id="the loop is that of the next sample",
+        ),
+        pytest.param(ON_A_FROM_5_TO_9, moving("a", "b", 3), Loop(5, ROUND), id="an edge begins with its oldest sample"),
+        pytest.param(ON_A_FROM_5_TO_9, moving("a", "b", 20), None, id="in order"),
+        pytest.param(ON_A_FROM_5_TO_9, static("a", "b"), Loop(5, ROUND), id="a static edge"),
+        pytest.param(
+            [static("x", "a"), moving("b", "x", 5), moving("c", "x", 9)],
+            moving("a", "b", 6),
+            Loop(6, ("b", "a", "x", "b")),
+            id="through a static edge",
+        ),
+        pytest.param(
+            [moving("a", "x", 0), moving("x", "a", 5), moving("c", "x", 9), moving("c", "a", 9)],
+            moving("a", "b", 5),
+            None,
+            id="above a loop of others",
+        ),
+    ],
+)
+def test_the_first_loop_in_the_time_of_a_sample_is_found(
+    others: list[TransformStamped], sample: TransformStamped, loop: Loop | None
+) -> None:
+    frames = forest_with(*others, sample).frames
+    assert past_loop(frames, sample.child, STAMP_MIN if sample.static else sample.stamp) == loop

@@ -1,5 +1,8 @@
 """A policy on one edge, against the rule written down in the plainest way, and on whole paths."""
 
+import dataclasses
+import math
+import pickle
 from collections.abc import Iterable
 from typing import Any
 
@@ -19,8 +22,8 @@ from tfbus import (
     TransformTree,
 )
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree.history import FrameHistory, Samples
-from tfbus.tree.lookup import Policy, ReadStamp, read_stamp, read_stamps, read_stamps_at_many
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.lookup import Policy, ReadStamp, policy_of, read_stamp, read_stamps, read_stamps_at_many
 
 ROW = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -32,11 +35,6 @@ def history(samples: Iterable[int] | dict[int, str], keep: int | None = None) ->
     for stamp, parent in parents.items():
         made.insert(parent, stamp, ROW, "odometry")
     return made
-
-
-def samples_around(edge: FrameHistory, asked: list[int]) -> Samples:
-    """The samples that are copied for some questions, by the first and the last."""
-    return edge.samples_between(min(asked, default=0), max(asked, default=0))
 
 
 def rule(stamps: list[int], at: int, policy: Policy) -> ReadStamp | None:
@@ -72,45 +70,6 @@ def test_the_stamp_read_for_a_question_follows_the_rule(stamps: set[int], policy
         assert found == expected
 
 
-@given(stamp_sets, policies, st.lists(st.integers(-60, 60)), st.sampled_from((None, 20)))
-def test_the_stamps_read_for_many_questions_equal_those_for_single_ones(
-    stamps: set[int], policy: Policy, asked: list[int], keep: int | None
-) -> None:
-    edge = history(sorted(stamps), keep)
-    read_at, away, gap = read_stamps_at_many(samples_around(edge, asked), np.array(asked, np.int64), policy)
-    for i, at in enumerate(asked):
-        try:
-            found = read_stamp(edge, at, policy)
-        except ExtrapolationError:
-            assert away[i] == -1
-        else:
-            assert (read_at[i], away[i], gap[i]) == found
-
-
-@given(st.dictionaries(st.integers(-30, 30), st.sampled_from(("odom", "map")), max_size=8), policies)
-def test_a_sample_with_another_parent_is_never_read_instead(parents: dict[int, str], policy: Policy) -> None:
-    edge = history(dict(sorted(parents.items())))
-    asked = np.arange(-60, 61)
-    read_at, away, _ = read_stamps_at_many(samples_around(edge, asked.tolist()), asked, policy)
-    for i, at in enumerate(asked.tolist()):
-        try:
-            found = read_stamp(edge, at, policy)
-        except ExtrapolationError:
-            assert away[i] == -1
-            continue
-        assert (read_at[i], away[i]) == found[:2]
-        if found.stamp in parents:
-            assert parents[found.stamp] == edge.parent_at(at)
-
-
-def test_a_later_sample_stands_in_only_if_the_parent_stays() -> None:
-    edge = history({10: "odom", 20: "odom", 30: "map", 40: "map"})
-    asked = [14, 16, 24, 26, 34, 36]
-    stamps, away, _ = read_stamps_at_many(samples_around(edge, asked), np.array(asked), Policy(4, 5, 0))
-    assert away.tolist() == [4, 4, 4, -1, 4, 4]
-    assert stamps[[0, 1, 2, 4, 5]].tolist() == [10, 20, 20, 30, 40]
-
-
 def test_distances_beyond_64_bits_are_not_within_a_tolerance() -> None:
     edge = history([STAMP_MIN, STAMP_MAX])
     policy = Policy(tolerance=5, max_gap=5)
@@ -124,12 +83,6 @@ def test_distances_beyond_64_bits_are_not_within_a_tolerance() -> None:
         assert read_stamps_at_many(history([sample]).samples_between(at, at), np.array([at]), policy)[1].tolist() == [
             -1
         ]
-
-
-def test_gaps_beyond_64_bits_are_clipped_in_lookups_of_many_stamps() -> None:
-    edge = history([STAMP_MIN, STAMP_MAX])
-    assert read_stamp(edge, 0, Policy()).gap == STAMP_MAX - STAMP_MIN
-    assert read_stamps_at_many(edge.samples_between(0, 0), np.array([0]), Policy())[2].tolist() == [STAMP_MAX]
 
 
 @pytest.mark.parametrize(
@@ -178,14 +131,6 @@ def test_an_error_that_waiting_cannot_help_decides_else_that_of_the_edge_that_la
             read_stamps(edges, 30, Policy(max_gap=20))
         assert (caught.value.oldest, caught.value.newest) == (decisive.oldest, decisive.newest)
         assert isinstance(caught.value, FutureExtrapolationError) == (decisive not in (past, gap))
-
-
-@pytest.mark.parametrize(("policy", "slack"), [((0, 0), 0), ((5, 0), 5), ((5, 8), 8), ((0, 8), 8), ((8, 5), 8)])
-def test_the_error_of_a_gap_without_a_near_sample_has_the_slack(policy: tuple[int, int], slack: int) -> None:
-    edge = history([0, 100])
-    with pytest.raises(GapError) as caught:
-        read_stamp(edge, 50, Policy(tolerance=policy[0], hold=policy[1], max_gap=20))
-    assert (caught.value.stamp, caught.value.slack) == (50, slack)
 
 
 # On whole paths: odom -> base moves 1 m/s with samples at 0, 1, 2 and 6 s; base -> arm is sampled at 0 and 4 s.
@@ -336,31 +281,47 @@ def test_many_lookups_under_a_policy_equal_single_lookups(
         tree.lookup_many(*frames, asked, **policy)
 
 
-def test_many_time_travels_have_the_greater_extrapolation_and_gap_of_both_legs(tree: TransformTree) -> None:
-    found = tree.lookup_many(
-        "base", "base", [seconds(6.5)] * 2, source_at=[seconds(1.5), seconds(6.25)], fixed="odom", extrapolate=Hold(1.0)
-    )
-    assert found.translations[:, 0] == pytest.approx([1.5 - 6.0, 0.0])
-    assert found.extrapolated_by.tolist() == [seconds(0.5), seconds(0.5)]
-    assert found.gap is not None
-    assert found.gap.tolist() == [seconds(1.0), 0]
-    assert found[1:].extrapolated_by.tolist() == [seconds(0.5)]
+@pytest.mark.parametrize(
+    ("arguments", "policy"),
+    [
+        ((0.05, None, None), Policy(tolerance=50_000_000)),
+        ((0.0, 0.0, None), Policy(max_gap=0)),
+        ((0.0, None, Hold(0.0)), Policy()),
+        ((math.inf, None, Hold(math.inf)), Policy(tolerance=STAMP_MAX, hold=STAMP_MAX)),
+    ],
+)
+def test_each_argument_may_be_given_alone_and_be_infinite(arguments: Any, policy: Policy) -> None:
+    assert policy_of(*arguments) == policy
 
 
-@pytest.mark.parametrize("policy", [{"tolerance": 0.1}, {"max_gap": 1.0}, {"extrapolate": Hold(0.1)}])
-def test_many_lookups_under_any_policy_have_their_gaps_though_all_stamps_are_covered(
-    tree: TransformTree, policy: dict[str, Any]
-) -> None:
-    stamps = [seconds(0.5), seconds(1.0)]
-    # The path is known, and these questions have plain answers.
-    assert tree.lookup_many("odom", "base", stamps).gap is None
-    found = tree.lookup_many("odom", "base", stamps, **policy)
-    assert found.translations[:, 0].tolist() == [0.5, 1.0]
-    assert found.extrapolated_by.tolist() == [0, 0]
-    assert found.gap is not None
-    assert found.gap.tolist() == [seconds(1.0), 0]
+@pytest.mark.parametrize("bad", [-1.0, math.nan])
+def test_a_negative_duration_is_an_error_that_names_the_argument(bad: float) -> None:
+    with pytest.raises(ValueError, match="tolerance"):
+        policy_of(bad, None, None)
+    with pytest.raises(ValueError, match="max_gap"):
+        policy_of(0.0, bad, None)
+    with pytest.raises(ValueError, match="max_age"):
+        Hold(bad)
 
 
-def test_many_lookups_without_a_policy_have_no_extrapolation_and_gap(tree: TransformTree) -> None:
-    found = tree.lookup_many("odom", "tool", [seconds(3.0)])
-    assert (found.extrapolated_by.tolist(), found.gap) == ([0], None)
+@pytest.mark.parametrize("bad", ["1", None, True])
+def test_an_argument_that_is_no_number_of_seconds_is_a_type_error(bad: Any) -> None:
+    with pytest.raises(TypeError, match="tolerance"):
+        policy_of(bad, None, None)
+    with pytest.raises(TypeError, match="max_age"):
+        Hold(bad)
+
+
+def test_an_age_alone_is_no_extrapolation() -> None:
+    with pytest.raises(TypeError, match=r"extrapolate must be a Hold, not 0\.2"):
+        policy_of(0.0, None, 0.2)  # type: ignore[arg-type]
+
+
+def test_a_hold_is_a_value() -> None:
+    hold = Hold(0.2)
+    assert pickle.loads(pickle.dumps(hold)) == hold == Hold(0.2)
+    assert len({hold, Hold(0.2), Hold(0.3)}) == 2
+    for value, name in ((hold, "max_age"), (Policy(), "hold")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(value, name, 1)
+        assert not hasattr(value, "__dict__")

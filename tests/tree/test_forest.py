@@ -1,15 +1,149 @@
+""""""
+
 from collections.abc import Callable
 from functools import partial
-from itertools import count, permutations
+from itertools import count, pairwise, permutations
+from threading import Lock
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.histories import moving_edge, static_edge
 from support.samples import moving, static
 
-from tfbus import LATEST, DisconnectedError, Outcome, TransformStamped, TransformTree
-from tfbus.tree.forest import Forest
+from tfbus import (
+    LATEST,
+    DisconnectedError,
+    FutureExtrapolationError,
+    Transform,
+    TransformStamped,
+    TransformTree,
+)
+from tfbus.rows import IDENTITY
+from tfbus.stamps import STAMP_MAX, STAMP_MIN
+from tfbus.tree.forest import Forest, Path, PathCache, find_path, path_at
 from tfbus.tree.history import FrameHistory, save_frame
+from tfbus.tree.tree import forest_of
+
+Frames = dict[str, FrameHistory]
+
+
+def frames_of(*edges: FrameHistory) -> Frames:
+    return {edge.child: edge for edge in edges}
+
+
+def static_frames(parents: dict[str, str]) -> Frames:
+    """Static edges from each key to its value."""
+    return frames_of(*(static_edge(parent, child, Transform()) for child, parent in parents.items()))
+
+
+# Search
+
+
+def test_the_search_climbs_above_the_common_ancestor_no_further_than_the_shorter_side() -> None:
+    asked: list[str] = []
+
+    class CountedFrames(dict[str, FrameHistory]):
+        def get(self, key: str, default: FrameHistory | None = None) -> FrameHistory | None:  # type: ignore[override]
+            asked.append(key)
+            return super().get(key, default)
+
+    trunk = {f"trunk {depth + 1}": f"trunk {depth}" for depth in range(5_000)}
+    frames = CountedFrames(static_frames({**trunk, "left": "trunk 5000", "right": "trunk 5000", "tip": "right"}))
+    assert find_path(frames, "left", "tip", None).frames == ("left", "trunk 5000", "right", "tip")
+    assert len(asked) <= 6
+
+
+NAMES = "abcdef"
+ANY_PARENTS = st.tuples(*(st.sampled_from((NAMES + "g").replace(name, "")) for name in NAMES))
+
+
+@given(ANY_PARENTS, st.sampled_from(NAMES), st.sampled_from(NAMES))
+def test_the_search_ends_for_any_parents_and_finds_a_path_or_names_a_loop(
+    parents: tuple[str, ...], target: str, source: str
+) -> None:
+    parent_of = dict(zip(NAMES, parents, strict=True))
+    try:
+        found = find_path(static_frames(parent_of), target, source, None).frames
+    except DisconnectedError as error:
+        assert not ancestors(parent_of, target) & ancestors(parent_of, source)
+        assert all(parent_of[frame] == parent for frame, parent in pairwise(error.loop))
+        # There is only one root, 'g', so two walks that never meet end in a loop.
+        assert len(error.loop) > 2
+        assert error.loop[0] == error.loop[-1]
+    else:
+        assert (found[0], found[-1]) == (target, source)
+        assert len(set(found)) == len(found)
+        assert all(parent_of.get(a) == b or parent_of.get(b) == a for a, b in pairwise(found))
+
+
+def ancestors(parent_of: dict[str, str], frame: str) -> set[str]:
+    """A frame and all its ancestors."""
+    seen = {frame}
+    while (frame := parent_of.get(frame, frame)) not in seen:
+        seen.add(frame)
+    return seen
+
+
+# The edge that decides
+
+
+def path_over(*windows: tuple[int, int] | None) -> Path:
+    """A path up over one moving edge for each window, the lowest first; None is an edge without samples."""
+    frames: Frames = {}
+    for level, window in enumerate(windows):
+        samples = [] if window is None else [(window[0], Transform()), (window[1], Transform())]
+        frames[str(level)] = moving_edge(str(level + 1), str(level), samples)
+    return find_path(frames, str(len(windows)), "0", None)
+
+
+def test_of_several_future_extrapolations_that_of_the_most_lagging_edge_decides() -> None:
+    error = path_over((0, 12), (0, 10), (0, 20)).deciding_error(15)
+    assert type(error) is FutureExtrapolationError
+    assert (error.child, error.newest) == ("1", 10)
+    assert path_over((0, 12), None, (0, 10)).deciding_error(15).child == "1"
+    # A stamp that some edges have reached is the oldest that the others lack.
+    last = STAMP_MAX
+    assert path_over((0, last), (0, last - 1)).deciding_error(last).child == "1"
+    assert path_over((0, last - 1), (0, last)).deciding_error(last).child == "0"
+    # Of two that lag as far, the first one.
+    assert path_over((0, 20), (0, 10), (0, 10)).deciding_error(15).child == "1"
+    assert path_over((0, 20), None, (STAMP_MIN, STAMP_MIN)).deciding_error(15).child == "1"
+
+
+# The path that counts at a stamp
+
+
+def loop_of(*, a_on_b: tuple[int, ...], b_on_a: tuple[int, ...]) -> Frames:
+    """Frames a and b, each on the other at these stamps, and by the newest stamp, 100, both on c."""
+    a = moving_edge("b", "a", [(at, Transform()) for at in a_on_b])
+    b = moving_edge("a", "b", [(at, Transform()) for at in b_on_a])
+    a.insert("c", 100, IDENTITY, "")
+    b.insert("c", 100, IDENTITY, "")
+    return {"a": a, "b": b}
+
+
+def at_stamp(frames: Frames, target: str, source: str, at: int) -> Path:
+    return path_at(frames, target, source, at, find_path(frames, target, source, None))
+
+
+@pytest.mark.parametrize("at", [0, 5, 10, 99])
+def test_of_two_ways_round_a_loop_the_one_with_samples_counts(at: int) -> None:
+    frames = loop_of(a_on_b=(0, 10), b_on_a=())
+    for target, source in (("a", "b"), ("b", "a")):
+        path = at_stamp(frames, target, source, at)
+        assert path.frames == (target, source)
+        assert [edge.child for edge in path.moving] == ["a"]
+
+
+def test_waiting_helps_if_it_helps_on_one_of_two_ways() -> None:
+    frames: Frames = {"a": moving_edge("b", "a", [(30, Transform())]), "b": moving_edge("a", "b", [(10, Transform())])}
+    for target, source in (("a", "b"), ("b", "a")):
+        error = path_at(frames, target, source, 20, None).deciding_error(20)
+        assert type(error) is FutureExtrapolationError
+        assert (error.child, error.others) in (("b", ()), ("b", ("a",)))
 
 
 def forest(*batch: TransformStamped, window: int | None = None) -> Forest:
@@ -17,39 +151,6 @@ def forest(*batch: TransformStamped, window: int | None = None) -> Forest:
     for sample in batch:
         made.insert_judged(sample)
     return made
-
-
-def test_insert_judged_returns_the_outcome() -> None:
-    known = forest(moving("a", "b", 10), window=5)
-    assert known.insert_judged(moving("a", "b", 4)) is Outcome.EXPIRED
-    assert known.insert_judged(moving("a", "b", 5)) is Outcome.INSERTED
-    assert known.insert_judged(moving("a", "b", 5)) is Outcome.REPLACED
-
-
-def test_a_commit_counts_each_sample_of_a_batch_by_its_outcome() -> None:
-    known = forest(moving("a", "b", 10), window=5)
-    known.forget_changes()
-    plain = (moving("a", "b", 11), moving("a", "b", 12))
-    mixed = (
-        moving("a", "b", 13),
-        moving("a", "new", 1),
-        *(moving("a", "b", stamp) for stamp in (14, 15, 16)),
-        *(moving("a", "b", stamp) for stamp in (16, 10, 15, 12)),
-        *(moving("a", "new", stamp) for stamp in (2, 3)),
-    )
-    version = known.version
-    assert known.commit(plain)
-    assert (known.inserted, known.replaced, known.expired) == (3, 0, 0)
-    assert not known.commit(mixed)
-    assert known.version > version
-    assert (known.inserted, known.replaced, known.expired) == (3 + 5 + 2, 3, 1)
-    assert [sample.child for sample in known.expired_samples] == ["b"]
-    assert known.insert((moving("a", "b", 17), moving("a", "b", 17), moving("a", "b", 3))) == [
-        Outcome.INSERTED,
-        Outcome.REPLACED,
-        Outcome.EXPIRED,
-    ]
-    assert (known.inserted, known.replaced, known.expired, known.expired_samples) == (11, 4, 2, [])
 
 
 @pytest.mark.parametrize(
@@ -87,34 +188,6 @@ def test_nothing_is_appended_to_a_static_an_emptied_or_a_reparented_frame() -> N
     assert not any(known.can_append("a", child, "", np.array([9])) for child in ("still", "empty", "moved"))
 
 
-def test_a_permanent_path_is_cached() -> None:
-    known = forest(moving("a", "b", 0), static("b", "c"))
-    path = known.find_path("a", "c", LATEST)
-    assert known.find_path("a", "c", 12_345) is path
-    known.insert_judged(moving("a", "b", 1))
-    known.insert_judged(moving("elsewhere", "x", 1))
-    assert known.find_path("a", "c", 7) is path, "neither a newer sample nor a new frame makes it another path"
-
-
-def test_a_path_that_depends_on_the_stamp_is_searched_each_time() -> None:
-    known = forest(moving("a", "b", 0), moving("z", "b", 10))
-    assert known.find_path("a", "b", 5).frames == ("a", "b")
-    assert known.find_path("z", "b", 15).frames == ("z", "b")
-    with pytest.raises(DisconnectedError):
-        known.find_path("a", "b", 15)
-
-
-def test_a_changing_newest_path_is_kept_until_the_topology_changes() -> None:
-    known = forest(moving("a", "b", 0), moving("z", "b", 10))
-    path = known.find_path("z", "b", LATEST)
-    assert known.find_path("z", "b", 10) is path
-    assert known.find_path("z", "b", LATEST) is path
-    known.insert_judged(moving("y", "b", 20))
-    assert known.find_path("y", "b", LATEST) is not path
-    with pytest.raises(DisconnectedError):
-        known.find_path("z", "b", LATEST)
-
-
 def test_a_bounded_number_of_changing_newest_paths_is_kept() -> None:
     known = forest()
     names = [f"{number}" for number in range(80)]
@@ -129,71 +202,6 @@ def test_a_bounded_number_of_changing_newest_paths_is_kept() -> None:
 
 
 # Recorded changes, from which a live tree finds the lookups to wake
-
-
-def test_samples_that_change_no_path_are_not_recorded_as_changes() -> None:
-    known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"), window=15)
-    known.new_parents.clear()
-    known.changed.clear()
-    for sample in (moving("a", "b", 20), moving("a", "b", 15), moving("a", "b", 30), static("b", "c", 1.0, stamp=9)):
-        known.insert_judged(sample)
-    assert (known.new_parents, known.changed) == (set(), set())
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        pytest.param(moving("z", "b", 20), id="another parent"),
-        pytest.param(moving("z", "b", 5), id="another parent in the past"),
-        pytest.param(static("a", "b"), id="now static"),
-        pytest.param(moving("b", "c", 5), id="now moving"),
-        pytest.param(moving("a", "b", -5), id="a longer past"),
-    ],
-)
-def test_samples_that_may_change_a_path_are_recorded_as_changes(change: TransformStamped) -> None:
-    known = forest(moving("a", "b", 0), moving("a", "b", 10), static("b", "c"))
-    known.changed.clear()
-    known.new_parents.clear()
-    known.insert_judged(change)
-    assert known.changed == {change.child}
-    assert change.parent in known.new_parents
-
-
-def test_the_expiry_of_an_old_parent_is_recorded_as_a_change() -> None:
-    known = forest(moving("old", "b", 0), moving("new", "b", 10), window=10)
-    known.changed.clear()
-    known.insert_judged(moving("new", "b", 11))
-    assert known.changed == {"b"}
-    assert "old" not in known.names
-    known.forget_changes()
-    known.insert_judged(moving("new", "b", 12))
-    assert known.changed == set(), "it is recorded once"
-
-
-def test_a_static_sample_sent_again_leaves_the_path_and_one_that_moves_its_frame_does_not() -> None:
-    known = forest(static("a", "b", 1.0), moving("b", "c", 5))
-    path = known.find_path("a", "c", LATEST)
-    known.insert_judged(static("a", "b", 1.0, stamp=9))
-    assert known.find_path("a", "c", LATEST) is path
-    known.insert_judged(static("a", "b", 2.0))
-    assert known.find_path("a", "c", LATEST).row_at(5)[0] == 2.0
-
-
-def test_after_all_samples_are_dropped_a_frame_has_its_newest_parent_and_the_next_sample_changes_nothing() -> None:
-    known = forest(moving("old", "b", 0), moving("new", "b", 10))
-    known.clear()
-    known.forget_changes()
-    assert known.names.sorted() == ("b", "new")
-    known.insert_judged(moving("new", "b", 0))
-    assert known.changed == set()
-
-
-def test_the_first_parent_of_a_new_frame_and_of_a_root_are_recorded() -> None:
-    known = forest(moving("a", "b", 0))
-    assert (known.new_parents, known.changed) == ({"a"}, set())
-    known.new_parents.clear()
-    known.insert_judged(moving("root", "a", 0))
-    assert (known.new_parents, known.changed) == ({"root"}, {"a"})
 
 
 def test_no_change_is_recorded_any_longer_once_it_is_forgotten_or_was_inserted_without_a_bus() -> None:
@@ -229,77 +237,7 @@ def test_the_version_is_another_one_after_each_change() -> None:
     assert len(set(versions)) == 9
 
 
-def test_names_below_include_those_under_every_parent_in_the_window() -> None:
-    known = forest(moving("a", "b", 0), moving("b", "c", 0), moving("x", "c", 5), static("c", "d"), moving("x", "y", 0))
-    assert known.names_below("abcdxy", {"b"}) == {"b", "c", "d"}
-    assert known.names_below("abcdxy", {"x"}) == {"x", "c", "d", "y"}
-    assert known.names_below("ady", {"x"}) == {"d", "y"}
-    assert known.names_below(["d", "nowhere"], {"nowhere"}) == {"nowhere"}
-
-
-# Edges without samples
-
-
-def test_edges_without_samples_are_forgotten_if_a_new_edge_forms_a_loop_with_them() -> None:
-    known = forest(moving("map", "odom", 0), moving("odom", "base", 0), static("base", "camera"))
-    known.clear()
-    known.forget_changes()
-    assert known.find_path("map", "camera", LATEST).frames == ("map", "odom", "base", "camera")
-    known.insert_judged(moving("base", "map", 1))
-    assert known.changed == {"map", "odom", "base"}
-    assert known.find_path("base", "map", LATEST).frames == ("base", "map")
-    assert sorted(known.frames) == ["camera", "map"]
-
-
-def test_edges_without_samples_stay_while_no_new_edge_contradicts_them() -> None:
-    known = forest(moving("map", "odom", 0), moving("odom", "base", 0))
-    known.clear()
-    known.insert_judged(moving("odom", "base", 1))
-    known.insert_judged(moving("world", "map", 1))
-    assert known.find_path("world", "base", LATEST).frames == ("world", "map", "odom", "base")
-
-
-# Many stamps
-
-
-def test_edges_above_are_those_by_every_parent_in_the_window() -> None:
-    known = forest(moving("a", "b", 0), moving("b", "c", 0), moving("x", "c", 5), static("y", "x"), moving("c", "d", 0))
-    assert sorted(edge.child for edge in known.edges_above("c")) == ["b", "c", "x"]
-    assert sorted(edge.child for edge in known.edges_above("y", "b")) == ["b"]
-
-
-def test_a_copy_within_a_shorter_window_has_only_the_frames_of_its_samples() -> None:
-    known = forest(moving("old", "b", 0), moving("a", "b", 10), static("a", "c"), window=100)
-    short = known.copy_within(5)
-    assert (short.names.sorted(), known.names.sorted()) == (("a", "b", "c"), ("a", "b", "c", "old"))
-    assert (short.window, short.changed, short.new_parents) == (5, set(), set())
-    short.insert_judged(moving("a", "b", 20))
-    assert (len(short.frames["b"]), len(known.frames["b"])) == (1, 2)
-
-
 # All frames at one moment
-
-
-def test_frames_that_change_while_others_are_read_are_read_again() -> None:
-    known = forest(*(moving("root", f"f{number}", 0) for number in range(250)))
-    seen: list[str] = []
-
-    def newest(history: FrameHistory) -> int | None:
-        seen.append(history.child)
-        if len(seen) in (150, 250):
-            # Another thread cannot do this here, because the lock is held; it does so between two parts.
-            known.lock.release()
-            known.commit((moving("root", "f0", len(seen)), moving("root", "new", len(seen))))
-            if len(seen) == 250:
-                known.remove("f1")
-            known.lock.acquire()
-        return history.newest
-
-    found = known.read_all(newest)
-    assert (found["f0"], found["new"], found["f249"]) == (250, 250, 0)
-    assert found.keys() == known.frames.keys()
-    assert "f1" not in found
-    assert len(seen) <= 254
 
 
 @pytest.mark.parametrize(
@@ -334,24 +272,6 @@ def test_every_kind_of_change_is_seen_by_those_who_read_meanwhile(change: Callab
     assert found == {child: (history, history.newest) for child, history in known.frames.items()}
 
 
-def test_reading_ends_although_all_frames_change_all_the_time() -> None:
-    known = forest(*(moving("root", f"f{number}", 0) for number in range(250)))
-    seen: list[str] = []
-
-    def newest(history: FrameHistory) -> int | None:
-        seen.append(history.child)
-        if len(seen) <= 650 and len(seen) % 50 == 0:
-            known.lock.release()
-            known.commit(tuple(moving("root", f"f{number}", len(seen)) for number in range(250)))
-            known.lock.acquire()
-        return history.newest
-
-    found = known.read_all(newest)
-    assert (set(found.values()), len(seen)) == ({650}, 899)
-    known.commit((moving("root", "f0", 10_000),))
-    assert found["f0"] != 10_000
-
-
 def test_an_error_of_a_reader_ends_the_reading() -> None:
     known = forest(moving("root", "a", 0))
     with pytest.raises(ZeroDivisionError):
@@ -372,40 +292,6 @@ def looping(*batch: TransformStamped) -> list[tuple[str, int, tuple[str, ...]]]:
         known.find_past_loops()
     assert known.looped == len(known.looping)
     return [(found.sample.child, found.loop.stamp, found.loop.frames) for found in known.looping]
-
-
-def test_late_samples_that_form_a_loop_in_the_past_are_noted() -> None:
-    before = (moving("c", "a", 0), moving("c", "a", 9), moving("a", "b", 4), moving("a", "b", 9))
-    assert looping(*before) == []
-    assert looping(*before, moving("b", "a", 5)) == [("a", 5, ("a", "b", "a"))]
-    # The late sample comes before the frame of its parent does: the loop begins with that.
-    assert looping(*before, moving("b", "a", 2)) == [("a", 4, ("a", "b", "a"))]
-
-
-def test_the_first_sample_of_a_root_may_form_a_loop_in_the_past() -> None:
-    before = [moving("a", "b", 0), moving("a", "b", 5), moving("odom", "b", 10)]
-    assert looping(*before, moving("b", "a", 3)) == [("a", 3, ("a", "b", "a"))]
-    assert looping(*before, moving("b", "a", 11)) == []
-
-
-def test_frames_that_change_places_in_one_batch_form_no_loop() -> None:
-    known = forest(moving("c", "a", 0), moving("a", "b", 0))
-    known.commit((moving("b", "a", 10), moving("c", "b", 10)))
-    known.commit((moving("c", "a", 20), moving("a", "b", 20)))
-    assert known.looped == 0
-
-
-def test_the_notes_of_loops_are_emptied_and_their_number_stays() -> None:
-    known = forest(moving("c", "a", 0), moving("c", "a", 9), moving("a", "b", 4), moving("a", "b", 9))
-    known.forget_changes()
-    known.commit((moving("b", "a", 5),))
-    assert [found.sample for found in known.looping] == [moving("b", "a", 5)]
-    known.forget_changes()
-    assert (known.looping, known.looped) == ([], 1)
-    known.commit((moving("b", "a", 6),))
-    assert known.looped == 2
-    known.commit((moving("root", "c", 0),))
-    assert known.looped == 2, "none is noted twice"
 
 
 # Searches without the lock
@@ -431,7 +317,8 @@ def deep_tree(on_step: Callable[[bool], None]) -> TransformTree:
     """A chain of 50 edges from f0 down."""
     tree = TransformTree()
     tree.insert_many(moving(f"f{k}", f"f{k + 1}", stamp) for stamp in (0, 10) for k in range(DEEP))
-    tree._forest.frames = WatchedFrames(tree._forest, on_step)
+    forest = forest_of(tree)
+    forest.frames = WatchedFrames(forest, on_step)
     return tree
 
 
@@ -480,3 +367,21 @@ def test_a_path_that_was_found_while_a_parent_changed_is_not_used() -> None:
         tree.lookup("f0", "f50")
     assert next(steps) > 60
     assert tree.lookup("elsewhere", "f25").stamp == 20
+
+
+def path_of_one_edge() -> Path:
+    return find_path({"b": moving_edge("a", "b", [(0, Transform())])}, "a", "b", None)
+
+
+def test_paths_that_are_asked_for_are_kept_and_others_are_forgotten_in_time() -> None:
+    cache, kept = PathCache(Lock()), path_of_one_edge()
+    cache.keep("a", "wanted", kept)
+    for number in range(50_000):
+        cache.keep("a", str(number), kept)
+        if number % 1_000 == 0:
+            assert len(cache) <= 20_000
+            assert cache.find("a", "wanted") is kept
+    assert cache.find("a", "0") is None
+    assert cache.find("a", "49999") is kept
+    assert [cache.holds("a", name) for name in ("0", "41000", "49999", "wanted")] == [False, True, True, True]
+    assert not cache.holds("b", "wanted")

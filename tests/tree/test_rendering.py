@@ -1,19 +1,24 @@
+""""""
+
 import ast
 import json
 import re
 import shutil
 import subprocess
 from dataclasses import replace
+from html import unescape
 from typing import Any
 from xml.etree import ElementTree as ET
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.samples import moving, static, tree_of
 from support.strategies import TODAY, frame_names
 
-from tfbus import SECOND, Edge, Transform, TransformStamped, TransformTree
-from tfbus.tree.rendering import describe, to_dot, to_yaml
+from tfbus import SECOND, Buffer, Bus, Edge, SimulatedClock, Transform, TransformStamped, TransformTree
+from tfbus.tree.history import EdgeState, state_of
+from tfbus.tree.rendering import describe, legend, to_dot, to_html, to_yaml
 
 MOVING = Edge("map", "base_link", False, 101, 2 * SECOND, 4 * SECOND, "odometry")
 STATIC = Edge("base_link", "lidar", True, 1, None, None, "")
@@ -117,11 +122,6 @@ def test_graphviz_has_an_arrow_for_each_edge_with_rate_and_authority() -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["küche", "腕", "🦾", "base link"])
-def test_graphviz_keeps_names_of_every_alphabet(name: str) -> None:
-    assert f'    "{name}" -> "lidar" [' in to_dot([edge(name, "lidar")])
-
-
 @given(frame_names(), frame_names(), frame_names())
 def test_graphviz_escapes_every_name(parent: str, child: str, authority: str) -> None:
     text = to_dot([replace(STATIC, parent=parent, child=child, authority=authority)])
@@ -157,15 +157,6 @@ def test_graphviz_shows_a_name_in_one_line_with_its_control_characters_escaped(n
     )
 
 
-def test_graphviz_tells_a_name_from_its_escaped_form() -> None:
-    text = drawn_by_graphviz(edge("map", "\u202e"), edge("map", r"\u202e"), edge("map", "\n"), edge("map", r"\n"))
-    assert sorted(text.split("\n")) == sorted(["map", r"\u202e", r"\u202e", r"\n", r"\n", *["static"] * 4])
-
-
-def test_graphviz_draws_a_loop() -> None:
-    assert to_dot([edge("b", "a"), edge("a", "b")]).count("->") == 2
-
-
 # YAML
 
 
@@ -189,44 +180,15 @@ def parsed(text: str) -> dict[str, dict[str, Any]]:
 
 
 def test_yaml_has_the_keys_of_tf2_and_stamps_in_seconds() -> None:
-    assert parsed(to_yaml(EDGES)) == {
-        "arm": {
-            "parent": "base_link",
-            "broadcaster": "driver",
-            "static": False,
-            "rate": None,
-            "most_recent_transform": 3.0,
-            "oldest_transform": 3.0,
-            "buffer_length": 0.0,
-        },
-        "base_link": {
-            "parent": "map",
-            "broadcaster": "odometry",
-            "static": False,
-            "rate": 50.0,
-            "most_recent_transform": 4.0,
-            "oldest_transform": 2.0,
-            "buffer_length": 2.0,
-        },
-        "lidar": {
-            "parent": "base_link",
-            "broadcaster": "",
-            "static": True,
-            "rate": None,
-            "most_recent_transform": None,
-            "oldest_transform": None,
-            "buffer_length": None,
-        },
-        "tool": {
-            "parent": "base_link",
-            "broadcaster": "",
-            "static": False,
-            "rate": None,
-            "most_recent_transform": None,
-            "oldest_transform": None,
-            "buffer_length": None,
-        },
+    newest_oldest_length = "most_recent_transform", "oldest_transform", "buffer_length"
+    keys = "parent", "broadcaster", "static", "rate", *newest_oldest_length
+    facts = {
+        "arm": ("base_link", "driver", False, None, 3.0, 3.0, 0.0),
+        "base_link": ("map", "odometry", False, 50.0, 4.0, 2.0, 2.0),
+        "lidar": ("base_link", "", True, None, None, None, None),
+        "tool": ("base_link", "", False, None, None, None, None),
     }
+    assert parsed(to_yaml(EDGES)) == {frame: dict(zip(keys, values, strict=True)) for frame, values in facts.items()}
 
 
 def test_yaml_keeps_the_nanoseconds_of_stamps_of_today() -> None:
@@ -258,18 +220,6 @@ def test_pyyaml_reads_names_of_any_length_back(letter: str, length: int) -> None
     read = yaml.safe_load(to_yaml([replace(STATIC, parent=name, child=name, authority=name), edge(name, "tool")]))
     assert list(read) == [name, "tool"]
     assert (read[name]["parent"], read[name]["broadcaster"], read["tool"]["parent"]) == (name, name, name)
-
-
-@given(frame_names(), frame_names(), frame_names())
-def test_pyyaml_reads_every_name_back(parent: str, child: str, authority: str) -> None:
-    yaml: Any = pytest.importorskip("yaml")
-    read = yaml.safe_load(to_yaml([replace(STATIC, parent=parent, child=child, authority=authority)]))
-    assert list(read) == [child]
-    assert (read[child]["parent"], read[child]["broadcaster"]) == (parent, authority)
-
-
-def test_yaml_escapes_characters_outside_the_basic_plane_whole() -> None:
-    assert '"🦾":\n' in to_yaml([edge("map", "🦾")])
 
 
 # The tree
@@ -315,3 +265,98 @@ def test_the_dot_of_a_tree_takes_a_stamp() -> None:
     tree.insert(TransformStamped("map", "base", SECOND, Transform()))
     assert r"age 2 s" in tree.to_dot(3 * SECOND)
     assert "age" not in tree.to_dot()
+
+
+TWO_EDGES = [
+    Edge("map", "base", False, 101, 2 * SECOND, 4 * SECOND, "odometry"),
+    Edge("base", "lidar", True, 1, None, None, "driver"),
+]
+
+
+def plain(html: str) -> list[str]:
+    """The lines without their elements."""
+    return [unescape(re.sub("<[^>]*>", "", line)).rstrip() for line in html.split("\n")]
+
+
+def test_the_tree_has_a_line_with_the_facts_of_each_frame() -> None:
+    assert plain(to_html(TWO_EDGES, 5 * SECOND)) == [
+        "map",
+        "└── base       50.0 Hz  age 1 s  span 2 s  from 'odometry'",
+        "    └── lidar  static  from 'driver'",
+    ]
+
+
+def test_the_facts_can_be_left_out() -> None:
+    assert plain(to_html(TWO_EDGES, 0, with_facts=False)) == ["map", "└── base", "    └── lidar"]
+
+
+def test_frames_have_the_colour_of_their_state() -> None:
+    root, base, lidar = to_html(TWO_EDGES, 9 * SECOND).split("\n")
+    assert f'color: {EdgeState.STALE.value}">base<' in base
+    assert f'color: {EdgeState.STATIC.value}">lidar<' in lidar
+    assert "; color" not in root
+
+
+def test_the_age_from_which_frames_are_stale_can_be_chosen() -> None:
+    for stale_after, state in ((1.0, EdgeState.MOVING), (0.9, EdgeState.STALE)):
+        assert f'color: {state.value}">base<' in to_html(TWO_EDGES, 5 * SECOND, stale_after)
+
+
+def test_marked_frames_stand_out() -> None:
+    lines = to_html(TWO_EDGES, 0, marked=("lidar",)).split("\n")
+    assert ["background" in line for line in lines] == [False, False, True]
+
+
+def test_names_and_authorities_cannot_become_elements() -> None:
+    evil = "<script>alert('&')</script>"
+    html = to_html([Edge(evil, f"{evil}2", False, 1, 0, 0, evil)], 0)
+    assert "<script" not in html
+    assert html.count("&lt;script&gt;") == 3
+
+
+def test_an_empty_tree_has_a_text() -> None:
+    assert plain(to_html([], 0)) == ["(no frames)"]
+
+
+def test_the_legend_names_every_state_in_its_colour() -> None:
+    for state in EdgeState:
+        assert f'color: {state.value}">\u25cf {state.name.lower()}<' in legend()
+
+
+def test_a_tree_in_a_notebook_counts_ages_from_its_newest_stamp() -> None:
+    tree = tree_of(moving("map", "base", 5 * SECOND), moving("map", "arm", 3 * SECOND))
+    html = tree._repr_html_()
+    assert "age 0 ns" in html
+    assert "age 2 s" in html
+    assert "static" in html
+
+
+def test_a_buffer_in_a_notebook_has_its_own_names_and_ages_by_the_clock() -> None:
+    bus = Bus(SimulatedClock(9 * SECOND))
+    with Buffer(bus, prefix="robot1/") as buffer:
+        bus.publish([moving("robot1/map", "robot1/base", 5 * SECOND), static("robot1/base", "lidar")])
+        html = buffer._repr_html_()
+    assert ">base<" in html
+    assert "age 4 s" in html
+
+
+def newest_at(newest: int | None) -> Edge:
+    return Edge("map", "base", False, 0 if newest is None else 1, newest, newest, "")
+
+
+@pytest.mark.parametrize(
+    ("edge", "now", "state"),
+    [
+        pytest.param(newest_at(5 * SECOND), 6 * SECOND, EdgeState.MOVING, id="just recent enough"),
+        pytest.param(newest_at(5 * SECOND), 6 * SECOND + 1, EdgeState.STALE, id="one ns too old"),
+        pytest.param(newest_at(5 * SECOND), 4 * SECOND, EdgeState.MOVING, id="ahead of the clock"),
+        pytest.param(newest_at(None), 0, EdgeState.SILENT, id="no samples"),
+        pytest.param(Edge("map", "base", True, 1, None, None, ""), 9 * SECOND, EdgeState.STATIC, id="static"),
+    ],
+)
+def test_the_state_follows_from_kind_and_age(edge: Edge, now: int, state: EdgeState) -> None:
+    assert state_of(edge, now, stale_after=1.0) is state
+
+
+def test_no_two_states_share_a_colour() -> None:
+    assert len({state.value for state in EdgeState}) == 4

@@ -1,3 +1,5 @@
+""""""
+
 from functools import partial
 from itertools import product
 from typing import Any
@@ -10,9 +12,6 @@ from support.samples import any_samples, moving, static
 
 from tfbus import (
     LATEST,
-    BufferStatistics,
-    ClockResetError,
-    DisconnectedError,
     Edge,
     ExtrapolationError,
     FutureExtrapolationError,
@@ -40,10 +39,6 @@ def park(live: LiveTree, target: str, source: str, at: int, woken: list[str]) ->
     live.park(waiter, caught.value)
 
 
-def blockers(live: LiveTree) -> list[type[TransformLookupError]]:
-    return [type(pending.blocked_by) for pending in live.waiting.pending()]
-
-
 def test_a_sample_wakes_exactly_the_waiters_whose_stamp_it_covers() -> None:
     live = live_tree(None)
     woken: list[str] = []
@@ -56,42 +51,6 @@ def test_a_sample_wakes_exactly_the_waiters_whose_stamp_it_covers() -> None:
     live.insert((moving("map", "a", 4),))
     assert woken == ["a", "a"]
     assert [pending.question.at for pending in live.waiting.pending()] == [5, 3]
-
-
-def test_an_expired_or_late_sample_does_not_wake_waiters_for_a_later_stamp() -> None:
-    live = live_tree(1e-6)
-    woken: list[str] = []
-    live.insert((moving("map", "a", 9_000), moving("map", "a", 10_000)))
-    park(live, "map", "a", 11_000, woken)
-    live.insert((moving("map", "a", 1), moving("map", "a", 9_500)))
-    assert woken == []
-    assert live.statistics(4) == BufferStatistics(offered=4, inserted=3, replaced=0, expired=1, waiting=1)
-
-
-@pytest.mark.parametrize("sample", [moving("map", "a", 1), moving("a", "child", 1), static("map", "a")])
-def test_the_first_sample_that_names_an_unknown_frame_wakes_its_waiters(sample: object) -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("map", "b", 1),))
-    park(live, "map", "a", 1, woken)
-    assert blockers(live) == [UnknownFrameError]
-    live.insert((moving("b", "c", 1),))
-    assert woken == []
-    live.insert((sample,))  # type: ignore[arg-type]
-    assert woken == ["a"]
-
-
-@pytest.mark.parametrize("root", ["map", "world"])
-def test_a_sample_of_either_root_wakes_a_waiter_for_two_trees(root: str) -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("map", "a", 1), moving("world", "b", 1)))
-    park(live, "a", "b", 1, woken)
-    assert blockers(live) == [DisconnectedError]
-    live.insert((moving("map", "a", 2), moving("world", "b", 2)))
-    assert woken == []
-    live.insert((moving("elsewhere", root, 1),))
-    assert woken == ["b"]
 
 
 @pytest.mark.parametrize(
@@ -126,56 +85,6 @@ def test_removing_a_frame_wakes_the_waiters_for_it_and_its_descendants() -> None
     live.remove_frame("a")
     assert sorted(woken) == ["a", "b", "c"]
     assert tree_over(live).frames() == ["b", "c"]
-
-
-def test_removing_the_last_child_of_a_root_wakes_the_waiters_for_the_root() -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("map", "a", 1), moving("world", "b", 1)))
-    park(live, "map", "b", 9, woken)
-    live.remove_frame("a")
-    assert woken == ["b"]
-
-
-def test_a_reset_drops_moving_samples_keeps_static_ones_and_wakes_every_waiter() -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("map", "a", 5), static("a", "camera")))
-    park(live, "map", "a", 9, woken)
-    live.reset(5, 2)
-    assert woken == ["a"]
-    error = live.last_reset
-    assert isinstance(error, ClockResetError)
-    assert (error.before, error.after) == (5, 2)
-    assert tree_over(live).can_transform("a", "camera", 5)
-    with pytest.raises(FutureExtrapolationError):
-        tree_over(live).lookup("map", "a", 5)
-
-
-def test_two_equal_resets_are_two_objects() -> None:
-    live = live_tree(None)
-    live.reset(5, 2)
-    first = live.last_reset
-    live.reset(5, 2)
-    assert live.last_reset is not first
-
-
-def test_the_end_wakes_every_waiter_and_keeps_its_first_reason() -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    park(live, "map", "a", 9, woken)
-    live.end("the buffer is closed")
-    live.end("the bus is closed")
-    assert woken == ["a"]
-    assert live.end_reason == "the buffer is closed"
-
-
-def test_statistics_count_every_offered_sample_once() -> None:
-    live = live_tree(1.0)
-    batch = (moving("map", "a", 5), moving("map", "a", 5, 1.0), static("map", "s"), static("map", "s", x=2.0))
-    live.insert(batch)
-    live.insert((moving("map", "a", 10**10), moving("map", "a", 6)))
-    assert live.statistics(6) == BufferStatistics(offered=6, inserted=3, replaced=2, expired=1, waiting=0)
 
 
 STAMPS: tuple[int | Latest, ...] = (LATEST, 5, 15)
@@ -229,50 +138,6 @@ def test_a_waiter_that_is_not_woken_still_has_no_answer(
                 ask(live, question)
 
 
-@pytest.mark.parametrize(
-    ("before", "then", "target", "source", "at"),
-    [
-        pytest.param(
-            [moving("b", "a", 11), moving("a", "d", 15), moving("b", "d", 13)],
-            moving("b", "a", 14),
-            "d",
-            "b",
-            LATEST,
-            id="the parent changed between the common stamp and the newest",
-        ),
-        pytest.param(
-            [moving("a", "d", 13), moving("d", "c", 16), moving("c", "b", 18), moving("a", "b", 16)],
-            moving("a", "d", 18),
-            "b",
-            "d",
-            LATEST,
-            id="another edge is missing at the common stamp",
-        ),
-        pytest.param(
-            [moving("a", "b", 17), moving("d", "a", 16), moving("c", "b", 23)],
-            static("b", "d"),
-            "d",
-            "b",
-            22,
-            id="a root gets a parent below itself in the past",
-        ),
-    ],
-)
-def test_late_samples_wake_the_waiters_that_they_answer(
-    before: list[TransformStamped], then: TransformStamped, target: str, source: str, at: int | Latest
-) -> None:
-    live = live_tree(None)
-    for sample in before:
-        live.insert((sample,))
-    with pytest.raises(TransformLookupError) as caught:
-        tree_over(live).lookup(target, source, at)
-    woken: list[str] = []
-    live.waiting.park(Waiter(Question(target, source, at), 0, partial(woken.append, source)), caught.value)
-    live.insert((then,))
-    assert tree_over(live).can_transform(target, source, at)
-    assert woken == [source]
-
-
 def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1), moving("map", "b", 1), static("map", "mount")))
@@ -287,11 +152,14 @@ def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
     assert len(live.waiting) == 100
 
 
+TWO_EDGES = [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)]
+
+
 @pytest.mark.parametrize(
     ("before", "question", "harmless", "then"),
     [
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            TWO_EDGES,
             Question("map", "b", 5),
             moving("a", "b", 10),
             moving("a", "b", 11),
@@ -305,21 +173,21 @@ def test_changes_of_parents_elsewhere_wake_no_waiter() -> None:
             id="another edge that lags jumps over the stamp",
         ),
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9), moving("map", "other", 500)],
+            [*TWO_EDGES, moving("map", "other", 500)],
             Question("map", "b", 5),
             moving("map", "other", 600),
             moving("a", "b", 11),
             id="other frames are far ahead",
         ),
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            TWO_EDGES,
             Question("map", "b", 30, 5, "a"),
             moving("map", "a", 9),
             moving("a", "b", 11),
             id="the other half of time travel slides past its stamp",
         ),
         pytest.param(
-            [moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)],
+            TWO_EDGES,
             Question("map", "b", 5, policy=Policy(tolerance=4)),
             moving("a", "b", 15),
             moving("a", "b", 20),
@@ -358,35 +226,6 @@ def test_a_waiter_is_woken_by_the_insertion_that_makes_it_hopeless(
     with pytest.raises(ExtrapolationError) as raised:
         ask(live, question)
     assert not isinstance(raised.value, FutureExtrapolationError)
-
-
-@pytest.mark.parametrize("far_ahead", [False, True])
-def test_nothing_is_left_of_a_waiter_that_a_sample_wakes_before_it_becomes_hopeless(far_ahead: bool) -> None:
-    live = live_tree(10e-9)
-    live.insert((moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 9)))
-    woken: list[str] = []
-    if far_ahead:
-        live.insert((moving("map", "other", 0),))
-        park(live, "map", "other", 5, [])
-        live.insert((moving("map", "other", 600),))
-        live.waiting.pop_limited(600)
-    park(live, "map", "b", 5, woken)
-    assert len(live.waiting.limits) == (not far_ahead), "samples that are 10 ns newer drop those of b around the stamp"
-    assert ("b" in live.waiting.by_frame) is far_ahead
-    live.insert((moving("map", "a", 5),))
-    assert woken == ["b"]
-    assert (len(live.waiting), live.waiting.by_frame, live.waiting.limits) == (0, {}, [])
-
-
-def test_a_frame_far_ahead_wakes_no_waiter_whose_own_edges_have_only_come_to_their_limits() -> None:
-    live = live_tree(10e-9)
-    live.insert((moving("map", "a", 0), moving("a", "b", 0), moving("a", "b", 10), moving("map", "other", 0)))
-    woken: list[str] = []
-    park(live, "map", "b", 5, woken)
-    live.insert((moving("map", "other", 600),))
-    assert woken == []
-    live.insert((moving("a", "b", 11),))
-    assert woken == ["b"]
 
 
 def test_an_expired_sample_of_a_frame_that_is_static_by_the_end_of_its_batch_is_not_ahead() -> None:
@@ -486,22 +325,6 @@ def test_changing_the_tree_of_a_buffer_directly_is_an_error() -> None:
     assert (tree_over(live).latest_common_stamp("map", "a"), own.latest_common_stamp("map", "a")) == (1, 2)
 
 
-def test_an_end_callback_is_called_once_or_at_once_after_the_end() -> None:
-    live = live_tree(10.0)
-    calls: list[str] = []
-    live.on_end(lambda: calls.append("early"))
-    live.on_end(lambda: calls.append("closed")).close()
-    assert live.has_waiters
-    live.end("the bus is closed")
-    assert calls == []
-    live.call_end_callbacks()
-    live.call_end_callbacks()
-    assert calls == ["early"]
-    live.on_end(lambda: calls.append("late"))
-    assert calls == ["early", "late"]
-    assert not live.has_waiters
-
-
 def test_an_error_of_an_end_callback_is_logged_and_the_others_are_called(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -513,21 +336,6 @@ def test_an_error_of_an_end_callback_is_logged_and_the_others_are_called(
     live.call_end_callbacks()
     assert calls == ["called"]
     assert "ZeroDivisionError" in caplog.text
-
-
-def test_forgetting_edges_without_samples_that_form_a_loop_wakes_the_waiters_below() -> None:
-    live = live_tree(None)
-    woken: list[str] = []
-    live.insert((moving("b", "c", 11), moving("a", "b", 10)))
-    live.reset(11, 9)
-    with pytest.raises(TransformLookupError) as caught:
-        tree_over(live).lookup("c", "b")
-    live.waiting.park(Waiter(Question("c", "b", LATEST), 0, lambda: woken.append("b")), caught.value)
-    # Now a is the parent of c, and the edges that the reset left without samples are contradicted.
-    live.insert((static("a", "c"),))
-    live.insert((moving("a", "b", 10),))
-    assert tree_over(live).can_transform("c", "b")
-    assert woken == ["b"]
 
 
 def test_an_interrupt_of_one_wake_up_keeps_no_other_from_being_woken() -> None:
@@ -545,3 +353,81 @@ def test_an_interrupt_of_one_wake_up_keeps_no_other_from_being_woken() -> None:
         live.insert((moving("map", "a", 5),))
     assert woken == ["a"]
     assert live.waiting.pending() == ()
+
+
+FED_FRAMES = "abc"
+FED_STAMPS = st.integers(0, 12)
+SAMPLES = st.tuples(
+    st.sampled_from(["map", "a", "b"]), st.sampled_from(FED_FRAMES), FED_STAMPS, st.sampled_from([False] * 9 + [True])
+)
+STEPS = st.one_of(
+    st.tuples(st.just("insert"), st.lists(SAMPLES, min_size=1, max_size=4)),
+    st.tuples(
+        st.just("park"), st.sampled_from(["map", *FED_FRAMES]), st.sampled_from(FED_FRAMES), FED_STAMPS | st.none()
+    ),
+    st.tuples(st.just("remove"), st.sampled_from(FED_FRAMES)),
+    st.tuples(st.just("end one"), st.integers(0, 5)),
+)
+
+
+class Play:
+    """A live tree whose plain edges go on by themselves, and what happened to it."""
+
+    def __init__(self, keep: float | None, feeds: bool) -> None:
+        self.live: LiveTree = live_tree(keep)
+        if not feeds:
+            self.live.feed = None
+        self.said: list[object] = []
+        self.waiters: list[Waiter] = []
+
+    def insert(self, drawn: list[tuple[str, str, int, bool]]) -> None:
+        batch = tuple(
+            static(parent, child) if is_static else moving(parent, child, stamp, float(stamp))
+            for parent, child, stamp, is_static in drawn
+            if parent != child
+        )
+        self.live.insert(batch)
+
+    def park(self, target: str, source: str, at: int | None) -> None:
+        stamp: Any = LATEST if at is None else at
+        try:
+            tree_over(self.live).lookup(target, source, stamp)
+        except MAY_COME as error:
+            waiter = Waiter(Question(target, source, stamp), 0, list)
+            waiter.wake = partial(self.note, waiter)
+            self.live.park(waiter, error)
+            self.waiters.append(waiter)
+        except TransformLookupError:
+            return
+
+    def note(self, waiter: Waiter) -> None:
+        answer = waiter.answer
+        found = None if answer is None else (answer.stamp, answer.transform)
+        self.said.append((waiter.question, found, waiter.version == self.live.forest.version))
+
+    def remove(self, frame: str) -> None:
+        self.live.remove_frame(frame)
+
+    def end_one(self, number: int) -> None:
+        if self.waiters:
+            self.live.waiting.remove(self.waiters.pop(number % len(self.waiters)))
+
+
+@given(st.sampled_from([None, 5e-9]), st.lists(STEPS, max_size=40))
+def test_with_and_without_the_feed_the_same_lookups_are_woken_with_the_same_answers(
+    keep: float | None, steps: list[tuple[str, ...]]
+) -> None:
+    plays = [Play(keep, feeds) for feeds in (True, False)]
+    for play in plays:
+        # Then most of what is drawn continues these edges.
+        play.insert([("map", child, 1, False) for child in FED_FRAMES])
+    for name, *arguments in steps:
+        for play in plays:
+            getattr(play, name.replace(" ", "_"))(*arguments)
+        first, second = (play.live for play in plays)
+        assert plays[0].said == plays[1].said
+        assert list(map(str, first.waiting.pending())) == list(map(str, second.waiting.pending()))
+        assert first.waiting.by_frame.keys() == second.waiting.by_frame.keys()
+        assert first.statistics(0) == second.statistics(0)
+        assert [place[:2] for place in first.waiting.limits] == [place[:2] for place in second.waiting.limits]
+        assert list(first.waiting.names) == list(second.waiting.names) or name != "remove"

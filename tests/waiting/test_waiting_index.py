@@ -1,6 +1,5 @@
 import weakref
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import pytest
@@ -44,89 +43,12 @@ def parked(index: WaitingIndex, error: TransformLookupError) -> Waiter:
     return made
 
 
-@pytest.mark.parametrize(
-    ("error", "frames"),
-    [(short_of("tool", 5), ("tool",)), (unknown("tool"), ("tool",)), (disconnected("map", "odom"), ("map", "odom"))],
-)
-def test_blocking_frames_are_the_frames_whose_samples_can_help(
-    error: TransformLookupError, frames: tuple[str, ...]
-) -> None:
-    assert blocking_frames(error) == frames
-
-
 def test_parking_with_an_error_that_waiting_cannot_help_is_a_type_error() -> None:
     index = WaitingIndex()
     with pytest.raises(TypeError, match="waiting cannot help"):
         index.park(waiter(), PastExtrapolationError(child="tool", stamp=1, oldest=2, newest=3))
     assert len(index) == 0
     assert index.pop_all() == []
-
-
-def test_pop_unblocked_gives_the_waiters_up_to_the_newest_stamp_in_order_of_stamp() -> None:
-    index = WaitingIndex()
-    late, early, exact, first = (parked(index, short_of("tool", stamp)) for stamp in (11, 5, 10, 1))
-    assert index.pop_unblocked("base", 100) == []
-    assert index.pop_unblocked("tool", 0) == []
-    assert index.pop_unblocked("tool", 10) == [first, early, exact]
-    assert index.pop_unblocked("tool", 10) == []
-    assert index.pop_unblocked("tool", 11) == [late]
-
-
-def test_waiters_for_one_stamp_are_given_in_order_of_arrival() -> None:
-    index = WaitingIndex()
-    waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
-    assert index.pop_unblocked("tool", 7) == waiters
-
-
-def test_a_waiter_for_any_sample_is_given_at_the_first_stamp() -> None:
-    index = WaitingIndex()
-    waiting = parked(index, short_of("tool", LATEST))
-    assert index.pop_unblocked("tool", None) == []
-    assert index.pop_unblocked("tool", -(2**63)) == [waiting]
-
-
-def test_a_waiter_for_an_unknown_frame_is_given_once_the_frame_is_named() -> None:
-    index = WaitingIndex()
-    waiting = parked(index, unknown("camera"))
-    assert index.pop_unblocked("camera", None) == [waiting]
-    assert len(index) == 0
-
-
-@pytest.mark.parametrize(("first", "second"), [("map", "odom"), ("odom", "map")])
-def test_a_waiter_for_two_trees_is_given_once_by_either_root(first: str, second: str) -> None:
-    index = WaitingIndex()
-    waiting = parked(index, disconnected("map", "odom"))
-    assert index.pop_unblocked(first, 3) == [waiting]
-    assert index.pop_unblocked(second, 3) == []
-    assert not index.by_frame
-
-
-def test_giving_a_waiter_for_two_trees_keeps_the_others_under_its_roots() -> None:
-    index = WaitingIndex()
-    joined = parked(index, disconnected("map", "odom"))
-    other = parked(index, disconnected("odom", "robot"))
-    stamped = parked(index, short_of("odom", 50))
-    assert index.pop_unblocked("map", 1) == [joined]
-    assert index.pop_unblocked("odom", 50) == [other, stamped]
-
-
-def test_a_removed_waiter_is_never_given_and_a_second_removal_does_nothing() -> None:
-    index = WaitingIndex()
-    errors = (short_of("tool", 5), short_of("tool", LATEST), unknown("camera"), disconnected("map", "odom"))
-    waiters = [parked(index, error) for error in errors]
-    stays = parked(index, short_of("tool", 5))
-    for removed in (*waiters, *waiters):
-        index.remove(removed)
-    assert len(index) == 1
-    assert set(index.by_frame) == {"tool"}
-    assert index.pop_all() == [stays]
-
-
-def test_removing_one_of_several_waiters_for_one_stamp_keeps_the_others() -> None:
-    index = WaitingIndex()
-    waiters = [parked(index, short_of("tool", 7)) for _ in range(5)]
-    index.remove(waiters[2])
-    assert index.pop_unblocked("tool", 7) == waiters[:2] + waiters[3:]
 
 
 def test_a_waiter_is_looked_at_when_any_frame_passes_its_first_limit() -> None:
@@ -154,17 +76,6 @@ def test_under_a_limit_that_some_frame_has_passed_a_waiter_is_given_by_its_own_f
     assert index.pop_unblocked("hand", 31) == [waiting]
     assert (len(index), index.by_frame) == (0, {})
     assert index.limit > 2**63
-
-
-def test_several_waiters_under_one_frame_are_given_by_limit() -> None:
-    index = WaitingIndex()
-    index.pop_limited(100)
-    waiting = {limit: waiter() for limit in (30, 10, 20)}
-    for limit, each in waiting.items():
-        index.park(each, unknown("tool"), [("arm", limit)])
-    assert index.pop_unblocked("arm", 20) == [waiting[10]]
-    assert index.pop_unblocked("arm", 99) == [waiting[20], waiting[30]]
-    assert index.by_frame == {}
 
 
 def test_a_waiter_that_is_blocked_and_limited_by_one_frame_is_given_once() -> None:
@@ -203,30 +114,6 @@ def test_the_names_are_those_of_all_questions_of_parked_waiters() -> None:
     assert set(index.names) == set()
 
 
-def test_pop_all_gives_every_waiter_in_order_of_arrival_and_empties_the_index() -> None:
-    index = WaitingIndex()
-    errors = (unknown("camera"), short_of("tool", 9), disconnected("map", "odom"), short_of("tool", 1))
-    waiters = [parked(index, error) for error in errors]
-    assert len(index.names) > 0
-    assert index.pop_all() == waiters
-    assert (len(index), index.by_frame, index.pending(), index.pop_all()) == (0, {}, (), [])
-    assert list(index.names) == []
-    index.park(waiters[0], unknown("camera"))
-    assert index.names == {"map", "tool"}, "a waiter may come back"
-
-
-def test_a_given_waiter_can_be_parked_again_with_another_error() -> None:
-    index = WaitingIndex()
-    waiting = parked(index, unknown("camera"))
-    for error in (short_of("camera", 30), short_of("camera", 20)):
-        assert index.names == {"map", "tool"}
-        assert index.pop_asking_for({"tool"}) == [waiting]
-        assert index.names == set()
-        index.park(waiting, error)
-    assert index.pop_unblocked("camera", 19) == []
-    assert index.pop_unblocked("camera", 20) == [waiting]
-
-
 def test_waiting_since_leaves_out_those_that_came_later() -> None:
     index = WaitingIndex()
     for since in (10, 30, 20):
@@ -244,18 +131,6 @@ def test_pending_lists_each_question_with_its_error() -> None:
     assert str(pending) == "'camera' in 'map': frame 'camera' is not known"
     with pytest.raises(AttributeError):
         pending.since = 0  # type: ignore[misc]
-
-
-def test_the_index_wakes_no_waiter_itself() -> None:
-    woken: list[str] = []
-    index = WaitingIndex()
-    for name in ("first", "second"):
-        index.park(waiter(partial(woken.append, name)), unknown("camera"))
-    given = index.pop_unblocked("camera", None)
-    assert woken == []
-    for waiting in given:
-        waiting.wake()
-    assert woken == ["first", "second"]
 
 
 def test_without_traceback_has_none_in_the_error_and_in_all_its_causes() -> None:

@@ -3,7 +3,7 @@ from itertools import permutations
 from hypothesis import given
 from hypothesis import strategies as st
 from support.live_trees import live_tree, tree_over
-from support.samples import any_samples, moving, static
+from support.samples import any_samples, moving
 
 from tfbus import ClockResetError, InvalidTransformError, TransformLookupError, TransformStamped, TransformTree
 from tfbus.waiting.live_tree import LiveTree
@@ -38,15 +38,6 @@ def watched_frames(live: LiveTree) -> set[str]:
     return set(live.watching.by_frame)
 
 
-def test_an_answer_is_indexed_by_the_edges_of_its_path() -> None:
-    live = live_tree(None)
-    live.insert((moving("world", "map", 1), moving("map", "a", 1), moving("map", "b", 1), static("b", "c")))
-    watcher = Watcher(live, "a", "c")
-    assert watched_frames(live) == set()
-    watcher.read()
-    assert watched_frames(live) == {"a", "b", "c"}
-
-
 def test_the_first_batch_on_the_path_wakes_and_later_ones_are_only_counted() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 1), moving("a", "b", 1)))
@@ -57,55 +48,6 @@ def test_the_first_batch_on_the_path_wakes_and_later_ones_are_only_counted() -> 
     live.insert((moving("map", "a", 2), moving("a", "b", 2), moving("a", "b", 3)))
     live.insert((moving("map", "a", 3),))
     assert (watcher.woken, watcher.state.outdated, watcher.state.updates) == (1, True, 2)
-
-
-def test_a_watch_without_an_answer_is_woken_by_no_sample() -> None:
-    live = live_tree(None)
-    watcher = Watcher(live, "map", "a")
-    assert watcher.read() is None
-    live.insert((moving("map", "a", 1),))
-    assert (watcher.woken, watcher.state.updates) == (0, 0)
-    watcher.read()
-    live.remove_frame("a")
-    assert watcher.woken == 1
-    assert watcher.read() is None
-    assert watched_frames(live) == set()
-
-
-def test_the_frames_of_watches_without_a_permanent_path_may_change() -> None:
-    live = live_tree(None)
-    live.insert((moving("map", "a", 1),))
-    Watcher(live, "map", "a").read()
-    Watcher(live, "world", "nobody").read()
-    assert live.watching.changing_names == {"world", "nobody"}
-
-
-def test_the_paths_over_both_parents_are_watched_while_both_are_in_the_window() -> None:
-    live = live_tree(5e-9)
-    live.insert((moving("map", "left", 1), moving("map", "right", 1), moving("left", "box", 1)))
-    watcher = Watcher(live, "map", "box")
-    live.insert((moving("right", "box", 3),))
-    # The answer is that of stamp 1, under 'left'; the newest common stamp is that of the newest path.
-    watcher.read()
-    assert watched_frames(live) == {"left", "right", "box"}
-    live.insert((moving("map", "left", 9), moving("map", "right", 9), moving("right", "box", 9)))
-    watcher.read()
-    assert watched_frames(live) == {"right", "box"}
-
-
-def test_late_samples_that_form_a_loop_in_the_past_make_watches_outdated() -> None:
-    live = live_tree(None)
-    live.insert((moving("a", "c", 0),))
-    live.insert((moving("a", "b", 0), moving("c", "b", 1), moving("d", "a", 1)))
-    # At stamp 0, a is the parent of b, and soon b the parent of a.
-    watchers = [Watcher(live, target, source) for target, source in permutations("abc", 2)]
-    answers = [watcher.read() for watcher in watchers]
-    live.insert((moving("b", "a", 0, 1.0),))
-    outdated = [watcher for watcher in watchers if watcher.state.outdated]
-    changed = [watcher for watcher, answer in zip(watchers, answers, strict=True) if watcher.read() != answer]
-    assert changed
-    assert set(changed) <= set(outdated)
-    assert {watcher.woken for watcher in outdated} == {1}
 
 
 def test_a_change_of_parent_off_the_path_does_not_make_a_watch_outdated() -> None:
@@ -119,27 +61,6 @@ def test_a_change_of_parent_off_the_path_does_not_make_a_watch_outdated() -> Non
     assert (watcher.woken, watcher.state.outdated) == (0, False)
 
 
-def test_only_watches_that_ask_for_a_frame_and_have_no_permanent_path_are_marked_for_it() -> None:
-    live = live_tree(None)
-    live.insert((moving("map", "a", 1),))
-    watchers = [Watcher(live, *ends) for ends in (("map", "a"), ("map", "x"), ("x", "map"), ("y", "x"), ("x", "x"))]
-    for watcher in watchers:
-        watcher.read()
-        watcher.state.outdated = False
-    answered, source_named, target_named, neither, both = watchers
-    live.watching.add(outdated := WatchState("map", "x", list))
-    assert live.watching.mark_asking_for({"map"}) == [source_named.state, target_named.state]
-    assert [watcher.state.outdated for watcher in (answered, source_named, target_named, neither, both)] == [
-        False,
-        True,
-        True,
-        False,
-        False,
-    ]
-    assert live.watching.mark_asking_for({"map", "x"}) == [neither.state, both.state]
-    assert (outdated.outdated, outdated.updates) == (True, 0)
-
-
 def test_a_reset_makes_every_watch_outdated_and_keeps_it_registered() -> None:
     live = live_tree(None)
     live.insert((moving("map", "a", 5),))
@@ -150,17 +71,6 @@ def test_a_reset_makes_every_watch_outdated_and_keeps_it_registered() -> None:
         assert (watcher.woken, watcher.state.outdated) == (1, True)
         assert isinstance(watcher.state.reset, ClockResetError)
     assert (len(live.watching), watched_frames(live)) == (2, set())
-
-
-def test_the_end_wakes_and_removes_every_watch() -> None:
-    live = live_tree(None)
-    live.insert((moving("map", "a", 5),))
-    watchers = [Watcher(live, "map", "a"), Watcher(live, "map", "unknown")]
-    watchers[0].read()
-    live.end("the bus is closed")
-    assert [(watcher.woken, watcher.state.ended) for watcher in watchers] == [(1, True), (1, True)]
-    assert watchers[0].read() is not None
-    assert (len(live.watching), watched_frames(live)) == (0, set())
 
 
 def test_removing_a_watch_keeps_the_others_under_its_frames() -> None:

@@ -146,7 +146,7 @@ class TransformStamped(Sample):
         Raises
         ------
         ValueError
-            If the data are not those of a `TransformStamped`. The message names the field.
+            If the data do not describe a `TransformStamped`. The message names the field.
         """
         kinds = _KINDS if "gap" not in data else {**_KINDS, "extrapolated_by": int, "gap": int}
         fields = from_fields(TransformStamped, data, kinds)

@@ -274,7 +274,7 @@ class TransformArray:
     def __matmul__(self, other: "TransformArray | Transform") -> "TransformArray":
         """Compose with `other` one by one, or all with the same transform, without `extrapolated_by` and `gap`.
 
-        The stamps are those of the operand that has them; None if both have stamps, and those differ.
+        The product has the stamps of the operand that has some; None if both have stamps that differ.
         """
         columns = _columns_of(other, len(self))
         if columns is None:

@@ -41,7 +41,7 @@ class ExplainedEdge(PlainData):
     rate : float or None
         Mean samples a second over the window; None for fewer than two.
     authority : str
-        Who sent the newest sample; may be empty.
+        The sender of the newest sample; may be empty.
     error : ExtrapolationError or None
         The reason why this edge blocks the answer.
     """
@@ -183,7 +183,7 @@ class _Finding(NamedTuple):
 def explain(
     forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, policy: Policy | None, now: int | None
 ) -> Explanation:
-    """The explanation of a lookup; the parameters are those of `TransformTree.explain`. Takes the lock."""
+    """The explanation of a lookup, with the parameters of `TransformTree.explain`. Takes the lock."""
     forest.search(target, source)
     with forest.lock:
         found = _find(forest, target, source, at, bounds, policy)

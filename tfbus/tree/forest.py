@@ -8,7 +8,7 @@ that frame can fail or slow a lookup. Runs of static edges are folded into one r
 changes.
 
 The newest edges form no loop, but the edges that hold at an older stamp may (`tfbus.tree.cycles` draws one). Two ways
-then lead round the loop. `path_at` says which of them counts, by what is stored and never by what was asked before.
+then lead round the loop. `path_at` says which of them counts, by the stored samples and never by earlier questions.
 """
 
 import threading
@@ -311,8 +311,8 @@ _GENERATION = 10_000
 class PathCache(Paths):
     """The permanent paths that were asked for lately.
 
-    When a generation of 10,000 is complete, those of the one before it that nobody has asked for since are forgotten:
-    so up to 10,000 pairs in use stay known, and at most 20,000 are kept.
+    When a generation of 10,000 paths is complete, the cache forgets the paths of the generation before it that nobody
+    has asked for since: up to 10,000 pairs in use stay known, and at most 20,000 are kept.
 
     Parameters
     ----------
@@ -617,8 +617,8 @@ class Forest:
     def search(self, target: str, source: str) -> None:
         """Find the newest path and keep it, without the lock while it climbs, which may take long.
 
-        If a change may have made it wrong meanwhile, or there is none, nothing is kept: whoever asks then finds it, or
-        the error, under the lock.
+        If a change may have made the path wrong meanwhile, or there is no path, nothing is kept: the lookup that
+        follows finds the path, or the error, under the lock.
         """
         if self.paths.holds(target, source) or (target, source) in self.changing_paths:
             return
@@ -750,7 +750,7 @@ class Forest:
             self.names.update(saved.child, history.named_parents)
 
     def rebuild(self, save: Callable[[FrameHistory], SavedFrame]) -> None:
-        """Replace the history of each frame by what is saved of it."""
+        """Replace the history of each frame by its saved copy."""
         with self.lock:
             for child, history in self.frames.items():
                 self.frames[child] = load_frame(save(history), self.window)

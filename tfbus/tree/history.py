@@ -1,8 +1,8 @@
 """The samples of one frame: moving ones in its window, or a static one.
 
-The kernel stores the moving samples, and appends those that only continue the others, as nearly all do. Everything else
-is decided here: late samples, changes of the parent, static samples. Every sample may name its own parent, because a
-frame may be reparented; parents and authorities are stored as runs of samples with the same one.
+The kernel stores the moving samples, and appends a sample that only continues the others, as nearly all do. Every other
+case is decided here: late samples, changes of the parent, static samples. Every sample may name its own parent, because
+a frame may be reparented; parents and authorities are stored as runs of samples with the same one.
 """
 
 from bisect import bisect_right
@@ -65,14 +65,14 @@ class Runs:
         return [begin for begin, _ in self._runs[1:]]
 
     def push(self, stamp: int, name: str, newest: str) -> None:
-        """Note the name of a sample that is newer than all others, the newest of which has the name `newest`."""
+        """Note the name of a sample that is newer than all others; the newest of the others has the name `newest`."""
         if name != newest:
             if not self._runs:
                 self._runs.append((STAMP_MIN, newest))
             self._runs.append((stamp, name))
 
     def put(self, stamp: int, name: str, before: int | None, after: int | None, newest: str) -> None:
-        """Note the name of a sample between those at two stamps, of which there may be none; `newest` as in `push`."""
+        """Note the name of a sample between two others; None for a side without a sample. `newest` is as in `push`."""
         if not self._runs:
             if name == newest:
                 return
@@ -453,7 +453,7 @@ STALE_AFTER = 1.0
 class EdgeState(Enum):
     """A state, and the colour of its edges in every picture.
 
-    The colours are those of M. Okabe and K. Ito, "Color Universal Design" (2008), which people tell apart with any
+    The colours come from M. Okabe and K. Ito, "Color Universal Design" (2008), which people tell apart with any
     kind of colour vision.
     """
 

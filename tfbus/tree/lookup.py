@@ -1,4 +1,8 @@
-"""Lookups at one stamp: the stamp that `LATEST` means, the transform along the path, and the error if there is none."""
+"""Lookups at one stamp: the stamp that `LATEST` means, the transform along the path, and the error if there is none.
+
+A policy says which stamps a lookup may answer although no two close samples surround them. Without a policy a lookup
+extrapolates nothing, and interpolates between any two samples, however far apart they are.
+"""
 
 import math
 from collections.abc import Iterator
@@ -34,9 +38,6 @@ from tfbus.stamps import (
 )
 from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory, Samples
-
-# Policies say which stamps a lookup may answer although no two close samples surround them. Without a policy nothing is
-# extrapolated, and any two samples are interpolated between, however far apart they are.
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +127,7 @@ class Question:
 def question_of(
     data: Stamped, target: str, at: int | Latest | None, fixed: str | None, max_age: float | None, policy: Policy | None
 ) -> Question:
-    """The question whose answer moves `data`; the arguments are those of `Buffer.transform`.
+    """The question whose answer moves `data`, with the arguments of `Buffer.transform`.
 
     Raises
     ------
@@ -351,7 +352,7 @@ def answer(
 def find(
     forest: Forest, target: str, source: str, at: At, bounds: Bounds | None, extrapolation: Extrapolation | None = None
 ) -> Found:
-    """Source in target at one stamp. The caller holds the lock; the errors are those of `TransformTree.lookup`."""
+    """Source in target at one stamp, or an error of `TransformTree.lookup`. The caller holds the lock."""
     path = forest.paths.find(target, source)
     if path is None:
         path = forest.find_path(target, source, at)

@@ -1,7 +1,14 @@
 """Lookups at many stamps at once.
 
-The samples are copied under the lock, and numpy works on the copies in chunks that stay in the cache. Where a stamp has
-no answer, the lookup at one stamp is asked, so that both raise the same error.
+While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies the
+samples on them: as blocks of memory, or only the samples next to a stamp where there are many more samples than stamps.
+The compiled kernel copies nothing, because its blocks can be held. All other work in numpy comes after that, in chunks
+that stay in the cache.
+
+`Segments` interpolates one edge. It prepares each segment between two samples once, so that a stamp costs one search,
+one sine and one cosine; with fewer stamps than samples it prepares only the segments that are needed.
+
+Where a stamp has no answer, the lookup at that stamp alone raises the error, so that both raise the same one.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,12 +27,6 @@ from tfbus.tree.forest import Forest, Path, Step
 from tfbus.tree.history import FrameHistory, Samples
 from tfbus.tree.lookup import Policy, answer, read_stamps_at_many
 from tfbus.which_kernel import kernel
-
-# Interpolation of one edge at many stamps.
-#
-# Each segment between two samples is prepared once, so that a stamp costs one search, one sine and one cosine. If there
-# are fewer stamps than samples, only the segments that are needed are prepared.
-
 
 Floats = npt.NDArray[np.float64]
 
@@ -82,14 +83,6 @@ def _nanoseconds(begin: Stamps, end: Stamps) -> Floats:
     return (end - begin).view(np.uint64).astype(np.float64)
 
 
-# Copies of the samples that a lookup at many stamps needs.
-#
-# While the forest is locked, `copy_paths` finds the paths that hold between the first stamp and the last, and copies
-# the samples on them: as blocks of memory, or only those next to a stamp where there are many more samples than
-# stamps. All other work in numpy comes after that, on the copies. The compiled kernel copies nothing: its blocks can
-# be held.
-
-
 Places = slice | npt.NDArray[np.intp]
 """Indices into the stamps that were asked for."""
 
@@ -114,7 +107,7 @@ class CopiedPath(NamedTuple):
 
     @property
     def moving(self) -> list[Samples]:
-        """The moving edges, those of `up` first."""
+        """The moving edges, first the edges of `up`."""
         return [step for step in (*self.up, *self.down) if isinstance(step, Samples)]
 
     def covers_all(self, stamps: Stamps) -> bool:

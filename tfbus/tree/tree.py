@@ -459,7 +459,7 @@ class TransformTree:
             return history.parent_at(at)
 
     def samples_around(self, frame: str, at: StampLike) -> tuple[TransformStamped | None, TransformStamped | None]:
-        """The samples of a frame before and after a stamp, as they were sent: those that a lookup interpolates.
+        """The two samples of a frame around a stamp that a lookup interpolates, as they were sent.
 
         Parameters
         ----------

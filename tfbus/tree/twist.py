@@ -31,7 +31,7 @@ class Motion(NamedTuple):
 def twist(forest: Forest, frame: str, reference: str, at: At, axes: str) -> tuple[int, Vector, Vector]:
     """The stamp, and a frame's linear and angular velocity seen from `reference`, along the axes of a third frame.
 
-    The errors are those of `TransformTree.twist`. The caller holds the lock.
+    It raises the errors of `TransformTree.twist`. The caller holds the lock.
     """
     stamp = _common_stamp(forest, frame, reference, axes) if at is LATEST else at
     # This lookup raises the error of the deciding edge where several have no answer.

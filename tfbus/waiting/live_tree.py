@@ -202,7 +202,7 @@ class Waiter(Parked):
 
 
 def blocking_frames(error: TransformLookupError) -> tuple[str, ...]:
-    """The frames of which a new sample may remove the cause of `error`.
+    """The frames whose next sample may remove the cause of `error`.
 
     Raises
     ------
@@ -340,8 +340,8 @@ class WaitingIndex:
     def pop_unblocked(self, frame: str, stamp: int | None) -> list[Waiter]:
         """Remove and return the waiters that a sample of `frame` at `stamp` may have unblocked or made hopeless.
 
-        These are the waiters that need any sample, those that need this stamp or an older one, and those whose limit
-        for this frame is older. No waiter needs a stamp older than the newest sample, so a late sample unblocks no
+        These are the waiters that need any sample, that need this stamp or an older one, or whose limit for this frame
+        is older. No waiter needs a stamp older than the newest sample, so a late sample unblocks no
         others.
         """
         blocked = self.by_frame.get(frame)

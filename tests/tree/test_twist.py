@@ -90,27 +90,6 @@ def test_a_body_on_the_unit_circle_has_the_textbook_velocity(time: float) -> Non
     assert (twist.frame, twist.stamp) == ("map", round(time * SECOND))
 
 
-def test_between_samples_of_a_circle_the_origin_moves_along_the_chord() -> None:
-    """The chord's direction is the tangent's at its middle; its length is the arc's times sinc of half its angle."""
-    tree = tree_of(*trajectory("map", "body", lambda time: Transform((math.cos(time), math.sin(time), 0.0))))
-    speed = math.sin(0.125) / 0.125
-    for time in (1.01, 1.125, 1.24, 1.25):
-        linear = -speed * math.sin(1.125), speed * math.cos(1.125), 0.0
-        check_twist(tree.twist("body", "map", round(time * SECOND)), linear, STILL)
-
-
-def test_dense_samples_of_a_circle_give_the_velocity_of_the_circle() -> None:
-    step = SECOND // 1_000
-    poses = ((n * step, n / 1_000) for n in range(2_001))
-    tree = tree_of(
-        *(TransformStamped("map", "body", at, Transform((math.cos(t), math.sin(t), 0.0))) for at, t in poses)
-    )
-    for time in (0.0, 0.5, 0.5004, 1.0003, 1.9999, 2.0):
-        # A chord of 1 ms is half a ms off in direction at its ends.
-        twist = tree.twist("body", "map", round(time * SECOND))
-        check_twist(twist, (-math.sin(time), math.cos(time), 0.0), STILL, tolerance=0.5001e-3)
-
-
 @pytest.mark.parametrize(
     ("frame", "axes", "linear"),
     [
@@ -138,39 +117,6 @@ def test_a_rotating_observer_sees_a_resting_point_circle_in_the_opposite_directi
         tree.twist("post", "observer", at), (-speed * math.sin(angle), -speed * math.cos(angle), 0.0), (0.0, 0.0, -rate)
     )
     check_twist(tree.twist("post", "observer", at, expressed_in="map"), (0.0, -speed, 0.0), (0.0, 0.0, -rate))
-
-
-def test_an_observer_that_turns_with_the_body_sees_it_at_rest() -> None:
-    tree = tree_of(
-        *trajectory("map", "table", turning(2.0, (1.0, 2.0, 3.0))),
-        placed("table", "cup", (1.0, 0.0, 0.5)),
-        placed("table", "plate", (-1.0, 0.3, 0.5), (0.0, 0.6, 0.0, 0.8)),
-    )
-    check_twist(tree.twist("cup", "plate", SECOND // 3), STILL, STILL)
-    check_twist(tree.twist("cup", "plate", SECOND // 3, expressed_in="map"), STILL, STILL)
-
-
-def test_two_rates_about_one_axis_add_up_and_the_inner_one_moves_no_origin() -> None:
-    tree = tree_of(
-        *trajectory("map", "boom", turning(0.5)),
-        placed("boom", "tip", (2.0, 0.0, 0.0)),
-        *trajectory("tip", "wheel", turning(3.0)),
-    )
-    at = 3 * SECOND // 2
-    linear = (-math.sin(0.75), math.cos(0.75), 0.0)
-    check_twist(tree.twist("wheel", "map", at), linear, (0.0, 0.0, 3.5))
-    check_twist(tree.twist("wheel", "tip", at), STILL, (0.0, 0.0, 3.0))
-
-
-def test_a_walk_on_a_turntable_has_radial_and_tangential_velocity() -> None:
-    """In the rotating axes v = (walk, rate * radius, 0), as for any polar coordinates."""
-    rate, walk = 0.8, 0.5
-    tree = tree_of(
-        *trajectory("map", "table", turning(rate)),
-        *trajectory("table", "walker", lambda time: Transform((1.0 + walk * time, 0.0, 0.0))),
-    )
-    at, radius = 2 * SECOND + 1_000, 1.0 + walk * 2.000001
-    check_twist(tree.twist("walker", "map", at, expressed_in="table"), (walk, rate * radius, 0.0), (0.0, 0.0, rate))
 
 
 @given(
@@ -206,71 +152,6 @@ def test_a_half_turn_whose_quaternions_are_just_a_right_angle_apart_has_the_dire
     half_turn = Transform(rotation=(0.0, 0.0, sign, 0.0))
     tree = tree_of(moving("map", "body", 0), TransformStamped("map", "body", SECOND, half_turn))
     check_twist(tree.twist("body", "map", SECOND // 2), STILL, (0.0, 0.0, sign * math.pi))
-
-
-# What tf1 and tf2 test
-
-
-@pytest.mark.parametrize("speed", [1.0, 3.0, 0.3])
-@pytest.mark.parametrize("at", [QUARTER // 3, SECOND, 4 * SECOND, LATEST])
-def test_a_uniform_straight_motion_has_its_speed_at_every_stamp(speed: float, at: int | Latest) -> None:
-    tree = tree_of(*trajectory("map", "body", lambda time: Transform((speed * time, 0.0, 0.0))))
-    check_twist(tree.twist("body", "map", at), (speed, 0.0, 0.0), STILL)
-
-
-SIDES: list[tuple[float, Vector]] = [
-    (0.5, (1.0, 0.0, 0.0)),
-    (1.5, (0.0, 1.0, 0.0)),
-    (2.5, (-1.0, 0.0, 0.0)),
-    (3.5, (0.0, -1.0, 0.0)),
-    (4.5, (0.0, 0.0, 1.0)),
-    (5.5, (0.0, 0.0, -1.0)),
-]
-TURNS: list[tuple[float, Vector]] = [
-    (0.5, (1.0, 0.0, 0.0)),
-    (1.5, (-1.0, 0.0, 0.0)),
-    (2.5, (0.0, 1.0, 0.0)),
-    (3.5, (0.0, -1.0, 0.0)),
-    (4.5, (0.0, 0.0, 1.0)),
-    (5.5, (0.0, 0.0, -1.0)),
-]
-
-
-def stepping(velocities: list[tuple[float, Vector]], pose: Callable[[Vector], Transform]) -> list[TransformStamped]:
-    """Ten steps of 0.1 in each second, by one velocity after the other."""
-    there = STILL
-    samples = [TransformStamped("foo", "bar", 0, pose(there))]
-    for n in range(60):
-        there = plus(there, times(0.1, velocities[n // 10][1]))
-        samples.append(TransformStamped("foo", "bar", (n + 1) * SECOND // 10, pose(there)))
-    return samples
-
-
-@pytest.mark.parametrize(("time", "velocity"), SIDES)
-@pytest.mark.parametrize("observer", ["foo", "stationary_offset_child", "stationary_offset_parent"])
-def test_a_straight_motion_is_the_same_seen_from_three_resting_frames(
-    time: float, velocity: Vector, observer: str
-) -> None:
-    tree = tree_of(
-        *stepping(SIDES, Transform),
-        placed("foo", "stationary_offset_child", (1.0, 0.0, 0.0)),
-        placed("stationary_offset_parent", "foo", (0.0, 0.0, 1.0)),
-    )
-    check_twist(tree.twist("bar", observer, round(time * SECOND)), velocity, STILL)
-
-
-@pytest.mark.parametrize(("time", "velocity"), TURNS)
-def test_a_pure_rotation_moves_only_the_origin_of_an_offset_child(time: float, velocity: Vector) -> None:
-    tree = tree_of(
-        *stepping(TURNS, lambda rpy: Transform.from_xyz_rpy(STILL, rpy)),
-        placed("bar", "stationary_offset_child", (1.0, 0.0, 0.0)),
-        placed("stationary_offset_parent", "foo", (0.0, 0.0, 1.0)),
-    )
-    at = round(time * SECOND)
-    for observer in ("foo", "stationary_offset_parent"):
-        check_twist(tree.twist("bar", observer, at), STILL, velocity)
-    arm = Transform.from_axis_angle([abs(part) for part in velocity], 0.5).apply((1.0, 0.0, 0.0))
-    check_twist(tree.twist("stationary_offset_child", "foo", at), cross(velocity, arm), velocity)
 
 
 # Against differences
@@ -348,24 +229,6 @@ def test_do_transform_of_a_body_twist_gives_the_twist_of_another_frame_of_the_bo
     check_twist(carried, own.linear, own.angular)
 
 
-@given(trees(), st.data())
-def test_expressed_in_rotates_the_twist(drawn: tuple[TransformTree, int, list[str]], data: st.DataObject) -> None:
-    tree, at, frames = drawn
-    frame, reference, axes = (data.draw(st.sampled_from(frames)) for _ in range(3))
-    plain = tree.twist(frame, reference, at)
-    turn = tree.lookup(axes, reference, at).transform.rotation
-    assert plain == tree.twist(frame, reference, at, expressed_in=reference)
-    other = tree.twist(frame, reference, at, expressed_in=axes)
-    check_twist(other, rotate(turn, *plain.linear), rotate(turn, *plain.angular))
-
-
-@given(trees(), st.data())
-def test_a_frame_is_at_rest_seen_from_itself(drawn: tuple[TransformTree, int, list[str]], data: st.DataObject) -> None:
-    tree, at, frames = drawn
-    frame, axes = (data.draw(st.sampled_from(frames)) for _ in range(2))
-    check_twist(tree.twist(frame, frame, at, expressed_in=axes), STILL, STILL)
-
-
 # At samples
 
 
@@ -403,11 +266,6 @@ def test_samples_outside_the_window_are_not_differentiated(newest: int) -> None:
     assert speed(tree, (oldest + 1) * SECOND) == 2 * oldest + 1
     with pytest.raises(PastExtrapolationError):
         tree.twist("body", "map", oldest * SECOND - 1)
-
-
-def test_samples_one_nanosecond_apart_have_a_velocity() -> None:
-    tree = tree_of(moving("map", "body", TODAY, 0.0), moving("map", "body", TODAY + 1, 1e-9))
-    assert speed(tree, TODAY) == speed(tree, TODAY + 1) == pytest.approx(1.0, rel=1e-15)
 
 
 @given(st.sets(stamps(), min_size=2, max_size=2))
@@ -465,16 +323,6 @@ def test_a_held_frame_moves_with_its_old_parent() -> None:
     check_twist(tree.twist("box", "crane", 2 * SECOND), STILL, STILL)
 
 
-def test_a_single_sample_between_two_parents_is_at_rest() -> None:
-    tree = tree_of(
-        static("map", "left", 10.0),
-        *on_a_line((0, 0.0), parent="left"),
-        *on_a_line((1, 5.0)),
-        *on_a_line((2, 0.0), (3, 4.0), parent="left"),
-    )
-    assert [speed(tree, second * SECOND) for second in (0, 1, 2, 3)] == [0.0, 0.0, 4.0, 4.0]
-
-
 @pytest.mark.parametrize("at", [3 * SECOND, LATEST])
 def test_a_single_newest_sample_of_a_new_parent_has_no_velocity(at: int | Latest) -> None:
     tree = tree_of(*on_a_line((0, 0.0), (1, 1.0)), static("map", "lift"), *on_a_line((3, 0.0), parent="lift"))
@@ -490,20 +338,6 @@ def test_a_single_newest_sample_of_a_new_parent_has_no_velocity(at: int | Latest
 def test_a_static_frame_is_at_rest_at_any_stamp(at: int) -> None:
     tree = tree_of(static("map", "base", 1.0, stamp=5), static("base", "lidar", 2.0, stamp=9))
     assert tree.twist("lidar", "map", at) == TwistStamped("map", at, STILL, STILL)
-
-
-@pytest.mark.parametrize(
-    ("frame", "reference"), [("lidar", "base"), ("base", "lidar"), ("lidar", "lidar"), ("base", "base"), ("map", "map")]
-)
-def test_the_twist_of_a_static_frame_has_the_stamp_of_the_lookup(frame: str, reference: str) -> None:
-    tree = tree_of(*on_a_line((0, 0.0), (8, 1.0)), static("body", "base", stamp=5), static("base", "lidar", stamp=7))
-    tree.insert_many([moving("body", "arm", 0), moving("body", "arm", 3)])
-    assert tree.twist(frame, reference).stamp == tree.lookup(reference, frame).stamp
-
-
-def test_the_twist_of_a_frame_fixed_to_a_moving_one_has_the_stamp_of_the_static_edge() -> None:
-    tree = tree_of(*on_a_line((0, 0.0), (8, 1.0)), static("body", "lidar", stamp=5))
-    assert tree.twist("lidar", "body") == TwistStamped("body", 5, STILL, STILL)
 
 
 def slow_and_fast() -> TransformTree:
@@ -535,22 +369,6 @@ def test_latest_is_the_newest_common_stamp_of_frame_reference_and_axes(
     twist = tree.twist(frame, reference, expressed_in=axes)
     assert twist.stamp == seconds * SECOND
     assert twist == tree.twist(frame, reference, twist.stamp, expressed_in=axes)
-
-
-@pytest.mark.parametrize("last", [2.0, 4.0, 6.0])
-def test_the_axes_are_those_at_the_stamp(last: float) -> None:
-    tree = tree_of(
-        *trajectory("map", "axes", turning(0.5), last),
-        *trajectory("map", "body", lambda time: Transform((time, 0.0, 0.0))),
-    )
-    angle = 0.5 * min(last, 4.0)
-    check_twist(tree.twist("body", "map", expressed_in="axes"), (math.cos(angle), -math.sin(angle), 0.0), STILL)
-
-
-def test_a_late_sample_changes_the_velocity_on_both_sides() -> None:
-    tree = tree_of(*on_a_line((0, 0.0), (2, 2.0)))
-    tree.insert(moving("map", "body", SECOND, 3.0))
-    assert (speed(tree, QUARTER), speed(tree, 7 * QUARTER)) == (3.0, -1.0)
 
 
 # Errors
@@ -593,31 +411,6 @@ def test_outside_the_window_the_errors_are_those_of_lookup(frame: str, reference
         with pytest.raises(error) as caught:
             tree.twist(frame, reference, at, expressed_in=axes)
         assert (caught.value.child, caught.value.stamp) == ("body", at)
-
-
-@pytest.mark.parametrize(("frame", "reference"), [("hand", "map"), ("map", "hand")])
-def test_where_several_edges_have_no_answer_the_error_is_that_of_the_one_that_lags_most(
-    frame: str, reference: str
-) -> None:
-    arm = [moving("map", "arm", second * SECOND) for second in (0, 1)]
-    tree = tree_of(*arm, *(moving("arm", "hand", second * SECOND) for second in (0, 2)))
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.twist(frame, reference, 3 * SECOND)
-    assert (caught.value.child, caught.value.newest) == ("arm", SECOND)
-
-
-def gap(axes_first: bool) -> TransformTree:
-    """One of two frames has stopped before the other began."""
-    early, late = ("axes", "body") if axes_first else ("body", "axes")
-    first = [moving("map", early, second * SECOND) for second in (0, 1)]
-    return tree_of(*first, *(moving("map", late, second * SECOND) for second in (5, 6)))
-
-
-@pytest.mark.parametrize("axes_first", [True, False])
-def test_latest_without_a_common_stamp_waits_for_the_lagging_frame(axes_first: bool) -> None:
-    with pytest.raises(FutureExtrapolationError) as caught:
-        gap(axes_first).twist("body", "map", expressed_in="axes")
-    assert (caught.value.child, caught.value.stamp) == ("axes" if axes_first else "body", 5 * SECOND)
 
 
 @pytest.mark.parametrize("at", [1.5, True, "now", None])

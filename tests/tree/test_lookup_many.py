@@ -1,13 +1,11 @@
 """Many lookups in one call, compared with single lookups."""
 
 import math
-import sys
-import threading
+import struct
 from array import array
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import cycle, islice, product
-from types import FrameType
+from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
@@ -15,14 +13,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.samples import moving, over, static, tree_of
-from support.strategies import TODAY, transforms
+from support.strategies import TODAY, small_angles, transforms, unit_vectors
 from support.threads import threads_that
 
+import tfbus
 from tfbus import (
     LATEST,
     SECOND,
-    Buffer,
-    Bus,
     DisconnectedError,
     FutureExtrapolationError,
     Latest,
@@ -35,9 +32,10 @@ from tfbus import (
     TransformTree,
     UnknownFrameError,
 )
+from tfbus.rows import Vector
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
-from tfbus.tree.lookup_many import OutOfRange
-from tfbus.tree.tree import forest_of
+from tfbus.tree.history import FrameHistory
+from tfbus.tree.lookup_many import OutOfRange, Segments
 
 FRAMES = "rsabcdef"
 ROOTS = 2
@@ -198,28 +196,6 @@ def xs(found: TransformArray) -> list[float]:
 
 
 @few_and_many
-def test_stamps_may_be_in_any_order_and_repeated(asked: Asked) -> None:
-    tree = tree_of(*over("a", "b", [0, 10, 20]), static("b", "c", 100.0))
-    stamps = asked([20, 0, 7, 7, 13, 0])
-    assert xs(tree.lookup_many("a", "c", stamps)) == pytest.approx([100.0 + stamp for stamp in stamps])
-    assert xs(tree.lookup_many("c", "a", stamps)) == pytest.approx([-100.0 - stamp for stamp in stamps])
-
-
-@few_and_many
-def test_one_nanosecond_outside_the_samples_is_out_of_range(asked: Asked) -> None:
-    tree = tree_of(*over("a", "b", [TODAY, TODAY + 10], speed=0.0))
-    stamps = asked([TODAY, TODAY - 1, TODAY + 10, TODAY + 11])
-    found = tree.lookup_many("a", "b", stamps, out_of_range="nan")
-    assert found.valid.tolist() == [TODAY <= stamp <= TODAY + 10 for stamp in stamps]
-    with pytest.raises(PastExtrapolationError) as past:
-        tree.lookup_many("a", "b", stamps)
-    assert (past.value.index, past.value.stamp, past.value.oldest) == (1, TODAY - 1, TODAY)
-    with pytest.raises(FutureExtrapolationError) as future:
-        tree.lookup_many("a", "b", stamps[2:])
-    assert (future.value.index, future.value.stamp, future.value.newest) == (1, TODAY + 11, TODAY + 10)
-
-
-@few_and_many
 def test_a_stamp_before_the_window_is_out_of_range(asked: Asked) -> None:
     # The window's slack, a sixteenth, is ten here: what has left the window is still in memory.
     tree = tree_of(*over("a", "b", range(166)), keep=160e-9)
@@ -237,72 +213,6 @@ def test_the_error_has_the_index_and_the_facts_of_the_first_stamp_without_an_ans
     text = "stamps[17]: frame 'b': asked for 1.000 s, oldest sample is 2.000 s (1 s too early)"
     assert str(caught.value) == text
     assert (caught.value.oldest, caught.value.newest) == (2 * SECOND, 12 * SECOND)
-
-
-@few_and_many
-def test_a_static_path_answers_at_any_stamp(asked: Asked) -> None:
-    tree = tree_of(static("a", "b", 1.0), static("b", "c", 2.0), static("a", "d", 10.0), moving("a", "e", 5))
-    stamps = asked([STAMP_MIN, 0, STAMP_MAX])
-    assert set(xs(tree.lookup_many("d", "c", stamps))) == {-7.0}
-    assert set(xs(tree.lookup_many("e", "e", stamps))) == {0.0}
-
-
-@few_and_many
-def test_the_last_value_under_the_old_parent_is_held_until_the_new_parent(asked: Asked) -> None:
-    tree = tree_of(
-        *over("left", "b", [0, 10]),
-        *over("right", "b", [20, 30]),
-        static("w", "left", 100.0),
-        static("w", "right", 5.0),
-    )
-    found = tree.lookup_many("w", "b", asked([25, 5, 10, 15, 19, 20]))
-    assert xs(found)[:6] == pytest.approx([30.0, 105.0, 110.0, 110.0, 110.0, 25.0])
-
-
-@few_and_many
-def test_a_parent_in_another_tree_answers_only_at_arguments_stamps(asked: Asked) -> None:
-    tree = tree_of(*over("old", "b", [0, 10]), *over("new", "b", [20, 30]))
-    stamps = asked([5, 15, 20, 10])
-    with pytest.raises(DisconnectedError) as caught:
-        tree.lookup_many("old", "b", stamps)
-    assert (caught.value.index, caught.value.stamp, caught.value.roots) == (2, 20, ("old", "new"))
-    assert str(caught.value).startswith("stamps[2]: no path")
-    found = tree.lookup_many("old", "b", stamps, out_of_range="nan")
-    assert found.valid[:4].tolist() == [True, True, False, True]
-
-
-@few_and_many
-def test_without_a_path_at_any_stamp_nan_mode_raises(asked: Asked) -> None:
-    tree = tree_of(*over("a", "b", [0, 10]), *over("x", "y", [0, 10]))
-    with pytest.raises(DisconnectedError) as caught:
-        tree.lookup_many("b", "y", asked([5, 99]), out_of_range="nan")
-    assert caught.value.index == 0
-
-
-@few_and_many
-def test_with_a_path_only_at_stamps_out_of_range_nan_mode_gives_nan(asked: Asked) -> None:
-    tree = tree_of(*over("old", "b", [0, 10]), *over("new", "b", [20, 30]))
-    assert not tree.lookup_many("old", "b", asked([25, -1]), out_of_range="nan").valid.any()
-    assert not tree.lookup_many("old", "b", asked([-1, 25]), out_of_range="nan").valid.any()
-
-
-@few_and_many
-def test_an_edge_that_is_reversed_has_at_each_stamp_the_direction_of_that_time(asked: Asked) -> None:
-    tree = tree_of(moving("earth", "map", 0), moving("map", "base", 0, 5.0))
-    tree.insert_many([moving("base", "map", 10, -7.0), moving("world", "base", 10)])
-    stamps = asked([0, 10])
-    assert xs(tree.lookup_many("map", "base", stamps))[:2] == [5.0, 7.0]
-    assert xs(tree.lookup_many("base", "map", stamps))[:2] == [-5.0, -7.0]
-
-
-@few_and_many
-def test_of_two_ways_round_a_loop_the_one_with_samples_counts_at_each_stamp(asked: Asked) -> None:
-    tree = tree_of(moving("b", "a", 0, 1.0), moving("c", "b", 30), moving("b", "a", 10, 1.0))
-    # Late, b comes onto a as well: that counts where a has no sample.
-    tree.insert_many([moving("a", "b", 5, 7.0), moving("a", "b", 20, 7.0)])
-    stamps = asked([0, 9, 10, 11, 12, 20])
-    assert xs(tree.lookup_many("a", "b", stamps))[:6] == [-1.0, -1.0, -1.0, 7.0, 7.0, 7.0]
-    assert xs(tree.lookup_many("b", "a", stamps))[:6] == [1.0, 1.0, 1.0, -7.0, -7.0, -7.0]
 
 
 @few_and_many
@@ -337,34 +247,6 @@ def test_time_travel_leads_over_the_fixed_frame_though_a_path_without_it_is_know
     found = tree.lookup_many("map", "b", asked([1, 9]), source_at=asked([9, 2]), fixed="f")
     # At 1, f is 2 in map; at 9 it is 18 in a, and b is 9 in a; at 2, it is 4 in map, and b is 2 + 2 there.
     assert xs(found)[:2] == pytest.approx([2.0 + (9.0 - 18.0), (9.0 + 18.0) + (4.0 - 4.0)])
-
-
-@few_and_many
-@pytest.mark.parametrize(("target", "source"), ["ab", "ay", "ya"])
-def test_the_error_of_many_time_travels_is_that_of_a_single_one(asked: Asked, target: str, source: str) -> None:
-    tree = tree_of(*over("map", "a", [0, 10]), *over("map", "b", [0, 10]), *over("x", "y", [0, 10]))
-    for at, source_at in product((-1, 5, 99), (-1, 5, 99)):
-        try:
-            tree.lookup(target, source, at, source_at=source_at, fixed="map")
-        except TransformLookupError as error:
-            with pytest.raises(TransformLookupError) as caught:
-                tree.lookup_many(target, source, asked([at]), source_at=source_at, fixed="map")
-            assert caught.value.index == 0
-            assert facts(caught.value) == facts(error)
-        else:
-            assert tree.lookup_many(target, source, asked([at]), source_at=source_at, fixed="map").valid.all()
-
-
-@few_and_many
-def test_at_and_source_at_may_each_be_out_of_range(asked: Asked) -> None:
-    tree = tree_of(*over("map", "a", [0, 10]), *over("map", "b", [0, 20]))
-    found = tree.lookup_many(
-        "a", "b", asked([5, 11, 5, 11]), source_at=asked([15, 15, 21, 21]), fixed="map", out_of_range="nan"
-    )
-    assert found.valid[:4].tolist() == [True, False, False, False]
-    with pytest.raises(FutureExtrapolationError) as caught:
-        tree.lookup_many("a", "b", asked([5, 5, 11]), source_at=asked([15, 21, 15]), fixed="map")
-    assert (caught.value.index, caught.value.child) == (1, "b")
 
 
 # Arguments
@@ -458,15 +340,6 @@ def test_stamps_beyond_64_bits_are_a_value_error(stamps: Any) -> None:
             tree.lookup_many("a", source, stamps)
 
 
-@pytest.mark.parametrize("question", [{"source_at": [5]}, {"source_at": 5}, {"fixed": "a"}])
-def test_source_at_without_fixed_and_fixed_without_source_at_are_type_errors(question: dict[str, Any]) -> None:
-    tree = tree_of(moving("a", "b", 5))
-    for _ in range(2):
-        with pytest.raises(TypeError, match="source_at and fixed go together"):
-            tree.lookup_many("a", "b", [5], **question)
-        assert len(tree.lookup_many("a", "b", [5])) == 1
-
-
 @pytest.mark.parametrize("stamps", [[], [5], [5] * 100])
 def test_an_unknown_out_of_range_mode_is_a_value_error(stamps: list[int]) -> None:
     with pytest.raises(ValueError, match="'drop'"):
@@ -491,29 +364,6 @@ def test_many_lookups_never_see_half_a_batch_of_another_thread() -> None:
             tree.insert_many(moving("body", side, stamp, float(stamp)) for side in ("left", "right"))
 
 
-class NumpyFreeLock:
-    """A lock that records the functions that use arrays while it is held."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self.acquisitions = 0
-        self.array_functions: list[str] = []
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-        self.acquisitions += 1
-        sys.setprofile(self._record)
-
-    def __exit__(self, *_: object) -> None:
-        sys.setprofile(None)
-        self._lock.release()
-
-    def _record(self, frame: FrameType, event: str, called: Any) -> None:
-        values = frame.f_locals.values() if event == "return" else [getattr(called, "__self__", None)]
-        if any(isinstance(value, np.ndarray) for value in values):
-            self.array_functions.append(frame.f_code.co_qualname)
-
-
 def test_a_policy_is_checked_although_no_stamp_needs_it() -> None:
     tree = tree_of(*over("map", "cart", range(0, 101, 10)))
     assert len(tree.lookup_many("map", "cart", [10, 25], tolerance=0.0)) == 2
@@ -521,49 +371,6 @@ def test_a_policy_is_checked_although_no_stamp_needs_it() -> None:
     for options in wrong:
         with pytest.raises(ValueError, match=next(iter(options))):
             tree.lookup_many("map", "cart", [10, 25], **options)
-
-
-STAMPS = np.arange(10_000) % 2_001 * 10
-LOCKED_QUESTIONS: list[Any] = [
-    pytest.param(lambda tree: tree.lookup_many("map", "cart", STAMPS), id="plain"),
-    pytest.param(lambda tree: tree.lookup_many("cart", "map", STAMPS + 50, tolerance=1.0, max_gap=1.0), id="policy"),
-    pytest.param(lambda tree: tree.lookup_many("map", "guest", STAMPS), id="reparented"),
-    pytest.param(lambda tree: tree.lookup_many("map", "guest", STAMPS, tolerance=1.0), id="reparented with a policy"),
-    pytest.param(lambda tree: tree.lookup_many("map", "cart", STAMPS - 50, out_of_range="nan"), id="nan"),
-    pytest.param(
-        lambda tree: tree.lookup_many("cart", "cart", STAMPS, source_at=STAMPS[::-1], fixed="map"), id="time travel"
-    ),
-    pytest.param(lambda tree: tree.deskew(scan(np.zeros((10_000, 3)), STAMPS), "cart", "map"), id="deskew"),
-    pytest.param(
-        lambda tree: tree.deskew(scan(np.zeros((10_000, 3)), STAMPS - 50, 0), "cart", "map", out_of_range="nan"),
-        id="deskew with nan",
-    ),
-]
-
-
-@pytest.mark.parametrize("ask", LOCKED_QUESTIONS)
-def test_no_array_is_used_while_the_tree_is_locked(ask: Callable[[TransformTree], object]) -> None:
-    tree = tree_of(*over("map", "cart", range(0, 20_001, 10)), static("cart", "lidar"))
-    tree.insert_many([*over("cart", "guest", range(0, 10_000, 10)), *over("map", "guest", range(10_000, 20_001, 10))])
-    forest: Any = forest_of(tree)
-    forest.lock = lock = NumpyFreeLock()
-    ask(tree)
-    assert lock.acquisitions
-    assert lock.array_functions == []
-
-
-def test_a_subscriber_can_look_up_the_samples_of_its_batch() -> None:
-    bus = Bus()
-    seen: list[list[float]] = []
-
-    def ask(batch: tuple[TransformStamped, ...]) -> None:
-        found = buffer.tree.lookup_many("a", "b", [sample.stamp for sample in batch])
-        seen.append(found.translations[:, 0].tolist())
-
-    with Buffer(bus) as buffer, bus.subscribe(ask):
-        bus.publish(over("a", "b", [1, 2, 3]))
-        bus.publish(over("a", "b", range(10, 100)))
-    assert seen == [[1.0, 2.0, 3.0], [float(stamp) for stamp in range(10, 100)]]
 
 
 # Clouds from a moving sensor
@@ -680,21 +487,6 @@ def test_deskewing_keeps_the_other_fields_and_does_not_modify_the_cloud() -> Non
     assert (points.tolist(), stamps.tolist()) == ([[0.0] * 3] * 2, [0, SECOND])
 
 
-def test_deskewing_follows_a_sensor_to_its_next_parent() -> None:
-    tree = tree_of(static("map", "dock", 5.0), moving("map", "lidar", 0), moving("map", "lidar", 10, 10.0), keep=None)
-    tree.insert_many([moving("dock", "lidar", 20, 20.0), moving("dock", "lidar", 30, 30.0)])
-    found = tree.deskew(scan(np.zeros((4, 3)), [0, 5, 20, 25], 30), "map", "map")
-    assert found.points.tolist() == [[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [25.0, 0.0, 0.0], [30.0, 0.0, 0.0]]
-
-
-def test_a_cloud_stamped_latest_gets_the_stamp_of_its_newest_point() -> None:
-    tree = along(straight)
-    cloud = scan(np.zeros((3, 3)), [SECOND // 4, SECOND // 2, 0])
-    found = tree.deskew(cloud, "cart", "odom")
-    assert found.stamp == SECOND // 2
-    assert found.points[:, 0].tolist() == pytest.approx([0.75, 1.0, 0.5])
-
-
 def test_a_nan_point_stays_nan_and_the_others_are_moved() -> None:
     tree = along(straight)
     nowhere = (math.nan, 0.0, 0.0)
@@ -751,18 +543,6 @@ def test_an_empty_cloud_stays_empty(at: int | Latest) -> None:
     assert found.stamp == (SECOND if at is LATEST else at)
 
 
-@pytest.mark.parametrize("count", [0, 2])
-@pytest.mark.parametrize(
-    "names", [("nobody", "cart", "odom"), ("lidar", "nobody", "odom"), ("lidar", "cart", "nobody")]
-)
-def test_each_frame_of_deskew_must_be_known(count: int, names: tuple[str, str, str]) -> None:
-    frame, target, fixed = names
-    cloud = PointCloud(frame, 0, np.zeros((count, 3)), [0] * count)  # type: ignore[arg-type]
-    with pytest.raises(UnknownFrameError) as caught:
-        along(straight).deskew(cloud, target, fixed)
-    assert caught.value.frame == "nobody"
-
-
 def test_points_without_stamps_cannot_be_deskewed() -> None:
     with pytest.raises(ValueError, match="no stamps"):
         along(straight).deskew(scan(np.zeros((2, 3)), None), "cart", "odom")
@@ -788,3 +568,92 @@ def test_the_answers_have_the_stamps_that_were_asked_and_slices_and_masks_keep_t
     travelled = tree.lookup_many("map", "base", [3, 4], source_at=np.datetime64(5, "ns"), fixed="map")
     assert travelled.stamps is not None
     assert travelled.stamps.tolist() == [3, 4]
+
+
+def turned_frame(poses: Iterable[tuple[int, Transform]], parents: Sequence[str] = ("parent",)) -> FrameHistory:
+    """A moving frame; its samples name the parents in turn."""
+    made = FrameHistory("child", parents[0], static=False, keep=None)
+    for number, (stamp, pose) in enumerate(poses):
+        made.insert(parents[number % len(parents)], stamp, (*pose.translation, *pose.rotation), "")
+    return made
+
+
+def curve(frame: FrameHistory, stamps: Sequence[int]) -> Segments:
+    return Segments(frame.samples_between(min(stamps), max(stamps)), np.array(stamps, np.int64))
+
+
+def at(frame: FrameHistory, stamps: Sequence[int]) -> list[list[float]]:
+    """The row at each stamp. Asked alone and all together, because the curve is prepared otherwise."""
+    alone = [np.array(curve(frame, [stamp]).at(slice(None))).T[0] for stamp in stamps]
+    asked = [*stamps] * (len(frame) + 1)
+    together = np.array(curve(frame, asked).at(slice(0, len(stamps)))).T
+    np.testing.assert_allclose(together, alone, rtol=0, atol=1e-13)
+    rows: list[list[float]] = together.tolist()
+    return rows
+
+
+def near(row: object, tolerance: float = 1e-12) -> object:
+    return pytest.approx(row, rel=0, abs=tolerance)
+
+
+@st.composite
+def drawn_frames(draw: st.DrawFn) -> FrameHistory:
+    """One to eight samples, packed or far apart anywhere in time, with one parent or with several."""
+    first, step = draw(st.sampled_from([(0, 1), (0, 10), (TODAY, SECOND // 10), (STAMP_MIN, 2**61), (STAMP_MAX, -3)]))
+    numbers = draw(st.lists(st.integers(0, 7), min_size=1, max_size=8, unique=True))
+    poses = draw(st.lists(transforms(10.0), min_size=1, max_size=len(numbers)))
+    parents = draw(st.sampled_from([("p",), ("p", "q"), ("p", "p", "q")]))
+    placed = ((number, poses[place * len(poses) // len(numbers)]) for place, number in enumerate(numbers))
+    return turned_frame([(first + number * step, pose) for number, pose in placed], parents)
+
+
+@given(drawn_frames(), st.data())
+def test_a_curve_equals_the_history_at_every_stamp(frame: FrameHistory, data: st.DataObject) -> None:
+    known = [frame.sample(i)[0] for i in range(frame.count)]
+    low, high = known[0], known[-1]
+    inside = st.integers(low, high) | st.sampled_from(known)
+    beside = st.sampled_from(known).map(lambda stamp: min(max(stamp + 1, low), high))
+    stamps = data.draw(st.lists(inside | beside, min_size=1, max_size=12))
+    for stamp, row in zip(stamps, at(frame, stamps), strict=True):
+        assert row == near(frame.row_at(stamp))
+
+
+@given(st.lists(transforms(), min_size=1, max_size=5))
+def test_the_row_at_the_stamp_of_a_sample_is_the_sample_bit_for_bit(poses: list[Transform]) -> None:
+    rows = at(turned_frame(enumerate(poses)), range(len(poses)))
+    assert rows == [[*pose.translation, *pose.rotation] for pose in poses]
+
+
+@given(unit_vectors(), st.floats(-3.1, 3.1) | small_angles(), st.sampled_from([1.0, -1.0]))
+def test_the_angle_of_an_interpolated_turn_is_linear_in_time_for_any_angle_and_sign(
+    axis: Vector, angle: float, sign: float
+) -> None:
+    turned = Transform.from_axis_angle(axis, angle, (8.0, 0.0, -4.0))
+    last = Transform(turned.translation, [sign * part for part in turned.rotation])
+    quarters = at(turned_frame([(0, Transform()), (4, last)]), range(4))
+    for quarter, row in enumerate(quarters):
+        expected = Transform.from_axis_angle(axis, angle * quarter / 4, (2.0 * quarter, 0.0, -1.0 * quarter))
+        assert row == near([*expected.translation, *expected.rotation], 1e-15 + 1e-9 * abs(angle))
+
+
+def test_half_a_turn_has_the_direction_of_the_sign_of_the_second_quaternion() -> None:
+    for w in (1e-17, -1e-17):
+        frame = turned_frame([(0, Transform()), (2, Transform(rotation=(0.0, 0.0, 1.0, w)))])
+        assert at(frame, [1])[0][5] == pytest.approx(math.copysign(math.sqrt(0.5), w))
+
+
+def test_parents_that_differ_in_the_last_character_are_different() -> None:
+    frame = turned_frame([(0, Transform()), (10, Transform((10.0, 0.0, 0.0)))], ["odom", "odom\0"])
+    assert at(frame, [9])[0][0] == 0.0
+
+
+@pytest.mark.skipif(tfbus.kernel != "compiled", reason="numpy's sine may differ from that of the kernel in Python")
+@pytest.mark.parametrize("count", [1, 10, 1_000])
+@pytest.mark.parametrize(("target", "source"), [("map", "cart"), ("dog", "lidar"), ("cart", "lidar"), ("map", "map")])
+def test_many_answers_have_the_bits_of_single_lookups(target: str, source: str, count: int) -> None:
+    tree = tree_of(*over("map", "cart", range(0, 1_001, 10)), static("cart", "lidar"), *over("map", "dog", [0, 500]))
+    stamps = np.arange(count)[::-1] * 499 // max(count - 1, 1)
+    found = tree.lookup_many(target, source, stamps)
+    single = [tree.lookup(target, source, stamp).transform for stamp in stamps.tolist()]
+    expected = b"".join(struct.pack("7d", *one.translation, *one.rotation) for one in single)
+    assert np.hstack((found.translations, found.rotations)).tobytes() == expected
