@@ -1,5 +1,4 @@
 import math
-import time
 from collections.abc import Awaitable, Callable, Coroutine
 from fractions import Fraction
 from functools import partial
@@ -38,14 +37,6 @@ BEYOND_STAMPS = 1e11
 """A duration in s that is longer than stamps last."""
 
 
-async def test_simulated_time_stands_still_until_it_is_advanced() -> None:
-    clock = SimulatedClock(start=7)
-    await settle()
-    assert clock.now() == 7
-    await clock.advance(2.5)
-    assert clock.now() == 7 + 2_500_000_000
-
-
 async def test_simulated_time_stays_at_the_last_stamp_and_sleeps_go_on() -> None:
     clock = SimulatedClock(start=STAMP_MAX - 1)
     slept = []
@@ -61,75 +52,12 @@ async def test_simulated_time_stays_at_the_last_stamp_and_sleeps_go_on() -> None
     TransformStamped("map", "base", clock.now(), Transform())
 
 
-async def test_a_sleeper_wakes_at_its_own_time_during_an_advance() -> None:
-    clock = SimulatedClock(start=100)
-    woken = []
-
-    async def sleep(seconds: float) -> None:
-        await clock.sleep(seconds)
-        woken.append(clock.now())
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(sleep, 1.25)
-        await clock.advance(10.0)
-    assert woken == [100 + 1_250_000_000]
-
-
 async def test_tasks_that_have_just_been_started_fall_asleep_before_time_moves() -> None:
     clock = SimulatedClock()
     async with anyio.create_task_group() as tasks:
         asked = [Asked(tasks, partial(clock.sleep_until, k * SECOND)) for k in range(1, 4)]
         await clock.advance(3.0)
         assert all(sleeper.ended for sleeper in asked)
-
-
-async def test_sleepers_started_during_an_advance_wake_during_it() -> None:
-    clock = SimulatedClock()
-    woken = []
-
-    async def nap() -> None:
-        for _ in range(10):
-            await clock.sleep(0.1)
-            woken.append(clock.now())
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(nap)
-        await clock.advance(1.0)
-    assert woken == [k * 100_000_000 for k in range(1, 11)]
-
-
-async def test_sleepers_wake_in_the_order_of_their_times_and_then_of_registration() -> None:
-    clock = SimulatedClock()
-    woken = []
-
-    async def sleep(name: int, seconds: float) -> None:
-        await clock.sleep(seconds)
-        woken.append((seconds, name))
-
-    async with anyio.create_task_group() as tasks:
-        for name in range(50):
-            tasks.start_soon(sleep, name, 1.0 + name % 2)
-            await settle()
-        await clock.advance(2.0)
-    assert woken == [(1.0, name) for name in range(0, 50, 2)] + [(2.0, name) for name in range(1, 50, 2)]
-
-
-async def test_each_timed_task_has_run_until_it_blocks_before_the_next_one_wakes() -> None:
-    clock = SimulatedClock()
-    events = []
-
-    async def work(name: str) -> None:
-        await clock.sleep(1.0)
-        for step in range(3):
-            events.append(f"{name}{step}")
-            await anyio.lowlevel.checkpoint()
-
-    async with anyio.create_task_group() as tasks:
-        for name in "ab":
-            tasks.start_soon(work, name)
-            await settle()
-        await clock.advance(1.0)
-    assert events == ["a0", "a1", "a2", "b0", "b1", "b2"]
 
 
 async def test_what_a_timed_task_sets_off_over_a_hundred_tasks_ends_before_the_next_one_wakes() -> None:
@@ -275,29 +203,11 @@ async def test_sleep_until_ends_when_a_jump_passes_its_stamp() -> None:
         await settle()
         assert on_the_stamp.ended
         assert not later.ended
-        assert len(clock._timers) == 1, "the jump has put another in its place"
+        assert repr(clock) == "<SimulatedClock at 5.000 s, 1 timer>", "the jump has put another in its place"
         await clock.advance(2.999)
         assert not later.ended
         await clock.advance(0.001)
         assert later.ended
-
-
-async def test_sleep_until_ends_at_its_stamp_on_a_clock_that_has_run_and_jumped() -> None:
-    clock = SimulatedClock(start=100 * SECOND)
-    await clock.advance(1.0)
-    async with anyio.create_task_group() as tasks:
-        before = Asked(tasks, partial(clock.sleep_until, 103 * SECOND))
-        after = Asked(tasks, partial(clock.sleep_until, 106 * SECOND))
-        await clock.advance(1.999)
-        assert not before.ended
-        await clock.advance(0.001)
-        assert before.ended
-        clock.set(104 * SECOND)
-        await clock.advance(1.999)
-        assert not after.ended
-        await clock.advance(0.001)
-        assert after.ended
-        assert clock.now() == 106 * SECOND
 
 
 async def test_listeners_get_each_new_stamp_until_they_are_closed() -> None:
@@ -324,17 +234,6 @@ async def test_sleep_until_raises_after_a_jump_back() -> None:
         error = asked.error
         assert isinstance(error, ClockResetError)
         assert (error.before, error.after) == (4 * SECOND, 1 * SECOND)
-
-
-async def test_a_jump_to_the_current_stamp_resets_no_sleeper() -> None:
-    clock = SimulatedClock(start=4)
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(clock.sleep_until, 9))
-        await settle()
-        clock.set(4)
-        await settle()
-        assert not asked.ended
-        asked.cancel()
 
 
 async def test_jump_callbacks_get_both_stamps_until_they_are_closed() -> None:
@@ -409,7 +308,7 @@ async def test_an_outer_move_on_after_that_expires_first_cancels_only_its_own_sc
         asked = Asked(tasks, wait)
         await clock.advance(1.0)
         assert asked.answer == (True, False)
-        assert clock._timers == []
+        assert repr(clock) == "<SimulatedClock at 1.000 s, 0 timers>"
 
 
 @pytest.mark.parametrize("make", CLOCKS)
@@ -494,20 +393,6 @@ async def test_only_one_task_may_advance_a_clock_at_a_time() -> None:
     assert clock.now() == 5 * SECOND
 
 
-async def test_advancing_in_a_task_that_the_advance_woke_is_an_error() -> None:
-    clock = SimulatedClock()
-
-    async def meddle() -> None:
-        await clock.sleep(1.0)
-        await clock.advance(1.0)
-
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, meddle)
-        await clock.advance(3.0)
-        assert isinstance(asked.error, RuntimeError)
-    assert clock.now() == 3 * SECOND
-
-
 async def test_a_cancelled_advance_stops_at_its_current_time_and_can_be_resumed() -> None:
     clock = SimulatedClock()
 
@@ -533,7 +418,7 @@ async def test_a_cancelled_sleeper_leaves_no_timer() -> None:
         for asked in cancelled:
             asked.cancel()
         await settle()
-        assert len(clock._timers) == 1, "that of the one who stays"
+        assert ", 1 timer>" in repr(clock), "that of the one who stays"
         clock.set(10 * SECOND)
         await clock.advance(1.0)
         assert all(asked.cancelled for asked in cancelled)
@@ -549,12 +434,6 @@ def test_a_clock_can_be_made_and_set_without_an_event_loop() -> None:
     with pytest.raises(TypeError, match="from_seconds"):
         SimulatedClock(start=0.5)  # type: ignore[arg-type]
     assert clock.now() == 2**63 - 1
-
-
-def test_the_system_clock_gives_nanoseconds_since_1970() -> None:
-    before = time.time_ns()
-    now = SystemClock().now()
-    assert before <= now <= time.time_ns()
 
 
 async def test_the_system_clock_sleeps_until_a_stamp_that_is_still_to_come() -> None:
@@ -575,13 +454,6 @@ async def test_the_system_clock_ticks_in_real_time() -> None:
     assert seen[0] == 0
     assert seen == sorted(set(seen))
     assert seen[-1] == 2 + ticks.skipped
-
-
-async def test_the_system_clock_never_announces_a_jump() -> None:
-    jumps = []
-    with SystemClock().on_jump(lambda before, after: jumps.append((before, after))):
-        await settle()
-    assert not jumps
 
 
 async def test_of_two_jumps_in_one_turn_the_first_decides_for_a_sleeper() -> None:

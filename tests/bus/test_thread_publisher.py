@@ -93,14 +93,6 @@ async def test_the_samples_of_each_thread_arrive_in_order_and_without_loss() -> 
     assert bus.statistics().samples == 8_000
 
 
-async def test_a_batch_from_a_thread_arrives_whole() -> None:
-    bus = Bus()
-    got: list[tuple[TransformStamped, ...]] = []
-    with bus.subscribe(got.append), bus.threadsafe() as publish:
-        assert in_thread(lambda: publish(moving("map", name, 1) for name in "abc")) == []
-    assert got == [tuple(moving("map", name, 1) for name in "abc")]
-
-
 async def test_samples_beyond_the_capacity_while_the_loop_is_blocked_are_dropped_and_counted() -> None:
     bus = Bus()
     got: list[int] = []
@@ -133,25 +125,6 @@ async def test_publishing_after_the_end_of_the_with_raises_in_the_thread() -> No
         pass
     (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
     assert isinstance(error, BusClosedError)
-    assert bus.statistics().samples == 0
-
-
-async def test_publishing_to_a_closed_bus_raises_in_the_thread() -> None:
-    bus = Bus()
-    with bus.threadsafe() as publish:
-        bus.close()
-        (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
-        assert isinstance(error, BusClosedError)
-    with pytest.raises(BusClosedError):
-        bus.threadsafe()
-
-
-async def test_queued_samples_are_not_published_after_the_bus_was_closed() -> None:
-    bus = Bus()
-    with bus.threadsafe() as publish:
-        in_thread(lambda: publish(moving("map", "a", 1)))
-        bus.close()
-        await settle()
     assert bus.statistics().samples == 0
 
 
@@ -228,15 +201,6 @@ async def test_samples_queued_before_a_jump_back_are_discarded_and_statics_stay(
         assert [queue.dropped for queue in bus.statistics().queues] == [1]
 
 
-async def test_a_jump_forward_discards_nothing() -> None:
-    clock = SimulatedClock(start=100)
-    bus = Bus(clock)
-    with bus.threadsafe() as publish:
-        in_thread(lambda: publish(moving("map", "a", 100)))
-        clock.set(200)
-    assert bus.statistics().samples == 1
-
-
 async def test_queued_samples_of_a_removed_frame_are_discarded() -> None:
     bus = Bus()
     buffer = Buffer(bus)
@@ -310,20 +274,6 @@ def test_threads_can_publish_to_a_bus_made_outside_the_thread_of_its_loop(run: R
         publishers[0](moving("map", "a", 7, 7.0))
         assert done.wait(PATIENCE)
     assert found[0].transform.translation == (7.0, 0.0, 0.0)
-
-
-async def test_awaited_lookups_in_another_thread_are_an_error() -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
-    bus.publish(moving("map", "a", 1))
-
-    async def ask() -> None:
-        assert (await buffer.lookup("map", "a", 1)).stamp == 1
-        await buffer.lookup("map", "a", 2)
-
-    (error,) = in_thread(lambda: anyio.run(ask))
-    assert isinstance(error, RuntimeError)
-    assert buffer.pending() == ()
 
 
 async def test_worker_threads_may_read_while_the_loop_publishes() -> None:
@@ -404,3 +354,33 @@ async def test_a_thread_hears_of_a_translation_that_is_too_long_and_a_stamp_ahea
 
         await anyio.to_thread.run_sync(drive)
     assert (bus.statistics().samples, bus.statistics().rejected) == (1, {"ahead": 1})
+
+
+def test_a_loop_in_the_thread_that_made_the_bus_leaves_it_to_no_other_loop(run: Run) -> None:
+    bus = Bus()
+
+    async def use() -> None:
+        bus.events().close()
+
+    run(use)
+    assert [type(error) for error in in_thread(lambda: run(use))] == [RuntimeError]
+    bus.events().close()
+
+
+async def test_publishing_to_a_closed_bus_raises_in_the_thread() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        bus.close()
+        (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
+        assert isinstance(error, BusClosedError)
+    with pytest.raises(BusClosedError):
+        bus.threadsafe()
+
+
+async def test_queued_samples_are_not_published_after_the_bus_was_closed() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        in_thread(lambda: publish(moving("map", "a", 1)))
+        bus.close()
+        await settle()
+    assert bus.statistics().samples == 0

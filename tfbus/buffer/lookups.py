@@ -252,7 +252,7 @@ class LoopAlarms:
     """Alarms by the time of the event loop that runs, which may be another one later."""
 
     def __init__(self) -> None:
-        self._heap: _AlarmHeap | None = None
+        self._heap: AlarmHeap | None = None
 
     def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
         """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
@@ -260,11 +260,11 @@ class LoopAlarms:
         heap = self._heap
         if heap is None or heap.timer.loop is not loop:
             # The heap of another loop still wakes the lookups that wait there.
-            heap = self._heap = _AlarmHeap(loop)
+            heap = self._heap = AlarmHeap(loop)
         return heap.add(seconds, callback)
 
 
-class _AlarmHeap:
+class AlarmHeap:
     """The alarms on one event loop by their times, with one timer for the first."""
 
     def __init__(self, loop: Any) -> None:
@@ -273,6 +273,9 @@ class _AlarmHeap:
         # The callbacks that are neither made nor cancelled, by number.
         self._callbacks: dict[int, Callable[[], object]] = {}
         self._numbers = count()
+
+    def __len__(self) -> int:
+        return len(self._alarms)
 
     def add(self, seconds: float, callback: Callable[[], object]) -> Cancel:
         due = self.timer.now() + seconds
