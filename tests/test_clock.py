@@ -32,7 +32,6 @@ pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
 Run = Callable[[Callable[[], Awaitable[list[str]]]], list[str]]
 
 CLOCKS = [pytest.param(SystemClock, id="system"), pytest.param(SimulatedClock, id="simulated")]
-NEVER = 1e6
 BEYOND_STAMPS = 1e11
 """A duration in s that is longer than stamps last."""
 
@@ -248,21 +247,6 @@ async def test_jump_callbacks_get_both_stamps_until_they_are_closed() -> None:
     assert jumps == [(5, 9), (9, 2)]
 
 
-def test_a_jump_callback_may_close_itself() -> None:
-    clock = SimulatedClock()
-    jumps = []
-
-    def once(_before: int, after: int) -> None:
-        jumps.append(after)
-        registration.close()
-
-    registration = clock.on_jump(once)
-    clock.on_jump(lambda _before, after: jumps.append(-after))
-    clock.set(1)
-    clock.set(2)
-    assert jumps == [1, -1, -2]
-
-
 async def test_move_on_after_counts_simulated_time_across_jumps() -> None:
     clock = SimulatedClock()
 
@@ -296,43 +280,11 @@ async def test_call_after_calls_once_after_a_simulated_duration_across_jumps_unl
         clock.call_after(-1.0, list)
 
 
-async def test_an_outer_move_on_after_that_expires_first_cancels_only_its_own_scope() -> None:
-    clock = SimulatedClock()
-
-    async def wait() -> tuple[bool, bool]:
-        with clock.move_on_after(1.0) as outer, clock.move_on_after(2.0) as inner:
-            await anyio.sleep_forever()
-        return outer.cancelled_caught, inner.cancelled_caught
-
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, wait)
-        await clock.advance(1.0)
-        assert asked.answer == (True, False)
-        assert repr(clock) == "<SimulatedClock at 1.000 s, 0 timers>"
-
-
 @pytest.mark.parametrize("make", CLOCKS)
 async def test_move_on_after_zero_ends_at_the_first_checkpoint(make: Callable[[], Clock]) -> None:
     with make().move_on_after(0) as scope:
         await anyio.lowlevel.checkpoint()
     assert scope.cancelled_caught
-
-
-@pytest.mark.parametrize("seconds", [math.inf, BEYOND_STAMPS])
-async def test_move_on_after_may_be_infinite(seconds: float) -> None:
-    clock = SimulatedClock()
-
-    async def wait() -> None:
-        with clock.move_on_after(seconds):
-            await clock.sleep(NEVER)
-
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, wait)
-        await clock.advance(NEVER - 1.0)
-        assert not asked.ended
-        await clock.advance(1.0)
-        assert asked.ended
-        assert not asked.cancelled
 
 
 @pytest.mark.parametrize("seconds", [math.inf, BEYOND_STAMPS])
@@ -588,17 +540,6 @@ async def test_jumps_do_not_change_the_times_of_ticks() -> None:
         (3, SECOND // 4),
         (4, 100 * SECOND + SECOND // 4),
     ]
-
-
-async def test_every_tick_passes_a_checkpoint_even_a_late_one() -> None:
-    clock = SimulatedClock()
-    ticks = clock.ticks(10)
-    await anext(ticks)
-    await clock.advance(1.0)
-    with anyio.CancelScope() as scope:
-        scope.cancel()
-        await anext(ticks)
-    assert scope.cancelled_caught
 
 
 @pytest.mark.parametrize("make", [SystemClock, SimulatedClock])

@@ -148,43 +148,8 @@ async def checkpoints(hops: int, log: Log) -> None:
     log.end()
 
 
-async def streams(hops: int, log: Log) -> None:
-    """Each of many tasks sends on what it has received."""
-    async with anyio.create_task_group() as tasks:
-        ends = [anyio.create_memory_object_stream[int](0) for _ in range(hops + 1)]
-
-        async def send_on(hop: int) -> None:
-            await ends[hop + 1][0].send(await ends[hop][1].receive())
-
-        for hop in range(hops):
-            tasks.start_soon(send_on, hop)
-        await ends[0][0].send(1)
-        await ends[-1][1].receive()
-        for end in ends:
-            end[0].close()
-            end[1].close()
-    log.end()
-
-
-async def cancellations(hops: int, log: Log) -> None:
-    """Each of many tasks cancels the next one when it is cancelled itself."""
-    async with anyio.create_task_group() as tasks:
-        scopes = [anyio.CancelScope() for _ in range(hops)]
-
-        async def wait(hop: int) -> None:
-            with scopes[hop]:
-                await anyio.sleep_forever()
-            if hop + 1 < hops:
-                scopes[hop + 1].cancel()
-
-        for hop in range(hops):
-            tasks.start_soon(wait, hop)
-        scopes[0].cancel()
-    log.end()
-
-
 @pytest.mark.parametrize("hops", [1, 2, 100])
-@pytest.mark.parametrize("chain", [events, nested_task_groups, checkpoints, streams, cancellations])
+@pytest.mark.parametrize("chain", [events, nested_task_groups, checkpoints])
 async def test_a_chain_has_ended_before_settling_ends(
     chain: Callable[[int, Log], Coroutine[Any, Any, None]], hops: int
 ) -> None:
@@ -220,19 +185,6 @@ async def test_tasks_that_wait_for_threads_or_real_time_count_as_blocked() -> No
             await settle()
         assert not release.is_set()
         release.set()
-        tasks.cancel_scope.cancel()
-
-
-async def test_settling_may_be_cancelled() -> None:
-    async def spin() -> None:
-        while True:
-            await anyio.lowlevel.checkpoint()
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(spin)
-        with settling() as settle, anyio.move_on_after(0.01) as scope:
-            await settle()
-        assert scope.cancelled_caught
         tasks.cancel_scope.cancel()
 
 

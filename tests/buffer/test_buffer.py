@@ -1,6 +1,6 @@
 import logging
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -345,38 +345,6 @@ def waiting(bus: Bus) -> int:
     return bus.statistics().buffers[0].waiting
 
 
-@pytest.mark.thorough
-async def test_samples_of_other_edges_wake_none_of_ten_thousand_waiters() -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "quiet", 0), driving("map", "busy", 0), driving("map", "x", 0), static("map", "s")])
-    async with anyio.create_task_group() as tasks:
-        for k in range(10_000):
-            tasks.start_soon(buffer.lookup, "map", "quiet", (1 + k) * SECOND)
-        await settle()
-        for second in range(1, 50):
-            bus.publish([driving("map", "busy", second), static("map", "s"), driving("map", "x", second / 2)])
-            bus.publish([driving("map", f"new_{second}", second), driving("map", "quiet", 0.5)])
-            assert waiting(bus) == 10_000
-        bus.publish(driving("map", "quiet", 3))
-        assert waiting(bus) == 9_997
-        tasks.cancel_scope.cancel()
-    assert waiting(bus) == 0
-    assert buffer.pending() == ()
-
-
-@pytest.mark.parametrize("more", range(3))
-async def test_a_description_has_ten_waiting_lookups_and_the_number_of_all_others(more: int) -> None:
-    _, _, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        for number in range(10 + more):
-            tasks.start_soon(buffer.lookup, "map", f"frame{number}")
-        await settle()
-        waiting = [line for line in buffer.describe().splitlines() if line.startswith("waiting: ")]
-        tasks.cancel_scope.cancel()
-    assert ["see pending()" in line for line in waiting] == [False] * 10 + [True] * (more > 0)
-    assert not more or waiting[-1] == f"waiting: {more} more lookups, see pending()"
-
-
 @pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])
 async def test_cancelled_lookups_leave_no_waiters_for_any_error(source: str) -> None:
     _, bus, buffer = make()
@@ -599,24 +567,6 @@ async def test_transform_moves_data_to_another_stamp_through_a_fixed_frame() -> 
     assert buffer.transform_nowait(back, "laser", at=2 * SECOND, fixed="map").point == (1.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize(("stamp", "at"), [(2, 5), (5, 2)], ids=["to the future", "to the past"])
-async def test_transform_to_another_stamp_waits_for_both_stamps(stamp: int, at: int) -> None:
-    _, bus, buffer = make()
-    bus.publish(driving("map", "base", 1))
-    point = PointStamped("base", stamp * SECOND, (1.0, 0.0, 0.0))
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.transform, point, "base", at=at * SECOND, fixed="map"))
-        await settle()
-        bus.publish(driving("map", "base", 3))
-        await settle()
-        assert not asked.ended
-        with pytest.raises(FutureExtrapolationError):
-            buffer.transform_nowait(point, "base", at=at * SECOND, fixed="map")
-        bus.publish(driving("map", "base", 5))
-        await settle()
-    assert asked.answer == PointStamped("base", at * SECOND, (1.0 + stamp - at, 0.0, 0.0))
-
-
 async def test_transform_to_another_stamp_passes_timeout_and_max_age_on() -> None:
     clock, bus, buffer = make()
     bus.publish([driving("map", "base", 0), driving("map", "base", 2)])
@@ -669,22 +619,6 @@ async def test_registered_data_without_frame_and_stamp_are_transformed_by_an_ans
     with pytest.raises(TypeError, match="look the transform up and call do_transform"):
         await buffer.transform(message, "map")  # type: ignore[type-var]
     assert do_transform(message, await buffer.lookup("map", "base")) is message
-
-
-def test_a_buffer_may_be_made_before_a_loop_and_used_on_several_loops(
-    run: Callable[[Callable[[], Awaitable[None]]], None],
-) -> None:
-    _, bus, buffer = make()
-
-    async def wait(stamp: int) -> None:
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, partial(buffer.lookup, "map", "a", stamp))
-            await settle()
-            bus.publish(moving("map", "a", stamp))
-        assert asked.answer.stamp == stamp
-
-    for stamp in (1, 2, 3):
-        run(partial(wait, stamp))
 
 
 # Lookups that have become hopeless

@@ -20,7 +20,6 @@ from tfbus import (
     Bus,
     DisconnectedError,
     InvalidTransformError,
-    PastExtrapolationError,
     SimulatedClock,
     TransformLookupError,
     TransformStamped,
@@ -118,31 +117,6 @@ def test_a_late_buffer_with_prefill_answers_as_an_early_one(
 
 
 # What is taken over
-
-
-def test_a_prefilled_buffer_has_history_static_samples_and_old_parents() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus)
-    bus.publish(
-        [*over("map", "a", (10, 20)), moving("odom", "a", 30, 7.0), static("a", "laser", 0.5), moving("m", "b", 5)]
-    )
-    bus.publish(static("map", "odom", 100.0))
-    late = Buffer(bus, prefill=first)
-    assert x_of(late.tree, "map", "laser", 15) == 15.5
-    assert x_of(late.tree, "map", "laser", 25) == 20.5
-    assert x_of(late.tree, "map", "laser", 30) == 107.5
-    assert late.tree.edges() == first.tree.edges()
-
-
-def test_a_prefilled_buffer_has_only_the_samples_inside_its_own_window() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus, 100 * NANO)
-    bus.publish([*over("map", "a", range(0, 101, 10)), *over("old", "b", (0, 10)), *over("map", "b", (90, 100))])
-    late = Buffer(bus, 20 * NANO, prefill=first)
-    assert [(edge.child, edge.oldest, edge.samples) for edge in late.tree.edges()] == [("a", 80, 3), ("b", 90, 2)]
-    assert late.tree.frames() == ["a", "b", "map"]
-    with pytest.raises(PastExtrapolationError):
-        late.lookup_nowait("map", "a", 79)
 
 
 def test_a_prefilled_buffer_with_a_longer_window_keeps_more_from_then_on() -> None:

@@ -149,16 +149,6 @@ def test_a_buffer_with_a_prefix_cannot_name_frames_of_another_robot() -> None:
             robot.lookup_nowait("map", name)
 
 
-def test_errors_have_bus_names() -> None:
-    _, _, _, (robot, _) = two_robots()
-    with pytest.raises(UnknownFrameError) as unknown:
-        robot.lookup_nowait("map", "aarm")
-    assert (unknown.value.frame, unknown.value.close_matches[0]) == ("robot1/aarm", "robot1/arm")
-    with pytest.raises(FutureExtrapolationError) as future:
-        robot.lookup_nowait("map", "arm", 2 * SECOND)
-    assert future.value.child == "robot1/base"
-
-
 async def test_a_waiting_lookup_is_listed_with_local_names_and_blocked_by_bus_names() -> None:
     clock, _, (first, second), (robot, _) = two_robots()
     async with anyio.create_task_group() as tasks:

@@ -1,9 +1,7 @@
 """Alarms on a loop whose time stands still until the test moves it, and on the loops that there are."""
 
 import gc
-import math
 import random
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -29,7 +27,7 @@ from tfbus import (
     from_seconds,
     to_seconds,
 )
-from tfbus.buffer.lookups import AlarmHeap, LoopAlarms, LoopTimer, running_loop
+from tfbus.buffer.lookups import AlarmHeap, LoopAlarms
 
 
 class HandLoop:
@@ -386,51 +384,20 @@ async def test_a_lookup_that_has_waited_leaves_no_reference_cycles(source: str) 
         assert left == []
 
 
-PATIENCE = 30.0
-"""Real seconds after which a test that hangs is given up."""
+async def test_timeouts_by_the_clock_of_the_machine_end_in_their_order() -> None:
+    ended: list[float] = []
+    with Bus() as bus, Buffer(bus) as buffer, anyio.fail_after(30.0):
 
+        async def ask(timeout: float) -> None:
+            with pytest.raises(LookupTimeoutError):
+                await buffer.lookup("map", "base", timeout=timeout)
+            ended.append(timeout)
+            if len(ended) == 2:
+                tasks.cancel_scope.cancel()
 
-class Rung:
-    """A timer of the running loop, with the times at which it rang."""
-
-    def __init__(self, then: Callable[[], object] = lambda: None) -> None:
-        self.times: list[float] = []
-        self._then = then
-        self.event = anyio.Event()
-        self.timer = LoopTimer(running_loop(), self._ring)
-
-    def _ring(self) -> None:
-        self.times.append(self.timer.now())
-        self.event.set()
-        self._then()
-
-    async def wait(self) -> None:
-        with anyio.fail_after(PATIENCE):
-            await self.event.wait()
-        self.event = anyio.Event()
-
-
-async def test_a_timer_rings_once_at_each_time_that_is_set() -> None:
-    rung = Rung()
-    assert rung.timer.due == math.inf
-    for count in (1, 2):
-        due = rung.timer.now() + 0.002
-        rung.timer.set(due)
-        assert rung.timer.due == due
-        await rung.wait()
-        assert rung.timer.due == math.inf
-        assert len(rung.times) == count
-        # uvloop rounds to milliseconds.
-        assert rung.times[-1] >= due - 0.001
-
-
-@pytest.mark.parametrize(("first", "second"), [(60.0, 0.002), (0.001, 0.004)])
-async def test_another_time_takes_the_place_of_the_one_before(first: float, second: float) -> None:
-    rung = Rung()
-    now = rung.timer.now()
-    rung.timer.set(now + first)
-    rung.timer.set(now + second)
-    await rung.wait()
-    assert rung.times[0] >= now + second - 0.001
-    await anyio.sleep(0.006)
-    assert len(rung.times) == 1
+        for _ in range(2):
+            async with anyio.create_task_group() as tasks:
+                for timeout in (60.0, 0.03, 0.002):
+                    tasks.start_soon(ask, timeout)
+            assert ended == [0.002, 0.03]
+            ended.clear()

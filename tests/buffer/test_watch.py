@@ -2,7 +2,6 @@ import asyncio
 import gc
 import logging
 import math
-import threading
 import weakref
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -190,23 +189,6 @@ async def test_several_edges_are_watched_at_their_newest_common_stamp() -> None:
     assert reader.xs == [2.0, 4.0, 6.0]
 
 
-async def test_a_static_sample_changes_the_answers_behind_it() -> None:
-    _, bus, buffer = make()
-    bus.publish([static("base", "laser", 1.0), moving("map", "base", 5, 10.0)])
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "laser") as changes, buffer.watch("base", "laser") as mounted:
-            reader, fixed = Reader(tasks, changes), Reader(tasks, mounted)
-            await settle()
-            bus.publish(static("base", "laser", 2.0))
-            await settle()
-            bus.publish(static("base", "laser", 2.0))
-            await settle()
-            bus.publish(moving("map", "base", 6, 20.0))
-            await settle()
-    assert [(answer.stamp, x_of(answer)) for answer in reader.answers] == [(5, 11.0), (5, 12.0), (6, 22.0)]
-    assert (fixed.xs, [answer.static for answer in fixed.answers]) == ([1.0, 2.0], [True, True])
-
-
 async def test_a_watch_follows_a_frame_to_another_parent() -> None:
     _, bus, buffer = make()
     bus.publish([static("map", "left", 100.0), static("map", "right", 200.0)])
@@ -248,19 +230,6 @@ async def test_max_rate_gives_the_newest_answer_once_a_period(hz: float) -> None
         assert time - 0.01 - 1e-9 <= x <= time + 1e-9
     # All updates in between are counted as skipped.
     assert skipped == sum(round(after * 100) - round(before * 100) - 1 for before, after in pairwise(xs))
-
-
-async def test_after_more_than_a_period_without_answers_the_next_one_comes_at_once() -> None:
-    clock, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a", max_rate=1.0) as changes:
-            reader = Reader(tasks, changes, clock)
-            for at, stamp in ((0.0, 1), (5.0, 2), (5.25, 3), (5.5, 4), (9.0, 5)):
-                await clock.advance(at - clock.now() / SECOND)
-                bus.publish(moving("map", "a", stamp))
-            await clock.advance(10.0)
-    assert list(zip(reader.times, reader.stamps, strict=True)) == [(0.0, 1), (5.0, 2), (6.0, 4), (9.0, 5)]
-    assert changes.skipped == 1
 
 
 async def test_a_reader_slower_than_the_period_gets_the_next_answer_at_once() -> None:
@@ -595,22 +564,6 @@ async def test_a_jump_back_gives_a_static_answer_again_and_a_jump_forward_does_n
             await anext(changes)
 
 
-async def test_updates_dropped_by_a_jump_back_count_as_skipped() -> None:
-    clock, bus, buffer = make(start=10)
-    bus.publish(moving("map", "a", 1))
-    with buffer.watch("map", "a") as changes:
-        await anext(changes)
-        for stamp in (2, 3):
-            bus.publish(moving("map", "a", stamp))
-        clock.set(0)
-        with pytest.raises(ClockResetError):
-            await anext(changes)
-        assert changes.skipped == 2
-        for stamp in (0, 1):
-            bus.publish(moving("map", "a", stamp))
-        assert (await anext(changes)).stamp == 1
-
-
 # Cancellation, readers and threads
 
 
@@ -687,38 +640,6 @@ async def test_an_available_answer_passes_a_checkpoint() -> None:
         assert (await anext(changes)).stamp == 1
 
 
-async def test_another_thread_may_not_open_read_or_close_a_watch_while_a_reader_waits() -> None:
-    _, bus, buffer = make()
-    bus.publish(moving("map", "a", 1))
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a") as changes:
-            await anext(changes)
-            asked = Asked(tasks, changes.__anext__)
-            await settle()
-            refused: list[str] = []
-
-            def elsewhere() -> None:
-                for use in (
-                    partial(buffer.watch, "map", "a"),
-                    lambda: asyncio.run(partial(anext, changes)()),
-                    changes.close,
-                    buffer.close,
-                    bus.close,
-                ):
-                    try:
-                        use()
-                    except RuntimeError as error:
-                        refused.append(str(error))
-
-            thread = threading.Thread(target=elsewhere)
-            thread.start()
-            thread.join()
-            assert ["another thread" in message for message in refused] == [True] * 5
-            bus.publish(moving("map", "a", 2))
-            await settle()
-            assert asked.answer.stamp == 2
-
-
 def test_a_watch_may_be_made_before_a_loop_and_read_on_several_loops(run: Run) -> None:
     _, bus, buffer = make()
     watch = buffer.watch("map", "a")
@@ -790,22 +711,6 @@ def test_a_wrong_argument_raises_when_the_watch_is_made(
     with pytest.raises(error, match=message):
         buffer.watch(**{"target": "map", "source": "a", **arguments})
     assert buffer.pending() == ()
-
-
-@pytest.mark.parametrize("max_rate", [5e-324, 1e300, 1])
-async def test_extreme_rates_and_thresholds_work(max_rate: float) -> None:
-    _, bus, buffer = make()
-    bus.publish(moving("map", "a", 1))
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a", max_rate=max_rate, min_translation=math.inf, min_rotation=math.pi) as changes:
-            reader = Reader(tasks, changes)
-            await settle()
-            bus.publish(moving("map", "a", 2, 1e9))
-            await settle()
-            bus.publish(turned(math.pi, 3))
-            changes.close()
-            await settle()
-    assert reader.stamps == [1, 3]
 
 
 async def test_of_two_thresholds_one_is_enough_and_zero_means_no_threshold() -> None:

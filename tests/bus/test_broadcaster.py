@@ -1,9 +1,7 @@
 import math
 from collections.abc import Callable
 
-import anyio
 import pytest
-from support.asking import settle
 from support.samples import moving
 
 from tfbus import (
@@ -118,37 +116,6 @@ def test_bad_input_raises_stores_nothing_and_leaves_the_bus_usable(
         broadcaster.send("map", "a", HERE)
         assert buffer.can_transform("a", "base")
         assert len(got) == 1
-
-
-async def test_bad_samples_of_another_sender_do_not_disturb_a_broadcaster() -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    buffer = Buffer(bus)
-    good, bad = TransformBroadcaster(bus, "good"), TransformBroadcaster(bus, "bad")
-    refused = 0
-
-    async def broadcast() -> None:
-        async for _ in clock.ticks(100):
-            good.send("map", "base", HERE)
-
-    async def disturb() -> None:
-        nonlocal refused
-        async for tick in clock.ticks(100):
-            with pytest.raises((InvalidTransformError, TypeError)):
-                (*BAD_CALLS.values(), *MISTAKES.values())[tick % (len(BAD_CALLS) + len(MISTAKES))](bad)
-            bus.publish([moving("base", "map", clock.now()), "noise"], invalid="drop")  # type: ignore[list-item]
-            refused += 1
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(broadcast)
-        await settle()
-        tasks.start_soon(disturb)
-        await clock.advance(1.0)
-        tasks.cancel_scope.cancel()
-    assert refused == 101
-    (edge,) = buffer.tree.edges()
-    assert (edge.child, edge.samples, edge.newest, edge.authority) == ("base", 101, 1_000_000_000, "good")
-    assert bus.statistics().rejected["not a sample"] == 101
 
 
 # Owning

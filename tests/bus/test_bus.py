@@ -42,14 +42,6 @@ Batch = tuple[TransformStamped, ...]
 # Publishing
 
 
-def test_a_published_sample_is_buffered_at_once_without_an_event_loop() -> None:
-    bus = Bus()
-    buffers = [Buffer(bus), Buffer(bus, keep=None)]
-    bus.publish(moving("map", "a", 1, 3.0))
-    for buffer in buffers:
-        assert buffer.lookup_nowait("map", "a", 1).transform.translation == (3.0, 0.0, 0.0)
-
-
 def test_frames_turned_round_at_the_last_stamp_leave_the_bus_as_it_was() -> None:
     bus = Bus(max_ahead=None)
     buffer = Buffer(bus, keep=None)
@@ -553,37 +545,6 @@ def test_statistics_count_everything_on_the_bus() -> None:
         }
     buffer.close()
     assert bus.statistics().buffers == ()
-
-
-@pytest.mark.thorough
-def test_a_long_run_keeps_memory_flat() -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    buffer = Buffer(bus, keep=0.5)
-    bus.subscribe(lambda _: None)
-
-    def run_for(seconds: int) -> None:
-        for _ in range(1_000 * seconds):
-            clock.set(clock.now() + 1_000_000)
-            now = clock.now()
-            bus.publish([moving("map", "odom", now), moving("odom", "base", now), static("base", "laser", stamp=now)])
-            bus.publish(moving("odom", "base", now - 100_000))
-            bus.publish(moving("laser", "odom", now), invalid="drop")
-
-    with bus.stream(capacity=10, overflow="drop_oldest"), bus.stream():
-        tracemalloc.start()
-        try:
-            run_for(1)
-            before, _ = tracemalloc.get_traced_memory()
-            run_for(2)
-            after, _ = tracemalloc.get_traced_memory()
-        finally:
-            tracemalloc.stop()
-    assert after - before < 10_000
-    assert [edge.samples for edge in buffer.tree.edges()] == [1001, 1, 501]
-    statistics = bus.statistics()
-    assert statistics.samples == 12_000
-    assert sum(asdict(statistics.buffers[0])[outcome] for outcome in ("inserted", "replaced")) == 12_000
 
 
 @pytest.mark.thorough

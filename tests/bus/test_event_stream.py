@@ -139,19 +139,6 @@ async def test_a_waiting_reader_gets_a_stale_frame_at_the_very_time_of_the_limit
             assert got[3:] == [FrameStale(13 * SECOND + 1, "base", 23 * SECOND // 2, "odometry")]
 
 
-async def test_samples_in_time_do_not_wake_the_reader() -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    got: Events = []
-    async with anyio.create_task_group() as tasks:
-        with bus.events() as events:
-            tasks.start_soon(read, events, got)
-            for tenth in range(100):
-                bus.publish(driving("map", "base", tenth / 10))
-                await clock.advance(0.1)
-            assert [type(event) for event in got] == [FrameAdded]
-
-
 async def test_staleness_is_not_computed_while_no_task_reads() -> None:
     clock = SimulatedClock()
     bus = Bus(clock)
@@ -543,18 +530,6 @@ class World:
         self.staleness.forget(frame)
 
 
-def test_clear_forgets_every_frame() -> None:
-    world = World()
-    world.send("a", 100)
-    world.send("b", 100)
-    world.send("c", 150)
-    world.staleness.changes(111)
-    world.send("a", 111)
-    world.edges.clear()
-    world.staleness.clear()
-    assert (size_of(world.staleness), world.staleness.due(), world.staleness.changes(500)) == (0, None, [])
-
-
 def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
     world = World()
     world.send("base", 100)
@@ -577,16 +552,6 @@ def test_frames_turn_stale_in_order_when_most_others_were_removed() -> None:
         world.remove(f"frame {stamp}")
     stale = [event.frame for now in range(0, 1_100, 100) for event in world.staleness.changes(now + LIMIT)]
     assert stale == [f"frame {stamp}" for stamp in sorted(kept)]
-
-
-def test_a_sample_of_a_live_frame_adds_no_entry() -> None:
-    world = World()
-    world.send("a", 0)
-    world.staleness.changes(0)
-    before = size_of(world.staleness)
-    for stamp in range(1, 1_000):
-        assert not world.send("a", stamp)
-    assert size_of(world.staleness) == before
 
 
 STEPS = st.one_of(

@@ -176,15 +176,6 @@ def test_conflate_drops_the_moving_children_that_have_waited_longest() -> None:
     assert queue.dropped == 1
 
 
-def test_an_emptied_queue_has_its_full_capacity_again() -> None:
-    for overflow in ("conflate", "drop_oldest"):
-        queue = SampleQueue(2, overflow)
-        for _ in range(3):
-            queue.put((moving("map", "a", 1), moving("map", "b", 1)))
-            assert [set(batch) for batch in emptied(queue)] == [{moving("map", "a", 1), moving("map", "b", 1)}]
-        assert queue.dropped == 0
-
-
 @pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])
 def test_moving_samples_of_a_forgotten_child_count_as_dropped(overflow: Overflow) -> None:
     queue = SampleQueue(2, overflow)

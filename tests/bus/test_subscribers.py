@@ -165,24 +165,6 @@ def test_endless_publishing_in_a_callback_is_stopped_by_an_error_that_names_it(
     assert len(errors) == 2
 
 
-def test_a_callback_may_publish_a_thousand_batches() -> None:
-    bus = Bus(SimulatedClock())
-    got: list[Batch] = []
-
-    def burst(batch: Batch) -> None:
-        if batch[0].child == "a":
-            for stamp in range(1_000):
-                bus.publish(moving("map", "b", stamp))
-
-    bus.subscribe(burst)
-    bus.subscribe(got.append)
-    for _ in range(2):
-        got.clear()
-        bus.publish(moving("map", "a", 0))
-        assert [batch[0].stamp for batch in got[1:]] == list(range(1_000))
-    assert bus.statistics().callbacks_failed == 0
-
-
 def test_a_subscriber_that_closes_the_bus_does_not_stop_the_delivery_of_the_batch() -> None:
     bus = Bus(SimulatedClock())
     got: list[Batch] = []
@@ -334,24 +316,6 @@ def test_an_exception_of_a_removal_callback_is_isolated_and_announced(caplog: py
     assert all("clumsy" in event.subscriber for event in pending)
     (record,) = caplog.records
     assert "clumsy" in record.getMessage()
-
-
-def test_a_base_exception_of_a_removal_callback_is_raised() -> None:
-    bus = Bus(SimulatedClock())
-    log: list[object] = []
-
-    def interrupted(frame: str) -> None:
-        bus.publish(moving("map", "b", 1))
-        raise KeyboardInterrupt(frame)
-
-    noting(bus, log)
-    registration = bus.subscribe(lambda _: None, interrupted)
-    bus.publish(moving("map", "a", 1))
-    with pytest.raises(KeyboardInterrupt):
-        bus.remove_frame("a")
-    registration.close()
-    bus.publish(moving("map", "c", 1))
-    assert log == [["a"], "a", ["b"], ["c"]]
 
 
 def test_a_registration_closed_in_a_removal_callback_ends_both_callbacks() -> None:

@@ -254,28 +254,6 @@ async def test_a_bus_made_on_a_loop_belongs_to_the_thread_of_that_loop() -> None
     assert bus.statistics().samples == 1
 
 
-def test_threads_can_publish_to_a_bus_made_outside_the_thread_of_its_loop(run: Run) -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
-    ready, done = threading.Event(), threading.Event()
-    publishers: list[ThreadPublisher] = []
-    found: list[TransformStamped] = []
-
-    async def serve() -> None:
-        with bus.threadsafe() as publish:
-            publishers.append(publish)
-            ready.set()
-            with anyio.fail_after(PATIENCE):
-                found.append(await buffer.lookup("map", "a", 7))
-        done.set()
-
-    with threads_running(lambda: run(serve)):
-        assert ready.wait(PATIENCE)
-        publishers[0](moving("map", "a", 7, 7.0))
-        assert done.wait(PATIENCE)
-    assert found[0].transform.translation == (7.0, 0.0, 0.0)
-
-
 async def test_worker_threads_may_read_while_the_loop_publishes() -> None:
     bus = Bus()
     buffer = Buffer(bus, keep=1e-6)
