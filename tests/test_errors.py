@@ -67,10 +67,7 @@ ONE_OF_EACH: list[tuple[TransformError, str]] = [
         ExtrapolationError(child="base_link", stamp=from_seconds(12.5), oldest=None, newest=None),
         "frame 'base_link': asked for 12.500 s, there is no sample in its window",
     ),
-    (
-        SHORT,
-        "frame 'base_link': asked for 12.500 s, newest sample is 12.090 s (410 ms short), from 'odometry'",
-    ),
+    (SHORT, "frame 'base_link': asked for 12.500 s, newest sample is 12.090 s (410 ms short), from 'odometry'"),
     (
         PastExtrapolationError(
             child="base_link",

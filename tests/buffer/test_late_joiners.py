@@ -119,19 +119,6 @@ def test_a_late_buffer_with_prefill_answers_as_an_early_one(
 # What is taken over
 
 
-def test_a_prefilled_buffer_with_a_longer_window_keeps_more_from_then_on() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus, 20 * NANO)
-    bus.publish(over("map", "a", range(101)))
-    late = Buffer(bus, 1_000 * NANO, prefill=first)
-    assert late.tree.edges()[0].oldest == 80
-    bus.publish(moving("map", "a", 70, 70.0))
-    assert (late.tree.edges()[0].oldest, first.tree.edges()[0].oldest) == (70, 80)
-    bus.publish(over("map", "a", range(101, 201)))
-    assert (late.tree.edges()[0].oldest, first.tree.edges()[0].oldest) == (70, 180)
-    assert x_of(late.tree, "map", "a", 75) == 75.0
-
-
 def test_latched_samples_of_the_bus_are_inserted_after_the_prefill() -> None:
     clock = SimulatedClock()
     bus, elsewhere = Bus(clock), Bus(clock)

@@ -3,8 +3,6 @@ import gc
 import logging
 import math
 import weakref
-from collections.abc import Awaitable, Callable
-from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -29,8 +27,6 @@ from tfbus import (
 )
 
 pytestmark = pytest.mark.anyio
-
-Run = Callable[[Callable[[], Awaitable[None]]], None]
 
 
 def make(start: int = 0, keep: float | None = 10.0) -> tuple[SimulatedClock, Bus, Buffer]:
@@ -356,67 +352,7 @@ async def test_samples_off_the_path_do_not_wake_a_watch(elsewhere: list[Transfor
             assert (len(reader.answers), changes.skipped) == (1, 0)
 
 
-async def test_samples_that_cannot_give_an_answer_do_not_wake_a_watch() -> None:
-    clock, bus, buffer = hand_made()
-    bus.publish([moving("map", "odom", 1), moving("odom", "base", 5)])
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "base") as changes:
-            reader = Reader(tasks, changes)
-            await settle()
-            waits = len(clock.scopes)
-            for stamp in range(6, 10):
-                bus.publish([moving("odom", "base", stamp), moving("map", "other", stamp)])
-                await settle()
-            assert len(clock.scopes) == waits
-            bus.publish(moving("map", "odom", 7))
-            await settle()
-            assert (reader.stamps, changes.skipped) == ([7], 0)
-
-
-async def test_updates_during_a_period_do_not_wake_a_watch() -> None:
-    clock, bus, buffer = hand_made()
-    bus.publish(moving("map", "a", 0))
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a", max_rate=1e-9) as changes:
-            reader = Reader(tasks, changes)
-            await settle()
-            bus.publish(moving("map", "a", 1))
-            await settle()
-            waits = len(clock.scopes)
-            for stamp in range(2, 10):
-                bus.publish(moving("map", "a", stamp))
-                await settle()
-            assert (len(clock.scopes), reader.stamps) == (waits, [0])
-            clock.scopes[-1].cancel()
-            await settle()
-            assert (reader.stamps, changes.skipped) == ([0, 9], 8)
-
-
 # While there is no answer
-
-
-@pytest.mark.parametrize("reading", [True, False])
-async def test_a_watch_waits_for_a_removed_frame_to_return(reading: bool) -> None:
-    _, bus, buffer = make()
-    first, second = moving("map", "a", 1, 1.0), moving("map", "a", 2, 2.0)
-    bus.publish(first)
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a") as changes:
-            assert await anext(changes) == first
-            asked = Asked(tasks, changes.__anext__) if reading else None
-            await settle()
-            bus.remove_frame("a")
-            await settle()
-            assert len(buffer.pending()) == reading
-            bus.publish(first)
-            await settle()
-            asked = asked or Asked(tasks, changes.__anext__)
-            await settle()
-            # The same answer as before is no change.
-            assert not asked.ended
-            bus.publish(second)
-            await settle()
-            assert asked.answer == second
 
 
 async def test_a_watch_gives_answers_again_after_one_that_was_too_old() -> None:
@@ -457,57 +393,6 @@ async def test_a_gap_delays_answers_until_the_lagging_edge_is_past_it() -> None:
 # The end
 
 
-Close = Callable[[Bus, Buffer, Watch], None]
-CLOSES = [
-    pytest.param(lambda _bus, _buffer, watch: watch.close(), id="watch"),
-    pytest.param(lambda _bus, buffer, _watch: buffer.close(), id="buffer"),
-    pytest.param(lambda bus, _buffer, _watch: bus.close(), id="bus"),
-]
-
-
-@pytest.mark.parametrize("close", CLOSES)
-@pytest.mark.parametrize("source", ["a", "unknown"])
-async def test_closing_ends_a_waiting_reader(close: Close, source: str) -> None:
-    _, bus, buffer = make()
-    bus.publish(moving("map", "a", 1))
-    async with anyio.create_task_group() as tasks:
-        watch = buffer.watch("map", source)
-        reader = Reader(tasks, watch)
-        await settle()
-        assert not reader.asked.ended
-        close(bus, buffer, watch)
-        await settle()
-        assert reader.asked.answer is None
-        assert reader.stamps == ([1] if source == "a" else [])
-    assert buffer.pending() == ()
-    with pytest.raises(StopAsyncIteration):
-        await anext(watch)
-
-
-@pytest.mark.parametrize("close", CLOSES)
-@pytest.mark.parametrize("rate", [None, 1.0])
-@pytest.mark.parametrize("reading", [True, False])
-async def test_a_change_before_the_end_is_given(close: Close, rate: float | None, reading: bool) -> None:
-    clock, bus, buffer = make()
-    bus.publish(moving("map", "a", 1))
-    async with anyio.create_task_group() as tasks:
-        watch = buffer.watch("map", "a", max_rate=rate)
-        await anext(watch)
-        reader = Reader(tasks, watch, clock) if reading else None
-        await settle()
-        bus.publish(moving("map", "a", 2))
-        if rate is not None and reading:
-            # The reader waits for the end of the period.
-            await settle()
-            assert reader is not None
-            assert reader.stamps == []
-        close(bus, buffer, watch)
-        reader = reader or Reader(tasks, watch, clock)
-        await settle()
-        assert reader.asked.answer is None
-        assert (reader.stamps, reader.times) == ([2], [0.0])
-
-
 @pytest.mark.parametrize("end", ["buffer", "bus"])
 async def test_a_watch_of_a_closed_buffer_gives_the_current_answer_and_ends(end: str) -> None:
     _, bus, buffer = make()
@@ -519,32 +404,6 @@ async def test_a_watch_of_a_closed_buffer_gives_the_current_answer_and_ends(end:
 
 
 # Jumps
-
-
-@pytest.mark.parametrize("doing", ["waiting", "resting", "without an answer", "nothing"])
-async def test_a_jump_back_is_raised_once_and_the_iteration_starts_over(doing: str) -> None:
-    clock, bus, buffer = make(start=10)
-    bus.publish([moving("map", "a", 10, 1.0), static("map", "b", 2.0)])
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "unknown" if doing == "without an answer" else "a", max_rate=1.0) as changes:
-            if doing != "without an answer":
-                await anext(changes)
-            asked = None if doing == "nothing" else Asked(tasks, changes.__anext__)
-            await settle()
-            if doing == "resting":
-                bus.publish(moving("map", "a", 11, 1.0))
-                await settle()
-            clock.set(5)
-            asked = asked or Asked(tasks, changes.__anext__)
-            await settle()
-            assert isinstance(asked.error, ClockResetError)
-            assert (asked.error.before, asked.error.after) == (10, 5)
-            again = Asked(tasks, changes.__anext__)
-            await settle()
-            assert len(buffer.pending()) == 1
-            bus.publish([moving("map", "a", 5, 1.0), moving("map", "unknown", 5)])
-            await settle()
-            assert again.answer.stamp == 5
 
 
 async def test_a_jump_back_gives_a_static_answer_again_and_a_jump_forward_does_not() -> None:
@@ -593,29 +452,6 @@ async def test_a_cancelled_reader_loses_no_answer_and_leaves_no_waiter(doing: st
     assert buffer.pending() == ()
 
 
-@pytest.mark.parametrize("data_first", [True, False])
-@pytest.mark.parametrize("known", [True, False])
-async def test_an_answer_in_the_turn_of_a_cancellation_is_given_once(data_first: bool, known: bool) -> None:
-    _, bus, buffer = make()
-    if known:
-        bus.publish(moving("map", "a", 1))
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a") as changes:
-            if known:
-                await anext(changes)
-            asked = Asked(tasks, changes.__anext__)
-            await settle()
-            steps: list[Callable[[], object]] = [asked.cancel, lambda: bus.publish(moving("map", "a", 2))]
-            for step in reversed(steps) if data_first else steps:
-                step()
-            await settle()
-            assert asked.ended
-            changes.close()
-            rest = [answer.stamp async for answer in changes]
-            assert rest == ([2] if asked.cancelled else [])
-            assert asked.cancelled or asked.answer.stamp == 2
-
-
 async def test_a_second_reader_is_busy_and_the_first_continues() -> None:
     _, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
@@ -638,22 +474,6 @@ async def test_an_available_answer_passes_a_checkpoint() -> None:
             await anext(changes)
         assert scope.cancelled_caught
         assert (await anext(changes)).stamp == 1
-
-
-def test_a_watch_may_be_made_before_a_loop_and_read_on_several_loops(run: Run) -> None:
-    _, bus, buffer = make()
-    watch = buffer.watch("map", "a")
-
-    async def read_one(second: int) -> None:
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, watch.__anext__)
-            await settle()
-            bus.publish(driving("map", "a", second))
-            await settle()
-            assert x_of(asked.answer) == second
-
-    for second in range(3):
-        run(partial(read_one, second))
 
 
 def test_timeouts_and_cancellation_of_asyncio_work_with_a_watch() -> None:

@@ -4,15 +4,7 @@ from collections.abc import Callable
 import pytest
 from support.samples import moving
 
-from tfbus import (
-    Buffer,
-    Bus,
-    InvalidTransformError,
-    SimulatedClock,
-    Transform,
-    TransformBroadcaster,
-    TransformStamped,
-)
+from tfbus import Buffer, Bus, InvalidTransformError, SimulatedClock, Transform, TransformBroadcaster, TransformStamped
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 
 pytestmark = pytest.mark.anyio

@@ -2,9 +2,8 @@
 
 import math
 import random
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import anyio
 import pytest
@@ -41,7 +40,6 @@ from tfbus.bus.event_stream import EventQueue, Staleness
 pytestmark = pytest.mark.anyio
 
 Events = list[Event]
-Run = Callable[[Callable[[], Awaitable[None]]], None]
 ENDS: list[Callable[[Bus, EventStream], None]] = [lambda bus, _: bus.close(), lambda _, events: events.close()]
 
 
@@ -325,22 +323,6 @@ async def test_rejected_objects_that_are_no_samples_are_events() -> None:
 
 
 # Loops and threads
-
-
-def test_a_stream_may_be_made_before_a_loop_runs_and_read_on_several(run: Run) -> None:
-    bus = Bus(SimulatedClock())
-    events = bus.events()
-
-    async def read_one(name: str) -> None:
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, events.__anext__)
-            await settle()
-            bus.publish(static("map", name))
-            await settle()
-            assert asked.answer == FrameAdded(0, name, "map", "", static=True)
-
-    for name in "abc":
-        run(partial(read_one, name))
 
 
 async def test_another_thread_may_not_touch_the_events_of_a_bus_in_use() -> None:

@@ -252,9 +252,7 @@ def _pending_moving(queue: SampleQueue) -> int:
 
 
 @given(steps=st.lists(BATCHES | st.none(), max_size=40))
-def test_conflate_equals_a_dict_of_the_newest_samples(
-    steps: list[tuple[TransformStamped, ...] | None],
-) -> None:
+def test_conflate_equals_a_dict_of_the_newest_samples(steps: list[tuple[TransformStamped, ...] | None]) -> None:
     queue = SampleQueue(4, "conflate")
     model: dict[str, TransformStamped] = {}
     for batch in steps:

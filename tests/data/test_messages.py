@@ -426,14 +426,6 @@ def test_a_field_may_have_several_numbers_for_each_point_in_one_row() -> None:
         new_layout(PointCloud("a", 5, np.zeros((2, 3)), fields={"grid": np.zeros((2, 1, 1), np.uint8)}))
 
 
-def test_an_empty_cloud_has_the_layout_of_a_full_one() -> None:
-    def fields_of(count: int) -> object:
-        fields: dict[str, Any] = {"pair": np.zeros((count, 2), np.uint16), "index": np.zeros(count, np.int32)}
-        return new_layout(PointCloud("a", 5, np.zeros((count, 3), np.float32), fields=fields))["fields"]
-
-    assert fields_of(0) == fields_of(3)
-
-
 def test_a_coordinate_is_one_number() -> None:
     message = new_layout(PointCloud("a", 5, np.ones((1, 3))))
     message["fields"][0]["count"] = 3

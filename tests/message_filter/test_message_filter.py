@@ -8,7 +8,6 @@ import weakref
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple, get_overloads
 
@@ -169,39 +168,6 @@ def test_the_defaults_that_type_checkers_and_pages_show_are_those_of_the_filter(
     assert shown[0]["capacity"] == 100
 
 
-async def test_the_target_can_be_changed_while_messages_wait(bus: Bus, buffer: Buffer, streams: Streams) -> None:
-    got: list[Pair] = []
-    async with anyio.create_task_group() as tasks, MessageFilter(streams.receive, buffer, "map") as pairs:
-        tasks.start_soon(read, pairs, got)
-        put(streams, Scan(5))
-        bus.publish(moving("odom", "laser", 5, x=1.0))
-        await settle()
-        assert got == []
-        pairs.set_target("odom")
-        await settle()
-        put(streams, Scan(5))
-        await settle()
-        assert [(found.parent, found.transform.translation[0]) for _, found in got] == [("odom", 1.0)] * 2
-        pairs.set_target("world")
-        put(streams, Scan(5))
-        await settle()
-        assert [waiting.question.target for waiting in buffer.pending()] == ["world"]
-        tasks.cancel_scope.cancel()
-
-
-async def test_a_ready_message_keeps_its_transform_when_the_target_changes(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    bus.publish([moving("map", "laser", 5), static("map", "odom")])
-    put(streams, Scan(5))
-    async with MessageFilter(streams.receive, buffer, "map") as pairs:
-        await settle()
-        pairs.set_target("odom")
-        put(streams, Scan(5))
-        await settle()
-        assert [(await anext(pairs))[1].parent for _ in range(2)] == ["map", "odom"]
-
-
 async def test_a_message_needs_the_transforms_of_all_targets(bus: Bus, buffer: Buffer, streams: Streams) -> None:
     got: list[tuple[Scan, tuple[TransformStamped, ...]]] = []
     pairs = MessageFilter(streams.receive, buffer, ["world", "odom", "laser"])
@@ -299,8 +265,7 @@ async def test_stamped_data_are_messages_and_may_be_stamped_latest(bus: Bus, buf
 
 
 @pytest.mark.parametrize(
-    ("order", "expected"),
-    [("ready", [4, 2, 3, 1, 5]), ("stamp", [1, 2, 3, 4, 5]), ("arrival", [5, 3, 1, 4, 2])],
+    ("order", "expected"), [("ready", [4, 2, 3, 1, 5]), ("stamp", [1, 2, 3, 4, 5]), ("arrival", [5, 3, 1, 4, 2])]
 )
 async def test_messages_are_delivered_in_the_given_order(
     order: Any, expected: list[int], bus: Bus, buffer: Buffer, streams: Streams
@@ -319,114 +284,7 @@ async def test_messages_are_delivered_in_the_given_order(
         tasks.cancel_scope.cancel()
 
 
-async def test_messages_made_ready_by_one_batch_are_delivered_in_order_of_arrival(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    order = [7, 3, 9, 1, 5, 8, 2]
-    async with MessageFilter(streams.receive, buffer, "map") as pairs:
-        put(streams, *map(Scan, order))
-        bus.publish(moving("map", "laser", 0))
-        await settle()
-        bus.publish(moving("map", "laser", 10))
-        await settle()
-        assert stamps([await anext(pairs) for _ in order]) == order
-
-
-async def test_messages_made_ready_by_replaced_samples_are_delivered_in_the_order_of_readiness(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    bus.publish([static("map", "base"), moving("odom", "one", 5), moving("odom", "two", 5)])
-    async with MessageFilter(streams.receive, buffer, "map") as pairs:
-        put(streams, Scan(5, "one"), Scan(5, "two"))
-        await settle()
-        for frame in ("two", "one"):
-            bus.publish(moving("map", frame, 5))
-            await settle()
-        assert buffer.tree.inserted == 3
-        assert [(await anext(pairs))[0].frame for _ in range(2)] == ["two", "one"]
-
-
-@pytest.mark.parametrize("order", ["stamp", "arrival"])
-async def test_a_waiting_message_holds_back_later_ones_until_it_is_dropped(
-    order: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    got: list[Pair] = []
-    bus.publish(moving("map", "laser", 2))
-    pairs = MessageFilter(streams.receive, buffer, "map", timeout=1.0, order=order)
-    async with anyio.create_task_group() as tasks, pairs:
-        tasks.start_soon(read, pairs, got)
-        put(streams, Scan(1, "nobody"), Scan(2))
-        await clock.advance(0.9)
-        assert got == []
-        await clock.advance(0.2)
-        assert stamps(got) == [2]
-        tasks.cancel_scope.cancel()
-
-
 # Bounds
-
-
-async def test_drop_newest_drops_the_messages_that_arrive_at_a_full_queue(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    drops = DroppedMessages()
-    bus.publish(moving("map", "laser", 0))
-    put(streams, *map(Scan, range(1, 6)))
-    async with MessageFilter(
-        streams.receive, buffer, "map", capacity=2, overflow="drop_newest", on_drop=drops
-    ) as pairs:
-        await settle()
-        assert drops.told == [(Scan(stamp), "queue full") for stamp in (3, 4, 5)]
-        assert {type(error) for _, _, error in drops.all} == {FutureExtrapolationError}
-        bus.publish(moving("map", "laser", 9))
-        await settle()
-        assert stamps([await anext(pairs) for _ in range(2)]) == [1, 2]
-
-
-async def test_block_reads_no_message_beyond_the_capacity(bus: Bus, buffer: Buffer, streams: Streams) -> None:
-    put(streams, *map(Scan, range(1, 8)))
-    bus.publish(moving("map", "laser", 0))
-    got: list[Pair] = []
-    pairs = MessageFilter(streams.receive, buffer, "map", capacity=3, overflow="block")
-    async with anyio.create_task_group() as tasks, pairs:
-        await settle()
-        assert (pairs.arrived, streams.receive.statistics().current_buffer_used) == (3, 4)
-        bus.publish(moving("map", "laser", 9))
-        await settle()
-        assert pairs.arrived == 3
-        await anext(pairs)
-        await settle()
-        assert pairs.arrived == 4
-        tasks.start_soon(read, pairs, got)
-        await settle()
-        assert stamps(got) == [2, 3, 4, 5, 6, 7]
-        assert dict(pairs.dropped) == {}
-        tasks.cancel_scope.cancel()
-
-
-async def test_a_message_dropped_in_the_turn_of_its_transform_stays_dropped(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    put(streams, Scan(5))
-    got: list[Pair] = []
-    async with MessageFilter(streams.receive, buffer, "map", capacity=1) as pairs:
-        await settle()
-        put(streams, Scan(6))
-        bus.publish([moving("map", "laser", 5), moving("map", "laser", 6)])
-        await settle()
-        streams.send.close()
-        await read(pairs, got)
-        # Which of the two tasks runs first is the loop's affair.
-        assert stamps(got) == [6]
-        assert pairs.dropped == {"queue full": 1}
-
-
-async def test_a_message_dropped_on_arrival_displaces_no_other(bus: Bus, buffer: Buffer, streams: Streams) -> None:
-    bus.publish(moving("map", "laser", 10))
-    put(streams, Scan(11), Scan(5), Scan(5, ""))
-    async with MessageFilter(streams.receive, buffer, "map", capacity=1) as pairs:
-        await settle()
-        assert (pairs.pending, pairs.dropped) == (1, {"too old": 1, "unknown frame": 1})
 
 
 # Time
@@ -469,26 +327,6 @@ async def test_the_timeout_error_names_the_missing_target(
         ((_, _, error),) = drops.all
         assert isinstance(error, LookupTimeoutError)
         assert (error.target, error.source) == ("map", "laser")
-
-
-async def test_a_message_dropped_by_timeout_zero_displaces_no_other(bus: Bus, buffer: Buffer, streams: Streams) -> None:
-    bus.publish(moving("map", "laser", 5))
-    put(streams, Scan(5), Scan(6), Scan(5, "nobody"))
-    async with MessageFilter(streams.receive, buffer, "map", timeout=0.0, capacity=1) as pairs:
-        await settle()
-        assert pairs.dropped == {"timed out": 1, "unknown frame": 1}
-        assert (await anext(pairs))[0] == Scan(5)
-
-
-async def test_changing_the_target_does_not_extend_the_timeout(
-    clock: SimulatedClock, buffer: Buffer, streams: Streams
-) -> None:
-    put(streams, Scan(5))
-    async with MessageFilter(streams.receive, buffer, "map", timeout=2.0) as pairs:
-        await clock.advance(1.5)
-        pairs.set_target("odom")
-        await clock.advance(0.5)
-        assert pairs.pending == 0
 
 
 async def test_a_transform_in_the_turn_in_which_the_timeout_expires_delivers_the_message(streams: Streams) -> None:
@@ -550,17 +388,6 @@ async def test_an_exception_of_the_callback_is_isolated_and_logged_once(
 # How it ends
 
 
-async def test_dropping_the_last_message_after_the_end_of_the_source_ends_the_iteration(
-    clock: SimulatedClock, buffer: Buffer, streams: Streams
-) -> None:
-    async with anyio.create_task_group() as tasks, MessageFilter(streams.receive, buffer, "map", timeout=1.0) as pairs:
-        reading = Asked(tasks, pairs.__anext__)
-        put(streams, Scan(5))
-        streams.send.close()
-        await clock.advance(1.0)
-        assert isinstance(reading.error, StopAsyncIteration)
-
-
 @pytest.mark.parametrize("closed", ["bus", "buffer"])
 async def test_closing_ends_the_iteration_after_the_ready_messages(
     closed: str, bus: Bus, buffer: Buffer, streams: Streams
@@ -580,26 +407,6 @@ async def test_closing_ends_the_iteration_after_the_ready_messages(
         assert isinstance(error, BusClosedError)
         assert isinstance(error.__cause__, FutureExtrapolationError)
         assert streams.receive.statistics().current_buffer_used == 1
-
-
-@pytest.mark.parametrize("closed", ["bus", "buffer"])
-@pytest.mark.parametrize("before", [True, False])
-async def test_closing_ends_the_iteration_without_waiting_messages(
-    before: bool, closed: str, bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    close = (bus if closed == "bus" else buffer).close
-    if before:
-        close()
-        put(streams, Scan(5, "map"))
-    async with anyio.create_task_group() as tasks, MessageFilter(streams.receive, buffer, "map") as pairs:
-        reading = Asked(tasks, pairs.__anext__)
-        await settle()
-        if not before:
-            assert not reading.ended
-            close()
-            await settle()
-        assert isinstance(reading.error, StopAsyncIteration)
-        assert pairs.arrived == 0
 
 
 async def test_a_filter_belongs_to_the_loop_of_its_bus(buffer: Buffer) -> None:
@@ -710,16 +517,6 @@ async def test_an_error_of_the_source_is_raised_after_the_ready_messages(bus: Bu
     assert caught.value is error
     assert stamps(got) == [5]
     assert (pairs.dropped, buffer.pending()) == ({"closed": 1}, ())
-
-
-async def test_after_an_error_of_the_source_the_waiting_messages_can_be_read(bus: Bus, buffer: Buffer) -> None:
-    got: list[Pair] = []
-    async with MessageFilter(Source(OSError("unplugged"), Scan(5)), buffer, "map") as pairs:
-        with pytest.raises(OSError, match="unplugged"):
-            await anext(pairs)
-        bus.publish(moving("map", "laser", 5))
-        await read(pairs, got)
-    assert stamps(got) == [5]
 
 
 async def test_an_error_of_the_source_is_raised_at_the_end_if_it_was_not_read(buffer: Buffer) -> None:
@@ -868,23 +665,6 @@ async def test_cancelling_the_body_ends_the_filter(buffer: Buffer, streams: Stre
             await anext(pairs)
     assert scope.cancelled_caught
     assert (buffer.pending(), pairs.dropped) == ((), {"closed": 2})
-
-
-async def test_a_cancelled_reader_loses_no_message(bus: Bus, buffer: Buffer, streams: Streams) -> None:
-    async with anyio.create_task_group() as tasks, MessageFilter(streams.receive, buffer, "map") as pairs:
-        reading = Asked(tasks, pairs.__anext__)
-        await settle()
-        reading.cancel()
-        bus.publish(moving("map", "laser", 5))
-        put(streams, Scan(5))
-        await settle()
-        assert reading.cancelled
-        with anyio.CancelScope() as scope:
-            scope.cancel()
-            await anext(pairs)
-        assert scope.cancelled_caught
-        assert (await anext(pairs))[0] == Scan(5)
-        assert (pairs.arrived, pairs.delivered) == (1, 1)
 
 
 async def test_a_second_reader_is_busy_and_the_first_continues(buffer: Buffer, streams: Streams) -> None:
@@ -1078,22 +858,3 @@ async def test_a_callback_may_call_the_filter_and_the_bus(bus: Bus, buffer: Buff
         assert (seen, pairs.callbacks_failed) == ([1, 2], 0)
         assert [(await anext(pairs))[1].parent] == ["odom"]
         assert pairs.dropped == {"queue full": 1, "too old": 1}
-
-
-async def test_waiting_messages_are_delivered_after_the_end_of_the_source(
-    bus: Bus, buffer: Buffer, streams: Streams
-) -> None:
-    got: list[Pair] = []
-    async with anyio.create_task_group() as tasks, MessageFilter(streams.receive, buffer, "map") as pairs:
-        reading = Asked(tasks, partial(read, pairs, got))
-        put(streams, Scan(5), Scan(6))
-        streams.send.close()
-        await settle()
-        bus.publish(moving("map", "laser", 5))
-        await settle()
-        assert (stamps(got), reading.ended) == ([5], False)
-        bus.publish(moving("map", "laser", 6))
-        await settle()
-        assert (stamps(got), reading.answer) == ([5, 6], None)
-        with pytest.raises(StopAsyncIteration):
-            await anext(pairs)
