@@ -14,6 +14,7 @@ import pytest
 from support.asking import settle
 
 from tfbus._aio.loops import LoopWaker, join_all, settling, wait_for_all
+from tfbus._aio.task_groups import close_task_group
 from tfbus._aio.turn_budget import TurnBudget
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
@@ -337,3 +338,24 @@ async def test_work_gives_way_once_its_time_is_spent_and_not_before() -> None:
     assert not budget.spent
     now = 5.5
     assert budget.spent
+
+
+async def fail(error: BaseException) -> None:
+    raise error
+
+
+async def close_with(*errors: BaseException) -> None:
+    """Close a group whose tasks raise these errors in one turn of the loop."""
+    tasks = anyio.create_task_group()
+    await tasks.__aenter__()
+    for error in errors:
+        tasks.start_soon(fail, error)
+    await close_task_group(tasks)
+
+
+@pytest.mark.parametrize("in_one_task", [True, False])
+async def test_a_group_that_one_task_raises_and_the_errors_of_several_tasks_are_a_group(in_one_task: bool) -> None:
+    errors = [KeyError("a"), ValueError("b")]
+    with pytest.raises(ExceptionGroup) as caught:
+        await close_with(*([ExceptionGroup("own", errors)] if in_one_task else errors))
+    assert {*caught.value.exceptions} == {*errors}

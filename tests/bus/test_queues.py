@@ -154,18 +154,6 @@ def test_repeated_static_samples_do_not_fill_the_queue() -> None:
     assert (queue.dropped, queue.conflated, len(queue)) == (0, 0, 0)
 
 
-@pytest.mark.parametrize("first_static", [True, False])
-def test_conflate_keeps_the_last_kind_of_a_child_for_any_stamps(first_static: bool) -> None:
-    pair = [static("map", "a", stamp=9), moving("map", "a", 1)]
-    first, last = pair if first_static else pair[::-1]
-    queue = SampleQueue(1, "conflate")
-    queue.put((first,))
-    queue.put((last,))
-    queue.put((moving("map", "b", 1),))
-    assert emptied(queue) == [((moving("map", "b", 1),) if first_static else (last, moving("map", "b", 1)))]
-    assert queue.dropped == first_static
-
-
 def test_conflate_drops_the_moving_children_that_have_waited_longest() -> None:
     queue = SampleQueue(2, "conflate")
     queue.put((static("map", "s"), moving("map", "a", 1), moving("map", "b", 1)))

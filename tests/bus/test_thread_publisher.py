@@ -150,16 +150,6 @@ async def test_publishing_before_the_with_raises() -> None:
     assert "with" in str(error)
 
 
-async def test_after_a_with_that_failed_to_begin_publishing_raises() -> None:
-    bus = Bus()
-    publish = bus.threadsafe()
-    bus.close()
-    with pytest.raises(BusClosedError):
-        publish.__enter__()
-    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
-    assert isinstance(error, BusClosedError)
-
-
 def test_the_with_is_entered_on_an_event_loop_only() -> None:
     bus = Bus()
     with pytest.raises(RuntimeError), bus.threadsafe():
@@ -209,16 +199,6 @@ async def test_queued_samples_of_a_removed_frame_are_discarded() -> None:
         in_thread(lambda: publish([moving("map", "a", 2), moving("map", "b", 2)]))
         bus.remove_frame("a")
     assert buffer.tree.frames() == ["b", "map"]
-
-
-async def test_bus_publish_from_another_thread_is_an_error_that_names_threadsafe() -> None:
-    bus = Bus()
-    errors = in_thread(lambda: bus.publish(moving("map", "a", 1)))
-    errors += await anyio.to_thread.run_sync(lambda: in_thread(lambda: bus.publish(moving("map", "a", 1))))
-    assert [type(error) for error in errors] == [RuntimeError, RuntimeError]
-    assert all("bus.threadsafe" in str(error) for error in errors)
-    assert bus.statistics().samples == 0
-    bus.publish(moving("map", "a", 1))
 
 
 USES: list[Callable[[Bus, Buffer], object]] = [

@@ -858,3 +858,32 @@ async def test_a_callback_may_call_the_filter_and_the_bus(bus: Bus, buffer: Buff
         assert (seen, pairs.callbacks_failed) == ([1, 2], 0)
         assert [(await anext(pairs))[1].parent] == ["odom"]
         assert pairs.dropped == {"queue full": 1, "too old": 1}
+
+
+@pytest.mark.parametrize("order", ["stamp", "arrival"])
+async def test_a_waiting_message_holds_back_later_ones_until_it_is_dropped(
+    order: Any, clock: SimulatedClock, bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    got: list[Pair] = []
+    bus.publish(moving("map", "laser", 2))
+    pairs = MessageFilter(streams.receive, buffer, "map", timeout=1.0, order=order)
+    async with anyio.create_task_group() as tasks, pairs:
+        tasks.start_soon(read, pairs, got)
+        put(streams, Scan(1, "nobody"), Scan(2))
+        await clock.advance(0.9)
+        assert got == []
+        await clock.advance(0.2)
+        assert stamps(got) == [2]
+        tasks.cancel_scope.cancel()
+
+
+async def test_a_full_queue_of_ready_messages_drops_without_an_error(
+    bus: Bus, buffer: Buffer, streams: Streams
+) -> None:
+    drops = DroppedMessages()
+    bus.publish([moving("map", "laser", 0), moving("map", "laser", 9)])
+    put(streams, *map(Scan, range(1, 6)))
+    async with MessageFilter(streams.receive, buffer, "map", capacity=2, on_drop=drops) as pairs:
+        await settle()
+        assert drops.all == [(Scan(stamp), "queue full", None) for stamp in (1, 2, 3)]
+        assert stamps([await anext(pairs) for _ in range(2)]) == [4, 5]
