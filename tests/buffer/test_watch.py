@@ -120,17 +120,6 @@ async def test_without_thresholds_a_new_stamp_or_a_new_value_is_a_change() -> No
     assert [(answer.stamp, x_of(answer)) for answer in got] == [(1, 5.0), (2, 5.0), (2, 6.0), (3, 6.0)]
 
 
-async def test_min_translation_is_measured_from_the_last_answer() -> None:
-    _, bus, buffer = make()
-    xs = [0.0, 0.25, 0.375, 0.5, 0.75, 0.25, 0.125, 0.0, -0.25, -0.5, 5.0]
-    samples = [moving("map", "a", stamp, x) for stamp, x in enumerate(xs)]
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "a", min_translation=0.5) as changes:
-            got = await read_along(changes, bus, samples, tasks)
-    assert [x_of(answer) for answer in got] == [0.0, 0.5, 0.0, -0.5, 5.0]
-    assert changes.skipped == 0
-
-
 @pytest.mark.parametrize(
     ("before", "after", "angle"),
     [
@@ -161,50 +150,6 @@ async def test_min_rotation_is_the_angle_for_any_quaternion_signs(
         came = [[answer.stamp async for answer in watch] for watch in (reached, missed)]
     assert came[0] == ([2] if angle > 0.0 else [])
     assert came[1] == ([] if angle < math.pi else [2])
-
-
-async def test_several_edges_are_watched_at_their_newest_common_stamp() -> None:
-    _, bus, buffer = make()
-    reader_sees = []
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "base") as changes:
-            reader = Reader(tasks, changes)
-            for sample in [
-                driving("map", "odom", 1.0),
-                driving("odom", "base", 1.0),
-                driving("odom", "base", 2.0),
-                driving("odom", "base", 3.0),
-                driving("map", "odom", 2.0),
-                driving("map", "odom", 9.0),
-            ]:
-                bus.publish(sample)
-                await settle()
-                reader_sees.append((reader.stamps or [0])[-1] // SECOND)
-    # Where map has not come further, neither has the answer.
-    assert reader_sees == [0, 1, 1, 1, 2, 3]
-    assert reader.xs == [2.0, 4.0, 6.0]
-
-
-async def test_a_watch_follows_a_frame_to_another_parent() -> None:
-    _, bus, buffer = make()
-    bus.publish([static("map", "left", 100.0), static("map", "right", 200.0)])
-    async with anyio.create_task_group() as tasks:
-        with buffer.watch("map", "box") as changes:
-            samples = [
-                moving("left", "box", 1, 1.0),
-                moving("right", "box", 2, 2.0),
-                static("map", "right", 300.0),
-                moving("right", "box", 3, 3.0),
-                moving("left", "box", 4, 4.0),
-            ]
-            got = await read_along(changes, bus, samples, tasks)
-    assert [(answer.stamp, x_of(answer)) for answer in got] == [
-        (1, 101.0),
-        (2, 202.0),
-        (2, 302.0),
-        (3, 303.0),
-        (4, 104.0),
-    ]
 
 
 # Rates

@@ -5,8 +5,9 @@
 unblocks the lookup hands over the answer. The task gives that answer if the tree has not changed until it runs, one
 turn of the event loop later; otherwise it asks again, and may park again on the same deadline.
 
-The end of a wait is an alarm. Alarms share one timer of the event loop, because nearly all are cancelled before they
-ring. A lookup that has waited for 5 s is logged, with all others that have.
+The end of a wait is an alarm. A cancel scope for each wait would set and remove a timer of the event loop each time;
+the alarms of a buffer share one timer. It is set for the first alarm, and stays as it is when that alarm is cancelled,
+because the next one is nearly always later. A lookup that has waited for 5 s is logged, with all others that have.
 """
 
 import logging
@@ -208,11 +209,6 @@ class LocalNames:
                 for edge in found.edges
             ),
         )
-
-
-# Alarms. A cancel scope for each wait would set and remove a timer of the event loop each time. The alarms of a buffer
-# share one timer: it is set for the first alarm, and stays as it is when that alarm is cancelled, because the next one
-# is nearly always later.
 
 
 _CANCELLED_KEPT = 64
