@@ -1,7 +1,9 @@
+""""""
+
 import anyio
 import pytest
 
-from tfbus import ClockResetError, SimulatedClock, Transform, TransformStamped, from_seconds
+from tfbus import ClockResetError, Registration, SimulatedClock, Transform, TransformStamped, from_seconds
 from tfbus.testing import assert_close, simulate
 
 pytestmark = pytest.mark.anyio
@@ -57,3 +59,41 @@ async def test_assert_close_takes_transforms_and_samples_up_to_the_sign_of_the_r
 async def test_assert_close_says_how_far_apart_they_are() -> None:
     with pytest.raises(AssertionError, match=r"is 2 m and 0\.5 rad from .*allowed: 0\.1 m, 1e-09 rad"):
         assert_close(Transform(), Transform.from_axis_angle((0, 0, 1), 0.5, (0.0, 2.0, 0.0)), translation_tolerance=0.1)
+
+
+def test_the_end_of_the_with_undoes_it_once() -> None:
+    undone: list[str] = []
+    with Registration(lambda: undone.append("undone")) as registration:
+        assert undone == []
+    assert undone == ["undone"]
+    registration.close()
+    assert undone == ["undone"]
+
+
+def test_an_error_in_the_body_undoes_it_and_is_raised() -> None:
+    undone: list[str] = []
+    with pytest.raises(KeyError), Registration(lambda: undone.append("undone")):
+        raise KeyError
+    assert undone == ["undone"]
+
+
+def test_closing_during_the_undo_does_not_undo_twice() -> None:
+    undone: list[str] = []
+
+    def undo() -> None:
+        undone.append("undone")
+        registration.close()
+
+    registration = Registration(undo)
+    registration.close()
+    assert undone == ["undone"]
+
+
+def test_a_failed_undo_is_not_repeated() -> None:
+    def undo() -> None:
+        raise KeyError
+
+    registration = Registration(undo)
+    with pytest.raises(KeyError):
+        registration.close()
+    registration.close()

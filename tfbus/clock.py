@@ -18,7 +18,7 @@ import anyio.lowlevel
 from tfbus._aio.loops import settling
 from tfbus.errors import ClockResetError
 from tfbus.registration import Registration
-from tfbus.stamps import SECOND, STAMP_MAX, as_duration, as_stamp, from_seconds, is_real
+from tfbus.stamps import SECOND, STAMP_MAX, as_duration, as_stamp, format_stamp, from_seconds, is_real
 
 JumpCallback = Callable[[int, int], object]
 """A function that is called with the stamps just before and just after a jump, in ns."""
@@ -178,6 +178,10 @@ class SimulatedClock:
         self._callbacks: dict[int, JumpCallback] = {}
         self._listeners: dict[int, Callable[[int], object]] = {}
         self._advancing = False
+
+    def __repr__(self) -> str:
+        timers = len(self._timers)
+        return f"<SimulatedClock at {format_stamp(self._now)}, {timers:,} timer{'' if timers == 1 else 's'}>"
 
     def now(self) -> int:
         """The current simulated stamp, in ns."""

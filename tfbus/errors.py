@@ -158,8 +158,8 @@ class UnknownFrameError(TransformLookupError):
     frame : str
         The unknown frame.
     close_matches : tuple of str
-        Frames with a similar name, the most similar first: of those that were known when the error was raised, or of
-        some, if they were many. Computed when first read.
+        Frames with a similar name, the most similar first: of the frames that were known when the error was raised, or
+        of some, if they were many. Computed when first read.
     """
 
     frame: str
@@ -471,7 +471,7 @@ class InvalidTransformError(TransformError, ValueError):
         The broken rule as a fixed text (``"cycle"``, ``"not finite"``, ``"frame name"``); statistics count rejected
         samples by it.
     parent, child, authority : str or None
-        Those of the sample; None if not known where the error is raised.
+        Of the sample; None if not known where the error is raised.
     loop : tuple of str
         For ``"cycle"``, the whole loop from child to parent, with its first frame repeated at the end.
     owner : str or None

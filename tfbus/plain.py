@@ -23,9 +23,10 @@ _PLAIN = frozenset((types.NoneType, bool, int, str))
 def printable(text: str) -> str:
     """A text with the characters escaped that `repr` would escape, so that it stays in its line and its place.
 
-    These are control and format characters, such as those that begin a new line, command a terminal, or reverse the
-    direction of letters; blanks other than the usual one; and what is no character. Letters of any alphabet stay. A
-    second call changes nothing, so a line may be made of names and of texts that are printable already.
+    These are control and format characters, such as the ones that begin a new line, command a terminal, or reverse the
+    direction of letters; blanks other than the usual one; and code points that are no character. Letters of any
+    alphabet stay. A second call changes nothing, so a line may be made of names and of texts that are printable
+    already.
     """
     if text.isprintable():
         return text

@@ -192,7 +192,7 @@ class RecorderStatistics(PlainData):
     samples, messages : int
         Samples and messages that are in the file, and remain there if the process is killed.
     unattributed : int
-        Those of the samples whose authority is not in the file, because there were too many authorities.
+        The part of them whose authority is not in the file, because there were too many authorities.
     refused : mapping of str to int
         Samples that a ROS message cannot hold, by reason.
     queue : QueueStatistics

@@ -1,12 +1,11 @@
 import logging
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import anyio
 import anyio.lowlevel
-import numpy as np
 import pytest
 from support.asking import Asked, HandClock, driving, settle
 from support.samples import moving, static
@@ -21,20 +20,16 @@ from tfbus import (
     ClockResetError,
     DisconnectedError,
     FutureExtrapolationError,
-    LaserScan,
     LookupTimeoutError,
     PastExtrapolationError,
     PointStamped,
     Question,
     SimulatedClock,
     SystemClock,
-    TransformBroadcaster,
     TransformStamped,
     UnknownFrameError,
-    Vector3Stamped,
     do_transform,
 )
-from tfbus.buffer.buffer import _DESCRIBED
 
 pytestmark = pytest.mark.anyio
 
@@ -79,22 +74,6 @@ async def test_an_available_answer_passes_a_checkpoint() -> None:
         scope.cancel()
         await buffer.lookup("map", "a")
     assert scope.cancelled_caught
-
-
-async def test_a_lookup_with_timeout_zero_returns_an_available_answer() -> None:
-    _, bus, buffer = make()
-    bus.publish(driving("map", "a", 1.0))
-    assert (await buffer.lookup("map", "a", timeout=0)).stamp == SECOND
-    with pytest.raises(LookupTimeoutError):
-        await buffer.lookup("map", "a", 2 * SECOND, timeout=0)
-
-
-async def test_a_past_extrapolation_raises_at_once() -> None:
-    _, bus, buffer = make(keep=2.0)
-    bus.publish([driving("map", "a", 5.0), driving("map", "a", 9.0), static("a", "b")])
-    with pytest.raises(PastExtrapolationError) as caught:
-        await buffer.lookup("map", "b", 6 * SECOND)
-    assert (caught.value.child, caught.value.oldest) == ("a", 9 * SECOND)
 
 
 @pytest.mark.parametrize("bad", ["", "/a"])
@@ -162,25 +141,6 @@ async def test_a_waiting_lookup_raises_if_the_first_sample_is_newer_than_its_sta
         assert isinstance(asked.error, PastExtrapolationError)
 
 
-async def test_a_lookup_sees_out_of_order_samples_of_one_batch_together() -> None:
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 1 * SECOND))
-        await settle()
-        bus.publish([driving("map", "a", second) for second in range(10, 0, -1)])
-    assert asked.answer.transform.translation == (1.0, 0.0, 0.0)
-
-
-async def test_a_lookup_woken_before_its_timeout_answers() -> None:
-    clock, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 2 * SECOND, timeout=1.0))
-        await settle()
-        bus.publish([driving("map", "a", 1), driving("map", "a", 3)])
-        await clock.advance(1.0)
-    assert asked.answer.stamp == 2 * SECOND
-
-
 async def test_a_timeout_raises_with_the_last_error_as_its_cause() -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
@@ -238,17 +198,6 @@ async def test_jumps_of_the_clock_do_not_change_a_timeout() -> None:
         assert not asked.ended
         await clock.advance(0.001)
         assert isinstance(asked.error, LookupTimeoutError)
-
-
-async def test_an_infinite_timeout_never_expires() -> None:
-    clock, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=math.inf))
-        await clock.advance(1e6)
-        assert not asked.ended
-        bus.publish(moving("map", "a", 7))
-        await settle()
-        assert asked.answer.stamp == 7
 
 
 @pytest.mark.parametrize("phase", ["before the report", "after the report", "at the timeout"])
@@ -317,30 +266,6 @@ async def test_a_lookup_waits_until_two_trees_are_joined() -> None:
     assert asked.answer.transform.translation == (10.0, 0.0, 0.0)
 
 
-async def test_a_lookup_wakes_when_a_static_sample_arrives() -> None:
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "base", "laser", 123))
-        await settle()
-        bus.publish(static("base", "laser", x=0.5))
-    assert (asked.answer.stamp, asked.answer.static) == (123, True)
-
-
-async def test_a_woken_lookup_reads_the_tree_when_its_task_runs() -> None:
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
-        await settle()
-        bus.publish(moving("map", "a", 5))
-        assert not asked.ended
-        bus.remove_frame("a")
-        await settle()
-        assert not asked.ended
-        bus.publish(moving("map", "a", 5, 1.0))
-        bus.publish(moving("map", "a", 5, 2.0))
-    assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
-
-
 @pytest.mark.parametrize("change", ["replace", "remove", "reset"])
 async def test_the_answer_that_woke_a_lookup_is_dropped_if_the_tree_changes_in_the_same_turn(change: str) -> None:
     clock, bus, buffer = make()
@@ -362,16 +287,6 @@ async def test_the_answer_that_woke_a_lookup_is_dropped_if_the_tree_changes_in_t
         assert isinstance(asked.error, ClockResetError)
     else:
         assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
-
-
-async def test_a_thousand_waiters_of_one_publish_are_all_answered() -> None:
-    _, bus, buffer = make()
-    bus.publish(driving("map", "a", 0))
-    async with anyio.create_task_group() as tasks:
-        asked = [Asked(tasks, partial(buffer.lookup, "map", "a", stamp)) for stamp in range(1, 1001)]
-        await settle()
-        bus.publish(driving("map", "a", 10))
-    assert [each.answer.stamp for each in asked] == list(range(1, 1001))
 
 
 # LATEST and max_age
@@ -422,67 +337,12 @@ async def test_a_lookup_with_max_age_waits_for_a_sample_that_is_recent_enough() 
         assert asked.answer.stamp == 7_500_000_000
 
 
-async def test_max_age_applies_to_the_most_lagging_edge() -> None:
-    clock, bus, buffer = make()
-    bus.publish([driving("map", "a", 0), driving("a", "b", 0), driving("a", "b", 2)])
-    await clock.advance(2.0)
-    with pytest.raises(FutureExtrapolationError, match="'a'"):
-        buffer.lookup_nowait("map", "b", max_age=1.0)
-
-
-async def test_max_age_does_not_apply_to_static_answers() -> None:
-    clock, bus, buffer = make()
-    bus.publish(static("map", "a"))
-    await clock.advance(1e6)
-    found = await buffer.lookup("map", "a", max_age=0.001)
-    assert found.static
-
-
-async def test_an_infinite_max_age_refuses_nothing() -> None:
-    clock, bus, buffer = make()
-    bus.publish(driving("map", "a", 0))
-    await clock.advance(1e6)
-    assert (await buffer.lookup("map", "a", max_age=math.inf)).stamp == 0
-
-
 # Waking
 
 
 def waiting(bus: Bus) -> int:
     """The number of parked lookups; a woken one is not parked until its task runs and it waits again."""
     return bus.statistics().buffers[0].waiting
-
-
-@pytest.mark.thorough
-async def test_samples_of_other_edges_wake_none_of_ten_thousand_waiters() -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "quiet", 0), driving("map", "busy", 0), driving("map", "x", 0), static("map", "s")])
-    async with anyio.create_task_group() as tasks:
-        for k in range(10_000):
-            tasks.start_soon(buffer.lookup, "map", "quiet", (1 + k) * SECOND)
-        await settle()
-        for second in range(1, 50):
-            bus.publish([driving("map", "busy", second), static("map", "s"), driving("map", "x", second / 2)])
-            bus.publish([driving("map", f"new_{second}", second), driving("map", "quiet", 0.5)])
-            assert waiting(bus) == 10_000
-        bus.publish(driving("map", "quiet", 3))
-        assert waiting(bus) == 9_997
-        tasks.cancel_scope.cancel()
-    assert waiting(bus) == 0
-    assert buffer.pending() == ()
-
-
-@pytest.mark.parametrize("more", range(3))
-async def test_a_description_has_ten_waiting_lookups_and_the_number_of_all_others(more: int) -> None:
-    _, _, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        for number in range(_DESCRIBED + more):
-            tasks.start_soon(buffer.lookup, "map", f"frame{number}")
-        await settle()
-        waiting = [line for line in buffer.describe().splitlines() if line.startswith("waiting: ")]
-        tasks.cancel_scope.cancel()
-    assert ["see pending()" in line for line in waiting] == [False] * _DESCRIBED + [True] * (more > 0)
-    assert not more or waiting[-1] == f"waiting: {more} more lookups, see pending()"
 
 
 @pytest.mark.parametrize("source", ["edge", "nowhere", "elsewhere"], ids=["too old", "unknown", "disconnected"])
@@ -498,19 +358,6 @@ async def test_cancelled_lookups_leave_no_waiters_for_any_error(source: str) -> 
     assert waiting(bus) == 0
     assert buffer.pending() == ()
     assert "waiting" not in buffer.describe()
-
-
-async def test_cancelling_one_lookup_keeps_the_others_waiting() -> None:
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = [Asked(tasks, partial(buffer.lookup, "map", "a", 5)) for _ in range(3)]
-        await settle()
-        asked[1].cancel()
-        await settle()
-        assert len(buffer.pending()) == 2
-        bus.publish(moving("map", "a", 5))
-    assert asked[1].cancelled
-    assert asked[0].answer == asked[2].answer
 
 
 @pytest.mark.parametrize("data_first", [True, False])
@@ -586,21 +433,6 @@ async def test_a_long_wait_is_logged_once_for_each_cause(caplog: pytest.LogCaptu
         tasks.cancel_scope.cancel()
 
 
-async def test_a_long_wait_with_a_new_cause_is_logged_again(caplog: pytest.LogCaptureFixture) -> None:
-    clock, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(buffer.lookup, "map", "a", 60 * SECOND)
-        await clock.advance(6.0)
-        bus.publish(driving("map", "a", 1))
-        await clock.advance(3.9)
-        assert len(caplog.messages) == 1
-        await clock.advance(0.1)
-        first, second = caplog.messages
-        tasks.cancel_scope.cancel()
-    assert "not known" in first
-    assert "newest sample is 1.000 s" in second
-
-
 async def test_short_waits_are_not_logged(caplog: pytest.LogCaptureFixture) -> None:
     clock, bus, buffer = make()
     async with anyio.create_task_group() as tasks:
@@ -634,42 +466,6 @@ async def test_a_jump_back_ends_every_wait_with_an_error_that_has_both_stamps() 
         assert (each.error.before, each.error.after) == (100 * SECOND, 90 * SECOND)
     assert len({id(each.error) for each in asked}) == len(asked)
     assert buffer.pending() == ()
-
-
-async def test_a_lookup_woken_and_reset_in_one_turn_raises_the_reset() -> None:
-    clock, bus, buffer = make(start=100)
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 101))
-        await settle()
-        bus.publish(moving("map", "a", 101))
-        clock.set(50)
-        bus.publish(moving("map", "a", 101))
-        await settle()
-        assert isinstance(asked.error, ClockResetError)
-
-
-async def test_a_lookup_after_a_jump_back_waits_for_new_samples() -> None:
-    clock, bus, buffer = make(start=100 * SECOND)
-    bus.publish(driving("map", "a", 100))
-    clock.set(0)
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a"))
-        await settle()
-        assert not asked.ended
-        bus.publish(driving("map", "a", 1))
-    assert asked.answer.stamp == 1 * SECOND
-
-
-async def test_a_jump_forward_ends_no_wait() -> None:
-    clock, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
-        await settle()
-        clock.set(10**12)
-        await settle()
-        assert not asked.ended
-        bus.publish(moving("map", "a", 5))
-    assert asked.answer.stamp == 5
 
 
 # The end
@@ -722,17 +518,6 @@ async def test_a_closed_buffer_gets_no_more_samples_and_others_do(clock: Clock) 
     assert bus.statistics().buffers == ()
 
 
-async def test_a_lookup_woken_before_the_close_in_the_same_turn_answers() -> None:
-    _, bus, buffer = make()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.lookup, "map", "a", 5))
-        await settle()
-        bus.publish(moving("map", "a", 5))
-        bus.close()
-        await settle()
-    assert asked.answer.stamp == 5
-
-
 @pytest.mark.parametrize("keep", [-1.0, math.nan])
 def test_a_buffer_with_a_bad_window_is_an_error_and_not_attached(keep: float) -> None:
     bus = Bus(SimulatedClock())
@@ -759,13 +544,6 @@ async def test_transform_waits_for_the_stamp_of_the_data() -> None:
     assert buffer.transform_nowait(point, "map") == asked.answer
 
 
-async def test_data_stamped_latest_get_the_stamp_of_the_transform() -> None:
-    _, bus, buffer = make()
-    bus.publish(driving("map", "base", 4))
-    moved = await buffer.transform(Vector3Stamped("base", LATEST, (1.0, 0.0, 0.0)), "map")
-    assert moved == Vector3Stamped("map", 4 * SECOND, (1.0, 0.0, 0.0))
-
-
 async def test_transform_passes_timeout_and_max_age_on() -> None:
     clock, bus, buffer = make()
     bus.publish(driving("map", "base", 0))
@@ -787,41 +565,6 @@ async def test_transform_moves_data_to_another_stamp_through_a_fixed_frame() -> 
     assert buffer.transform_nowait(point, "base", at=5 * SECOND, fixed="map") == moved
     back = PointStamped("laser", 5 * SECOND, (-2.0, 0.0, 0.0))
     assert buffer.transform_nowait(back, "laser", at=2 * SECOND, fixed="map").point == (1.0, 0.0, 0.0)
-
-
-async def test_transform_to_latest_gives_the_stamp_of_the_answer() -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
-    point = PointStamped("base", 2 * SECOND, (1.0, 0.0, 0.0))
-    moved = await buffer.transform(point, "base", at=LATEST, fixed="map")
-    assert moved == PointStamped("base", 6 * SECOND, (-3.0, 0.0, 0.0))
-    assert buffer.transform_nowait(point, "base", at=LATEST, fixed="map") == moved
-
-
-async def test_transform_moves_data_stamped_latest_to_another_stamp() -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "base", 1), driving("map", "base", 6)])
-    newest = PointStamped("base", LATEST, (1.0, 0.0, 0.0))
-    moved = await buffer.transform(newest, "base", at=2 * SECOND, fixed="map")
-    assert moved == PointStamped("base", 2 * SECOND, (5.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize(("stamp", "at"), [(2, 5), (5, 2)], ids=["to the future", "to the past"])
-async def test_transform_to_another_stamp_waits_for_both_stamps(stamp: int, at: int) -> None:
-    _, bus, buffer = make()
-    bus.publish(driving("map", "base", 1))
-    point = PointStamped("base", stamp * SECOND, (1.0, 0.0, 0.0))
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, partial(buffer.transform, point, "base", at=at * SECOND, fixed="map"))
-        await settle()
-        bus.publish(driving("map", "base", 3))
-        await settle()
-        assert not asked.ended
-        with pytest.raises(FutureExtrapolationError):
-            buffer.transform_nowait(point, "base", at=at * SECOND, fixed="map")
-        bus.publish(driving("map", "base", 5))
-        await settle()
-    assert asked.answer == PointStamped("base", at * SECOND, (1.0 + stamp - at, 0.0, 0.0))
 
 
 async def test_transform_to_another_stamp_passes_timeout_and_max_age_on() -> None:
@@ -876,64 +619,6 @@ async def test_registered_data_without_frame_and_stamp_are_transformed_by_an_ans
     with pytest.raises(TypeError, match="look the transform up and call do_transform"):
         await buffer.transform(message, "map")  # type: ignore[type-var]
     assert do_transform(message, await buffer.lookup("map", "base")) is message
-
-
-async def test_a_scan_is_transformed_as_its_points() -> None:
-    _, bus, buffer = make()
-    bus.publish([driving("map", "laser", 1), driving("map", "laser", 3)])
-    scan = LaserScan("laser", 2 * SECOND, np.array([4.0]), angle_min=0.0, angle_increment=0.0)
-    cloud = await buffer.transform(scan.to_points(), "map")
-    assert cloud.points.tolist() == [[6.0, 0.0, 0.0]]
-
-
-async def test_a_listener_once_a_second_follows_a_broadcaster_at_100_hz() -> None:
-    clock, bus, buffer = make()
-    broadcaster = TransformBroadcaster(bus, "odometry")
-
-    async def broadcast() -> None:
-        async for _ in clock.ticks(100):
-            broadcaster.send("odom", "base", driving("odom", "base", clock.now() / SECOND).transform)
-
-    async def listen() -> list[float]:
-        seen = []
-        async for tick in clock.ticks(1):
-            found = await buffer.lookup("odom", "base", clock.now())
-            seen.append(found.transform.translation[0])
-            if tick == 10:
-                break
-        return seen
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(broadcast)
-        listener = Asked(tasks, listen)
-        await clock.advance(10.0)
-        assert listener.answer == [float(second) for second in range(11)]
-        tasks.cancel_scope.cancel()
-    assert buffer.tree.edges()[0].samples == 1001
-
-
-def test_a_buffer_may_be_made_before_a_loop_and_used_on_several_loops(
-    run: Callable[[Callable[[], Awaitable[None]]], None],
-) -> None:
-    _, bus, buffer = make()
-
-    async def wait(stamp: int) -> None:
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, partial(buffer.lookup, "map", "a", stamp))
-            await settle()
-            bus.publish(moving("map", "a", stamp))
-        assert asked.answer.stamp == stamp
-
-    for stamp in (1, 2, 3):
-        run(partial(wait, stamp))
-
-
-async def test_the_error_of_an_invalid_name_has_similar_names() -> None:
-    with Bus(SimulatedClock()) as bus, Buffer(bus) as buffer:
-        bus.publish(moving("map", "base", 0))
-        with pytest.raises(UnknownFrameError) as caught:
-            await buffer.lookup("/map", "base")
-        assert caught.value.close_matches == ("map",)
 
 
 # Lookups that have become hopeless
@@ -1013,3 +698,21 @@ async def test_whether_there_will_be_an_answer_can_be_awaited() -> None:
         assert not await buffer.can_transform_within("map", "base", None, 0)
     with pytest.raises(BusClosedError):
         await buffer.can_transform_within("map", "base", None, 7)
+
+
+async def test_an_infinite_timeout_never_expires() -> None:
+    clock, bus, buffer = make()
+    async with anyio.create_task_group() as tasks:
+        asked = Asked(tasks, partial(buffer.lookup, "map", "a", timeout=math.inf))
+        await clock.advance(1e6)
+        assert not asked.ended
+        bus.publish(moving("map", "a", 7))
+        await settle()
+        assert asked.answer.stamp == 7
+
+
+async def test_an_infinite_max_age_refuses_nothing() -> None:
+    clock, bus, buffer = make()
+    bus.publish(driving("map", "a", 0))
+    await clock.advance(1e6)
+    assert (await buffer.lookup("map", "a", max_age=math.inf)).stamp == 0

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-import anyio
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.asking import Asked, settle
-from support.samples import any_samples, moving, over, static, tree_of, x_of
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+from support.samples import any_samples, edges_of, moving, over, static, tree_of, x_of
 
 from tfbus import (
     LATEST,
@@ -19,10 +18,8 @@ from tfbus import (
     Buffer,
     BufferStatistics,
     Bus,
-    BusClosedError,
-    FutureExtrapolationError,
+    DisconnectedError,
     InvalidTransformError,
-    PastExtrapolationError,
     SimulatedClock,
     TransformLookupError,
     TransformStamped,
@@ -122,63 +119,6 @@ def test_a_late_buffer_with_prefill_answers_as_an_early_one(
 # What is taken over
 
 
-def test_a_prefilled_buffer_has_history_static_samples_and_old_parents() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus)
-    bus.publish(
-        [*over("map", "a", (10, 20)), moving("odom", "a", 30, 7.0), static("a", "laser", 0.5), moving("m", "b", 5)]
-    )
-    bus.publish(static("map", "odom", 100.0))
-    late = Buffer(bus, prefill=first)
-    assert x_of(late.tree, "map", "laser", 15) == 15.5
-    assert x_of(late.tree, "map", "laser", 25) == 20.5
-    assert x_of(late.tree, "map", "laser", 30) == 107.5
-    assert late.tree.edges() == first.tree.edges()
-
-
-def test_without_prefill_a_late_buffer_has_only_latched_samples() -> None:
-    bus = Bus(SimulatedClock())
-    bus.publish([moving("map", "a", 10), static("a", "laser")])
-    assert Buffer(bus).tree.frames() == ["a", "laser"]
-
-
-def test_a_prefilled_buffer_has_only_the_samples_inside_its_own_window() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus, 100 * NANO)
-    bus.publish([*over("map", "a", range(0, 101, 10)), *over("old", "b", (0, 10)), *over("map", "b", (90, 100))])
-    late = Buffer(bus, 20 * NANO, prefill=first)
-    assert [(edge.child, edge.oldest, edge.samples) for edge in late.tree.edges()] == [("a", 80, 3), ("b", 90, 2)]
-    assert late.tree.frames() == ["a", "b", "map"]
-    with pytest.raises(PastExtrapolationError):
-        late.lookup_nowait("map", "a", 79)
-
-
-def test_a_prefilled_buffer_with_a_longer_window_keeps_more_from_then_on() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus, 20 * NANO)
-    bus.publish(over("map", "a", range(101)))
-    late = Buffer(bus, 1_000 * NANO, prefill=first)
-    assert late.tree.edges()[0].oldest == 80
-    bus.publish(moving("map", "a", 70, 70.0))
-    assert (late.tree.edges()[0].oldest, first.tree.edges()[0].oldest) == (70, 80)
-    bus.publish(over("map", "a", range(101, 201)))
-    assert (late.tree.edges()[0].oldest, first.tree.edges()[0].oldest) == (70, 180)
-    assert x_of(late.tree, "map", "a", 75) == 75.0
-
-
-def test_a_prefilled_buffer_is_independent_of_the_other() -> None:
-    clock = SimulatedClock()
-    bus, elsewhere = Bus(clock), Bus(clock)
-    first = Buffer(elsewhere)
-    elsewhere.publish(over("map", "a", (10, 20)))
-    late = Buffer(bus, prefill=first)
-    elsewhere.publish([moving("map", "a", 15, 1.0), moving("map", "a", 30, 1.0)])
-    assert (x_of(late.tree, "map", "a", 15), late.lookup_nowait("map", "a").stamp) == (15.0, 20)
-    bus.publish([moving("map", "a", 12, 2.0), moving("map", "a", 40, 2.0)])
-    assert (x_of(first.tree, "map", "a", 10), first.lookup_nowait("map", "a").stamp) == (10.0, 30)
-    assert x_of(late.tree, "map", "a", 12) == 2.0
-
-
 def test_latched_samples_of_the_bus_are_inserted_after_the_prefill() -> None:
     clock = SimulatedClock()
     bus, elsewhere = Bus(clock), Bus(clock)
@@ -187,23 +127,6 @@ def test_latched_samples_of_the_bus_are_inserted_after_the_prefill() -> None:
     bus.publish([static("base", "laser", 5.0), static("base", "arm", 6.0)])
     late = Buffer(bus, prefill=other)
     assert [x_of(late.tree, "base", frame, 15) for frame in ("laser", "imu", "arm")] == [5.0, 2.0, 6.0]
-
-
-def test_a_tree_without_a_bus_can_be_the_prefill() -> None:
-    tree = tree_of(*over("map", "a", (10, 20)))
-    bus = Bus(SimulatedClock())
-    late = Buffer(bus, prefill=tree)
-    tree.insert(moving("map", "a", 30))
-    assert late.lookup_nowait("map", "a").stamp == 20
-    bus.publish(moving("map", "a", 40, 60.0))
-    assert x_of(late.tree, "map", "a", 30) == 40.0
-
-
-def test_a_frame_known_only_from_the_prefill_can_be_removed() -> None:
-    bus = Bus(SimulatedClock())
-    late = Buffer(bus, prefill=tree_of(*over("map", "a", (10, 20))))
-    bus.remove_frame("a")
-    assert late.tree.frames() == []
 
 
 def test_the_counters_of_a_prefilled_buffer_start_with_samples_of_the_bus() -> None:
@@ -230,22 +153,6 @@ def test_a_prefill_copies_bus_names_between_buffers_with_prefixes() -> None:
 # Joining
 
 
-async def test_lookups_of_a_prefilled_buffer_use_samples_from_before_and_after() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus)
-    bus.publish(moving("map", "a", 1 * SECOND, 1.0))
-    late = Buffer(bus, prefill=first)
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, lambda: late.lookup("map", "a", 2 * SECOND))
-        await settle()
-        (pending,) = late.pending()
-        assert isinstance(pending.blocked_by, FutureExtrapolationError)
-        assert pending.blocked_by.newest == SECOND
-        bus.publish(moving("map", "a", 3 * SECOND, 3.0))
-        await settle()
-        assert asked.answer.transform.translation == (2.0, 0.0, 0.0)
-
-
 def test_a_buffer_prefilled_in_a_callback_has_the_current_batch_once() -> None:
     bus = Bus(SimulatedClock())
     first = Buffer(bus)
@@ -265,9 +172,238 @@ def test_a_prefill_that_is_no_buffer_or_tree_is_a_type_error(prefill: Any) -> No
     assert bus.statistics().buffers == ()
 
 
-def test_a_buffer_on_a_closed_bus_is_an_error() -> None:
-    bus = Bus(SimulatedClock())
-    first = Buffer(bus)
-    bus.close()
-    with pytest.raises(BusClosedError):
-        Buffer(bus, prefill=first)
+def bus_with(*batches: list[TransformStamped]) -> Bus:
+    bus = Bus(SimulatedClock(100 * SECOND))
+    for batch in batches:
+        bus.publish(batch)
+    return bus
+
+
+# What is superseded
+
+
+def test_a_late_sample_with_an_old_parent_is_not_the_newest_of_a_buffer_that_missed_the_new_one() -> None:
+    bus = Bus(SimulatedClock(100 * SECOND))
+    early = Buffer(bus)
+    bus.publish(moving("a", "x", 5 * SECOND))
+    late = Buffer(bus)
+    bus.publish(moving("x", "b", 6 * SECOND))
+    bus.publish(moving("b", "x", 4 * SECOND, 7.0))
+    assert x_of(early.tree, "b", "x") == 0.0
+    assert x_of(late.tree, "b", "x") == 0.0
+    counted = bus.statistics().buffers[1]
+    assert (counted.offered, counted.inserted, counted.expired, counted.superseded) == (2, 1, 1, 1)
+
+
+def test_a_late_sample_with_the_newest_parent_is_stored_and_so_is_every_sample_after_the_newest() -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus)
+    bus.publish([moving("a", "x", 40, 4.0), moving("old", "x", 45)])
+    assert x_of(late.tree, "a", "x", 40) == 4.0
+    assert late.tree.frames() == ["a", "x"]
+    bus.publish([moving("a", "x", 50, 5.0), moving("old", "x", 45, 1.0)])
+    assert (late.tree.parent("x", 45), late.tree.parent("x")) == ("old", "a")
+    assert bus.statistics().buffers[0].superseded == 1
+
+
+@pytest.mark.parametrize("newer", [moving("b", "x", 60), static("b", "x")])
+def test_a_new_parent_ends_the_waiting_for_the_sample_that_was_missed(newer: TransformStamped) -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus)
+    bus.publish([newer, moving("c", "x", 45)])
+    assert bus.statistics().buffers[0].superseded == 0
+    assert late.tree.parent("x") == ("b" if not newer.static else "c")
+
+
+def test_a_removed_frame_and_a_jump_back_of_the_clock_supersede_nothing() -> None:
+    clock = SimulatedClock(100 * SECOND)
+    bus = Bus(clock)
+    bus.publish([moving("a", "x", 50), moving("a", "y", 50)])
+    late = Buffer(bus)
+    bus.remove_frame("x")
+    bus.publish(moving("b", "x", 40))
+    clock.set(0)
+    bus.publish(moving("b", "y", 40))
+    assert (late.tree.parent("x"), late.tree.parent("y")) == ("b", "b")
+    assert bus.statistics().buffers[0].superseded == 0
+
+
+# What a prefill contradicts
+
+
+def test_a_prefilled_frame_with_another_newest_parent_than_on_the_bus_is_left_out() -> None:
+    bus = bus_with([moving("a", "x", 50), moving("a", "y", 50)])
+    late = Buffer(bus, prefill=tree_of(moving("b", "x", 60), moving("a", "y", 40, 3.0), static("b", "z")))
+    assert late.tree.frames() == ["a", "b", "y", "z"]
+    assert x_of(late.tree, "a", "y", 40) == 3.0
+    bus.publish(moving("b", "y", 45))
+    assert late.tree.parent("y") == "a"
+
+
+@pytest.mark.parametrize(("held", "superseded"), [(49, 1), (50, 0), (51, 0)])
+def test_a_prefill_with_the_newest_sample_of_the_bus_has_missed_nothing(held: int, superseded: int) -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus, prefill=tree_of(moving("a", "x", held)))
+    bus.publish(moving("old", "x", 45))
+    assert late.tree.frames() == (["a", "x"] if superseded else ["a", "old", "x"])
+    assert bus.statistics().buffers[0].superseded == superseded
+
+
+def test_a_prefilled_edge_that_closes_a_loop_with_the_bus_is_removed() -> None:
+    bus = bus_with([moving("a", "x", 50), static("x", "y")])
+    late = Buffer(bus, prefill=tree_of(moving("y", "a", 40), moving("y", "z", 40)))
+    assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("x", "y"), ("y", "z")]
+    bus.publish(moving("z", "p", 60))
+    bus.publish(moving("p", "y", 60))
+    assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("z", "p"), ("p", "y")]
+
+
+def test_a_prefilled_edge_gives_way_to_a_frame_that_is_back_after_a_jump_of_the_clock() -> None:
+    clock = SimulatedClock(10)
+    bus = Bus(clock)
+    bus.publish([moving("c", "b", 5), static("b", "e")])
+    late = Buffer(bus, prefill=tree_of(static("d", "c")))
+    bus.publish(moving("c", "b", 6))
+    clock.set(0)
+    bus.publish(moving("e", "d", 1))
+    held = {(edge.parent, edge.child) for edge in late.tree.edges() if edge.samples}
+    assert held == {("b", "e"), ("d", "c"), ("e", "d")}
+    # Under the same parent as before, but a loop by now.
+    bus.publish(moving("c", "b", 2))
+    held = {(edge.parent, edge.child) for edge in late.tree.edges() if edge.samples}
+    assert held == {("b", "e"), ("c", "b"), ("e", "d")}
+
+
+def test_only_the_prefilled_edges_in_the_loop_are_removed() -> None:
+    bus = bus_with()
+    late = Buffer(
+        bus, prefill=tree_of(*[moving(p, c, 40) for p, c in (("a", "b"), ("b", "c"), ("b", "d"), ("r", "a"))])
+    )
+    bus.publish(moving("c", "b", 60))
+    assert [(edge.parent, edge.child) for edge in late.tree.edges()] == [("r", "a"), ("c", "b"), ("b", "d")]
+
+
+def test_samples_of_a_prefill_that_are_ahead_of_the_bus_give_way_when_the_bus_reparents() -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus, prefill=tree_of(*over("a", "x", (50, 90)), keep=None))
+    bus.publish(moving("a", "x", 60))
+    assert late.tree.edges()[0].newest == 90
+    bus.publish(moving("b", "x", 70))
+    assert [(edge.parent, edge.newest) for edge in late.tree.edges()] == [("b", 70)]
+
+
+@pytest.mark.parametrize("heard", [89, 90, 91])
+def test_samples_of_a_prefill_stay_when_the_bus_reparents_later_than_them(heard: int) -> None:
+    bus = bus_with([moving("a", "x", 50)])
+    late = Buffer(bus, prefill=tree_of(*over("a", "x", (50, 90)), keep=None))
+    bus.publish(moving("a", "x", heard))
+    bus.publish(moving("b", "x", 95))
+    assert [late.tree.parent("x", stamp) for stamp in (50, 94, 95)] == ["a", "a", "b"]
+    assert late.tree.edges()[0].samples == len({50, 90, 95, heard})
+
+
+# Any history
+
+samples = any_samples(FRAMES, 12)
+trees = st.lists(samples, max_size=6)
+
+
+def newest_of(bus: Bus) -> dict[str, tuple[str, bool]]:
+    return {edge.frame: (edge.parent, edge.static) for edge in edges_of(bus)}
+
+
+class LateBuffers(RuleBasedStateMachine):
+    """Buffers that join a bus at any moment, with any window and any prefill."""
+
+    buffers = Bundle("buffers")
+
+    @initialize(target=buffers)
+    def begin(self) -> Buffer:
+        self.clock = SimulatedClock(1_000)
+        self.bus = Bus(self.clock)
+        self.open: list[Buffer] = []
+        return self.join(None, None)
+
+    def join(self, keep: int | None, prefill: Buffer | TransformTree | None) -> Buffer:
+        buffer = Buffer(self.bus, None if keep is None else keep * NANO, prefill=prefill)
+        self.open.append(buffer)
+        return buffer
+
+    @rule(target=buffers, keep=st.none() | st.integers(0, 12))
+    def join_empty(self, keep: int | None) -> Buffer:
+        return self.join(keep, None)
+
+    @rule(target=buffers, keep=st.none() | st.integers(0, 12), other=buffers)
+    def join_prefilled(self, keep: int | None, other: Buffer) -> Buffer:
+        return self.join(keep, other)
+
+    @rule(target=buffers, stored=trees)
+    def join_with_a_foreign_tree(self, stored: list[TransformStamped]) -> Buffer:
+        tree = TransformTree(keep=None)
+        for sample in stored:
+            with suppress(InvalidTransformError):
+                tree.insert(sample)
+        return self.join(None, tree)
+
+    @rule(target=buffers, buffer=consumes(buffers))
+    def leave(self, buffer: Buffer) -> object:
+        buffer.close()
+        if buffer in self.open:
+            self.open.remove(buffer)
+        # It may still be the prefill of others.
+        return multiple(buffer)
+
+    @rule(batch=st.lists(samples, min_size=1, max_size=3))
+    def publish(self, batch: list[TransformStamped]) -> None:
+        self.bus.publish(batch, invalid="drop")
+
+    @rule(frame=st.sampled_from(FRAMES))
+    def remove(self, frame: str) -> None:
+        with suppress(UnknownFrameError):
+            self.bus.remove_frame(frame)
+
+    @rule()
+    def jump_back(self) -> None:
+        self.clock.set(self.clock.now() - 1)
+
+    @invariant()
+    def the_newest_edges_of_each_buffer_are_those_of_the_bus(self) -> None:
+        newest = newest_of(self.bus)
+        for buffer in self.open:
+            for edge in buffer.tree.edges():
+                if edge.samples and edge.child in newest:
+                    assert (edge.parent, edge.static) == newest[edge.child]
+
+    @invariant()
+    def no_buffer_holds_a_loop_even_with_what_it_has_not_seen(self) -> None:
+        parents = {child: parent for child, (parent, _) in newest_of(self.bus).items()}
+        for buffer in self.open:
+            own = {edge.child: edge.parent for edge in buffer.tree.edges() if edge.samples}
+            check_no_loop({**own, **parents})
+
+    @invariant()
+    def every_sample_is_counted(self) -> None:
+        for counted in self.bus.statistics().buffers:
+            assert counted.offered == counted.inserted + counted.replaced + counted.expired
+            assert counted.superseded <= counted.expired
+
+
+def check_no_loop(parents: dict[str, str]) -> None:
+    for frame in parents:
+        walk = [frame]
+        while walk[-1] in parents:
+            walk.append(parents[walk[-1]])
+            assert len(walk) <= len(parents) + 1, walk
+
+
+TestLateBuffers = LateBuffers.TestCase
+TestLateBuffers.settings = settings(stateful_step_count=25)
+
+
+def test_a_loop_that_a_late_buffer_would_have_held_is_none_for_any_question() -> None:
+    bus = bus_with([moving("a", "x", 5)])
+    late = Buffer(bus)
+    bus.publish([moving("x", "b", 6), moving("b", "x", 4)])
+    with pytest.raises((DisconnectedError, UnknownFrameError)):
+        late.lookup_nowait("a", "b")
+    assert late.explain("x", "b").answerable

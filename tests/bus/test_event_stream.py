@@ -1,17 +1,22 @@
+""""""
+
 import math
-from collections.abc import Awaitable, Callable
-from functools import partial
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import anyio
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
 from support.samples import moving, static
+from support.wires import size_of
 
 from tfbus import (
     SECOND,
     AuthorityConflict,
     Bus,
-    BusClosedError,
     ClockReset,
     Event,
     EventStream,
@@ -20,17 +25,21 @@ from tfbus import (
     FrameRemoved,
     FrameStale,
     InvalidTransformError,
+    KindChanged,
+    PastLoop,
     QueueStatistics,
+    Reparented,
     SampleRejected,
     SimulatedClock,
+    StampAhead,
     SubscriberFailed,
     to_seconds,
 )
+from tfbus.bus.event_stream import EventQueue, Staleness
 
 pytestmark = pytest.mark.anyio
 
 Events = list[Event]
-Run = Callable[[Callable[[], Awaitable[None]]], None]
 ENDS: list[Callable[[Bus, EventStream], None]] = [lambda bus, _: bus.close(), lambda _, events: events.close()]
 
 
@@ -69,13 +78,6 @@ async def test_a_stream_begins_with_an_event_for_each_frame_that_has_a_parent() 
             FrameAdded(9, "tool", "base", "", static=False),
         ]
         assert events.dropped == 0
-
-
-async def test_each_of_two_streams_gives_every_event() -> None:
-    bus = Bus(SimulatedClock())
-    with bus.events() as first, bus.events() as second:
-        bus.publish(static("map", "a"))
-        assert await anext(first) == await anext(second) == FrameAdded(0, "a", "map", "", static=True)
 
 
 async def test_a_late_stream_gives_a_conflict_of_authorities_within_two_samples() -> None:
@@ -133,19 +135,6 @@ async def test_a_waiting_reader_gets_a_stale_frame_at_the_very_time_of_the_limit
             assert got[2:] == [FrameLive(23 * SECOND // 2, "base", 23 * SECOND // 2, "odometry")]
             await clock.advance(2.0)
             assert got[3:] == [FrameStale(13 * SECOND + 1, "base", 23 * SECOND // 2, "odometry")]
-
-
-async def test_samples_in_time_do_not_wake_the_reader() -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    got: Events = []
-    async with anyio.create_task_group() as tasks:
-        with bus.events() as events:
-            tasks.start_soon(read, events, got)
-            for tenth in range(100):
-                bus.publish(driving("map", "base", tenth / 10))
-                await clock.advance(0.1)
-            assert [type(event) for event in got] == [FrameAdded]
 
 
 async def test_staleness_is_not_computed_while_no_task_reads() -> None:
@@ -294,32 +283,6 @@ async def test_a_closed_stream_ends_after_the_pending_events(end: Callable[[Bus,
         await anext(events)
 
 
-async def test_a_closed_stream_gets_no_more_events() -> None:
-    bus = Bus(SimulatedClock())
-    with bus.events() as events:
-        pass
-    events.close()
-    bus.publish(static("map", "a"))
-    assert len(events.queue) == 0
-
-
-async def test_a_reader_cancelled_while_it_waits_for_a_stale_frame_loses_no_event() -> None:
-    clock = SimulatedClock()
-    bus = Bus(clock)
-    bus.publish(driving("map", "base", 0.0))
-    events = bus.events(stale_after=20.0)
-    assert isinstance(await anext(events), FrameAdded)
-    async with anyio.create_task_group() as tasks:
-        before = Asked(tasks, events.__anext__)
-        await settle()
-        before.cancel()
-        bus.remove_frame("base")
-        await settle()
-        assert before.cancelled
-    await clock.advance(10.0)
-    assert await anext(events) == FrameRemoved(0, "base")
-
-
 async def test_each_failure_of_a_subscriber_is_an_event_with_its_name_and_error() -> None:
     bus = Bus(SimulatedClock(start=3))
     errors = [ValueError("first"), OSError("second")]
@@ -349,18 +312,6 @@ async def test_the_error_of_a_rejection_event_has_no_traceback_into_the_sender()
         assert rejected.error.__traceback__ is None
 
 
-async def test_rejected_samples_of_threads_are_events() -> None:
-    bus = Bus(SimulatedClock(), on_conflict="reject")
-    bus.publish(moving("map", "base", 1, authority="odometry"))
-    with bus.events() as events:
-        with bus.threadsafe() as publish:
-            await anyio.to_thread.run_sync(publish, moving("map", "base", 2, authority="driver"))
-        await anext(events)
-        rejected = await anext(events)
-        assert isinstance(rejected, SampleRejected)
-        assert (rejected.reason, rejected.authority) == ("authority", "driver")
-
-
 async def test_rejected_objects_that_are_no_samples_are_events() -> None:
     bus = Bus(SimulatedClock())
     with bus.events() as events:
@@ -374,25 +325,8 @@ async def test_rejected_objects_that_are_no_samples_are_events() -> None:
 # Loops and threads
 
 
-def test_a_stream_may_be_made_before_a_loop_runs_and_read_on_several(run: Run) -> None:
-    bus = Bus(SimulatedClock())
-    events = bus.events()
-
-    async def read_one(name: str) -> None:
-        async with anyio.create_task_group() as tasks:
-            asked = Asked(tasks, events.__anext__)
-            await settle()
-            bus.publish(static("map", name))
-            await settle()
-            assert asked.answer == FrameAdded(0, name, "map", "", static=True)
-
-    for name in "abc":
-        run(partial(read_one, name))
-
-
 async def test_another_thread_may_not_touch_the_events_of_a_bus_in_use() -> None:
     bus = Bus(SimulatedClock())
-    bus._check_thread()
     with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
         await anyio.to_thread.run_sync(bus.events)
     with pytest.raises(RuntimeError, match=r"bus\.threadsafe"):
@@ -418,8 +352,233 @@ def test_a_stream_with_a_bad_capacity_or_limit_is_not_registered(bad: dict[str, 
     assert bus.statistics().queues == ()
 
 
-def test_a_closed_bus_gives_no_events() -> None:
-    bus = Bus(SimulatedClock())
-    bus.close()
-    with pytest.raises(BusClosedError):
-        bus.events()
+def emptied(queue: EventQueue) -> list[Event]:
+    events = []
+    while (event := queue.get()) is not None:
+        events.append(event)
+    return events
+
+
+def added(frame: str) -> FrameAdded:
+    return FrameAdded(0, frame, "map", "", static=False)
+
+
+def test_an_initial_event_of_a_frame_ahead_of_the_clock_is_given_once() -> None:
+    ahead = StampAhead(1, "a", 10**9, "x")
+    queue = EventQueue(10, [added("a"), ahead])
+    queue.put(StampAhead(2, "a", 2 * 10**9, "x"))
+    assert emptied(queue) == [added("a"), ahead]
+    queue.put(StampAhead(3, "a", 10**9, "y"))
+    assert emptied(queue) == [StampAhead(3, "a", 10**9, "y")]
+
+
+def test_a_conflict_of_two_authorities_is_given_once_for_a_frame_until_it_is_removed() -> None:
+    queue = EventQueue(100)
+    one, two = AuthorityConflict(1, "a", "x", "y"), AuthorityConflict(1, "a", "y", "x")
+    third, elsewhere = AuthorityConflict(2, "a", "x", "z"), AuthorityConflict(3, "b", "x", "y")
+    for event in (one, two, one, third, one, third, elsewhere, elsewhere):
+        queue.put(event)
+    assert emptied(queue) == [one, third, elsewhere]
+    queue.put(FrameRemoved(4, "a"))
+    for event in (one, elsewhere):
+        queue.put(event)
+    assert emptied(queue) == [FrameRemoved(4, "a"), one]
+    queue.put(ClockReset(0, 5))
+    queue.put(elsewhere)
+    assert emptied(queue) == [ClockReset(0, 5), elsewhere]
+
+
+def test_in_a_conflict_each_parent_and_kind_of_an_authority_is_given_once() -> None:
+    queue = EventQueue(100)
+    queue.put(AuthorityConflict(0, "a", "x", "y"))
+    to_p, to_q = Reparented(1, "a", "p", "q", "x"), Reparented(1, "a", "q", "p", "y")
+    still, moves = KindChanged(1, "a", static=True, authority="x"), KindChanged(1, "a", static=False, authority="y")
+    for _ in range(5):
+        for event in (to_p, to_q, still, moves):
+            queue.put(event)
+    new = Reparented(2, "a", "r", "q", "x")
+    queue.put(new)
+    assert emptied(queue)[1:] == [to_p, to_q, still, moves, new]
+
+
+def test_every_change_of_parent_by_a_single_authority_is_given() -> None:
+    queue = EventQueue(100)
+    queue.put(AuthorityConflict(0, "elsewhere", "x", "y"))
+    taken, put_down = Reparented(1, "cup", "hand", "table", "x"), Reparented(2, "cup", "table", "hand", "x")
+    froze = KindChanged(3, "cup", static=True, authority="x")
+    for event in (taken, put_down, taken, put_down, froze, froze):
+        queue.put(event)
+    assert emptied(queue)[1:] == [taken, put_down, taken, put_down, froze, froze]
+
+
+def rejected(frame: str | None, authority: str | None, reason: str = "authority") -> SampleRejected:
+    return SampleRejected(1, reason, frame, "map", authority, ValueError())
+
+
+def test_a_rejection_is_given_once_for_a_frame_authority_and_reason_until_the_frame_is_removed_added_or_reset() -> None:
+    queue = EventQueue(100)
+    different: list[Event] = [
+        rejected("a", "x"),
+        rejected("b", "x"),
+        rejected("a", "y"),
+        rejected("a", "x", "cycle"),
+        rejected(None, None, "not a sample"),
+    ]
+    for event in different * 3:
+        queue.put(event)
+    assert emptied(queue) == different
+    for end, again in (
+        (FrameRemoved(2, "a"), [rejected("a", "x")]),
+        (added("a"), [rejected("a", "x")]),
+        (ClockReset(2, 3), [rejected("a", "x"), rejected("b", "x")]),
+    ):
+        for event in (end, *[rejected("a", "x"), rejected("b", "x")] * 2):
+            queue.put(event)
+        assert emptied(queue) == [end, *again]
+
+
+def test_a_loop_in_the_past_is_given_once_for_a_frame_authority_and_parent() -> None:
+    queue = EventQueue(100)
+    loops: list[Event] = [
+        PastLoop(1, frame, parent, authority, 0, (frame, parent, frame))
+        for frame, parent, authority in (("a", "b", "x"), ("a", "c", "x"), ("a", "b", "y"), ("d", "b", "x"))
+    ]
+    for event in (*loops, *loops, rejected("a", "x", "b")):
+        queue.put(event)
+    assert emptied(queue) == [*loops, rejected("a", "x", "b")]
+
+
+def test_memory_is_bounded_for_rejections_of_new_frames_and_authorities() -> None:
+    queue = EventQueue(1)
+    for number in range(3_000):
+        queue.put(rejected(f"frame {number}", "x"))
+        queue.put(rejected("frame 0", f"process {number}"))
+    dropped = queue.dropped
+    queue.put(rejected("frame 2999", "x"))
+    queue.put(rejected("frame 2500", "x"))
+    assert queue.dropped == dropped, "still remembered"
+    queue.put(rejected("frame 1", "x"))
+    assert queue.dropped == dropped + 1, "forgotten in favour of later ones"
+
+
+def test_a_frame_that_changes_its_parent_all_the_time_does_not_displace_events_of_others() -> None:
+    queue = EventQueue(5)
+    others: list[Event] = [added("a"), Reparented(0, "b", "map", "odom", "x"), FrameRemoved(0, "a")]
+    for event in others:
+        queue.put(event)
+    moves: list[Event] = []
+    for stamp in range(100):
+        moves += [Reparented(stamp, "cup", "hand", "table", ""), KindChanged(stamp, "cup", stamp % 2 == 0, "")]
+    for event in moves:
+        queue.put(event)
+    assert queue.dropped == len(moves) - 2
+    assert emptied(queue) == [*others, *moves[-2:]]
+
+
+LIMIT = 10
+
+
+@dataclass(frozen=True)
+class Known:
+    newest: int | None
+    authority: str = ""
+    parent: str = "map"
+
+    @property
+    def static(self) -> bool:
+        return self.newest is None
+
+
+class World:
+    """A stand-in for the frames of a bus, and for those who watch them."""
+
+    def __init__(self) -> None:
+        self.edges: dict[str, Known] = {}
+        self.staleness = Staleness(LIMIT, self.edges.get)
+
+    def send(self, frame: str, stamp: int | None) -> bool:
+        known = self.edges.get(frame)
+        if known is None or known.static != (stamp is None):
+            # The bus announces new frames and other kinds.
+            self.staleness.note(frame)
+        before = None if known is None else known.newest
+        newest = stamp if stamp is None or before is None else max(stamp, before)
+        self.edges[frame] = Known(newest)
+        sample = static("map", frame) if stamp is None else moving("map", frame, stamp)
+        return self.staleness.arrived((sample,))
+
+    def remove(self, frame: str) -> None:
+        self.edges.pop(frame, None)
+        self.staleness.forget(frame)
+
+
+def test_memory_is_bounded_for_frames_that_are_added_and_removed() -> None:
+    world = World()
+    world.send("base", 100)
+    for number in range(10_000):
+        world.send(f"object {number}", 101 + number)
+        world.staleness.changes(100)
+        world.remove(f"object {number}")
+    assert size_of(world.staleness) < 200
+    assert world.staleness.changes(111) == [FrameStale(111, "base", 100, "")]
+
+
+def test_frames_turn_stale_in_order_when_most_others_were_removed() -> None:
+    world = World()
+    stamps = random.Random(1).sample(range(1_000), 500)
+    for stamp in stamps:
+        world.send(f"frame {stamp}", stamp)
+    world.staleness.changes(0)
+    kept = stamps[::10]
+    for stamp in set(stamps) - set(kept):
+        world.remove(f"frame {stamp}")
+    stale = [event.frame for now in range(0, 1_100, 100) for event in world.staleness.changes(now + LIMIT)]
+    assert stale == [f"frame {stamp}" for stamp in sorted(kept)]
+
+
+STEPS = st.one_of(
+    st.tuples(st.just("send"), st.sampled_from("abc"), st.integers(0, 60) | st.none()),
+    st.tuples(st.just("remove"), st.sampled_from("abc"), st.none()),
+    st.tuples(st.just("look"), st.just(""), st.integers(0, 8)),
+)
+
+
+@given(st.lists(STEPS, max_size=30))
+def test_the_events_add_up_to_the_set_of_stale_frames(steps: list[tuple[str, str, int | None]]) -> None:
+    world = World()
+    announced: set[str] = set()
+    now = 0
+    for kind, frame, number in steps:
+        if kind == "send":
+            world.send(frame, number)
+        elif kind == "remove":
+            world.remove(frame)
+            announced.discard(frame)
+        else:
+            events = world.staleness.changes(now)
+            due = world.staleness.due()
+            now += number or 0
+            later = world.staleness.changes(now)
+            assert not later or (due is not None and due <= now), "nothing changes before the announced time"
+            events += later
+            for event in events:
+                assert (event.frame in announced) == isinstance(event, FrameLive)
+                announced ^= {event.frame}
+            stale = {
+                name for name, known in world.edges.items() if known.newest is not None and known.newest + LIMIT < now
+            }
+            assert announced == stale
+
+
+def test_a_stale_frame_is_live_again_with_a_sample_that_is_recent_enough() -> None:
+    world = World()
+    world.send("a", 100)
+    world.staleness.changes(200)
+    assert world.send("a", 189)
+    assert world.staleness.changes(200) == [], "newer, but still too old"
+    assert world.send("a", 190)
+    assert world.staleness.changes(200) == [FrameLive(200, "a", 190, "")]
+    assert world.staleness.due() == 201
+    assert not world.send("a", 195)
+    assert world.staleness.changes(205) == []
+    assert world.staleness.changes(206) == [FrameStale(206, "a", 195, "")]

@@ -93,14 +93,6 @@ async def test_the_samples_of_each_thread_arrive_in_order_and_without_loss() -> 
     assert bus.statistics().samples == 8_000
 
 
-async def test_a_batch_from_a_thread_arrives_whole() -> None:
-    bus = Bus()
-    got: list[tuple[TransformStamped, ...]] = []
-    with bus.subscribe(got.append), bus.threadsafe() as publish:
-        assert in_thread(lambda: publish(moving("map", name, 1) for name in "abc")) == []
-    assert got == [tuple(moving("map", name, 1) for name in "abc")]
-
-
 async def test_samples_beyond_the_capacity_while_the_loop_is_blocked_are_dropped_and_counted() -> None:
     bus = Bus()
     got: list[int] = []
@@ -136,25 +128,6 @@ async def test_publishing_after_the_end_of_the_with_raises_in_the_thread() -> No
     assert bus.statistics().samples == 0
 
 
-async def test_publishing_to_a_closed_bus_raises_in_the_thread() -> None:
-    bus = Bus()
-    with bus.threadsafe() as publish:
-        bus.close()
-        (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
-        assert isinstance(error, BusClosedError)
-    with pytest.raises(BusClosedError):
-        bus.threadsafe()
-
-
-async def test_queued_samples_are_not_published_after_the_bus_was_closed() -> None:
-    bus = Bus()
-    with bus.threadsafe() as publish:
-        in_thread(lambda: publish(moving("map", "a", 1)))
-        bus.close()
-        await settle()
-    assert bus.statistics().samples == 0
-
-
 def test_publishing_after_the_end_of_the_loop_raises(run: Run) -> None:
     bus = Bus()
     publishers: list[ThreadPublisher] = []
@@ -175,16 +148,6 @@ async def test_publishing_before_the_with_raises() -> None:
     (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
     assert isinstance(error, RuntimeError)
     assert "with" in str(error)
-
-
-async def test_after_a_with_that_failed_to_begin_publishing_raises() -> None:
-    bus = Bus()
-    publish = bus.threadsafe()
-    bus.close()
-    with pytest.raises(BusClosedError):
-        publish.__enter__()
-    (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
-    assert isinstance(error, BusClosedError)
 
 
 def test_the_with_is_entered_on_an_event_loop_only() -> None:
@@ -228,15 +191,6 @@ async def test_samples_queued_before_a_jump_back_are_discarded_and_statics_stay(
         assert [queue.dropped for queue in bus.statistics().queues] == [1]
 
 
-async def test_a_jump_forward_discards_nothing() -> None:
-    clock = SimulatedClock(start=100)
-    bus = Bus(clock)
-    with bus.threadsafe() as publish:
-        in_thread(lambda: publish(moving("map", "a", 100)))
-        clock.set(200)
-    assert bus.statistics().samples == 1
-
-
 async def test_queued_samples_of_a_removed_frame_are_discarded() -> None:
     bus = Bus()
     buffer = Buffer(bus)
@@ -245,16 +199,6 @@ async def test_queued_samples_of_a_removed_frame_are_discarded() -> None:
         in_thread(lambda: publish([moving("map", "a", 2), moving("map", "b", 2)]))
         bus.remove_frame("a")
     assert buffer.tree.frames() == ["b", "map"]
-
-
-async def test_bus_publish_from_another_thread_is_an_error_that_names_threadsafe() -> None:
-    bus = Bus()
-    errors = in_thread(lambda: bus.publish(moving("map", "a", 1)))
-    errors += await anyio.to_thread.run_sync(lambda: in_thread(lambda: bus.publish(moving("map", "a", 1))))
-    assert [type(error) for error in errors] == [RuntimeError, RuntimeError]
-    assert all("bus.threadsafe" in str(error) for error in errors)
-    assert bus.statistics().samples == 0
-    bus.publish(moving("map", "a", 1))
 
 
 USES: list[Callable[[Bus, Buffer], object]] = [
@@ -288,42 +232,6 @@ async def test_a_bus_made_on_a_loop_belongs_to_the_thread_of_that_loop() -> None
     assert isinstance(error, RuntimeError)
     bus.publish(moving("map", "a", 2))
     assert bus.statistics().samples == 1
-
-
-def test_threads_can_publish_to_a_bus_made_outside_the_thread_of_its_loop(run: Run) -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
-    ready, done = threading.Event(), threading.Event()
-    publishers: list[ThreadPublisher] = []
-    found: list[TransformStamped] = []
-
-    async def serve() -> None:
-        with bus.threadsafe() as publish:
-            publishers.append(publish)
-            ready.set()
-            with anyio.fail_after(PATIENCE):
-                found.append(await buffer.lookup("map", "a", 7))
-        done.set()
-
-    with threads_running(lambda: run(serve)):
-        assert ready.wait(PATIENCE)
-        publishers[0](moving("map", "a", 7, 7.0))
-        assert done.wait(PATIENCE)
-    assert found[0].transform.translation == (7.0, 0.0, 0.0)
-
-
-async def test_awaited_lookups_in_another_thread_are_an_error() -> None:
-    bus = Bus()
-    buffer = Buffer(bus)
-    bus.publish(moving("map", "a", 1))
-
-    async def ask() -> None:
-        assert (await buffer.lookup("map", "a", 1)).stamp == 1
-        await buffer.lookup("map", "a", 2)
-
-    (error,) = in_thread(lambda: anyio.run(ask))
-    assert isinstance(error, RuntimeError)
-    assert buffer.pending() == ()
 
 
 async def test_worker_threads_may_read_while_the_loop_publishes() -> None:
@@ -404,3 +312,33 @@ async def test_a_thread_hears_of_a_translation_that_is_too_long_and_a_stamp_ahea
 
         await anyio.to_thread.run_sync(drive)
     assert (bus.statistics().samples, bus.statistics().rejected) == (1, {"ahead": 1})
+
+
+def test_a_loop_in_the_thread_that_made_the_bus_leaves_it_to_no_other_loop(run: Run) -> None:
+    bus = Bus()
+
+    async def use() -> None:
+        bus.events().close()
+
+    run(use)
+    assert [type(error) for error in in_thread(lambda: run(use))] == [RuntimeError]
+    bus.events().close()
+
+
+async def test_publishing_to_a_closed_bus_raises_in_the_thread() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        bus.close()
+        (error,) = in_thread(lambda: publish(moving("map", "a", 1)))
+        assert isinstance(error, BusClosedError)
+    with pytest.raises(BusClosedError):
+        bus.threadsafe()
+
+
+async def test_queued_samples_are_not_published_after_the_bus_was_closed() -> None:
+    bus = Bus()
+    with bus.threadsafe() as publish:
+        in_thread(lambda: publish(moving("map", "a", 1)))
+        bus.close()
+        await settle()
+    assert bus.statistics().samples == 0

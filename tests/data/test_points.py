@@ -1,14 +1,22 @@
+""""""
+
+import copy
 import math
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, assert_type
 
 import numpy as np
 import pytest
 from hypothesis import given
-from support.stamped_data import ANSWER
+from support.ros_messages import Header, Point, PointMessage, Time
+from support.stamped_data import ANSWER, MOVABLE, SCAN, arrays_of, contents, name_of, numbers
 from support.strategies import rotations, transforms, vectors
 
 from tfbus import (
+    LATEST,
     InvalidTransformError,
+    Latest,
+    PointCloud,
     PointStamped,
     Polygon,
     PoseStamped,
@@ -31,26 +39,10 @@ def test_a_vector_is_rotated_but_not_translated() -> None:
     assert moved.vector == pytest.approx((1.0, -2.0, -3.0), abs=1e-13)
 
 
-def test_a_pose_is_composed_with_the_transform() -> None:
-    moved = do_transform(PoseStamped("B", 7, Transform((1.0, 2.0, 3.0))), ANSWER)
-    assert moved.pose.is_close(Transform((-9.0, 18.0, 27.0), (1.0, 0.0, 0.0, 0.0)), translation_tolerance=1e-12)
-
-
-def test_an_orientation_is_rotated_but_not_translated() -> None:
-    half = math.sqrt(0.5)
-    answer = TransformStamped("A", "B", 0, Transform((10.0, 20.0, 30.0), (1.0, 0.0, 0.0, 0.0)))
-    moved = do_transform(QuaternionStamped("B", 7, (0.0, -half, 0.0, half)), answer)
-    assert moved.quaternion == pytest.approx((half, 0.0, -half, 0.0), abs=1e-15)
-
-
 def test_a_polygon_is_transformed_corner_by_corner() -> None:
     moved = do_transform(Polygon("B", 7, np.array([(1, 2, 3), (0, 0, 0)], np.float32)), ANSWER)
     assert moved.points.dtype == np.float32
     np.testing.assert_allclose(moved.points, [(-9.0, 18.0, 27.0), (-10.0, 20.0, 30.0)], rtol=1e-6)
-
-
-def test_a_polygon_may_have_no_corners() -> None:
-    assert do_transform(Polygon("B", 7, np.empty((0, 3))), ANSWER).points.shape == (0, 3)
 
 
 @given(transforms(), vectors(), vectors())
@@ -78,11 +70,6 @@ def test_an_orientation_is_that_of_the_pose(t: Transform, place: Vector, turn: Q
     pose = do_transform(PoseStamped("B", 0, Transform(place, turn)), sample).pose
     quaternion = do_transform(QuaternionStamped("B", 0, turn), sample).quaternion
     assert quaternion == pytest.approx(pose.rotation, abs=1e-14)
-
-
-def test_a_missing_point_stays_missing() -> None:
-    moved = do_transform(PointStamped("B", 0, (math.nan, math.nan, math.nan)), ANSWER)
-    assert all(map(math.isnan, moved.point))
 
 
 @pytest.mark.parametrize("pose", [None, (1.0, 2.0, 3.0), np.eye(4)])
@@ -113,3 +100,84 @@ def test_a_transform_is_moved_as_the_pose_of_its_child(static: bool, moves: bool
     assert moved.transform.is_close(Transform((1.0, 2.0, 0.0)) @ quarter)
     with pytest.raises(ValueError, match="in frame 'base'"):
         do_transform(TransformStamped("base", "tool", 5, Transform()), moved)
+
+
+@pytest.mark.parametrize("data", MOVABLE, ids=name_of)
+def test_transformed_data_have_the_frame_and_the_stamp_of_the_transform(data: Any) -> None:
+    moved = do_transform(data, ANSWER)
+    assert type(moved) is type(data)
+    assert (moved.frame, moved.stamp) == ("A", 2_000_000_000)
+
+
+@pytest.mark.parametrize("data", MOVABLE, ids=name_of)
+def test_data_stamped_latest_get_the_stamp_of_the_transform(data: Any) -> None:
+    assert do_transform(replace(data, stamp=LATEST), ANSWER).stamp == 2_000_000_000
+
+
+@pytest.mark.parametrize("data", MOVABLE, ids=name_of)
+def test_the_original_data_are_not_changed(data: Any) -> None:
+    before = copy.deepcopy(data)
+    moved = do_transform(data, ANSWER)
+    assert contents(data) == contents(before)
+    assert not any(array.flags.writeable for array in arrays_of(moved))
+
+
+@pytest.mark.parametrize("data", MOVABLE, ids=name_of)
+def test_data_in_another_frame_than_the_source_are_refused(data: Any) -> None:
+    with pytest.raises(ValueError, match=r"the data are in frame 'B', but the transform is from 'laser'"):
+        do_transform(data, TransformStamped("base", "laser", 0, Transform()))
+
+
+@given(transforms(10.0), transforms(10.0))
+def test_two_transforms_in_turn_equal_their_product(c_from_a: Transform, a_from_b: Transform) -> None:
+    first, second = TransformStamped("A", "B", 0, a_from_b), TransformStamped("C", "A", 0, c_from_a)
+    both = TransformStamped("C", "B", 0, c_from_a @ a_from_b)
+    for data in MOVABLE:
+        exact = replace(data, points=data.points.astype(np.float64)) if hasattr(data, "points") else data
+        steps, leap = do_transform(do_transform(exact, first), second), do_transform(exact, both)
+        assert steps.frame == leap.frame == "C"
+        np.testing.assert_allclose(numbers(steps), numbers(leap), rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize(("data", "kind"), [((1.0, 2.0, 3.0), "tuple"), (None, "NoneType"), (Transform(), "Transform")])
+def test_an_unregistered_type_is_a_type_error_that_says_how_to_register_it(data: Any, kind: str) -> None:
+    with pytest.raises(TypeError, match=rf"@do_transform\.register\({kind}\)") as caught:
+        do_transform(data, ANSWER)
+    assert "to_points" not in str(caught.value)
+
+
+def test_a_scan_is_refused_with_a_hint_at_to_points() -> None:
+    with pytest.raises(TypeError, match=r"cannot transform a LaserScan: transform its to_points\(\) instead"):
+        do_transform(SCAN, ANSWER)
+    assert do_transform(SCAN.to_points(), ANSWER).frame == "A"
+
+
+@dataclass(frozen=True)
+class Sphere:
+    frame: str
+    stamp: int | Latest
+    centre: Vector
+    radius: float
+
+
+@do_transform.register
+def _(data: Sphere, transform: TransformStamped) -> Sphere:
+    return Sphere(transform.parent, transform.stamp, transform.transform.apply(data.centre), data.radius)
+
+
+def test_a_program_can_register_its_own_type() -> None:
+    moved = do_transform(Sphere("B", 7, (1.0, 2.0, 3.0), 0.5), ANSWER)
+    assert (moved.frame, moved.stamp, moved.radius) == ("A", 2_000_000_000, 0.5)
+    assert moved.centre == pytest.approx((-9.0, 18.0, 27.0), abs=1e-13)
+
+
+@do_transform.register
+def _(data: PointMessage, transform: TransformStamped) -> PointMessage:
+    p = data.point
+    header = Header(Time(*divmod(transform.stamp, 1_000_000_000)), transform.parent)
+    return PointMessage(header, Point(*transform.transform.apply((p.x, p.y, p.z))))
+
+
+def test_type_checkers_see_the_type_that_was_given() -> None:
+    assert_type(do_transform(PointStamped("B", 0, (1.0, 2.0, 3.0)), ANSWER), PointStamped)
+    assert_type(do_transform(PointCloud("B", 0, np.zeros((1, 3))), ANSWER), PointCloud)

@@ -5,7 +5,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from tfbus import LATEST, Latest, Transform, TransformStamped, TransformTree
+from tfbus import LATEST, Bus, FrameAdded, Latest, Transform, TransformStamped, TransformTree
 
 
 def moving(parent: str, child: str, stamp: int, x: float = 0.0, authority: str = "") -> TransformStamped:
@@ -52,3 +52,9 @@ def newest_samples(stored: Iterable[TransformStamped]) -> dict[str, TransformSta
         if before is None or before.static or sample.static or sample.stamp >= before.stamp:
             newest[sample.child] = sample
     return newest
+
+
+def edges_of(bus: Bus) -> list[FrameAdded]:
+    """The newest edges of a bus, in the order in which their children came."""
+    with bus.events() as events:
+        return [event for event in iter(events.queue.get, None) if isinstance(event, FrameAdded)]

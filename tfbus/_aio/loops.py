@@ -1,4 +1,11 @@
-"""Waiting for threads that may never end."""
+"""Event loops and threads: waking a loop from any thread, waiting until its tasks are blocked, and joining threads.
+
+How `settling` waits: trio tells when nothing can go on, asyncio does not. `anyio.wait_all_tasks_blocked` looks at every
+task, which costs a program of n timed tasks n steps each time that one of them wakes. But every task and every callback
+that goes on has been given to the public method ``call_soon`` of the loop, and the loop runs them first in, first out.
+So `settling` counts the calls of that method. If nothing has called it between two turns of the task that settles, then
+everything that was given earlier has run, and nothing is left to run.
+"""
 
 import logging
 import threading
@@ -82,18 +89,9 @@ def _never() -> bool:
     return False
 
 
-# Waiting until all tasks of the event loop are blocked.
-#
-# trio tells when nothing can go on. asyncio does not: `anyio.wait_all_tasks_blocked` looks at every task, which costs
-# a program of n timed tasks n steps each time that one of them wakes. But whatever goes on there, be it a task or a
-# callback, has been given to the public method ``call_soon`` of the loop, and the loop runs what it has been given
-# first in, first out. So `settling` counts the calls of that method. If nothing has called it between two turns of the
-# task that settles, then all that was given earlier has run, and nothing is left to run.
-
-
 _QUIET_TURNS = 2
-# Who calls `call_soon_threadsafe` on the loop's own thread, or has kept a method, is not counted: a second quiet turn
-# sees what that callback sets off.
+# A call of `call_soon_threadsafe` on the loop's own thread, or of a method that was kept, is not counted: a second
+# quiet turn sees the calls that its callback makes.
 
 _MOST_TURNS = 1_000
 # A cancel scope whose task refuses to end gives the loop a callback every turn, though all tasks are blocked.

@@ -84,7 +84,7 @@ class WebDoor:
         Parameters
         ----------
         received : bytes
-            What was received, with `HEAD_END` in it; without it, that is refused.
+            The head of the request, with `HEAD_END` in it; bytes without it are refused.
         """
         status, why = self._judge(received)
         if not status:
@@ -111,7 +111,7 @@ class WebDoor:
         if found is None:
             return "400 Bad Request", f"no host has the name {hosts[0]!a}"
         host = _place(found[1], found[2])
-        # An address leads nowhere else, whoever owns the name of a page.
+        # An address leads nowhere else, while the owner of a name can make it lead here.
         if host.host not in self._names and not _is_address(host.host):
             return "403 Forbidden", f"this server is not {hosts[0]!a}; origins= allows other names"
         if origins and not self._is_own(origins[0], host):

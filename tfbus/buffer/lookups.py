@@ -5,8 +5,9 @@
 unblocks the lookup hands over the answer. The task gives that answer if the tree has not changed until it runs, one
 turn of the event loop later; otherwise it asks again, and may park again on the same deadline.
 
-The end of a wait is an alarm. Alarms share one timer of the event loop, because nearly all are cancelled before they
-ring. A lookup that has waited for 5 s is logged, with all others that have.
+The end of a wait is an alarm. A cancel scope for each wait would set and remove a timer of the event loop each time;
+the alarms of a buffer share one timer. It is set for the first alarm, and stays as it is when that alarm is cancelled,
+because the next one is nearly always later. A lookup that has waited for 5 s is logged, with all others that have.
 """
 
 import logging
@@ -210,11 +211,6 @@ class LocalNames:
         )
 
 
-# Alarms. A cancel scope for each wait would set and remove a timer of the event loop each time. The alarms of a buffer
-# share one timer: it is set for the first alarm, and stays as it is when that alarm is cancelled, because the next one
-# is nearly always later.
-
-
 _CANCELLED_KEPT = 64
 
 
@@ -252,7 +248,7 @@ class LoopAlarms:
     """Alarms by the time of the event loop that runs, which may be another one later."""
 
     def __init__(self) -> None:
-        self._heap: _AlarmHeap | None = None
+        self._heap: AlarmHeap | None = None
 
     def call_after(self, seconds: float, callback: Callable[[], object]) -> Cancel:
         """Call a function on the event loop after a duration in s, unless it is cancelled; it must not raise."""
@@ -260,11 +256,11 @@ class LoopAlarms:
         heap = self._heap
         if heap is None or heap.timer.loop is not loop:
             # The heap of another loop still wakes the lookups that wait there.
-            heap = self._heap = _AlarmHeap(loop)
+            heap = self._heap = AlarmHeap(loop)
         return heap.add(seconds, callback)
 
 
-class _AlarmHeap:
+class AlarmHeap:
     """The alarms on one event loop by their times, with one timer for the first."""
 
     def __init__(self, loop: Any) -> None:
@@ -273,6 +269,9 @@ class _AlarmHeap:
         # The callbacks that are neither made nor cancelled, by number.
         self._callbacks: dict[int, Callable[[], object]] = {}
         self._numbers = count()
+
+    def __len__(self) -> int:
+        return len(self._alarms)
 
     def add(self, seconds: float, callback: Callable[[], object]) -> Cancel:
         due = self.timer.now() + seconds

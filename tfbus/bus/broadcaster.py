@@ -26,7 +26,7 @@ class TransformBroadcaster:
     shared : iterable of str
         Names without a prefix, because they are the same for all robots, such as ``{"map"}``.
     invalid : {"raise", "drop"}
-        What to do with a sample that the bus refuses, as in `Bus.publish`. ``"drop"`` is for a program that must go on
+        The fate of a sample that the bus refuses, as in `Bus.publish`. ``"drop"`` is for a program that must go on
         whatever edges others publish: the sample is left out, counted, and logged once. A bad name, stamp or transform
         is an error all the same.
 

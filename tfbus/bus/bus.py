@@ -132,8 +132,8 @@ class Bus:
     clock : Clock, optional
         The source of stamps, and the clock of timeouts and timed tasks; by default a `SystemClock`.
     on_conflict : {"last", "reject"}
-        What happens to samples of a child that another authority has published before: they are accepted and reported,
-        or refused until the frame is removed, across jumps of the clock. The empty authority ``""`` is one like any
+        The fate of samples of a child that another authority has published before: the bus accepts and reports them, or
+        refuses them until the frame is removed, across jumps of the clock. The empty authority ``""`` is one like any
         other.
     max_translation : float
         The greatest magnitude of a translation, in m, at most 1e100; a longer one is refused as not physical.
@@ -246,7 +246,7 @@ class Bus:
         ----------
         samples : TransformStamped or iterable of them
         invalid : {"raise", "drop"}
-            What to do with a sample that the bus refuses: raise an error and store nothing of the batch; or leave that
+            The fate of a sample that the bus refuses: raise an error and store nothing of the batch; or leave that
             sample out, count it, and log it once for each reason, frame and authority. ``"drop"`` is for programs that
             pass on the samples of others, and for those that must not end because of the edges of others.
 

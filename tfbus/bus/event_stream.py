@@ -1,4 +1,10 @@
-"""Events as an async iterator."""
+"""Events as an async iterator.
+
+An `EventQueue` holds the events for one reader and leaves out repetitions. `Staleness` finds the moving frames whose
+newest sample is too old, without a timer: `EventStream` asks it for changes and for the time of the next one, while a
+task reads. A frame costs a few steps each time that it may have become stale; a sample costs nothing unless some frame
+is stale.
+"""
 
 import math
 from collections import deque
@@ -137,11 +143,6 @@ def _deduplication_key(event: SampleRejected | StampAhead | StampBehind | PastLo
     if isinstance(event, SampleRejected):
         return event.reason
     return event.parent if isinstance(event, PastLoop) else None
-
-
-# Staleness: the moving frames whose newest sample is too old. There is no timer here: the caller asks for changes and
-# for the time of the next one. A frame costs a few steps each time that it may have become stale; a sample costs
-# nothing unless some frame is stale.
 
 
 _SPARE = 64

@@ -1,4 +1,4 @@
-"""Publishing from other threads."""
+"""The bounded queue of samples, and the stream of batches that a task reads from one."""
 
 from collections import deque
 from collections.abc import Callable, Iterable

@@ -1,4 +1,4 @@
-"""The callbacks that a bus calls with each batch."""
+"""The callbacks of a bus, the announcement of its events, and log lines that are written once for each cause."""
 
 import logging
 from collections import deque

@@ -127,7 +127,7 @@ class Plausibility:
             self._kept -= 1
 
     def split(self, batch: Batch) -> tuple[Batch, list[InvalidTransformError], Batch, Batch]:
-        """The samples of a batch that may go on, the errors of the others, and those that are ahead, and behind.
+        """The samples of a batch that may go on, the errors of the others, and the samples that are ahead, and behind.
 
         All are in order. A static sample is never ahead or behind, because it holds at every stamp.
         """

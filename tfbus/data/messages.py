@@ -55,7 +55,7 @@ def numbers(message: object, names: Iterable[str]) -> tuple[float, ...]:
 def filled(like: Any, values: Mapping[str, Any]) -> Any:
     """A copy of a message with other values in some fields; fields that are mappings in `values` are copied likewise.
 
-    Arrays and sequences become what is there: an ``array``, an array of numpy, bytes or a list.
+    Arrays and sequences become of the kind of the old value: an ``array``, an array of numpy, bytes or a list.
     """
     result = copy(like)
     for name, value in values.items():
@@ -379,7 +379,7 @@ def _read_wrench(message: object, frame: str, stamp: int) -> WrenchStamped:
     return WrenchStamped(frame, stamp, _triple(message, "wrench", "force"), _triple(message, "wrench", "torque"))
 
 
-# A message of several, as nav_msgs/Odometry, is none of them: it is for the caller to say which part is meant.
+# A message with several of these, as nav_msgs/Odometry, is refused: the caller names the part that is meant.
 _READERS: dict[str, Callable[[object, str, int], Data]] = {
     "point_step": read_cloud,
     "ranges": _read_scan,

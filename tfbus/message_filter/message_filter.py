@@ -358,7 +358,7 @@ class MessageFilter(Generic[MessageT, AnswerT]):
     capacity : int
         How many messages may wait or be ready and unread.
     overflow : {"drop_oldest", "drop_newest", "block"}
-        What happens when one more arrives: the oldest is dropped, or the new one, or none, because the source is not
+        The consequence when one more arrives: the oldest is dropped, or the new one, or none, because the source is not
         read until there is room. Use ``"block"`` for a source that does not wait by itself, such as a recording.
     order : {"ready", "stamp", "arrival"}
         Deliver messages as they become ready; or by stamp, which holds back messages newer than one that waits; or in

@@ -1,15 +1,125 @@
-import copy
-from collections.abc import Iterable
+""""""
 
+import copy
+from collections.abc import Awaitable, Callable, Iterable
+from functools import partial
+
+import anyio
+import anyio.lowlevel
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.asking import Asked, driving, settle
 from support.samples import moving, static
 
-from tfbus import QueueStatistics, TransformStamped
+from tfbus import Bus, SimulatedClock, Stream, TransformStamped
 from tfbus.bus.queues import Overflow, SampleQueue
 
+pytestmark = pytest.mark.anyio
+
 Batches = list[tuple[TransformStamped, ...]]
+OVERFLOWS: list[Overflow] = ["conflate", "drop_oldest"]
+
+
+async def read(stream: Stream, batches: Batches) -> None:
+    async for batch in stream:
+        batches.append(batch)
+
+
+@pytest.mark.every_loop
+async def test_a_stream_gives_whole_batches_in_order() -> None:
+    bus = Bus(SimulatedClock())
+    sent = [(moving("map", "a", k), moving("a", "b", k)) for k in range(20)]
+    got: Batches = []
+    async with anyio.create_task_group() as tasks:
+        with bus.stream(overflow="drop_oldest") as stream:
+            tasks.start_soon(read, stream, got)
+            await settle()
+            for batch in sent[:10]:
+                bus.publish(batch)
+                await settle()
+            for batch in sent[10:]:
+                bus.publish(batch)
+            await settle()
+            assert got == sent
+
+
+@pytest.mark.parametrize("overflow", OVERFLOWS)
+async def test_a_late_stream_gives_the_latched_static_samples_first(overflow: Overflow) -> None:
+    bus = Bus(SimulatedClock())
+    bus.publish([static("map", "a"), static("map", "b", x=1.0), moving("map", "c", 1)])
+    bus.publish(static("map", "b", x=2.0))
+    with bus.stream(overflow=overflow) as stream:
+        assert set(await anext(stream)) == {static("map", "a"), static("map", "b", x=2.0)}
+        bus.publish(moving("map", "c", 2))
+        assert await anext(stream) == (moving("map", "c", 2),)
+
+
+@pytest.mark.parametrize("overflow", OVERFLOWS)
+@pytest.mark.parametrize("end", [lambda bus, _: bus.close(), lambda _, stream: stream.close()])
+async def test_a_closed_stream_ends_after_the_pending_batches(
+    end: Callable[[Bus, Stream], None], overflow: Overflow
+) -> None:
+    bus = Bus(SimulatedClock())
+    stream = bus.stream(overflow=overflow)
+    bus.publish(moving("map", "a", 1))
+    end(bus, stream)
+    got: Batches = []
+    await read(stream, got)
+    assert got == [(moving("map", "a", 1),)]
+    with pytest.raises(StopAsyncIteration):
+        await anext(stream)
+
+
+async def test_a_stream_may_be_closed_in_a_callback_of_the_bus() -> None:
+    bus = Bus(SimulatedClock())
+    with bus.stream() as closing, bus.stream() as staying, bus.subscribe(lambda _: closing.close()):
+        bus.publish(moving("map", "a", 1))
+        bus.publish(moving("map", "b", 2))
+        assert set(await anext(staying)) == {moving("map", "a", 1), moving("map", "b", 2)}
+        assert [batch async for batch in closing] == [(moving("map", "a", 1),)]
+    assert bus.statistics().callbacks_failed == 0
+
+
+@pytest.mark.parametrize("overflow", OVERFLOWS)
+async def test_a_jump_back_discards_pending_moving_samples(overflow: Overflow) -> None:
+    clock = SimulatedClock(start=10)
+    bus = Bus(clock)
+    with bus.stream(overflow=overflow) as stream:
+        bus.publish([static("map", "a"), moving("map", "b", 10)])
+        clock.set(5)
+        bus.publish(moving("map", "b", 5))
+        bus.close()
+        got = [sample async for batch in stream for sample in batch]
+        assert got == [static("map", "a"), moving("map", "b", 5)]
+        assert stream.dropped == 1
+
+
+def test_a_stream_may_be_made_before_a_loop_runs_and_read_on_several(
+    run: Callable[[Callable[[], Awaitable[None]]], None],
+) -> None:
+    bus = Bus(SimulatedClock())
+    stream = bus.stream()
+
+    async def read_one(second: int) -> None:
+        async with anyio.create_task_group() as tasks:
+            asked = Asked(tasks, stream.__anext__)
+            await settle()
+            bus.publish(driving("map", "a", second))
+            await settle()
+            assert asked.answer == (driving("map", "a", second),)
+
+    for second in range(3):
+        run(partial(read_one, second))
+
+
+@pytest.mark.parametrize(("capacity", "overflow"), [(0, "conflate"), (10, "block")])
+def test_a_stream_with_a_bad_capacity_or_overflow_is_not_registered(capacity: int, overflow: Overflow) -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(ValueError, match=r"capacity|overflow"):
+        bus.stream(capacity, overflow)
+    bus.publish(moving("map", "a", 1))
+    assert bus.statistics().queues == ()
 
 
 def emptied(queue: SampleQueue) -> Batches:
@@ -19,25 +129,6 @@ def emptied(queue: SampleQueue) -> Batches:
     return batches
 
 
-def test_drop_oldest_keeps_batches_whole_and_in_order() -> None:
-    queue = SampleQueue(10, "drop_oldest")
-    batches = [(moving("map", "a", 1), moving("map", "b", 1)), (moving("map", "a", 2),), (static("map", "c"),)]
-    for batch in batches:
-        queue.put(batch)
-    assert len(queue) == 4
-    assert emptied(queue) == batches
-    assert queue.dropped == 0
-
-
-def test_drop_oldest_drops_the_oldest_whole_batches_and_counts_their_samples() -> None:
-    queue = SampleQueue(3, "drop_oldest")
-    queue.put((moving("map", "a", 1), moving("map", "b", 1)))
-    queue.put((moving("map", "a", 2),))
-    queue.put((moving("map", "a", 3), moving("map", "b", 3)))
-    assert emptied(queue) == [(moving("map", "a", 2),), (moving("map", "a", 3), moving("map", "b", 3))]
-    assert queue.dropped == 2
-
-
 def test_the_newest_batch_stays_even_if_it_exceeds_the_capacity() -> None:
     queue = SampleQueue(2, "drop_oldest")
     large = tuple(moving("map", f"joint_{number}", 1) for number in range(5))
@@ -45,17 +136,6 @@ def test_the_newest_batch_stays_even_if_it_exceeds_the_capacity() -> None:
     queue.put(large)
     assert emptied(queue) == [large]
     assert queue.dropped == 1
-
-
-def test_drop_oldest_keeps_the_newest_static_sample_of_each_child() -> None:
-    queue = SampleQueue(1, "drop_oldest")
-    queue.put((static("map", "a", x=1.0), moving("map", "b", 1)))
-    queue.put((static("map", "a", x=2.0), static("map", "c"), moving("map", "b", 2)))
-    queue.put((moving("map", "b", 3),))
-    first, second = emptied(queue)
-    assert set(first) == {static("map", "a", x=2.0), static("map", "c")}
-    assert second == (moving("map", "b", 3),)
-    assert queue.dropped == 2
 
 
 def test_kept_static_samples_come_in_the_order_of_their_last_publication() -> None:
@@ -74,46 +154,6 @@ def test_repeated_static_samples_do_not_fill_the_queue() -> None:
     assert (queue.dropped, queue.conflated, len(queue)) == (0, 0, 0)
 
 
-def test_a_kept_static_sample_is_removed_only_with_its_frame() -> None:
-    queue = SampleQueue(1, "drop_oldest")
-    queue.put((static("map", "a"), static("map", "b"), moving("map", "c", 1)))
-    queue.put((moving("map", "c", 2),))
-    assert len(queue) == 3
-    queue.discard_moving()
-    queue.forget("a")
-    assert (len(queue), queue.dropped) == (1, 2)
-    assert emptied(queue) == [(static("map", "b"),)]
-
-
-def test_conflate_keeps_the_newest_sample_of_each_child_and_gives_all_as_one_batch() -> None:
-    queue = SampleQueue(10, "conflate")
-    for stamp in range(1, 6):
-        queue.put((moving("map", "a", stamp), moving("map", "b", 10 * stamp)))
-    assert len(queue) == 2
-    (batch,) = emptied(queue)
-    assert set(batch) == {moving("map", "a", 5), moving("map", "b", 50)}
-    assert queue.dropped == 0
-
-
-def test_conflate_keeps_the_newest_stamp_and_the_last_of_equal_stamps() -> None:
-    queue = SampleQueue(10, "conflate")
-    for sample in (moving("map", "a", 5, 1.0), moving("map", "a", 4, 2.0), moving("map", "a", 5, 3.0)):
-        queue.put((sample,))
-    assert emptied(queue) == [(moving("map", "a", 5, 3.0),)]
-
-
-@pytest.mark.parametrize("first_static", [True, False])
-def test_conflate_keeps_the_last_kind_of_a_child_for_any_stamps(first_static: bool) -> None:
-    pair = [static("map", "a", stamp=9), moving("map", "a", 1)]
-    first, last = pair if first_static else pair[::-1]
-    queue = SampleQueue(1, "conflate")
-    queue.put((first,))
-    queue.put((last,))
-    queue.put((moving("map", "b", 1),))
-    assert emptied(queue) == [((moving("map", "b", 1),) if first_static else (last, moving("map", "b", 1)))]
-    assert queue.dropped == first_static
-
-
 def test_conflate_drops_the_moving_children_that_have_waited_longest() -> None:
     queue = SampleQueue(2, "conflate")
     queue.put((static("map", "s"), moving("map", "a", 1), moving("map", "b", 1)))
@@ -122,15 +162,6 @@ def test_conflate_drops_the_moving_children_that_have_waited_longest() -> None:
     (batch,) = emptied(queue)
     assert set(batch) == {static("map", "s"), static("map", "t"), moving("map", "a", 2), moving("map", "c", 1)}
     assert queue.dropped == 1
-
-
-def test_an_emptied_queue_has_its_full_capacity_again() -> None:
-    for overflow in ("conflate", "drop_oldest"):
-        queue = SampleQueue(2, overflow)
-        for _ in range(3):
-            queue.put((moving("map", "a", 1), moving("map", "b", 1)))
-            assert [set(batch) for batch in emptied(queue)] == [{moving("map", "a", 1), moving("map", "b", 1)}]
-        assert queue.dropped == 0
 
 
 @pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])
@@ -146,24 +177,6 @@ def test_moving_samples_of_a_forgotten_child_count_as_dropped(overflow: Overflow
     assert queue.dropped == 1, "there is room for two again"
     queue.put((moving("map", "e", 1),))
     assert queue.dropped == (2 if overflow == "conflate" else 3), "and for no more"
-
-
-@pytest.mark.parametrize("overflow", ["conflate", "drop_oldest"])
-def test_discarded_moving_samples_count_as_dropped_and_static_ones_stay(overflow: Overflow) -> None:
-    queue = SampleQueue(5, overflow)
-    queue.put((moving("map", "a", 1), static("map", "s")))
-    queue.put((moving("map", "b", 1),))
-    queue.discard_moving()
-    assert emptied(queue) == [(static("map", "s"),)]
-    assert queue.dropped == 2
-
-
-def test_statistics_have_the_kind_and_the_counters_of_the_queue() -> None:
-    queue = SampleQueue(1, "drop_oldest")
-    queue.put((moving("map", "a", 1),))
-    queue.put((moving("map", "a", 2),))
-    expected = QueueStatistics(kind="stream", overflow="drop_oldest", capacity=1, pending=1, dropped=1)
-    assert queue.statistics("stream") == expected
 
 
 def test_conflated_moving_samples_are_counted_separately() -> None:
@@ -227,9 +240,7 @@ def _pending_moving(queue: SampleQueue) -> int:
 
 
 @given(steps=st.lists(BATCHES | st.none(), max_size=40))
-def test_conflate_equals_a_dict_of_the_newest_samples(
-    steps: list[tuple[TransformStamped, ...] | None],
-) -> None:
+def test_conflate_equals_a_dict_of_the_newest_samples(steps: list[tuple[TransformStamped, ...] | None]) -> None:
     queue = SampleQueue(4, "conflate")
     model: dict[str, TransformStamped] = {}
     for batch in steps:

@@ -1,10 +1,15 @@
+""""""
+
 import ast
+import runpy
+import sys
 from dataclasses import FrozenInstanceError, fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from support.commands import Command
 
 import tfbus
 
@@ -48,3 +53,13 @@ def test_type_checkers_read_the_names_and_modules_that_are_loaded() -> None:
         assert getattr(tfbus, name) is getattr(import_module(str(module)), name)
     for room in (alias.name for module, alias in imports if module == "tfbus"):
         assert getattr(tfbus, room) is import_module(f"tfbus.{room}")
+
+
+def test_the_package_runs_as_the_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    command = Command(monkeypatch, capsys)("query")
+    monkeypatch.setattr(sys, "argv", ["tfbus", "query"])
+    monkeypatch.delitem(sys.modules, "tfbus.__main__", raising=False)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("tfbus", run_name="__main__")
+    assert ended.value.code == command.returncode == 2
+    assert capsys.readouterr().err == command.stderr != ""

@@ -1,17 +1,107 @@
+""""""
+
 import asyncio
 import threading
 import types
 from collections.abc import Awaitable, Callable, Coroutine, Generator
+from threading import Event, Thread
 from typing import Any
 
 import anyio
 import anyio.lowlevel
 import anyio.to_thread
 import pytest
+from support.asking import settle
 
-from tfbus._aio.loops import settling
+from tfbus._aio.loops import LoopWaker, join_all, settling, wait_for_all
+from tfbus._aio.task_groups import close_task_group
+from tfbus._aio.turn_budget import TurnBudget
 
 pytestmark = [pytest.mark.anyio, pytest.mark.every_loop]
+
+Run = Callable[[Callable[[], Awaitable[None]]], None]
+
+PATIENCE = 30.0
+"""Real seconds after which a test that hangs is given up."""
+
+
+class CountedWaker:
+    """A waker with the number of its calls, and an event for the next call."""
+
+    def __init__(self) -> None:
+        self.waker = LoopWaker(self._answer)
+        self.calls = 0
+        self.threads: set[int] = set()
+        self.called = anyio.Event()
+
+    def _answer(self) -> None:
+        self.calls += 1
+        self.threads.add(threading.get_ident())
+        self.called.set()
+
+
+async def test_a_callback_that_raises_is_logged_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    answers: list[int] = []
+    waker = LoopWaker(lambda: answers.append(1 // len(answers)))
+    waker.bind()
+    waker.wake()
+    await settle()
+    assert [record.exc_info[0] for record in caplog.records if record.exc_info] == [ZeroDivisionError]
+    answers.append(0)
+    waker.wake()
+    await settle()
+    assert answers == [0, 1]
+
+
+def test_a_wake_that_a_closed_loop_never_answered_makes_the_next_one_raise_until_the_waker_is_bound_again() -> None:
+    counted = CountedWaker()
+
+    async def connect() -> None:
+        counted.waker.bind()
+
+    for _ in range(2):
+        native = asyncio.new_event_loop()
+        native.run_until_complete(connect())
+        counted.waker.wake()
+        native.close()
+        for _ in range(2):
+            with pytest.raises(RuntimeError):
+                counted.waker.wake()
+        assert counted.calls == 0
+
+    async def answer() -> None:
+        counted.waker.bind()
+        counted.waker.wake()
+        await asyncio.wait_for(counted.called.wait(), PATIENCE)
+
+    asyncio.run(answer())
+    assert counted.calls == 1
+
+
+def test_waking_in_a_thread_while_the_loop_ends_raises(run: Run) -> None:
+    counted = CountedWaker()
+    begun = threading.Event()
+    errors: list[Exception] = []
+
+    def keep_waking() -> None:
+        while not errors:
+            try:
+                counted.waker.wake()
+            except RuntimeError as error:
+                errors.append(error)
+            begun.set()
+
+    thread = threading.Thread(target=keep_waking)
+
+    async def serve() -> None:
+        counted.waker.bind()
+        thread.start()
+        assert begun.wait(PATIENCE)
+
+    run(serve)
+    thread.join(PATIENCE)
+    assert not thread.is_alive()
+
 
 ASYNCIO = [
     pytest.param(("asyncio", {"use_uvloop": uvloop}), id=name) for name, uvloop in (("asyncio", 0), ("uvloop", 1))
@@ -59,43 +149,8 @@ async def checkpoints(hops: int, log: Log) -> None:
     log.end()
 
 
-async def streams(hops: int, log: Log) -> None:
-    """Each of many tasks sends on what it has received."""
-    async with anyio.create_task_group() as tasks:
-        ends = [anyio.create_memory_object_stream[int](0) for _ in range(hops + 1)]
-
-        async def send_on(hop: int) -> None:
-            await ends[hop + 1][0].send(await ends[hop][1].receive())
-
-        for hop in range(hops):
-            tasks.start_soon(send_on, hop)
-        await ends[0][0].send(1)
-        await ends[-1][1].receive()
-        for end in ends:
-            end[0].close()
-            end[1].close()
-    log.end()
-
-
-async def cancellations(hops: int, log: Log) -> None:
-    """Each of many tasks cancels the next one when it is cancelled itself."""
-    async with anyio.create_task_group() as tasks:
-        scopes = [anyio.CancelScope() for _ in range(hops)]
-
-        async def wait(hop: int) -> None:
-            with scopes[hop]:
-                await anyio.sleep_forever()
-            if hop + 1 < hops:
-                scopes[hop + 1].cancel()
-
-        for hop in range(hops):
-            tasks.start_soon(wait, hop)
-        scopes[0].cancel()
-    log.end()
-
-
 @pytest.mark.parametrize("hops", [1, 2, 100])
-@pytest.mark.parametrize("chain", [events, nested_task_groups, checkpoints, streams, cancellations])
+@pytest.mark.parametrize("chain", [events, nested_task_groups, checkpoints])
 async def test_a_chain_has_ended_before_settling_ends(
     chain: Callable[[int, Log], Coroutine[Any, Any, None]], hops: int
 ) -> None:
@@ -117,16 +172,6 @@ async def test_a_chain_that_is_longer_than_the_count_goes_has_ended_as_well() ->
         assert log.ended == 1
 
 
-async def test_what_is_set_off_after_one_settling_has_ended_before_the_next_one() -> None:
-    async with anyio.create_task_group() as tasks:
-        with settling() as settle:
-            for hops in range(20):
-                log = Log()
-                tasks.start_soon(events, hops, log)
-                await settle()
-                assert log.ended == 1
-
-
 async def test_tasks_that_wait_for_threads_or_real_time_count_as_blocked() -> None:
     release = threading.Event()
 
@@ -142,36 +187,6 @@ async def test_tasks_that_wait_for_threads_or_real_time_count_as_blocked() -> No
         assert not release.is_set()
         release.set()
         tasks.cancel_scope.cancel()
-
-
-async def test_settling_may_be_cancelled() -> None:
-    async def spin() -> None:
-        while True:
-            await anyio.lowlevel.checkpoint()
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(spin)
-        with settling() as settle, anyio.move_on_after(0.01) as scope:
-            await settle()
-        assert scope.cancelled_caught
-        tasks.cancel_scope.cancel()
-
-
-async def test_two_tasks_may_settle_at_once() -> None:
-    log = Log()
-    seen: list[int] = []
-
-    async def settle_often() -> None:
-        with settling() as settle:
-            for _ in range(10):
-                await settle()
-                seen.append(log.ended)
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(settle_often)
-        tasks.start_soon(settle_often)
-        tasks.start_soon(checkpoints, 30, log)
-    assert seen == [1] * 20
 
 
 @types.coroutine
@@ -198,21 +213,6 @@ async def test_settling_takes_two_turns_if_nothing_goes_on_however_many_tasks_th
             await settle()
             assert await turns_of(settle()) == 2
         tasks.cancel_scope.cancel()
-
-
-@only_asyncio
-async def test_settling_of_two_tasks_at_once_takes_both_two_turns() -> None:
-    turns: list[int] = []
-
-    async def count(settle: Callable[[], Awaitable[None]]) -> None:
-        turns.append(await turns_of(settle()))
-
-    with settling() as first, settling() as second:
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(count, first)
-            tasks.start_soon(count, second)
-    # The start of the second task, and the end of the first one, are calls like any other.
-    assert all(2 <= each <= 5 for each in turns)
 
 
 @only_asyncio
@@ -293,3 +293,69 @@ async def test_a_method_that_somebody_else_has_put_there_stays(monkeypatch: pyte
         await settle()
     assert called
     assert loop.call_soon is traced
+
+
+async def test_threads_are_waited_for_until_they_end_or_the_time_is_over() -> None:
+    may_end = Event()
+    stuck, ended = Thread(target=may_end.wait), Thread(target=may_end.is_set)
+    for thread in (stuck, ended):
+        thread.start()
+    assert not await wait_for_all([stuck, ended], 0.01)
+    with anyio.CancelScope() as scope:
+        # The end of a cancelled task waits too.
+        scope.cancel()
+        assert await wait_for_all([ended], 60.0)
+    assert not scope.cancelled_caught
+    join_all([stuck], 0.0)
+    assert stuck.is_alive()
+    may_end.set()
+    assert await wait_for_all([stuck, ended], 60.0)
+    assert await wait_for_all([], 0.0)
+
+
+async def gives_way(budget: TurnBudget) -> bool:
+    """Whether it passes a checkpoint, where a cancelled task ends."""
+    with anyio.CancelScope() as scope:
+        scope.cancel()
+        await budget.give_way()
+    return scope.cancelled_caught
+
+
+async def test_work_gives_way_once_its_time_is_spent_and_not_before() -> None:
+    now = 0.0
+    budget = TurnBudget(2.0, lambda: now)
+    now = 1.5
+    assert not budget.spent
+    assert not await gives_way(budget)
+    now = 2.0
+    assert budget.spent
+    assert await gives_way(budget)
+    await budget.give_way()
+    now = 3.5
+    assert not await gives_way(budget)
+    budget.begin()
+    now = 5.0
+    assert not budget.spent
+    now = 5.5
+    assert budget.spent
+
+
+async def fail(error: BaseException) -> None:
+    raise error
+
+
+async def close_with(*errors: BaseException) -> None:
+    """Close a group whose tasks raise these errors in one turn of the loop."""
+    tasks = anyio.create_task_group()
+    await tasks.__aenter__()
+    for error in errors:
+        tasks.start_soon(fail, error)
+    await close_task_group(tasks)
+
+
+@pytest.mark.parametrize("in_one_task", [True, False])
+async def test_a_group_that_one_task_raises_and_the_errors_of_several_tasks_are_a_group(in_one_task: bool) -> None:
+    errors = [KeyError("a"), ValueError("b")]
+    with pytest.raises(ExceptionGroup) as caught:
+        await close_with(*([ExceptionGroup("own", errors)] if in_one_task else errors))
+    assert {*caught.value.exceptions} == {*errors}

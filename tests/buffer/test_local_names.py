@@ -7,8 +7,11 @@ from typing import Any
 
 import anyio
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 from support.asking import Asked, driving, settle
-from support.samples import moving, static, x_of
+from support.samples import static, x_of
+from support.strategies import frame_names
 
 from tfbus import (
     LATEST,
@@ -17,7 +20,6 @@ from tfbus import (
     Bus,
     DisconnectedError,
     FutureExtrapolationError,
-    Hold,
     InvalidTransformError,
     LookupTimeoutError,
     PointStamped,
@@ -25,9 +27,9 @@ from tfbus import (
     SimulatedClock,
     Transform,
     TransformBroadcaster,
-    TransformStamped,
     UnknownFrameError,
 )
+from tfbus.frames import Prefix, check_frame, is_frame
 
 pytestmark = pytest.mark.anyio
 
@@ -71,14 +73,6 @@ def test_a_bad_prefix_is_an_error(
     assert bus.statistics().buffers == ()
 
 
-@pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
-def test_shared_frames_without_a_prefix_are_a_type_error(make: Callable[..., object]) -> None:
-    bus = Bus(SimulatedClock())
-    with pytest.raises(TypeError, match="prefix"):
-        make(bus, shared={"map"})
-    assert bus.statistics().buffers == ()
-
-
 # Two robots
 
 
@@ -113,12 +107,6 @@ async def test_answers_have_the_local_names_of_the_question() -> None:
         assert (answer.parent, answer.child, answer.stamp, answer.transform) == ("map", "arm", SECOND, at_x(1.5))
 
 
-def test_an_answer_with_local_names_keeps_its_extrapolation_and_gap() -> None:
-    _, _, _, (robot, _) = two_robots()
-    found = robot.lookup_nowait("map", "arm", 3 * SECOND, extrapolate=Hold(5.0))
-    assert (found.parent, found.child, found.extrapolated_by, found.gap) == ("map", "arm", 2 * SECOND, 0)
-
-
 async def test_data_have_local_names_before_and_after_transform() -> None:
     _, _, _, (_, robot) = two_robots()
     point = PointStamped("arm", LATEST, (0.0, 0.0, 1.0))
@@ -126,23 +114,6 @@ async def test_data_have_local_names_before_and_after_transform() -> None:
     assert robot.transform_nowait(point, "map") == expected
     assert await robot.transform(point, "map") == expected
     assert robot.transform_nowait(expected, "arm", at=SECOND, fixed="base").point == (0.0, 0.0, 1.0)
-
-
-def test_every_sending_method_takes_local_names() -> None:
-    bus = Bus(SimulatedClock())
-    got: list[TransformStamped] = []
-    bus.subscribe(got.extend)
-    robot = TransformBroadcaster(bus, "me", prefix="r/", shared=["map"])
-    robot.send("map", "a", at_x(1.0))
-    robot.send_static("a", "b", at_x(2.0))
-    robot.send_all([("b", "c", at_x(3.0)), moving("map", "d", 7, 4.0)])
-    assert [(sample.parent, sample.child, sample.authority) for sample in got] == [
-        ("map", "r/a", "me"),
-        ("r/a", "r/b", "me"),
-        ("r/b", "r/c", "me"),
-        ("map", "r/d", "me"),
-    ]
-    assert [sample.transform.translation[0] for sample in got] == [1.0, 2.0, 3.0, 4.0]
 
 
 def test_owning_a_local_name_reserves_the_frame_of_that_robot_only() -> None:
@@ -156,22 +127,6 @@ def test_owning_a_local_name_reserves_the_frame_of_that_robot_only() -> None:
     assert not robot.can_transform("arm", "tool")
     assert not other.can_transform("arm", "tool")
     assert robot.can_transform("map", "arm")
-
-
-@pytest.mark.parametrize("bad", ["", "/a"])
-def test_a_bad_name_is_an_error_with_a_prefix_too(bad: str) -> None:
-    _, bus, (robot, _), (buffer, _) = two_robots()
-    before = bus.statistics().samples
-    with pytest.raises(InvalidTransformError):
-        robot.send("map", bad, at_x(0.0))
-    with pytest.raises(InvalidTransformError):
-        robot.send(bad, "a", at_x(0.0))
-    with pytest.raises(InvalidTransformError):
-        robot.send_static("map", bad, at_x(0.0))
-    with pytest.raises(InvalidTransformError):
-        robot.send_all([("map", bad, at_x(0.0))])
-    assert bus.statistics().samples == before
-    assert not buffer.can_transform("map", bad)
 
 
 @pytest.mark.parametrize("bad", ["", "/arm"])
@@ -192,16 +147,6 @@ def test_a_buffer_with_a_prefix_cannot_name_frames_of_another_robot() -> None:
         assert not robot.can_transform("map", name)
         with pytest.raises(UnknownFrameError):
             robot.lookup_nowait("map", name)
-
-
-def test_errors_have_bus_names() -> None:
-    _, _, _, (robot, _) = two_robots()
-    with pytest.raises(UnknownFrameError) as unknown:
-        robot.lookup_nowait("map", "aarm")
-    assert (unknown.value.frame, unknown.value.close_matches[0]) == ("robot1/aarm", "robot1/arm")
-    with pytest.raises(FutureExtrapolationError) as future:
-        robot.lookup_nowait("map", "arm", 2 * SECOND)
-    assert future.value.child == "robot1/base"
 
 
 async def test_a_waiting_lookup_is_listed_with_local_names_and_blocked_by_bus_names() -> None:
@@ -229,20 +174,6 @@ async def test_a_waiting_lookup_is_listed_with_local_names_and_blocked_by_bus_na
         await clock.advance(5.0)
         assert isinstance(late.error, LookupTimeoutError)
         assert (late.error.target, late.error.source) == ("map", "robot1/arm")
-
-
-async def test_a_lookup_with_local_names_wakes_when_a_frame_of_its_path_becomes_static() -> None:
-    _, bus, (first, _), (robot, _) = two_robots()
-    async with anyio.create_task_group() as tasks:
-        asked = Asked(tasks, lambda: robot.lookup("map", "arm", 0))
-        await settle()
-        assert asked.ended
-        asked = Asked(tasks, lambda: robot.lookup("map", "arm", 9 * SECOND))
-        await settle()
-        first.send_static("map", "base", at_x(7.0))
-        await settle()
-        assert asked.answer.transform == at_x(7.5)
-    assert bus.statistics().kind_changes == 1
 
 
 async def test_a_long_wait_is_logged_with_bus_names(caplog: pytest.LogCaptureFixture) -> None:
@@ -307,3 +238,62 @@ def test_an_explanation_has_local_names_and_its_errors_have_bus_names() -> None:
     assert isinstance(apart.errors[0], DisconnectedError)
     misspelt = robot.explain("map", "/arm")
     assert (misspelt.source, misspelt.answerable) == ("/arm", False)
+
+
+names = st.text("ab/_", min_size=1, max_size=6).filter(lambda name: not name.startswith("/"))
+
+
+@given(frame_names())
+def test_any_text_without_a_leading_slash_is_a_frame_name(name: str) -> None:
+    assert is_frame(name)
+    check_frame(name)
+
+
+@pytest.mark.parametrize(
+    ("bad", "text"),
+    [
+        ("", "a frame name must not be empty"),
+        ("/map", "a frame name must not start with '/', got '/map': write 'map'"),
+        ("//a/b", "a frame name must not start with '/', got '//a/b': write 'a/b'"),
+        ("/", "a frame name must not start with '/', got '/'"),
+    ],
+)
+def test_a_bad_frame_name_is_refused_with_the_facts(bad: str, text: str) -> None:
+    assert not is_frame(bad)
+    with pytest.raises(InvalidTransformError) as caught:
+        check_frame(bad, "map", "base_link", "odometry")
+    error = caught.value
+    assert (str(error), error.reason) == (text, "frame name")
+    assert (error.parent, error.child, error.authority) == ("map", "base_link", "odometry")
+
+
+@pytest.mark.parametrize("bad", [None, 5, b"map"])
+def test_a_frame_name_that_is_no_str_is_a_type_error_that_shows_it(bad: Any) -> None:
+    with pytest.raises(TypeError, match=f"a frame name must be a str, not {bad!r}"):
+        is_frame(bad)
+
+
+# Prefixes
+
+
+@given(names, st.sets(names, max_size=3), names)
+def test_a_local_name_survives_the_way_to_the_bus_and_back(text: str, shared: set[str], name: str) -> None:
+    assume(not any(other.startswith(text) for other in shared))
+    prefix = Prefix(text, shared)
+    assert prefix.local(prefix.on_bus(name)) == name
+
+
+@given(names, st.sets(names, max_size=3), names)
+def test_a_frame_without_a_local_name_gets_a_leading_slash(text: str, shared: set[str], name: str) -> None:
+    assume(not any(other.startswith(text) for other in shared))
+    prefix = Prefix(text, shared)
+    local = prefix.local(name)
+    assert local == f"/{name}" if local.startswith("/") else prefix.on_bus(local) == name
+
+
+@pytest.mark.parametrize("make", [partial(TransformBroadcaster), partial(Buffer)], ids=["broadcaster", "buffer"])
+def test_shared_frames_without_a_prefix_are_a_type_error(make: Callable[..., object]) -> None:
+    bus = Bus(SimulatedClock())
+    with pytest.raises(TypeError, match="prefix"):
+        make(bus, shared={"map"})
+    assert bus.statistics().buffers == ()
