@@ -18,7 +18,7 @@ from support.samples import moving
 
 from tfbus import RecordingError
 from tfbus.recording import convert, examine, load, open_recording
-from tfbus.recording.load import Problems
+from tfbus.recording.recording import Problems
 from tfbus.recording.summary import summarise
 from tfbus.tf_message import encode
 

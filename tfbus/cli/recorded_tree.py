@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tfbus.cli.arguments import DEFAULT_TOPICS, TopicOptions
 from tfbus.cli.output import format_counts, progress, warn
-from tfbus.recording.load import Problems, SpeedLimit, fill
+from tfbus.recording.recording import Problems, SpeedLimit, fill
 from tfbus.tree.tree import TransformTree
 
 

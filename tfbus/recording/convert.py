@@ -45,8 +45,7 @@ from tfbus.recording.formats.transforms import (
     holds_transforms,
     parser_of,
 )
-from tfbus.recording.load import MAX_DETAILS
-from tfbus.recording.recording import open_storage
+from tfbus.recording.recording import MAX_DETAILS, open_storage
 from tfbus.tf_message import MalformedMessageError
 
 

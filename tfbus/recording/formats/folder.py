@@ -46,8 +46,6 @@ from tfbus.recording.formats.storage import (
 # Columns of SQLite hold values of any type, whatever their declaration: a timestamp that is no integer is counted.
 
 
-MAGIC: Final = b"SQLite format 3\0"
-
 _DAMAGE = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 _BLOCK: Final = 256
 _BLOCK_BYTES: Final = 16 * MIB

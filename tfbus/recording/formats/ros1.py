@@ -279,7 +279,6 @@ class _Layout:
         return header[:a], header[b:c], header[d:]
 
 
-MAGIC: Final = b"#ROSBAG V"
 _VERSION: Final = b"#ROSBAG V2.0\n"
 
 
