@@ -26,7 +26,7 @@ class HeaderStamps(NamedTuple):
     from_headers: bool
     """Whether they are those of the headers; else the messages have no header, and these are their log times."""
     unreadable: int
-    """The number of messages that are damaged or too short, and left out."""
+    """The number of messages that are too short and of damaged places of the file, which are left out."""
 
 
 def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
@@ -51,7 +51,8 @@ def header_stamps(path: str | os.PathLike[str], topic: str) -> HeaderStamps:
     try:
         for received, channel, payload in storage.messages(lambda each: each.topic.removeprefix("/") == name):
             if not isinstance(channel, Channel):
-                unreadable += 1
+                # The report of a file without its end stands for no message.
+                unreadable += channel.reason != "unfinished"
             elif not begins_with_header(channel):
                 from_headers = False
                 stamps.append(received)

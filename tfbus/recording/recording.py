@@ -620,6 +620,12 @@ class Problems(Counter[str]):
             if isinstance(error, MalformedMessageError) and len(self.details) < MAX_DETAILS:
                 self.details.append(error.detail)
 
+    def noting(self, messages: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
+        """The same messages; their errors are counted as they pass."""
+        for message in messages:
+            self.note(message.errors)
+            yield message
+
 
 def load(
     path: str | os.PathLike[str],
