@@ -433,14 +433,14 @@ def open_recording(
     ValueError, TypeError
         If both `topics` and `namespaces` are given, or a prefix begins with a slash.
 
-    Notes
-    -----
-    The sizes that a file claims or unfolds to are bounded, and what exceeds its bound is left out and reported: 8 MiB
-    for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and for a value in
-    SQLite, 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its size, or 64 MiB
-    if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The descriptions of all
-    channels and types take at most 64 MiB. Messages of chunks that overlap in time are sorted in memory up to 512 MiB.
-    With all that, reading a hostile file takes at most 2 GiB of memory.
+    Notes ----- The sizes that a file claims or unfolds to are bounded, and what exceeds its bound is left out and
+    reported: 8 MiB for a message with transforms, 256 MiB for any other, for a chunk (and a million messages in it) and
+    for a value in SQLite, 4 MiB for ``metadata.yaml``. A compressed file in a folder unfolds to at most 100 times its
+    size, or 64 MiB if that is more, in a nameless temporary file. An index of more than 64 MiB is not used. The
+    descriptions of all channels and types take at most 64 MiB. All compressed chunks together unfold to at most 1,000
+    times the size of the file, or 1 GiB if that is more; the chunks behind that are left out. Messages of chunks that
+    overlap in time are sorted in memory up to 512 MiB. With all that, reading a hostile file takes at most 2 GiB of
+    memory.
 
     An SQLite file beside which a writer has left a journal is copied to a temporary folder, where SQLite undoes the
     last transaction; if the writer still runs, the file is read in its place.

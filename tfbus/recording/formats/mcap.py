@@ -53,6 +53,7 @@ from tfbus.recording.formats.storage import (
     Packed,
     Stored,
     StoredMessage,
+    UnfoldBudget,
     Wanted,
     batches,
     in_order,
@@ -184,6 +185,7 @@ class McapReading:
         self._storage = storage
         self.wants = wants
         self.counts: Counter[int] = Counter()
+        self._budget = UnfoldBudget.of_file(storage.size)
         self.unknown = 0
         self.contradictions: set[int] = set()
         self.finished_once = False
@@ -203,7 +205,7 @@ class McapReading:
             try:
                 if place.offset in too_long:
                     raise ValueError("it is behind the end of the file")
-                return self.split(self._storage.read_chunk(place.offset).unfold())
+                return self.split(self._storage.read_chunk(place.offset).unfold(budget=self._budget))
             except (*DAMAGE, EndOfFile) as error:
                 return lost_chunk(place, low, error)
 
@@ -226,7 +228,7 @@ class McapReading:
                     read = self._storage.read_chunk(place.offset)
                     if read.size > claimed:
                         raise ValueError(f"the index claims {claimed:,} bytes, and it has {read.size:,}")
-                    chunk = OpenChunk(place, read.unfold())
+                    chunk = OpenChunk(place, read.unfold(budget=self._budget))
                 except (*DAMAGE, EndOfFile) as error:
                     yield from packer.pack(chunks, low, high)
                     chunks.clear()
@@ -269,7 +271,7 @@ class McapReading:
         if content is None:
             raise ValueError("it exceeds its bound" if opcode in _KINDS else f"its kind, {opcode}, is unknown")
         if opcode == Opcode.CHUNK:
-            return self.split(Chunk.parse(content).unfold())
+            return self.split(Chunk.parse(content).unfold(budget=self._budget))
         if opcode == Opcode.MESSAGE:
             received, number, payload = split_message(content)
             self.count({number: 1})
@@ -294,7 +296,8 @@ class McapReading:
         """The readable part of the record in which the file ends."""
         with suppress(*DAMAGE):
             if torn.opcode == Opcode.CHUNK:
-                return self.split(Chunk.parse(torn.data, torn=True).unfold(torn=True), torn=True)
+                chunk = Chunk.parse(torn.data, torn=True)
+                return self.split(chunk.unfold(True, self._budget), torn=True)
         return []
 
     def wanted_channel(self, number: int) -> Channel | None:
@@ -545,6 +548,7 @@ class McapStorage:
 
     def _log_times(self) -> Iterator[tuple[int, int]]:
         """First and last log time of each chunk and of each message outside of chunks, as far as the file is good."""
+        budget = UnfoldBudget.of_file(self.size)
         try:
             self._file.seek(len(MAGIC))
             for _, opcode, content in read_records(self._file, self.size):
@@ -554,13 +558,13 @@ class McapStorage:
                 elif content is not None and opcode == Opcode.CHUNK:
                     with suppress(*DAMAGE):
                         chunk = Chunk.parse(content)
-                        if chunk.end or self._times_in(chunk.unfold()):
+                        if chunk.end or self._times_in(chunk.unfold(budget=budget)):
                             yield chunk.start, chunk.end
         except EndOfFile as end:
             for torn in end.args:
                 with suppress(*DAMAGE):
                     if torn.opcode == Opcode.CHUNK:
-                        times = self._times_in(Chunk.parse(torn.data, torn=True).unfold(torn=True))
+                        times = self._times_in(Chunk.parse(torn.data, torn=True).unfold(True, budget))
                         if times:
                             yield min(times), max(times)
         except DAMAGE:

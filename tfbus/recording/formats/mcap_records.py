@@ -25,6 +25,7 @@ from tfbus.recording.formats.storage import (
     MAX_OTHER_MESSAGE,
     Channel,
     StoredMessage,
+    UnfoldBudget,
     UnfoldError,
     unfold,
 )
@@ -133,17 +134,17 @@ class Chunk(NamedTuple):
             raise ValueError(f"{stored} bytes are announced, and there are {len(data) - at}")
         return cls(start, end, size, crc, compression, data[at : at + stored])
 
-    def unfold(self, torn: bool = False) -> bytes:
+    def unfold(self, torn: bool = False, budget: UnfoldBudget | None = None) -> bytes:
         """The records in the chunk; with `torn`, as far as they can be decompressed.
 
         Raises
         ------
         UnfoldError
-            If the data are damaged, or larger than `MAX_CHUNK`.
+            If the data are damaged, or larger than `MAX_CHUNK`, or nothing is left of the budget.
         """
         if self.size > MAX_CHUNK:
             raise UnfoldError(f"it claims {self.size:,} bytes, and {MAX_CHUNK:,} is the bound")
-        content = unfold(self.data, self.compression, self.size, torn)
+        content = unfold(self.data, self.compression, self.size, torn, budget)
         if len(content) < self.size and not torn:
             raise UnfoldError(f"it claims {self.size:,} bytes, and holds {len(content):,}")
         if len(content) == self.size and self.crc and zlib.crc32(content) != self.crc:

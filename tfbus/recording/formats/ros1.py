@@ -26,6 +26,7 @@ from tfbus.recording.formats.storage import (
     ChunkPlace,
     DescriptionBudget,
     StoredMessage,
+    UnfoldBudget,
     Wanted,
     in_words,
     lost_message,
@@ -200,20 +201,20 @@ class Content(NamedTuple):
     """The reason why the rest is missing; empty if nothing is."""
 
 
-def read_chunk(file: IO[bytes], record: Record, torn: bool = False) -> bytes:
+def read_chunk(file: IO[bytes], record: Record, torn: bool = False, budget: UnfoldBudget | None = None) -> bytes:
     """The records in a chunk; with `torn`, as far as they can be decompressed.
 
     Raises
     ------
     One of `DAMAGE`
-        If they cannot be decompressed, or are larger than `MAX_CHUNK`.
+        If they cannot be decompressed, or are larger than `MAX_CHUNK`, or nothing is left of the budget.
     """
     size = number_in(record.fields, b"size")
     if size > MAX_CHUNK:
         raise ValueError(f"it claims {size:,} bytes, and {MAX_CHUNK:,} is the bound")
     data = record.read(file, MAX_CHUNK)
     # While a chunk is written, its header claims nothing.
-    content = unfold(data, text_in(record.fields, b"compression"), size or MAX_CHUNK, torn)
+    content = unfold(data, text_in(record.fields, b"compression"), size or MAX_CHUNK, torn, budget)
     if not torn and len(content) != size:
         raise ValueError(f"it claims {size:,} bytes, and holds {len(content):,}")
     return content
@@ -390,9 +391,10 @@ class Ros1Storage:
             and (chunk.counts is None or any(self._may_be_wanted(number, wanted) for number in chunk.counts))
         }
         counts: Counter[int] = Counter()
+        budget = UnfoldBudget.of_file(self._size)
 
         def read_place(place: ChunkPlace) -> list[StoredMessage]:
-            content = self._content(place.offset, torn=chunks[place].counts is None)
+            content = self._content(place.offset, chunks[place].counts is None, budget)
             counts.update(number for _, number, _ in content.messages)
             channel_of = self._numbered.get
             found: list[StoredMessage] = [
@@ -480,12 +482,13 @@ class Ros1Storage:
     def _find_chunks(self) -> None:
         """Find the chunks of a file without an index, and the connections of their messages."""
         at = len(_VERSION)
+        budget = UnfoldBudget.of_file(self._size)
         cause: Exception | None = None
         while at < self._size:
             try:
                 record = read_record(self._file, at)
                 if record.kind == CHUNK:
-                    at = self._add_chunk(record)
+                    at = self._add_chunk(record, budget)
                     continue
                 if record.end > self._size:
                     raise CutOffError("a record goes on behind the end of the file")
@@ -505,7 +508,7 @@ class Ros1Storage:
             raise RecordingError(f"it cannot be read as a bag of ROS 1: {why}", path=str(self._path), reason="damaged")
         raise RecordingError("the file ends before its first message", path=str(self._path), reason="truncated")
 
-    def _add_chunk(self, record: Record) -> int:
+    def _add_chunk(self, record: Record, budget: UnfoldBudget) -> int:
         """Note a chunk, with the times and counts of the index records behind it; returns the offset of what follows.
 
         Raises
@@ -534,7 +537,7 @@ class Ros1Storage:
                 ends = [min([first, *ends]), max([last, *ends])]
             at = following.end
         if not counts or not counts.keys() <= self._numbered.keys():
-            content = self._content(record.offset, torn)
+            content = self._content(record.offset, torn, budget)
             ends = ends or [received for received, _, _ in content.messages]
             if not ends and content.damage:
                 # It has no log time, so it is told at the start.
@@ -545,7 +548,7 @@ class Ros1Storage:
 
     # Reading
 
-    def _content(self, offset: int, torn: bool) -> Content:
+    def _content(self, offset: int, torn: bool, budget: UnfoldBudget) -> Content:
         """The content of a chunk; its connections are registered. With `torn`, its end may be missing."""
         try:
             record = read_record(self._file, offset)
@@ -553,9 +556,9 @@ class Ros1Storage:
                 return Content([], [], "there is no chunk")
             if torn and (record.size == 0 or record.end > self._size):
                 record = record._replace(size=self._size - record.data)
-                content = split_chunk(read_chunk(self._file, record, torn=True))._replace(damage="")
+                content = split_chunk(read_chunk(self._file, record, True, budget))._replace(damage="")
             else:
-                content = split_chunk(read_chunk(self._file, record))
+                content = split_chunk(read_chunk(self._file, record, budget=budget))
         except DAMAGE as error:
             return Content([], [], in_words(error))
         for fields, data in content.connections:
