@@ -133,7 +133,7 @@ class Conversion:
     problems : Counter of str
         The number of messages that were left out, by reason.
     details : list of str
-        What was lost or left out at the first places.
+        The first losses, in words.
     statics : dict of str to StaticTransform
         The last static transform of each child frame, with its new names.
     """
@@ -165,8 +165,8 @@ def convert(
 ) -> Conversion:
     """Write recordings to a new one, all messages in the order of their log times.
 
-    Transforms keep every bit of their stamps and numbers, also those that nothing would accept. Other messages, and
-    messages with transforms that nothing changes, are passed through as they are. Where the new format cannot hold
+    Transforms keep every bit of their stamps and numbers, even invalid ones. Other messages, and messages whose
+    transforms no edit changes, are passed through as they are. Where the new format cannot hold
     their encoding, they are converted between CDR and ROS 1; what cannot be converted is left out and counted.
 
     Parameters
@@ -180,7 +180,7 @@ def convert(
     topics : collection of str, optional
         The topics to write; by default all.
     edits : Edits, optional
-        What is changed in the transforms.
+        The changes to transforms.
     overwrite : bool
         Whether to replace an existing file.
     schema : {"ros", "foxglove"}
@@ -258,7 +258,7 @@ def new_file(target: Path) -> Iterator[Path]:
 
 
 class _Run:
-    """One conversion: what is wanted, and what has been done."""
+    """One conversion, and its result so far."""
 
     def __init__(self, copy: Copy, edits: Edits, topics: Collection[str] | None) -> None:
         self.result = Conversion()
@@ -275,7 +275,7 @@ class _Run:
                 latched: dict[tuple[Channel, bytes], None] = {}
                 for _, channel, payload in storage.messages(self._is_static, None, since - 1):
                     if isinstance(channel, Channel):
-                        # In the order of those that stay.
+                        # In the order of the newest copies.
                         latched.pop((channel, payload), None)
                         latched[channel, payload] = None
                 yield from ((since, channel, payload) for channel, payload in latched)
@@ -283,7 +283,7 @@ class _Run:
         yield from heapq.merge(*(each.messages(wanted, since, until) for each in storages), key=itemgetter(0))
 
     def write(self, received: int, channel: Channel | MalformedMessageError, payload: bytes) -> None:
-        """Write one message, or count why it is left out."""
+        """Write one message, or count the reason for leaving it out."""
         if isinstance(channel, MalformedMessageError):
             self.result.note(channel.reason, channel.detail)
             return

@@ -52,12 +52,12 @@ class RecordedMessage(NamedTuple):
     batch: Batch
     """The valid transforms."""
     errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """The reason why others were refused; with ``"damaged"``, the part of the file that is lost here, and with
-    ``"unfinished"``, why messages may be missing at the end."""
+    """Why the other transforms were refused. An error with the reason ``"damaged"`` says which part of the file is
+    lost here, one with ``"unfinished"`` why messages may be missing at the end."""
 
     @property
     def is_report(self) -> bool:
-        """Whether it stands for no message of the file, but for what is missing there."""
+        """Whether it stands for no message of the file, but reports a loss there."""
         return any(error.reason in ("damaged", "unfinished") for error in self.errors)
 
 
@@ -546,7 +546,7 @@ class SpeedLimit:
         self._candidates: dict[tuple[str, str], list[TransformStamped]] = {}
 
     def admit(self, batch: Batch) -> Batch:
-        """The samples of a batch that are kept, with those from before that have become certain."""
+        """The samples of a batch that are kept, behind earlier ones that this batch has confirmed."""
         kept: list[TransformStamped] = []
         for sample in batch:
             if sample.static:
@@ -556,7 +556,7 @@ class SpeedLimit:
         return tuple(kept)
 
     def undecided(self) -> Batch:
-        """At the end of all samples: the first of each frame of which no two agree."""
+        """At the end of all samples: the first sample of each frame that has no two samples in agreement."""
         kept = []
         for candidates in self._candidates.values():
             kept.append(candidates[0])
@@ -606,7 +606,7 @@ class Problems(Counter[str]):
     Attributes
     ----------
     details : list of str
-        What was lost at the first damaged places; at most `MAX_DETAILS`.
+        The losses at the first damaged places, in words; at most `MAX_DETAILS`.
     """
 
     def __init__(self) -> None:
@@ -641,8 +641,8 @@ def load(
 ) -> TransformTree:
     """Read all transforms of a recording, or of a part of it, into a tree that keeps them all.
 
-    Invalid transforms, those that would close a loop of parents, and those that are further than `max_translation`, are
-    left out and counted, as are the damaged parts of a file.
+    Invalid transforms, transforms that would close a loop of parents, and transforms that are further than
+    `max_translation`, are left out and counted, as are the damaged parts of a file.
 
     Parameters
     ----------
@@ -712,7 +712,7 @@ def fill(
     limit: SpeedLimit | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> None:
-    """Insert the samples of a recording into a tree, and count by reason those that are left out.
+    """Insert the samples of a recording into a tree, and count the refused ones by reason.
 
     Parameters
     ----------
@@ -792,7 +792,7 @@ def without_loops(
     problems: Counter[str],
     max_translation: float = MAX_TRANSLATION,
 ) -> Batch:
-    """Return the batch without the samples that are too far away or would close a loop of parents, and count those.
+    """The batch without samples that are too far away or would close a loop of parents; these are counted.
 
     Parameters
     ----------

@@ -284,7 +284,7 @@ class RecordingSummary:
     remarks : tuple of str
         As `Recording.remarks`.
     details : tuple of str
-        What was lost at the first damaged places.
+        The losses at the first damaged places, in words.
     """
 
     path: Path

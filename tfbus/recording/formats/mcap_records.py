@@ -1,7 +1,8 @@
 """The records of an MCAP file, and the messages in its chunks (MCAP's specification, sections "Records" and "Chunk").
 
-The package `mcap` parses the records that are rare. This module only splits a file into records and a chunk into
-messages: to build an object for each message would take ten times as long.
+The package `mcap` parses the rare records. This module only splits a file into records and a chunk into messages: to
+build an object for each message would take ten times as long. `split_chunk` goes from record to record and tells what
+is wrong; `record_places` and `scan_chunks` find the same messages in many whole chunks at once, with numpy.
 """
 
 import struct
@@ -99,7 +100,7 @@ _READ: Final[dict[int, Callable[[bytes], records.McapRecord]]] = {
 
 
 class Torn(NamedTuple):
-    """The part of a record that there is of one that goes on behind the end of the file."""
+    """The beginning of a record that goes on behind the end of the file."""
 
     opcode: int
     data: bytes
@@ -311,7 +312,7 @@ def _cycle(lengths: list[int]) -> list[int] | None:
     """The shortest cycle that the lengths have gone through at least twice."""
     for period in range(1, len(lengths) // 2 + 1):
         if lengths[period:] == lengths[:-period]:
-            # In phase: what comes next is what came one period before.
+            # In phase: each length comes again one period later.
             return lengths[-period:]
     return None
 

@@ -1,4 +1,7 @@
-"""Reading bags of ROS 1, finished or not.
+"""Reading bags of ROS 1, finished or not (the format "ROSBAG V2.0").
+
+A record of a bag is a header, which is a list of named fields, and data; each of the two has its length before it. The
+first half of this module parses records, and the messages in chunks; `Ros1Storage` is the second half.
 
 The index at the end of a bag lists its chunks. Without it, because the writer was killed or the file was cut, the
 chunks are found one after the other; behind damage, by the bytes that begin each of them. A chunk that is damaged is
@@ -37,11 +40,6 @@ from tfbus.recording.formats.storage import (
     unfold,
 )
 from tfbus.stamps import SECOND, STAMP_MAX, STAMP_MIN
-
-# The records of a bag of ROS 1, and the messages in its chunks (the format "ROSBAG V2.0").
-#
-# A record is a header, which is a list of named fields, and data; each of the two has its length before it.
-
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = range(2, 8)
 _KNOWN: Final = range(2, 8)
@@ -420,13 +418,13 @@ class Ros1Storage:
         if since is None and until is None:
             known = {chunk.offset for chunk in chunks.values()}
             for chunk in self._chunks:
-                # What was not read is in an index.
+                # A chunk that was not read has an index.
                 if chunk.offset not in known:
                     counts.update(chunk.counts or {})
             self._counted = counts
             promised = self._promised
             if promised is not None:
-                # Also where another connection of the same topic is not described.
+                # Even if another connection of the same topic is not described.
                 yield from shortfalls(
                     now,
                     {channel: promised[number] for number, channel in self._numbered.items() if wanted(channel)},
@@ -460,7 +458,7 @@ class Ros1Storage:
                 if not any(missing) and len({chunk.offset for chunk in self._chunks}) == len(self._chunks):
                     return True
         except DAMAGE:
-            # Then the chunks tell all of it.
+            # Then the chunks are searched.
             pass
         self._chunks.clear()
         self._numbered.clear()
@@ -496,7 +494,7 @@ class Ros1Storage:
             except DAMAGE as error:
                 following = find_chunk(self._file, at + 1)
                 if following is None:
-                    # As every file that was cut, it ends inside of a record.
+                    # A file that was cut ends inside of a record.
                     cause = error
                     break
                 self._damage.append(f"nothing can be read from byte {at} to byte {following}: {in_words(error)}")

@@ -1,4 +1,14 @@
-"""`Packed`, many messages in one piece of memory: numpy decodes them without a Python object for each."""
+"""The parts that all formats share: the bounds of a hostile file, channels and messages, and their order by log time.
+
+A `Storage` is an open file. It gives `StoredMessage`, one by one, or `Packed`: many messages in one piece of memory,
+which numpy decodes without a Python object for each. Nothing here knows a format, or what a message holds.
+
+* Bounds. A few bytes can claim, or unfold to, more than any machine holds. A size beyond its bound is not read, and its
+  place is reported. `tfbus.recording.open_recording` tells these numbers to users. `unfold` decompresses up to a bound.
+* Losses. `lost_message`, `unfinished` and `shortfalls` make the reports that stand in place of missing messages.
+* Order. Chunks of a file may overlap in time. `merge_chunks` sorts their messages; `separate` finds the parts of an
+  index that can be sorted by themselves, and `in_order` sorts packed messages.
+"""
 
 import bz2
 from bisect import bisect_left
@@ -14,12 +24,6 @@ import numpy.typing as npt
 
 from tfbus.stamps import STAMP_MAX, STAMP_MIN
 from tfbus.tf_message import MalformedMessageError
-
-# The bounds of every size that a file claims or unfolds to.
-#
-# A few bytes can claim, or unfold to, more than any machine holds. What exceeds a bound is not read, and its place is
-# reported. `tfbus.recording.open_recording` tells these numbers to users.
-
 
 MIB: Final = 2**20
 
@@ -124,7 +128,7 @@ Wanted = Callable[[Channel], bool]
 
 
 def lost_message(received: int, detail: str) -> StoredMessage:
-    """A message in place of those that cannot be read."""
+    """The report that stands in place of messages that cannot be read."""
     return received, MalformedMessageError("damaged", detail), b""
 
 
@@ -142,17 +146,16 @@ def unfinished(received: int, read: Counter[Channel], why: str) -> StoredMessage
     read : Counter of Channel
         The number of messages that were read of each channel.
     why : str
-        What shows it.
+        The evidence.
     """
     count = sum(number for channel, number in read.items() if isinstance(channel, Channel))
     return received, MalformedMessageError("unfinished", f"{count:,} messages were read of the file; {why}"), b""
 
 
 def in_words(error: Exception) -> str:
-    """The fault that an error of a parser tells: what Python and others word for programmers is told in other words."""
+    """The error of a parser in words for people: only a `ValueError` has them already."""
     if isinstance(error, UnicodeDecodeError):
         return "a text in it is no text"
-    # `struct.error`, `KeyError` and the like have no words for people.
     return str(error) if isinstance(error, ValueError) else "it ends inside of a record, or a record is damaged"
 
 
@@ -224,7 +227,7 @@ class Storage(Protocol):
     complete : bool
         Whether `channels` has all channels and all counts; if not, only reading the whole file would tell.
     remarks : sequence of str
-        What a user should know about the choice of files, such as those that were ignored.
+        Notes for a user on the choice of files, such as ignored ones.
     """
 
     @property

@@ -1,9 +1,15 @@
-"""Decoding many messages at once, with numpy.
+"""From the payloads of messages to transforms, in three ways.
 
-Most messages of a channel differ only in their stamps and numbers: the same frames are at the same bytes. Such messages
-are stacked to a matrix of bytes, and each transform of the message becomes two slices of it. What does not fit, or may
-be invalid, is left to `ChannelDecoder`, which decodes one message after the other and tells what is wrong with it. Both
-give the same bits.
+* `RawTransform`, `parser_of` and the writers keep the numbers of a transform as bytes: nothing is checked or
+  normalised, so a transform passes from one format to another without a change of any bit. The layout of a ROS message
+  is a sequence of numbers and strings; in CDR each is aligned to its size (see `tfbus.tf_message`); in ROS 1 nothing is
+  aligned, strings have no NUL, and a header begins with a sequence number.
+* `ChannelDecoder` decodes one message to samples, and tells what is wrong with each. Payloads that are not in CDR are
+  converted to it first.
+* `ColumnDecoder` decodes many messages at once, with numpy. Most messages of a channel differ only in their stamps and
+  numbers: the same frames are at the same bytes. So messages of one size are stacked to a matrix of bytes, and each
+  transform of the message becomes two slices of it. It gives the same bits as `ChannelDecoder`, or None for a block
+  with anything unusual, or that may be invalid; then `ChannelDecoder` takes the block.
 """
 
 import json
@@ -23,14 +29,6 @@ from tfbus.recording.formats.storage import AUTHORITIES, MAX_MESSAGE, Channel, P
 from tfbus.rows import NORM_TOLERANCE, ROUNDING
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError, Tag, decode
-
-# Transforms of stored messages as they are in the file, bit by bit, and messages of them.
-#
-# Nothing is checked or normalised here: the numbers stay bytes, so that a transform can pass from one format to another
-# without a change. The layout of a ROS message is a sequence of numbers and strings; in CDR each is aligned to its size
-# (see `tfbus.tf_message`), in ROS 1 nothing is aligned, strings have no NUL, and a header begins with a sequence
-# number.
-
 
 TF_TYPES: Final = frozenset(("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/msg/tfMessage", "tf/tfMessage"))
 FOXGLOVE_TYPES: Final = frozenset(
@@ -254,6 +252,7 @@ def _raw(seconds: int, nanoseconds: int, parent: str, child: str, numbers: Seque
 
 
 Run = tuple[str, int]
+"""An authority, and the number of successive transforms that it sent."""
 
 
 class ChannelDecoder:
@@ -346,7 +345,7 @@ def _authorities(channel: Channel) -> tuple[Run, ...]:
 Stamps = npt.NDArray[np.int64]
 
 _LARGE: Final = 1e9
-"""m; whether a longer translation is valid, the slow path decides."""
+"""m; `ChannelDecoder` decides whether a longer translation is valid."""
 _MAX_LAYOUTS: Final = 10_000
 _MAX_STRUCTURES: Final = 64
 """Of one channel and one size of messages."""
