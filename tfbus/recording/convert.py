@@ -29,19 +29,17 @@ from tfbus.recording.formats.copies import (
 )
 from tfbus.recording.formats.storage import (
     AUTHORITIES,
-    MAX_OTHER_MESSAGE,
     Channel,
     Storage,
     StoredMessage,
     UnfoldError,
     Wanted,
-    unfold,
 )
 from tfbus.recording.formats.transforms import (
-    COMPRESSED,
     ChannelDecoder,
     RawTransform,
     bounded,
+    decompressed,
     holds_transforms,
     parser_of,
 )
@@ -291,9 +289,7 @@ class _Run:
             if holds_transforms(channel):
                 self._write_transforms(received, channel, payload)
             else:
-                if channel.encoding == "cdr" and payload[:4] == COMPRESSED:
-                    payload = unfold(payload, "zstd", MAX_OTHER_MESSAGE)
-                self._copy.write(channel, received, payload)
+                self._copy.write(channel, received, decompressed(channel, payload))
                 self.result.messages += 1
         except MalformedMessageError as error:
             self.result.note(error.reason, error.detail)
@@ -307,11 +303,11 @@ class _Run:
     def _write_transforms(self, received: int, channel: Channel, payload: bytes) -> None:
         decoder = self._decoder(channel)
         payload = bounded(payload)
-        plain = self._copy.holds(channel) and not self._edits.changes_messages
+        unchanged = self._copy.holds(channel) and not self._edits.changes_messages
         try:
             transforms = parser_of(channel)(payload)
         except MalformedMessageError:
-            if not plain:
+            if not unchanged:
                 raise
             # It is passed through as it is.
             transforms = []
@@ -324,7 +320,7 @@ class _Run:
             self._note_statics([each for each, _ in kept])
             if self._edits.drop_static:
                 return
-        if plain:
+        if unchanged:
             self._copy.write(channel, received, payload)
         elif kept or not transforms:
             runs = tuple((name, len(list(run))) for name, run in groupby(authority for _, authority in kept))

@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from tfbus.errors import RecordingError
 from tfbus.recording.formats.copies import MessageTypes, types_with_header
-from tfbus.recording.formats.storage import MAX_OTHER_MESSAGE, Channel, UnfoldError, unfold
-from tfbus.recording.formats.transforms import COMPRESSED
+from tfbus.recording.formats.storage import Channel, UnfoldError
+from tfbus.recording.formats.transforms import decompressed
 from tfbus.recording.recording import open_storage
 from tfbus.stamps import SECOND
 
@@ -90,8 +90,7 @@ def begins_with_header(channel: Channel) -> bool:
 
 
 def _stamp(channel: Channel, payload: bytes) -> int:
-    if payload[:4] == COMPRESSED and channel.encoding == "cdr":
-        payload = unfold(payload, "zstd", MAX_OTHER_MESSAGE)
+    payload = decompressed(channel, payload)
     if channel.encoding == "ros1":
         # Behind the number that counts the messages.
         seconds, nanoseconds = struct.unpack_from("<II", payload, 4)

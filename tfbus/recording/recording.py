@@ -52,8 +52,8 @@ class RecordedMessage(NamedTuple):
     batch: Batch
     """The valid transforms."""
     errors: tuple[InvalidTransformError | MalformedMessageError, ...]
-    """Why the other transforms were refused. An error with the reason ``"damaged"`` says which part of the file is
-    lost here, one with ``"unfinished"`` why messages may be missing at the end."""
+    """The reasons for refusing the other transforms. An error with the reason ``"damaged"`` says which part of the file
+    is lost here, one with ``"unfinished"`` why messages may be missing at the end."""
 
     @property
     def is_report(self) -> bool:

@@ -307,12 +307,12 @@ class FolderStorage:
         present = sorted(file for file in path.iterdir() if Path(file.name.removesuffix(COMPRESSED)).suffix in SUFFIXES)
         metadata = self._read_metadata(path / METADATA)
         if metadata is not None:
-            names, self._promised = metadata
-            chosen = [path / name for name in names]
+            named, self._promised = metadata
+            chosen = [path / name for name in named]
             why = f"{METADATA} does not name it"
         else:
-            plain = {file.name for file in present}
-            chosen = [file for file in present if file.name.removesuffix(COMPRESSED) not in plain - {file.name}]
+            names = {file.name for file in present}
+            chosen = [file for file in present if file.name.removesuffix(COMPRESSED) not in names - {file.name}]
             why = "the uncompressed file of the same name is there"
         self.remarks += [f"{file.name} is ignored: {why}" for file in present if file not in chosen]
         return chosen

@@ -25,7 +25,15 @@ import numpy.typing as npt
 from tfbus.errors import pip_install
 from tfbus.frames import is_frame
 from tfbus.geometry.stamped import TransformStamped, renamed
-from tfbus.recording.formats.storage import AUTHORITIES, MAX_MESSAGE, Channel, Packed, UnfoldError, unfold
+from tfbus.recording.formats.storage import (
+    AUTHORITIES,
+    MAX_MESSAGE,
+    MAX_OTHER_MESSAGE,
+    Channel,
+    Packed,
+    UnfoldError,
+    unfold,
+)
 from tfbus.rows import NORM_TOLERANCE, ROUNDING
 from tfbus.stamps import SECOND
 from tfbus.tf_message import MAX_NAME, Decoded, MalformedMessageError, Tag, decode
@@ -86,6 +94,13 @@ def bounded(payload: bytes) -> bytes:
         return unfold(payload, "zstd" if payload[:4] == COMPRESSED else "", MAX_MESSAGE)
     except UnfoldError as error:
         raise MalformedMessageError("oversized" if "bound" in str(error) else "encoding", str(error)) from None
+
+
+def decompressed(channel: Channel, payload: bytes) -> bytes:
+    """A payload of any type, decompressed if the recorder has compressed it; raises `UnfoldError`."""
+    if channel.encoding == "cdr" and payload[:4] == COMPRESSED:
+        return unfold(payload, "zstd", MAX_OTHER_MESSAGE)
+    return payload
 
 
 def write_cdr(transforms: Sequence[RawTransform]) -> bytes:
@@ -281,7 +296,7 @@ class ChannelDecoder:
         self.prefix = prefix
         self.authorities = _authorities(channel)
         self._count = sum(count for _, count in self.authorities)
-        self._plain = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform")
+        self._is_cdr = channel.encoding == "cdr" and not channel.type.endswith("FrameTransform")
         self._parse = parser_of(channel)
         self._names: dict[tuple[str, str], tuple[str, str]] = {}
 
@@ -293,7 +308,7 @@ class ChannelDecoder:
         MalformedMessageError
         """
         payload = bounded(payload)
-        if not self._plain:
+        if not self._is_cdr:
             payload = write_cdr(self._parse(payload))
         order: Literal["little", "big"] = "little" if payload[1:2] == b"\1" else "big"
         count = int.from_bytes(payload[4:8], order)
